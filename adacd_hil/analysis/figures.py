@@ -1,0 +1,652 @@
+"""The report's figures: the paper's figures 5 to 7, the contacts close up, and how punctual the cycles were.
+
+Drawn with matplotlib's object interface on a white ground; `svg` makes a fragment for a page instead, whose colours are
+the page's own CSS variables and which carries no style, script, date or reference to anything outside.
+
+Colours mean one thing throughout: blue the identified model, orange the CAD model (told apart by every kind of colour
+vision), green joint 1 and purple joint 2 where the two share an axis, red what was detected.
+"""
+
+import io
+import re
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.metrics import (
+    Contact,
+    Metrics,
+    Run,
+    Section,
+    filtered,
+    is_realtime,
+)
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
+
+# Each colour is written once on paper and once as the page's variable of the same name.
+COLOURS: Final = {
+    "ink": "#1a2027",
+    "muted": "#5a6672",
+    "rule": "#c9d0d7",
+    "grid": "#e6eaee",
+    "identified": "#0067b1",
+    "cad": "#d9780a",
+    "joint1": "#00856a",
+    "joint2": "#8a4fa3",
+    "alarm": "#c4342d",
+    "adaptation": "#dcebf8",
+    "detection": "#fdfdfe",
+    "payload": "#f3ebdb",
+    "fault": "#f7dedc",
+}
+_PAPER: Final = "#ffffff"
+_DOTS_PER_INCH: Final = 150
+_FONT: Final = "DejaVu Sans"
+_ENVELOPE_BINS: Final = 1000
+"""Two points each: as fine as the widest screen on which the report is read."""
+_PANEL_BINS: Final = 250
+"""The same for a panel of which four share the width."""
+CLOSE_UPS: Final = 24
+"""Contacts shown close up; six rows of four are a page."""
+_BEFORE_S: Final = 0.012
+_AFTER_S: Final = 0.06
+"""From the onset, and at least: a typical detection, and the isolation window after it."""
+
+_STYLE: Final[dict[Any, Any]] = {
+    "font.family": _FONT,
+    "font.size": 8.5,
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5.0,
+    "axes.labelsize": 8.5,
+    "axes.labelcolor": COLOURS["muted"],
+    "axes.edgecolor": COLOURS["rule"],
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.xmargin": 0.0,
+    "axes.unicode_minus": True,
+    "axes.titlecolor": COLOURS["ink"],
+    "grid.color": COLOURS["grid"],
+    "grid.linewidth": 0.6,
+    "text.color": COLOURS["ink"],
+    "xtick.color": COLOURS["rule"],
+    "ytick.color": COLOURS["rule"],
+    "xtick.labelcolor": COLOURS["muted"],
+    "ytick.labelcolor": COLOURS["muted"],
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "legend.borderpad": 0.0,
+    "legend.borderaxespad": 0.0,
+    "lines.solid_joinstyle": "round",
+    "path.simplify": False,
+    "svg.fonttype": "none",
+}
+
+
+def _style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
+    """Apply the figures' style for a while, whatever the user's own matplotlib configuration says."""
+    return mpl.rc_context({**mpl.rcParamsDefault, **_STYLE, **(more or {}), "backend": mpl.rcParams["backend"]})
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure with its name, its title and one sentence that says what to see."""
+
+    name: str
+    title: str
+    caption: str
+    figure: Figure
+
+    def png(self) -> bytes:
+        """Render on white, 150 dots per inch."""
+        out = io.BytesIO()
+        with _style():
+            canvas: Any = FigureCanvasAgg(self.figure)
+            self.figure.dpi = _DOTS_PER_INCH
+            canvas.print_png(out, metadata={"Software": None})
+        return out.getvalue()
+
+    def svg(self) -> str:
+        """Render a fragment for a page, see the module's first lines. Its ids begin with the figure's name."""
+        out = io.StringIO()
+        with _style({"svg.hashsalt": self.name}):
+            canvas: Any = FigureCanvasSVG(self.figure)
+            self.figure.patch.set_visible(False)
+            canvas.print_svg(out)
+            self.figure.patch.set_visible(True)
+        return _fragment(out.getvalue(), self.name, f"{self.title}. {self.caption}")
+
+
+def draw(run: Run, metrics: Metrics) -> list[Drawing]:
+    """Draw every figure that the run has something for."""
+    if run.cycle.size == 0:
+        return []
+    with _style():
+        drawings = [residuals(run, metrics)]
+        adaptations = [section for section in metrics.sections if section.kind == "adaptation"]
+        for number, section in enumerate(adaptations):
+            drawings.append(adaptation(run, metrics, section, number))
+        if metrics.contacts:
+            drawings.append(close_ups(run, metrics))
+        if is_realtime(run) and run.timing.cycle.size:
+            drawings.append(punctuality(run))
+    return drawings
+
+
+def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
+    """Choose the rows that keep the smallest and the largest value of each of `bins` equal parts, and both ends.
+
+    Rows ascend. A series of at most two rows per part is kept whole. NaN is chosen only where a part has nothing else.
+    """
+    count = y.shape[0]
+    width = -(-count // bins)
+    if width <= 2:
+        return np.arange(count)
+    whole = count // width * width
+    low = np.where(np.isnan(y), np.inf, y)
+    high = np.where(np.isnan(y), -np.inf, y)
+    starts = np.arange(0, whole, width)
+    chosen = [starts + part[:whole].reshape(-1, width).argmin(axis=1) for part in (low, -high)]
+    if whole < count:
+        chosen += [[whole + part[whole:].argmin()] for part in (low, -high)]
+    return np.unique(np.concatenate([*chosen, [0, count - 1]]))
+
+
+def _plot(axes: Axes, x: Vector, y: Vector, bins: int = _ENVELOPE_BINS, **style: Any) -> None:
+    rows = envelope(y, bins)
+    axes.plot(x[rows], y[rows], **style)
+
+
+def residuals(run: Run, metrics: Metrics) -> Drawing:
+    """Draw figure 5: the residual of both models over the whole run, each joint once in full and once near zero."""
+    figure = Figure(figsize=(10.0, 6.6))
+    time_s = run.time_s()
+    shown = time_s >= min(0.0, time_s[-1])
+    threshold_Nm = run.settings.detector.threshold_Nm
+    full = _stack(figure, (0.915, 0.475), 0.235)
+    near = _stack(figure, (0.655, 0.215), 0.135)
+    end_s = float(time_s[-1])
+    for joint in range(JOINTS):
+        for axes, is_near in ((full[joint], False), (near[joint], True)):
+            _shade(axes, metrics.sections)
+            h = threshold_Nm[joint]
+            for level in (-h, h):
+                axes.axhline(level, color=COLOURS["ink"], linewidth=0.8, dashes=(4, 2.5), label="threshold")
+            if run.has_cad:
+                _plot(
+                    axes,
+                    time_s[shown],
+                    run.tau_ext_hat_cad[shown, joint],
+                    color=COLOURS["cad"],
+                    linewidth=0.7,
+                    label="with the CAD model",
+                )
+            _plot(
+                axes,
+                time_s[shown],
+                run.tau_ext_hat[shown, joint],
+                color=COLOURS["identified"],
+                linewidth=0.8,
+                label="with the identified parameters",
+            )
+            axes.set_xlim(0.0, max(end_s, 1e-3))
+            if is_near:
+                axes.set_ylim(-1.8 * h, 1.8 * h)
+                axes.set_yticks([-h, 0.0, h], [f"−{h:g}", "0", f"{h:g}"])
+            else:
+                _pad(axes, run.tau_ext_hat[shown, joint], run.tau_ext_hat_cad[shown, joint], h)
+            axes.yaxis.set_label_coords(-0.052, 0.5)
+            axes.tick_params(labelbottom=is_near and joint == 1)
+        full[joint].set_title(f"({'ab'[joint]})  Joint {joint + 1}", pad=17 if joint == 0 else 5)
+        full[joint].set_ylabel("Nm")
+        near[joint].set_ylabel("near zero")
+        _mark(full[joint], metrics)
+    _label(full[0], metrics.sections, end_s)
+    near[1].set_xlabel("time since motion start, s")
+    lines = {str(line.get_label()): line for line in reversed(full[0].lines)}
+    labels = [label for label in lines if not label.startswith("_")]
+    handles = [lines[label] for label in labels]
+    figure.legend(
+        handles, labels, loc="upper right", bbox_to_anchor=(0.985, 0.99), ncols=len(labels), columnspacing=1.6
+    )
+    caption = (
+        "Estimated external torque with the identified parameters and with the CAD model; below each, the range around "
+        "the threshold, where the model's own error shows. Numbers mark contacts"
+    )
+    has_missed = any(contact.is_armed and contact.detected_s is None for contact in metrics.contacts)
+    caption += ", a hollow mark one that was not detected" if has_missed else ""
+    caption += ", a cross a false alarm." if metrics.false_alarms else "."
+    return Drawing("fig5", "Figure 5 — error in (a) joint 1 and (b) joint 2", caption, figure)
+
+
+def _stack(figure: Figure, tops: Sequence[float], height: float) -> list[Axes]:
+    return [figure.add_axes((0.066, top - height, 0.919, height)) for top in tops]
+
+
+def _shade(axes: Axes, sections: Iterable[Section]) -> None:
+    for section in sections:
+        if section.kind != "detection":
+            axes.axvspan(section.start_s, section.end_s, color=COLOURS[section.kind], linewidth=0.0, zorder=0)
+        axes.axvline(section.start_s, color=COLOURS["rule"], linewidth=0.7, zorder=1)
+
+
+_KIND_TITLES: Final = {
+    "adaptation": "adaptation",
+    "detection": "collision detection",
+    "payload": "payload change",
+    "fault": "fault",
+}
+
+
+def _label(axes: Axes, sections: Iterable[Section], end_s: float) -> None:
+    """Write letter and kind of each section above the axes, the kind only where it has room."""
+    for section in sections:
+        room = 165.0 * section.duration_s / max(end_s, 1e-9)  # characters
+        kind = _KIND_TITLES[section.kind]
+        text = f"{section.label}  {kind}" if len(kind) + 3 < room else section.label
+        axes.annotate(
+            text,
+            (0.5 * (section.start_s + section.end_s), 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 4),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=8.0,
+            color=COLOURS["muted"],
+        )
+
+
+def _pad(axes: Axes, identified: Vector, cad: Vector, h: float) -> None:
+    """Fit the ordinate to the data and leave a lane on top for the contact marks."""
+    values = np.concatenate((identified, cad))
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    low, high = min(low, -2.0 * h), max(high, 2.0 * h)
+    span = high - low
+    axes.set_ylim(low - 0.06 * span, high + 0.24 * span)
+    axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+
+
+def _when(contact: Contact) -> float:
+    """Give a contact's onset, or its detection where the onset is not known, s."""
+    at_s = contact.onset_s if contact.onset_s is not None else contact.detected_s
+    assert at_s is not None
+    return at_s
+
+
+def _mark(axes: Axes, metrics: Metrics) -> None:
+    lane = ("data", "axes fraction")
+    for contact in metrics.contacts:
+        at_s = _when(contact)
+        is_seen = contact.detected_s is not None
+        face = COLOURS["alarm"] if is_seen else "none"
+        axes.plot(
+            [at_s],
+            [0.915],
+            transform=axes.get_xaxis_transform(),
+            marker="o",
+            markersize=10.5,
+            color=COLOURS["alarm"],
+            markerfacecolor=face,
+            markeredgecolor=COLOURS["alarm"],
+            markeredgewidth=0.9,
+            linestyle="none",
+        )
+        axes.annotate(
+            str(contact.number),
+            (at_s, 0.915),
+            xycoords=lane,
+            ha="center",
+            va="center_baseline",
+            fontsize=7.0,
+            fontweight="bold",
+            color=_PAPER if is_seen else COLOURS["alarm"],
+        )
+    for false_s in metrics.false_alarms_s or ():
+        axes.plot(
+            [false_s],
+            [0.915],
+            transform=axes.get_xaxis_transform(),
+            marker="x",
+            markersize=8,
+            color=COLOURS["alarm"],
+            markeredgewidth=1.8,
+            linestyle="none",
+        )
+
+
+def parameter_label(name: str) -> str:
+    """Write a parameter's name as mathematics: F_v1 as F with the index v1."""
+    stem, index = (name[0], name[1:]) if "_" not in name else name.split("_", 1)
+    letters = index.rstrip("0123456789")
+    digits = index[len(letters) :]
+    inner = rf"\mathrm{{{letters}}}{digits}" if letters else digits
+    return rf"${stem}_{{{inner}}}$"
+
+
+def adaptation(run: Run, metrics: Metrics, section: Section, number: int) -> Drawing:
+    """Draw figure 6 or 7: each parameter over one adaptation, and the residual that ends it by eq. (15)."""
+    names = run.parameter_names
+    columns = 4
+    lines = -(-(len(names) + 1) // columns)
+    figure = Figure(figsize=(10.0, 0.35 + 2.05 * lines))
+    grid = figure.subplots(lines, columns, squeeze=False)
+    height = figure.get_figheight()
+    figure.subplots_adjust(
+        left=0.05, right=0.985, bottom=0.5 / height, top=1.0 - 0.33 / height, wspace=0.32, hspace=0.45
+    )
+    panels = list(grid.flat)
+    time_s = run.time_s() - section.start_s
+    after_s = 0.08 * section.duration_s
+    rows = (time_s >= 0.0) & (time_s <= section.duration_s + after_s)
+    if not rows.any():
+        rows[-1] = True
+    identified = metrics.parameters[section.label]
+    for column, name in enumerate(names):
+        axes = panels[column]
+        true, final = identified[name]
+        if true is not None:
+            axes.axhline(true, color=COLOURS["ink"], linewidth=0.9, dashes=(4, 2.5))
+        _plot(axes, time_s[rows], run.theta_hat[rows, column], _PANEL_BINS, color=COLOURS["identified"], linewidth=1.3)
+        _head(axes, name, true, final)
+        _fit(axes, run.theta_hat[rows, column], true)
+    _ending(panels[len(names)], run, rows, time_s)
+    for axes in panels[len(names) + 1 :]:
+        axes.set_axis_off()
+    for axes in panels[: len(names) + 1]:
+        axes.set_xlim(0.0, max(section.duration_s + after_s, 1e-3))
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        if section.is_complete:
+            axes.axvspan(0.0, section.duration_s, color=COLOURS["adaptation"], linewidth=0.0, zorder=0, alpha=0.55)
+            axes.axvline(section.duration_s, color=COLOURS["muted"], linewidth=0.8, zorder=1)
+    _label_below(figure, "time since the adaptation began, s")
+    ordinal = ("first", "second", "third", "fourth", "fifth")[number] if number < 5 else f"{number + 1}th"
+    payload_kg = metrics.payload_kg[section.label]
+    payload = "" if payload_kg is None else f", {payload_kg:g} kg payload" if payload_kg else ", no payload"
+    truth = "dashed the true values; " if identified and next(iter(identified.values()))[0] is not None else ""
+    end = (
+        f"it ended after {section.duration_s:.2f} s, when the residual had stayed within β for T"
+        if section.is_complete
+        else "it did not end"
+    )
+    return Drawing(
+        f"fig{6 + number}",
+        f"Figure {6 + number} — model identification, {ordinal} adaptation (section {section.label}{payload})",
+        f"Identified parameters over time, {truth}{end}.",
+        figure,
+    )
+
+
+def _head(axes: Axes, name: str, true: float | None, final: float) -> None:
+    axes.set_title(f"{parameter_label(name)}", fontsize=10.5)
+    text = f"{final:.4f}"
+    if true:
+        text += f"  ({100.0 * (final - true) / true:+.1f} %)".replace("-", "−")
+    _note(axes, f"{text}  {PARAMETER_UNITS[name]}")
+
+
+def _note(axes: Axes, text: str) -> None:
+    """Write above the right end of a panel."""
+    axes.annotate(
+        text,
+        (1.0, 1.0),
+        xycoords="axes fraction",
+        xytext=(0, 5),
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        fontsize=7.8,
+        color=COLOURS["muted"],
+    )
+
+
+def _fit(axes: Axes, values: Vector, true: float | None) -> None:
+    """Fit the ordinate, zero and the true value inside, so that a small error looks small."""
+    levels = np.append(values[np.isfinite(values)], [0.0, true or 0.0])
+    low, high = float(levels.min()), float(levels.max())
+    span = max(high - low, 1e-6)
+    axes.set_ylim(low - 0.08 * span, high + 0.1 * span)
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+
+
+def _label_below(figure: Figure, text: str) -> None:
+    """Write one label for the abscissae of all panels."""
+    figure.text(
+        0.5175, 0.08 / figure.get_figheight(), text, ha="center", va="bottom", fontsize=8.5, color=COLOURS["muted"]
+    )
+
+
+def _ending(axes: Axes, run: Run, rows: NDArray[np.bool_], time_s: Vector) -> None:
+    """Draw the larger residual of both joints against β, on a logarithmic ordinate."""
+    largest = np.abs(run.tau_ext_hat[rows]).max(axis=1)
+    beta_Nm = run.settings.termination.beta_Nm
+    axes.set_yscale("log")
+    _plot(axes, time_s[rows], np.maximum(largest, 1e-4), _PANEL_BINS, color=COLOURS["muted"], linewidth=0.8)
+    axes.axhline(beta_Nm, color=COLOURS["alarm"], linewidth=0.9, dashes=(4, 2.5))
+    high = float(np.nanmax(largest, initial=beta_Nm))
+    axes.set_ylim(1e-3, max(3.0 * high, 5.0 * beta_Nm))
+    axes.minorticks_off()
+    axes.set_title("eq. (15)")
+    _note(axes, f"residual, β = {beta_Nm:g} Nm")
+
+
+def close_ups(run: Run, metrics: Metrics) -> Drawing:
+    """Draw each contact's residuals around its onset, with threshold, onset and detection."""
+    contacts = metrics.contacts[:CLOSE_UPS]
+    columns = 4
+    lines = -(-len(contacts) // columns)
+    figure = Figure(figsize=(10.0, 0.75 + 1.85 * lines))
+    grid = figure.subplots(lines, columns, squeeze=False)
+    height = figure.get_figheight()
+    figure.subplots_adjust(
+        left=0.05, right=0.985, bottom=0.45 / height, top=1.0 - 0.62 / height, wspace=0.22, hspace=0.42
+    )
+    time_s = run.time_s()
+    for contact, axes in zip(contacts, grid.flat, strict=False):
+        _close_up(axes, run, contact, time_s)
+    for axes in list(grid.flat)[len(contacts) :]:
+        axes.set_axis_off()
+    _label_below(figure, "time since onset, ms" if run.truth else "time since detection, ms")
+    handles, labels = grid.flat[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="upper right",
+        bbox_to_anchor=(0.985, 1.0 - 0.06 / height),
+        ncols=len(labels),
+        columnspacing=1.6,
+    )
+    more = f" The first {CLOSE_UPS} of {len(metrics.contacts)}." if len(metrics.contacts) > CLOSE_UPS else ""
+    ideal = "; dotted, the true torque through the same filter" if run.truth is not None else ""
+    caption = f"Estimated external torque of both joints, Nm, around each contact{ideal}.{more}"
+    return Drawing("contacts", "Contacts close up", caption, figure)
+
+
+def _close_up(axes: Axes, run: Run, contact: Contact, time_s: Vector) -> None:
+    at_s = _when(contact)
+    delay_s = (contact.delay_ms or 0.0) * 1e-3
+    after_s = max(_AFTER_S, 2.0 * delay_s)
+    if contact.detected_s is None and contact.end_s is not None and contact.onset_s is not None:
+        after_s = max(after_s, min(1.0, 1.5 * (contact.end_s - contact.onset_s)))
+    rows = (time_s >= at_s - _BEFORE_S) & (time_s <= at_s + after_s)
+    ms = (time_s[rows] - at_s) * 1e3
+    h = min(run.settings.detector.threshold_Nm)
+    axes.axhspan(-h, h, color=COLOURS["grid"], linewidth=0.0, zorder=0.5, label="within the threshold")
+    levels = [run.tau_ext_hat[rows]]
+    if run.truth is not None:
+        ideal_ms, ideal = _ideal(run, at_s, after_s)
+        levels.append(ideal)
+    for joint in range(JOINTS):
+        colour = COLOURS[f"joint{joint + 1}"]
+        axes.plot(ms, run.tau_ext_hat[rows, joint], color=colour, linewidth=1.3, label=f"joint {joint + 1}")
+        if run.truth is not None:
+            axes.plot(ideal_ms, ideal[:, joint], color=colour, linewidth=0.9, linestyle=(0, (1, 1.6)))
+    if contact.onset_s is not None:
+        axes.axvline(0.0, color=COLOURS["ink"], linewidth=0.9, label="onset")
+    seen_ms = (contact.detected_s - at_s) * 1e3 if contact.detected_s is not None else float("nan")
+    if seen_ms > 0.0:
+        axes.axvspan(0.0, seen_ms, color=COLOURS["fault"], linewidth=0.0, zorder=0)
+    axes.axvline(seen_ms, color=COLOURS["alarm"], linewidth=1.2, label="detection")
+    low, high = _limits(levels, h)
+    axes.set_ylim(low, high)
+    axes.set_xlim(-1e3 * _BEFORE_S, 1e3 * after_s)
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    _describe(axes, contact)
+
+
+def _limits(levels: list[Vector], h: float) -> tuple[float, float]:
+    values = np.concatenate([level.ravel() for level in levels])
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    low, high = min(low, -2.0 * h), max(high, 2.0 * h)
+    margin = 0.08 * (high - low)
+    return low - margin, high + margin
+
+
+def _ideal(run: Run, onset_s: float, after_s: float) -> tuple[Vector, Vector]:
+    """Give time in ms and the true torque through the filter, Nm, around an onset."""
+    truth = run.truth
+    assert truth is not None
+    time_s = run.time_of_s(truth.cycle)
+    rows = np.flatnonzero((time_s >= onset_s - _BEFORE_S) & (time_s <= onset_s + after_s))
+    ideal = filtered(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, run.settings.filter.a_rad_s)
+    return (time_s[rows] - onset_s) * 1e3, ideal
+
+
+def _describe(axes: Axes, contact: Contact) -> None:
+    number = f"{contact.number}"
+    if contact.link is not None:
+        number += f"  link {contact.link}"
+    elif contact.link_detected is not None:
+        number += f"  link {contact.link_detected}"
+    axes.set_title(number)
+    if contact.delay_ms is not None:
+        text, colour = f"detected after {contact.delay_ms:.0f} ms", COLOURS["muted"]
+    elif contact.detected_s is not None:
+        text, colour = f"detected at {contact.detected_s:.2f} s", COLOURS["muted"]
+    else:
+        text, colour = ("missed" if contact.is_armed else "not armed"), COLOURS["alarm"]
+    axes.annotate(
+        text,
+        (1.0, 1.0),
+        xycoords="axes fraction",
+        xytext=(0, 5),
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        fontsize=7.8,
+        color=colour,
+    )
+
+
+def punctuality(run: Run) -> Drawing:
+    """Draw how late the cycles woke, and when their feedback was in and their commands were out."""
+    figure = Figure(figsize=(10.0, 2.5))
+    grid = figure.subplots(1, 3)
+    figure.subplots_adjust(left=0.05, right=0.985, bottom=0.2, top=0.87, wspace=0.2)
+    period_us = run.settings.bus.period_us
+    timing = run.timing
+    panels = (
+        ("Wake-up", timing.lateness_ns),
+        ("Feedback in", timing.feedback_ns),
+        ("Commands out", timing.command_ns),
+    )
+    for axes, (title, values_ns) in zip(grid, panels, strict=True):
+        values_us = values_ns * 1e-3
+        top_us = max(float(values_us.max()) * 1.02, 1.0)
+        heights, edges = np.histogram(values_us, bins=60, range=(min(0.0, float(values_us.min())), top_us))
+        axes.set_yscale("log")
+        axes.stairs(heights, edges, fill=True, color=COLOURS["muted"], baseline=0.5)
+        axes.set_ylim(0.5, 2.0 * max(float(heights.max()), 1.0))
+        axes.set_xlim(edges[0], edges[-1])
+        axes.minorticks_off()
+        axes.set_title(title)
+        p99, largest = np.percentile(values_us, (99.0, 100.0))
+        if top_us > period_us:
+            axes.axvline(period_us, color=COLOURS["alarm"], linewidth=0.9, dashes=(4, 2.5))
+        axes.annotate(
+            f"99 %: {p99:.0f} µs   max {largest:.0f} µs",
+            (1.0, 1.0),
+            xycoords="axes fraction",
+            xytext=(0, 5),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            fontsize=7.8,
+            color=COLOURS["muted"],
+        )
+    grid[0].set_ylabel("cycles")
+    grid[0].set_xlabel("after the grid point, µs")
+    for axes in grid[1:]:
+        axes.set_xlabel("after SYNC, µs")
+    caption = f"Distribution over all cycles, logarithmic; the period is {period_us} µs."
+    return Drawing("cycle", "Punctuality of the cycles", caption, figure)
+
+
+_VARIABLES: Final = {colour: f"var(--{name})" for name, colour in COLOURS.items()} | {_PAPER: "var(--paper)"}
+_HEAD: Final = re.compile(r".*?<svg[^>]*viewBox=\"([^\"]*)\"[^>]*>", re.DOTALL)
+_UNWANTED: Final = re.compile(r"<metadata>.*?</metadata>|<style[^>]*>.*?</style>|<!--.*?-->", re.DOTALL)
+_STYLES: Final = re.compile(r' style="([^"]*)"')
+_COLOUR: Final = re.compile(r"#[0-9a-f]{6}")
+_ID: Final = re.compile(r' id="([^"]*)"')
+_USE: Final = re.compile(r'(?:xlink:)?href="#([^"]*)"')
+_URL: Final = re.compile(r"url\(#([^)]*)\)")
+
+
+def _fragment(text: str, name: str, description: str) -> str:
+    """Turn matplotlib's file into a fragment: attributes for styles, variables for colours, ids of its own."""
+    head = _HEAD.match(text)
+    assert head is not None
+    body = _UNWANTED.sub("", text[head.end() :])
+    body = _STYLES.sub(_attributes, body)
+    used = {found for pattern in (_USE, _URL) for found in pattern.findall(body)}
+    body = _ID.sub(lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", body)
+    body = _USE.sub(lambda m: f'href="#{name}-{m[1]}"', body)
+    body = _URL.sub(lambda m: f"url(#{name}-{m[1]})", body)
+    body = _COLOUR.sub(lambda m: _VARIABLES.get(m[0], m[0]), body)
+    body = re.sub(r"\n\s*", "\n", body)
+    label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    return f'<svg viewBox="{head[1]}" role="img" aria-label="{label}">{body.strip()}'
+
+
+def _attributes(match: re.Match[str]) -> str:
+    """Write a style as presentation attributes, so that a strict content policy need not allow inline styles."""
+    attributes = []
+    for declaration in match[1].replace("&quot;", "'").split(";"):
+        key, _, value = declaration.strip().partition(": ")
+        if key == "font":
+            attributes += _font(value)
+        elif key:
+            attributes.append((key, value.strip()))
+    return "".join(f' {key}="{value}"' for key, value in attributes)
+
+
+def _font(value: str) -> list[tuple[str, str]]:
+    """Split the shorthand `[italic] [bold] 8.5px family`; the family is the page's own."""
+    words = value.split("px", 1)[0].split()
+    attributes = [("font-size", words[-1])]
+    if "italic" in words or "oblique" in words:
+        attributes.append(("font-style", "italic"))
+    attributes += [("font-weight", word) for word in words[:-1] if word.isdigit() or word == "bold"]
+    return attributes

@@ -1,0 +1,143 @@
+"""`adacd-hil`: the commands. Each parses, calls one function, prints."""
+
+import functools
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from adacd_hil import __version__
+from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
+from adacd_hil.config import ConfigError, builtin_names
+from adacd_hil.log.errors import LogError
+from adacd_hil.wire.bus import BusError, BusMissingError
+from adacd_hil.wire.codec import CodecError
+
+_CODES = (
+    (ConfigError, ExitCode.USAGE),
+    (CodecError, ExitCode.USAGE),
+    (BusMissingError, ExitCode.BUS_MISSING),
+    (BusError, ExitCode.SAFETY_STOP),
+    (LogError, ExitCode.FAILURE),
+    (OSError, ExitCode.FAILURE),
+)
+
+
+def _explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
+    """Turn what a command raises into one line and its exit code."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            code = command(*args, **kwargs)
+        except CommandError as error:
+            _fail(str(error), error.code)
+        except tuple(kind for kind, _ in _CODES) as error:
+            _fail(str(error), next(code for kind, code in _CODES if isinstance(error, kind)))
+        else:
+            sys.exit(code)
+
+    return run
+
+
+def _fail(line: str, code: ExitCode) -> None:
+    print(f"adacd-hil: {line}", file=sys.stderr)
+    sys.exit(code)
+
+
+_config = click.option(
+    "--config",
+    default="paper",
+    show_default=True,
+    metavar="NAME|FILE",
+    help=f"One of {builtin_names()}, or a TOML file.",
+)
+_profile = click.option(
+    "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
+)
+_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
+_clock = functools.partial(
+    click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
+)
+
+
+@click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+def cli() -> None:
+    """Identify an arm online from its joint torques over CAN, then detect collisions."""
+
+
+@cli.command(epilog=EPILOG)
+@_config
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/demo"), show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
+@_clock(default="lockstep")
+@_profile
+@_json
+@_explained
+def demo(config: str, out: Path, seed: int | None, clock: str, profile: str | None, as_json: bool) -> ExitCode:
+    """Play the paper's experiment with an emulated arm in this process, and report it."""
+    from adacd_hil.cli.demo import play
+
+    report, code = play(config, profile, seed, clock, out)
+    print(json.dumps(report.as_json(), indent=2) if as_json else report.as_text())
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
+@click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0.")
+@click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
+@_config
+@click.option("--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the package's.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/run"), show_default=True)
+@_clock(default="realtime")
+@_profile
+@_json
+@_explained
+def run(
+    interface: str,
+    channel: str,
+    bitrate: int | None,
+    config: str,
+    dbc: Path | None,
+    out: Path,
+    clock: str,
+    profile: str | None,
+    as_json: bool,
+) -> ExitCode:
+    """Run the scheme on an arm, real or emulated, that is on a bus.
+
+    On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, and
+    `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C stops at once.
+    """
+    from adacd_hil.cli.run import run_on_bus
+
+    result, code = run_on_bus(interface, channel, bitrate, config, profile, dbc, clock, out)
+    print(json.dumps(result, indent=2) if as_json else "\n".join(f"{key}: {value}" for key, value in result.items()))
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder; default: beside each log.")
+@_json
+@_explained
+def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
+    """Report logs: HTML, PNG and JSON. The emulator's truth.mcap beside a log is joined to it."""
+    from adacd_hil.cli.report import report_logs
+
+    reports, code = report_logs(logs, out)
+    if as_json:
+        print(json.dumps([entry.as_json() for entry in reports], indent=2))
+    else:
+        print("\n\n".join(entry.as_text() for entry in reports))
+    return code
+
+
+def main() -> None:
+    """Enter here from the console script."""
+    cli.main(prog_name="adacd-hil")

@@ -1,0 +1,27 @@
+"""Reports of logs that lie on disk."""
+
+from pathlib import Path
+
+from adacd_hil.analysis.report import Report, write_report
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.control.session import LOG_NAME
+
+TRUTH_NAME = "truth.mcap"
+
+
+def report_logs(logs: tuple[Path, ...], out: Path | None) -> tuple[list[Report], ExitCode]:
+    """Report each log, beside it or in `out`; a folder stands for the run log in it. Raises LogError."""
+    reports = []
+    is_complete = True
+    names: set[Path] = set()
+    for given in logs:
+        path = given / LOG_NAME if given.is_dir() else given
+        folder = path.parent if out is None else out if len(logs) == 1 else out / path.parent.name
+        if folder in names:
+            raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
+        names.add(folder)
+        truth = path.parent / TRUTH_NAME
+        report = write_report(path, truth if truth.exists() else None, folder)
+        is_complete = is_complete and report.is_complete
+        reports.append(report)
+    return reports, ExitCode.OK if is_complete else ExitCode.PARTIAL

@@ -1,0 +1,87 @@
+"""Runs on a bus: opens it, lets a session run, says how it ended."""
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
+from adacd_hil.cli.progress import Progress
+from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
+from adacd_hil.config import load_settings
+from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
+from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.wire.bus import is_hardware, open_bus
+from adacd_hil.wire.codec import load_codec
+
+
+def make_clock(name: str) -> Clock:
+    """Make the clock of a run: `lockstep` or `realtime`."""
+    return VirtualClock() if name == "lockstep" else MonotonicClock()
+
+
+@contextmanager
+def interruptible(session: Session) -> Iterator[None]:
+    """Let SIGINT and SIGTERM end the session instead of the process."""
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in previous:
+        signal.signal(number, lambda *_: session.interrupt())
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def run_on_bus(
+    interface: str,
+    channel: str,
+    bitrate: int | None,
+    config: str,
+    profile: str | None,
+    dbc: Path | None,
+    clock_name: str,
+    out: Path,
+) -> tuple[dict[str, Any], ExitCode]:
+    """Run the scheme on a bus. Raises ConfigError, CodecError, BusMissingError, LogError, CommandError."""
+    if clock_name == "lockstep" and is_hardware(interface, channel):
+        raise CommandError(
+            f"--clock lockstep is for emulated arms; {interface} {channel} is hardware and needs --clock realtime",
+            ExitCode.USAGE,
+        )
+    settings = load_settings(config, profile)
+    codec = load_codec(dbc)
+    clock = make_clock(clock_name)
+    received = [message.can_id for message in codec.messages.values() if "HOST" not in message.senders]
+    bus = open_bus(interface, channel, clock, received, bitrate)
+    operator: Operator = ScriptedOperator(settings.operator)
+    if sys.stdin is not None and sys.stdin.isatty():
+        operator = ConsoleOperator(ScriptedOperator(settings.operator))
+    progress = Progress()
+    session = Session(settings, codec, bus, clock, operator, out, interface, progress=progress)
+    try:
+        with interruptible(session):
+            summary = session.run()
+    finally:
+        bus.close()
+        progress.close()
+    return summarise(summary), exit_code(summary)
+
+
+def summarise(summary: SessionSummary) -> dict[str, Any]:
+    """Describe how a session ended, for people and machines."""
+    described: dict[str, Any] = {"log": str(summary.log.path), "scheduler": summary.grant.scheduler}
+    if summary.error:
+        described["error"] = summary.error
+        print(f"adacd-hil: {summary.error}", file=sys.stderr)
+    if summary.result is not None:
+        described |= {
+            "cycles": summary.result.cycles,
+            "overruns": summary.result.overruns,
+            "state": summary.result.state.name,
+            "fault": summary.result.fault.name,
+        }
+    log = summary.log
+    return described | {"frames": log.frames, "messages": log.messages, "dropped": log.dropped, "log_error": log.error}

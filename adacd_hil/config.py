@@ -1,0 +1,460 @@
+"""Frozen settings with unit and bounds, read from TOML; an unknown key is an error that names the nearest known one.
+
+A section is a frozen dataclass whose fields are made by `setting`. Field names carry their unit. Angles in degrees
+exist only here, in fields labelled `_deg`; the properties beside them give radians.
+"""
+
+import dataclasses
+import difflib
+import math
+import tomllib
+import types
+import typing
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES, Vector
+
+
+class ConfigError(ValueError):
+    """A setting that can't be used; the message is one line: key, value, bound, unit."""
+
+
+def setting(
+    default: Any = dataclasses.MISSING,
+    *,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+    meaning: str,
+) -> Any:
+    """Declare one setting. Bounds are inclusive and hold for each element of a tuple; no default means required."""
+    metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "meaning": meaning}
+    if isinstance(default, type):
+        return dataclasses.field(default_factory=default, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+Section = TypeVar("Section")
+
+
+def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Section:
+    """Make a `section` from a TOML table.
+
+    Raises ConfigError for an unknown key, a missing key, a wrong type or a value outside its bounds.
+    """
+    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, section))}
+    hints = typing.get_type_hints(section)
+    for key in table:
+        if key not in fields:
+            nearest = difflib.get_close_matches(key, fields, n=1, cutoff=0.4)
+            hint = f"; did you mean `{where}{nearest[0]}`?" if nearest else f"; known: {', '.join(fields)}"
+            raise ConfigError(f"unknown key `{where}{key}`{hint}")
+    values = {}
+    for name, field in fields.items():
+        if name in table:
+            values[name] = _parse_value(hints[name], table[name], f"{where}{name}", field.metadata)
+        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"missing key `{where}{name}`")
+    try:
+        return section(**values)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{where.rstrip('.')}: {error}") from error
+
+
+def _parse_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise ConfigError(f"`{key}` = {value!r} must be a table")
+        return parse(typing.cast(type[Any], hint), value, f"{key}.")
+    if typing.get_origin(hint) is tuple:
+        return _parse_tuple(hint, value, key, metadata)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        hint = next(option for option in typing.get_args(hint) if option is not type(None))
+        return _parse_value(hint, value, key, metadata)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise ConfigError(f"`{key}` = {value!r} must be of type {hint.__name__}")
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        _check_bounds(value, key, metadata)
+    if metadata["choices"] and value not in metadata["choices"]:
+        nearest = difflib.get_close_matches(str(value), metadata["choices"], n=1)
+        hint_text = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        raise ConfigError(f"`{key}` = {value!r} must be one of {', '.join(metadata['choices'])}{hint_text}")
+    return value
+
+
+def _parse_tuple(hint: Any, value: Any, key: str, metadata: Any) -> tuple[Any, ...]:
+    if not isinstance(value, list | tuple):
+        raise ConfigError(f"`{key}` = {value!r} must be a list")
+    arguments = typing.get_args(hint)
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        element_hints: tuple[Any, ...] = (arguments[0],) * len(value)
+    else:
+        element_hints = arguments
+    if len(value) != len(element_hints):
+        raise ConfigError(f"`{key}` has {len(value)} values, {len(element_hints)} expected")
+    return tuple(
+        _parse_value(element, item, f"{key}[{index}]", metadata)
+        for index, (element, item) in enumerate(zip(element_hints, value, strict=True))
+    )
+
+
+def _check_bounds(value: float, key: str, metadata: Any) -> None:
+    unit = f" {metadata['unit']}" if metadata["unit"] else ""
+    if not math.isfinite(value):
+        raise ConfigError(f"`{key}` = {value} is not finite")
+    if value < metadata["low"]:
+        raise ConfigError(f"`{key}` = {value}{unit} is below {metadata['low']:g}{unit}")
+    if value > metadata["high"]:
+        raise ConfigError(f"`{key}` = {value}{unit} is above {metadata['high']:g}{unit}")
+
+
+def _radians(degrees: tuple[float, float]) -> Vector:
+    return np.radians(np.array(degrees, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """The arm: what the host may know of it."""
+
+    profile: str = setting("P", choices=("P", "S", "M"), meaning="which of the emulated arms this is meant for")
+    link_length_m: tuple[float, float] = setting((0.35, 0.30), unit="m", low=0.01, high=5.0, meaning="joint to joint")
+    rated_torque_Nm: tuple[float, float] = setting(
+        (12.0, 6.0), unit="Nm", low=0.1, high=1000.0, meaning="0x6076; 1000 per mille of target torque"
+    )
+    sign: tuple[int, int] = setting((1, 1), low=-1, high=1, meaning="+1 or -1: device direction to joint direction")
+    torque_offset_Nm: tuple[float, float] = setting(
+        (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="sensor zero, subtracted after the sign"
+    )
+    torque_limit_Nm: tuple[float, float] = setting(
+        (12.0, 6.0), unit="Nm", low=0.0, high=1000.0, meaning="largest commanded torque"
+    )
+    torque_rate_limit_Nm_s: tuple[float, float] = setting(
+        (2000.0, 1000.0), unit="Nm/s", low=1.0, high=1e6, meaning="largest change of commanded torque"
+    )
+    position_limit_deg: tuple[float, float] = setting(
+        (75.0, 120.0), unit="deg", low=1.0, high=720.0, meaning="largest |q|; beyond it the run faults"
+    )
+    velocity_limit_deg_s: tuple[float, float] = setting(
+        (250.0, 300.0), unit="deg/s", low=1.0, high=3600.0, meaning="largest |dq|; beyond it the run faults"
+    )
+    cad_theta: tuple[float, ...] = setting((), low=0.0, meaning="the CAD model, in the order of the parameters")
+
+    def __post_init__(self) -> None:
+        if any(sign == 0 for sign in self.sign):
+            raise ValueError(f"sign = {self.sign} must be +1 or -1 for each joint")
+
+    @property
+    def position_limit_rad(self) -> Vector:
+        """Largest |q|, rad (2,)."""
+        return _radians(self.position_limit_deg)
+
+    @property
+    def velocity_limit_rad_s(self) -> Vector:
+        """Largest |dq|, rad/s (2,)."""
+        return _radians(self.velocity_limit_deg_s)
+
+
+@dataclass(frozen=True)
+class BusSettings:
+    """Timing on the bus; node ids are the DBC's."""
+
+    period_us: int = setting(1000, unit="µs", low=500, high=10_000, meaning="SYNC period, 0x1006")
+    heartbeat_ms: int = setting(100, unit="ms", low=10, high=10_000, meaning="heartbeat period, 0x1017")
+    command_patience_cycles: int = setting(
+        10, low=1, high=255, meaning="SYNCs without a new command until a drive faults by itself, 0x2200"
+    )
+    max_age_cycles: int = setting(3, low=1, high=100, meaning="oldest usable value; older faults the run")
+    feedback_timeout_ms: int = setting(
+        1000, unit="ms", low=1, high=60_000, meaning="lockstep: longest wait for one cycle's feedback"
+    )
+
+    @property
+    def period_s(self) -> float:
+        """SYNC period in s."""
+        return self.period_us * 1e-6
+
+    @property
+    def period_ns(self) -> int:
+        """SYNC period in ns."""
+        return self.period_us * 1000
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Eq. (16): F(s) = b / (s + a)."""
+
+    a_rad_s: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0, meaning="cut-off; 10 rad/s is 1.59 Hz")
+    b_rad_s: float = setting(
+        10.0, unit="rad/s", low=0.1, high=1000.0, meaning="gain; DC gain b/a scales every threshold"
+    )
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """Eq. (10)."""
+
+    law: str = setting(
+        "least_squares", choices=("least_squares", "gradient"), meaning="P from P(0) by least squares, or constant"
+    )
+    P0: tuple[float, ...] = setting(
+        (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5), low=0.0, high=1e6, meaning="diagonal of P(0), continuous-time gain, 1/s"
+    )
+    gravity: bool = setting(False, meaning="add a4 and a5: joint axes that are not vertical")
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the estimated parameters, in order."""
+        return PARAMETER_NAMES + (GRAVITY_PARAMETER_NAMES if self.gravity else ())
+
+    def __post_init__(self) -> None:
+        if len(self.P0) != len(self.parameter_names):
+            raise ValueError(f"P0 has {len(self.P0)} values for {len(self.parameter_names)} parameters")
+
+
+@dataclass(frozen=True)
+class TerminationSettings:
+    """Eq. (15) and the evidence it needs."""
+
+    beta_Nm: float = setting(0.1, unit="Nm", low=0.001, high=100.0, meaning="bound on |tau_ext_hat| of each joint")
+    hold_s: float = setting(5.0, unit="s", low=0.1, high=600.0, meaning="T: how long the bound must hold")
+    timeout_s: float = setting(60.0, unit="s", low=1.0, high=3600.0, meaning="longest adaptation; then FAULT")
+    travel_deg: float = setting(20.0, unit="deg", low=0.0, high=360.0, meaning="travel of each joint to count as moved")
+    velocity_deg_s: float = setting(
+        10.0, unit="deg/s", low=0.0, high=360.0, meaning="speed that each joint must reach both ways"
+    )
+    excitation_Nm2s: float = setting(
+        2e-4, unit="Nm² s", low=0.0, high=1e6, meaning="smallest eigenvalue of the scaled information matrix"
+    )
+    excitation_scale: tuple[float, float, float, float] = setting(
+        (0.1, 0.05, 0.05, 1.0),
+        low=1e-6,
+        high=1e6,
+        meaning="error that must not stay hidden: inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm",
+    )
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """Eq. (14)."""
+
+    threshold_Nm: tuple[float, float] = setting((0.15, 0.15), unit="Nm", low=0.001, high=100.0, meaning="per joint")
+    standstill_rad_s: float = setting(
+        0.01, unit="rad/s", low=0.0, high=1.0, meaning="|dq| below which friction may hold any torque up to F_c; 0: off"
+    )
+    isolation_window_s: float = setting(
+        0.05, unit="s", low=0.0, high=1.0, meaning="after detection, until the link is final"
+    )
+
+
+@dataclass(frozen=True)
+class ReactionSettings:
+    """Withdrawal along +tau_ext."""
+
+    distance_deg: tuple[float, float] = setting((8.0, 8.0), unit="deg", low=0.0, high=90.0, meaning="how far back")
+    velocity_limit_deg_s: tuple[float, float] = setting(
+        (100.0, 120.0), unit="deg/s", low=1.0, high=720.0, meaning="largest desired speed while withdrawing"
+    )
+    acceleration_limit_deg_s2: tuple[float, float] = setting(
+        (700.0, 900.0), unit="deg/s²", low=10.0, high=20_000.0, meaning="largest desired acceleration"
+    )
+    position_margin_deg: float = setting(
+        3.0, unit="deg", low=0.0, high=90.0, meaning="how far the withdrawal stays from the position limits"
+    )
+
+
+@dataclass(frozen=True)
+class TrajectorySettings:
+    """Quintic motion between two corners."""
+
+    amplitude_deg: tuple[float, float] = setting((30.0, 60.0), unit="deg", low=0.0, high=180.0, meaning="± per joint")
+    half_period_s: tuple[float, float] = setting(
+        (1.125, 4.5), unit="s", low=0.1, high=60.0, meaning="as printed (1.125, 4.5); synchronous (2.25, 2.25)"
+    )
+    approach_deg_s: float = setting(90.0, unit="deg/s", low=1.0, high=360.0, meaning="peak speed to the start corner")
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """Joint PD plus identified feedforward."""
+
+    Kp: tuple[float, float] = setting((250.0, 20.0), unit="Nm/rad", low=0.0, high=1e5, meaning="position gain")
+    Kd: tuple[float, float] = setting((12.5, 0.75), unit="Nm s/rad", low=0.0, high=1e4, meaning="velocity gain")
+    feedforward: bool = setting(True, meaning="feed the identified model forward once it is valid")
+
+
+@dataclass(frozen=True)
+class RequestSettings:
+    """One entry of the operator's script."""
+
+    at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="since the drives were enabled")
+    request: str = setting(choices=("payload", "payload_changed", "finish"), meaning="what the user asks")
+
+
+@dataclass(frozen=True)
+class OperatorSettings:
+    """The user, where a script plays the user."""
+
+    script: tuple[RequestSettings, ...] = setting((), meaning="requests by time")
+    acknowledge_after_s: float = setting(
+        0.0, unit="s", low=0.0, high=3600.0, meaning="acknowledge a stop by itself after this time; 0: never"
+    )
+
+
+@dataclass(frozen=True)
+class SafetySettings:
+    """Checks before torque."""
+
+    commission_cycles: int = setting(200, low=10, high=100_000, meaning="complete cycles at rest before enabling")
+    rest_velocity_rad_s: float = setting(0.05, unit="rad/s", low=1e-4, high=1.0, meaning="|dq| that counts as at rest")
+    rest_torque_Nm: float = setting(1.0, unit="Nm", low=0.01, high=100.0, meaning="largest |tau_J| before enabling")
+    phase_timeout_s: float = setting(5.0, unit="s", low=0.1, high=600.0, meaning="longest COMMISSION and ENABLE")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything a run depends on, resolved. Attached to every log."""
+
+    name: str = setting("", meaning="name of the configuration")
+    arm: ArmSettings = setting(ArmSettings, meaning="the arm")
+    bus: BusSettings = setting(BusSettings, meaning="timing on the bus")
+    filter: FilterSettings = setting(FilterSettings, meaning="torque filter")
+    estimator: EstimatorSettings = setting(EstimatorSettings, meaning="adaptation law")
+    termination: TerminationSettings = setting(TerminationSettings, meaning="end of adaptation")
+    detector: DetectorSettings = setting(DetectorSettings, meaning="collision detection")
+    reaction: ReactionSettings = setting(ReactionSettings, meaning="withdrawal")
+    trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
+    controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
+    operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
+    safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
+
+    @property
+    def cad_theta(self) -> Vector:
+        """The CAD model's parameters (p,)."""
+        return np.array(self.arm.cad_theta, dtype=np.float64)
+
+    def __post_init__(self) -> None:
+        count = len(self.estimator.parameter_names)
+        if len(self.arm.cad_theta) not in (0, count):
+            raise ValueError(f"arm.cad_theta has {len(self.arm.cad_theta)} values for {count} parameters")
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Lay one TOML table over another, section by section."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict):
+            merged[key] = merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read one TOML file. Raises ConfigError when it is missing or not TOML."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"configuration {path} does not exist") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"configuration {path}: {error}") from None
+
+
+def toml_names(folder: Traversable) -> list[str]:
+    """Name the TOML files of a package's folder, without their ending."""
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
+    """Find the file that a built-in name or a path stands for. Raises ConfigError with the nearest built-in name."""
+    names = toml_names(folder)
+    if name_or_file in names:
+        return Path(str(folder / f"{name_or_file}.toml"))
+    path = Path(name_or_file)
+    if not path.suffix and not path.exists():
+        nearest = difflib.get_close_matches(name_or_file, names, n=1)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; built in: {', '.join(names)}"
+        raise ConfigError(f"{kind} {name_or_file!r} is neither built in nor a file{hint}")
+    return path
+
+
+def _builtin_folder() -> Traversable:
+    return resources.files("adacd_hil") / "configs"
+
+
+def builtin_names() -> list[str]:
+    """Name the configurations that come with the package."""
+    return toml_names(_builtin_folder())
+
+
+def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Settings:
+    """Resolve a configuration: a built-in name, or a TOML file laid over the one it `extends` (default `paper`).
+
+    `profile` picks the `[profiles.X]` table that is laid over the rest. Raises ConfigError.
+    """
+    table = _load_table(name_or_file)
+    profiles = table.pop("profiles", {})
+    chosen = profile or table.get("arm", {}).get("profile", "P")
+    if chosen not in profiles:
+        raise ConfigError(f"profile {chosen!r} is not in configuration {name_or_file}; known: {', '.join(profiles)}")
+    # What the file says of the arm outweighs the profile's own values, not the other way round.
+    return parse(Settings, merge(merge(profiles[chosen], table), {"arm": {"profile": chosen}}))
+
+
+def _load_table(name_or_file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    if name_or_file in seen:
+        raise ConfigError(f"configuration {name_or_file} extends itself")
+    path = find_toml("configuration", name_or_file, _builtin_folder())
+    table = read_toml(path)
+    table.setdefault("name", path.stem)
+    if name_or_file in builtin_names():
+        return table
+    base = _load_table(str(table.pop("extends", "paper")), (*seen, name_or_file))
+    return merge(base, table)
+
+
+def to_toml(settings: Any) -> str:
+    """Write settings as TOML that `parse` reads back to the same value."""
+    lines: list[str] = []
+    _write_section(settings, "", lines)
+    return "\n".join(lines).strip() + "\n"
+
+
+def _write_section(section: Any, prefix: str, lines: list[str]) -> None:
+    nested = []
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if dataclasses.is_dataclass(value):
+            nested.append((field.name, value))
+        elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+            inner = ", ".join("{" + _inline(item) + "}" for item in value)
+            lines.append(f"{field.name} = [{inner}]")
+        elif value is not None:
+            lines.append(f"{field.name} = {_toml_value(value)}")
+    for name, value in nested:
+        lines.extend(("", f"[{prefix}{name}]"))
+        _write_section(value, f"{prefix}{name}.", lines)
+
+
+def _inline(section: Any) -> str:
+    return ", ".join(f"{f.name} = {_toml_value(getattr(section, f.name))}" for f in dataclasses.fields(section))
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    return repr(value)

@@ -1,0 +1,1 @@
+"""The cycle and what stands on both sides of the scheme in it."""

@@ -1,0 +1,257 @@
+"""The loop: read, step, limit, write, log.
+
+One cycle: SYNC k goes out, feedback and torque of k come in, the scheme decides, the controller follows the desired
+motion, the gate limits, the commands go out and act at SYNC k+1. In lockstep the next cycle begins at once; in real
+time it begins on the grid.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.config import Settings
+from adacd_hil.control.controller import Controller
+from adacd_hil.control.gate import Gate, GateFlag
+from adacd_hil.control.operator import Operator
+from adacd_hil.control.realtime import Pacer, Tick
+from adacd_hil.control.reference import Reference
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.network import Master
+from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_scheme
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import (
+    CONTROL_LAYOUT,
+    ArmCommand,
+    ArmState,
+    CycleRecord,
+    Event,
+    FaultReason,
+    Request,
+    SchemeOutput,
+    SchemeState,
+)
+from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.tap import Tap
+
+FEEDBACK_SHARE = 0.7
+"""Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
+the worst, and two commands need 230 µs before the next SYNC."""
+FAULT_LINGER_S = 0.5
+"""How long a faulted run goes on, so that the drives' quick stop is in the log."""
+DISABLE_CYCLES = 20
+"""Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
+
+_POWERED = frozenset(
+    (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
+)
+_ENABLING = _POWERED | {SchemeState.ENABLE}
+
+
+class SilenceError(RuntimeError):
+    """No device answered a SYNC in lockstep; one line."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """How a run ended. `fault`: NONE when it ended as asked."""
+
+    cycles: int
+    overruns: int
+    state: SchemeState
+    fault: FaultReason
+    is_interrupted: bool
+
+
+class Cycle:
+    """Everything one cycle needs; `run` is the loop."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        bus: Tap,
+        arm: Arm,
+        master: Master,
+        pacer: Pacer,
+        operator: Operator,
+        progress: Callable[[str], None],
+        is_lockstep: bool,
+    ) -> None:
+        self._period_s = settings.bus.period_s
+        self._heartbeat_cycles = max(1, round(settings.bus.heartbeat_ms * 1e-3 / self._period_s))
+        self._patience_s = (
+            settings.bus.feedback_timeout_ms * 1e-3 if is_lockstep else FEEDBACK_SHARE * settings.bus.period_s
+        )
+        self._is_lockstep = is_lockstep
+        self._progress = progress
+        self._bus, self._arm, self._master = bus, arm, master
+        self._pacer, self._operator = pacer, operator
+        self._stopwatch: Clock = MonotonicClock()
+        self._pipeline = Pipeline(settings)
+        self._controller = Controller(settings)
+        self._gate = Gate(settings.arm, self._period_s)
+        self._block = np.zeros(CONTROL_LAYOUT.size)
+        fields = {name: self._block[place] for name, place in CONTROL_LAYOUT.slices.items()}
+        self._q_d, self._dq_d, self._ddq_d = fields["q_d"], fields["dq_d"], fields["ddq_d"]
+        self._tau_d, self._tau_c = fields["tau_d"], fields["tau_c"]
+        self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)
+        self._state = SchemeState.INIT
+        self._enabled_cycle: int | None = None
+        self._faulted_cycle: int | None = None
+        self._interrupts = 0
+        self._is_finishing = False
+        self._sync_ns = 0
+        self._feedback_ns = 0
+
+    def compile(self) -> None:
+        """Compile everything the loop calls; to be done before the drives are enabled."""
+        self._pipeline.compile()
+        self._reference.compile()
+        self._controller.compile()
+
+    def interrupt(self) -> None:
+        """Ask the loop to park the arm and end; a second time, to end at once with a quick stop."""
+        self._interrupts += 1
+
+    def run(self, recorder: Recorder) -> RunResult:
+        """Run cycles until the run is finished, faulted or interrupted, then disable the drives.
+
+        Raises BusError, and SilenceError in lockstep.
+        """
+        output = None
+        while not self._is_over(output):
+            tick = self._pacer.next()
+            arm = self._read(tick)
+            request = self._request(tick)
+            output = self._pipeline.step(arm, request)
+            self._reference.step(arm, output)
+            command, flags = self._control(arm, output)
+            self._arm.write(command)
+            if tick.cycle % self._heartbeat_cycles == 0:
+                self._master.send_heartbeat()
+            self._record(recorder, tick, arm, request, output, command, flags)
+        fault = output.fault if output is not None else FaultReason.NONE
+        self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
+        return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
+
+    def _read(self, tick: Tick) -> ArmState:
+        """Send SYNC and take in what the devices sampled on it."""
+        bus, arm = self._bus, self._arm
+        while (late := bus.receive(0.0)) is not None:  # belongs to the cycle before
+            self._accept(late)
+        self._sync_ns = self._stopwatch.now_ns()
+        bus.held_ns = tick.t_ns if self._is_lockstep else self._sync_ns
+        arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
+        patience_s = self._patience_s
+        while not arm.has_all_frames and (frame := bus.receive(patience_s)) is not None:
+            self._accept(frame)
+            if not self._is_lockstep:
+                patience_s = self._patience_s - (frame.t_ns - self._sync_ns) * 1e-9
+        self._feedback_ns = self._stopwatch.now_ns()
+        if not self._is_lockstep:
+            bus.held_ns = self._feedback_ns
+        if self._is_lockstep and arm.missing_frames == len(arm.drives) + len(arm.sensors):
+            raise SilenceError(
+                f"no answer from {', '.join(arm.missing_names())} to SYNC of cycle {tick.cycle} on {bus.channel} "
+                f"within {self._patience_s:g} s"
+            )
+        return arm.state()
+
+    def _accept(self, frame: Frame) -> None:
+        if not self._arm.accept(frame):
+            self._master.accept(frame)
+
+    def _request(self, tick: Tick) -> Request:
+        """Ask the operator; what concerns the end of the run stays here."""
+        if self._interrupts and not self._is_finishing:
+            return self._finish()
+        elapsed_s = None if self._enabled_cycle is None else (tick.cycle - self._enabled_cycle) * self._period_s
+        request = self._operator.request(elapsed_s, self._state)
+        return self._finish() if request is Request.FINISH else request
+
+    def _finish(self) -> Request:
+        self._is_finishing = True
+        if self._state in _POWERED:
+            self._reference.park()
+        return Request.FINISH
+
+    def _control(self, arm: ArmState, output: SchemeOutput) -> tuple[ArmCommand, GateFlag]:
+        """Turn the decision into a limited command."""
+        if output.is_model_valid:
+            self._controller.feed_forward(output.theta_ff)
+        self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
+        is_open = output.state in _POWERED and arm.is_enabled
+        flags = self._gate.limit(self._tau_d, is_open, self._tau_c)
+        quick_stop = output.state is SchemeState.FAULT or bool(flags & GateFlag.NOT_A_NUMBER)
+        return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
+
+    def _record(
+        self,
+        recorder: Recorder,
+        tick: Tick,
+        arm: ArmState,
+        request: Request,
+        output: SchemeOutput,
+        command: ArmCommand,
+        flags: GateFlag,
+    ) -> None:
+        """Hand the cycle to the logger and remember where the scheme stands."""
+        t_ns = arm.t_ns
+        record = CycleRecord(
+            cycle=tick.cycle,
+            lateness_ns=tick.lateness_ns,
+            feedback_ns=self._feedback_ns - self._sync_ns,
+            command_ns=self._stopwatch.now_ns() - self._sync_ns,
+            overruns=self._pacer.overruns,
+            frames_missing=self._arm.missing_frames,
+        )
+        messages = [
+            (ChannelId.SCHEME, pack_scheme(output, request)),
+            (ChannelId.CONTROL, pack_control(tick.cycle, self._block, flags, command.enable, command.quick_stop)),
+            (ChannelId.CYCLE, pack_cycle(record)),
+        ]
+        if output.contact is not None:
+            messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
+        recorder.cycle(t_ns, messages, self._bus.take())
+        for event in self._master.take_events():
+            recorder.event(t_ns, event)
+        if output.state is not self._state:
+            event = self._transition(output)
+            recorder.event(t_ns, event)
+            self._follow_state(output.state, tick.cycle)
+            self._progress(f"{tick.cycle * self._period_s:9.3f} s  {event.message}")
+
+    def _transition(self, output: SchemeOutput) -> Event:
+        text = f"{output.previous_state.name} -> {output.state.name}"
+        if output.state is not SchemeState.FAULT:
+            return Event("info", "supervisor", text)
+        details = "; ".join([output.fault.name, *self._arm.describe_faults()])
+        return Event("error", "supervisor", f"{text}: {details}")
+
+    def _follow_state(self, state: SchemeState, cycle: int) -> None:
+        self._state = state
+        if state is SchemeState.ADAPT and self._enabled_cycle is None:
+            self._enabled_cycle = cycle
+        if state is SchemeState.FAULT:
+            self._faulted_cycle = cycle
+
+    def _is_over(self, output: SchemeOutput | None) -> bool:
+        if output is None:
+            return False
+        if self._faulted_cycle is not None:
+            return output.cycle - self._faulted_cycle >= FAULT_LINGER_S / self._period_s
+        if self._interrupts > 1:
+            return True
+        return self._is_finishing and (self._state not in _POWERED or self._reference.is_parked(output.cycle))
+
+    def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
+        """Send zero torque and disabled drives for a while, without the scheme."""
+        self._tau_c[:] = 0.0
+        command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
+        for _ in range(DISABLE_CYCLES):
+            tick = self._pacer.next()
+            self._read(tick)
+            self._arm.write(command)
+            recorder.cycle(tick.t_ns, [], self._bus.take())

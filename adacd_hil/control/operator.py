@@ -1,0 +1,78 @@
+"""The user of a running arm: a script, the console, or both. A request is what the scheme is asked in one cycle."""
+
+import sys
+import threading
+from collections import deque
+from typing import Protocol, TextIO
+
+from adacd_hil.config import OperatorSettings
+from adacd_hil.records import Request, SchemeState
+
+CONSOLE_WORDS = {
+    "ack": Request.ACKNOWLEDGE,
+    "payload": Request.PAYLOAD,
+    "changed": Request.PAYLOAD_CHANGED,
+    "finish": Request.FINISH,
+}
+
+
+class Operator(Protocol):
+    """Somebody who may ask something of the arm in each cycle."""
+
+    def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
+        """Return this cycle's request. `elapsed_s`: since the drives were enabled, None before."""
+
+
+class ScriptedOperator:
+    """Plays the user by the clock: requests at given times, acknowledgement a given time after each stop."""
+
+    def __init__(self, settings: OperatorSettings) -> None:
+        self._script = deque(sorted(settings.script, key=lambda entry: entry.at_s))
+        self._acknowledge_after_s = settings.acknowledge_after_s
+        self._stopped_since_s: float | None = None
+
+    def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
+        """Return what the script asks at this time."""
+        if elapsed_s is None:
+            return Request.NONE
+        if self._script and elapsed_s >= self._script[0].at_s:
+            return Request[self._script.popleft().request.upper()]
+        return self._acknowledge(elapsed_s, state)
+
+    def _acknowledge(self, elapsed_s: float, state: SchemeState) -> Request:
+        if state is not SchemeState.STOPPED:
+            self._stopped_since_s = None
+            return Request.NONE
+        if self._stopped_since_s is None:
+            self._stopped_since_s = elapsed_s
+        if self._acknowledge_after_s == 0.0 or elapsed_s - self._stopped_since_s < self._acknowledge_after_s:
+            return Request.NONE
+        self._stopped_since_s = elapsed_s
+        return Request.ACKNOWLEDGE
+
+
+class ConsoleOperator:
+    """Takes words from a terminal, a line each, on a thread of its own, and passes on what a script asks."""
+
+    def __init__(self, script: ScriptedOperator, stream: TextIO = sys.stdin) -> None:
+        self._script = script
+        self._stream = stream
+        self._asked: deque[Request] = deque()
+        self._thread = threading.Thread(target=self._listen, name="console", daemon=True)
+        self._thread.start()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait until the stream has ended, at most `timeout_s`."""
+        self._thread.join(timeout_s)
+
+    def _listen(self) -> None:
+        for line in self._stream:
+            request = CONSOLE_WORDS.get(line.strip().lower())
+            if request is not None:
+                self._asked.append(request)
+
+    def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
+        """Return what the user asked first, else what the script asks."""
+        if self._asked:
+            return self._asked.popleft()
+        return self._script.request(elapsed_s, state)

@@ -1,0 +1,67 @@
+"""When a cycle begins: at once in lockstep, on a fixed grid in real time."""
+
+from typing import NamedTuple, Protocol
+
+from adacd_hil.clock import Clock, VirtualClock
+
+
+class Tick(NamedTuple):
+    """The beginning of one cycle. `periods` since the previous one, 1 unless periods were skipped."""
+
+    cycle: int
+    t_ns: int
+    periods: int
+    lateness_ns: int
+
+
+class Pacer(Protocol):
+    """Decides when the next cycle begins."""
+
+    overruns: int
+
+    def next(self) -> Tick:
+        """Wait for the next cycle and return its beginning."""
+
+
+class LockstepPacer:
+    """Begins a cycle as soon as it is asked, and moves the virtual clock by one period each time."""
+
+    def __init__(self, clock: VirtualClock, period_ns: int) -> None:
+        self.overruns = 0
+        self._clock = clock
+        self._period_ns = period_ns
+        self._cycle = -1
+
+    def next(self) -> Tick:
+        """Return the next cycle's beginning, at once."""
+        self._cycle += 1
+        t_ns = self._cycle * self._period_ns
+        self._clock.sleep_until_ns(t_ns)
+        return Tick(self._cycle, t_ns, 1, 0)
+
+
+class GridPacer:
+    """Begins cycles on a fixed grid; a late one doesn't move the grid, a very late one skips whole periods."""
+
+    def __init__(self, clock: Clock, period_ns: int) -> None:
+        self.overruns = 0
+        self._clock = clock
+        self._period_ns = period_ns
+        self._start_ns: int | None = None
+        self._cycle = -1
+
+    def next(self) -> Tick:
+        """Sleep until the next grid point that is still ahead; the first call sets the grid."""
+        if self._start_ns is None:
+            self._start_ns = self._clock.now_ns() + self._period_ns
+        previous = self._cycle
+        self._cycle += 1
+        due_ns = self._start_ns + self._cycle * self._period_ns
+        self._clock.sleep_until_ns(due_ns)
+        now_ns = self._clock.now_ns()
+        skipped = (now_ns - due_ns) // self._period_ns
+        if skipped > 0:
+            self.overruns += skipped
+            self._cycle += skipped
+            due_ns += skipped * self._period_ns
+        return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)

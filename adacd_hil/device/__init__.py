@@ -1,0 +1,1 @@
+"""CANopen devices on the bus, joined into one arm."""

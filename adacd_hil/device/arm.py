@@ -1,0 +1,163 @@
+"""The arm: two drives and two torque sensors joined into `ArmState`, and `ArmCommand` turned into frames.
+
+The only place of sign, zero offset and torque ratio. Every value carries its age in cycles.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from adacd_hil.config import Settings
+from adacd_hil.device.drive import Cia402State, Drive
+from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
+from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
+from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.codec import Codec
+
+SYNC_OVERFLOW = 240
+"""0x1019: the SYNC counter runs 1…240."""
+
+_COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
+
+
+class Arm:
+    """Both joints on one bus. Per cycle: `synchronise`, `accept` each frame, `state`, `write`."""
+
+    def __init__(self, settings: Settings, codec: Codec, bus: Bus) -> None:
+        period_s = settings.bus.period_s
+        self.drives = tuple(Drive(codec, joint, period_s) for joint in range(1, JOINTS + 1))
+        self.sensors = tuple(TorqueSensor(codec, joint) for joint in range(1, JOINTS + 1))
+        self._bus = bus
+        self._sync_id = codec.message("Sync").can_id
+        self._sign = settings.arm.sign
+        self._offset_Nm = settings.arm.torque_offset_Nm
+        self._permille_per_Nm = tuple(
+            sign * 1000.0 / rated for sign, rated in zip(settings.arm.sign, settings.arm.rated_torque_Nm, strict=True)
+        )
+        self._handlers = self._build_handlers()
+        self._cycle = -1
+        self._t_ns = 0
+        self._periods = 1
+        self._received = 0
+        self._seen = 0
+        self._was_enabled = False
+
+    def _build_handlers(self) -> dict[int, tuple[Callable[[bytes], bool], int]]:
+        handlers: dict[int, tuple[Callable[[bytes], bool], int]] = {}
+        for joint, (drive, sensor) in enumerate(zip(self.drives, self.sensors, strict=True)):
+            handlers[drive.feedback_message.can_id] = (_at_cycle(self, drive.accept_feedback), 1 << joint)
+            handlers[sensor.torque_message.can_id] = (_at_cycle(self, sensor.accept_torque), 4 << joint)
+            handlers[drive.status_message.can_id] = (_without_cycle(drive.accept_status), 0)
+            handlers[sensor.status_message.can_id] = (_without_cycle(sensor.accept_status), 0)
+        return handlers
+
+    @property
+    def cycle(self) -> int:
+        """The present cycle; -1 before the first SYNC."""
+        return self._cycle
+
+    def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
+        """Begin a cycle: every device samples on this SYNC, every drive takes its last command. Raises BusError."""
+        self._cycle = cycle
+        self._t_ns = t_ns
+        self._periods = periods
+        self._received = 0
+        self._seen = 0
+        self._bus.send(self._sync_id, bytes((1 + cycle % SYNC_OVERFLOW,)))
+
+    def accept(self, frame: Frame) -> bool:
+        """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing."""
+        handler = self._handlers.get(frame.can_id)
+        if handler is None or frame.is_error:
+            return False
+        take, bit = handler
+        self._seen |= bit
+        if take(frame.data):
+            self._received |= bit
+        return True
+
+    @property
+    def has_all_frames(self) -> bool:
+        """Whether all cyclic frames of this cycle are in, passed their checks or not."""
+        return self._seen == _COMPLETE
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all cyclic frames of this cycle are in and passed their checks."""
+        return self._received == _COMPLETE
+
+    @property
+    def missing_frames(self) -> int:
+        """Count the cyclic frames of this cycle that are not in or failed their checks."""
+        return (_COMPLETE & ~self._received).bit_count()
+
+    def missing_names(self) -> list[str]:
+        """Name the devices whose cyclic frame of this cycle is not in or failed its checks."""
+        names = [drive.name for drive in self.drives] + [sensor.name for sensor in self.sensors]
+        return [name for bit, name in enumerate(names) if not self._received & (1 << bit)]
+
+    def state(self) -> ArmState:
+        """Join what has been received into the state of this cycle."""
+        (drive1, drive2), (sensor1, sensor2) = self.drives, self.sensors
+        sign1, sign2 = self._sign
+        offset1, offset2 = self._offset_Nm
+        cycle = self._cycle
+        is_enabled = drive1.is_enabled and drive2.is_enabled
+        return ArmState(
+            cycle=cycle,
+            t_ns=self._t_ns,
+            periods=self._periods,
+            q=np.array((sign1 * drive1.position_rad, sign2 * drive2.position_rad)),
+            dq=np.array((sign1 * drive1.velocity_rad_s, sign2 * drive2.velocity_rad_s)),
+            tau_J=np.array((sign1 * sensor1.torque_Nm - offset1, sign2 * sensor2.torque_Nm - offset2)),
+            age_q=(cycle - drive1.sample_cycle, cycle - drive2.sample_cycle),
+            age_tau_J=(cycle - sensor1.sample_cycle, cycle - sensor2.sample_cycle),
+            is_enabled=is_enabled,
+            is_complete=self.is_complete,
+            fault=self._device_fault(is_enabled),
+        )
+
+    def _device_fault(self, is_enabled: bool) -> FaultReason:
+        has_dropped_out = self._was_enabled and not is_enabled
+        self._was_enabled |= is_enabled
+        if has_dropped_out:
+            return FaultReason.DRIVE
+        if any(sensor.status & SensorStatus.NOT_VALID for sensor in self.sensors):
+            return FaultReason.SENSOR
+        return FaultReason.NONE
+
+    def write(self, command: ArmCommand) -> None:
+        """Send the commands of this cycle; they act at the next SYNC. Raises BusError."""
+        for drive, tau_c, ratio in zip(self.drives, command.tau_c.tolist(), self._permille_per_Nm, strict=True):
+            frame = drive.command(round(tau_c * ratio), command.enable, command.quick_stop)
+            self._bus.send(drive.command_id, frame)
+
+    def describe_checks(self) -> list[str]:
+        """Say how many cyclic frames of each device passed and failed their checks, one line each."""
+        drives = [f"{drive.name}: unprotected, {drive.implausible_frames} implausible" for drive in self.drives]
+        sensors = [
+            f"{sensor.name}: " + ", ".join(f"{count} {status.name}" for status, count in sensor.end_to_end.tally())
+            for sensor in self.sensors
+        ]
+        return drives + sensors
+
+    def describe_faults(self) -> list[str]:
+        """Say what is wrong with each device, one line each; empty when nothing is."""
+        lines = []
+        for drive in self.drives:
+            if drive.state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE) or drive.error_code:
+                lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}")
+        lines.extend(f"{sensor.name}: status 0x{int(sensor.status):02X}" for sensor in self.sensors if sensor.status)
+        return lines
+
+
+def _at_cycle(arm: Arm, accept: Callable[[bytes, int], bool]) -> Callable[[bytes], bool]:
+    return lambda data: accept(data, arm.cycle)
+
+
+def _without_cycle(accept: Callable[[bytes], None]) -> Callable[[bytes], bool]:
+    def take(data: bytes) -> bool:
+        accept(data)
+        return False
+
+    return take

@@ -1,0 +1,231 @@
+"""The table of topics: what a log holds, under which type, how often, and how each message is packed.
+
+The control side packs *bodies*: what follows the stamp. The writer puts encapsulation and stamp in front, the same
+for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its bytes.
+
+| topic | type | when |
+|---|---|---|
+| /to_can_bus, /from_can_bus | can_msgs/msg/Frame | every frame |
+| /decoded/<DBC message> | adacd_hil_msgs/msg/<DBC message> | every frame that the DBC knows |
+| /joint_states | sensor_msgs/msg/JointState | every cycle; measured q, dq, tau_J |
+| /scheme | adacd_hil_msgs/msg/Scheme | every cycle; records.scheme_layout |
+| /contact | adacd_hil_msgs/msg/Contact | when a report begins and when it is final |
+| /control | adacd_hil_msgs/msg/Control | every cycle; records.CONTROL_LAYOUT |
+| /cycle | adacd_hil_msgs/msg/Cycle | every cycle; records.CycleRecord |
+| /events | foxglove_msgs/msg/Log | when something happens |
+| /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; records.TRUTH_LAYOUT |
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+from adacd_hil.log.cdr import Member, MessageType, body_struct, number_type, ros_message_name
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.ros_types import CAN_FRAME, JOINT_STATE, LOG
+from adacd_hil.records import (
+    CONTROL_LAYOUT,
+    TRUTH_LAYOUT,
+    ContactReport,
+    CycleRecord,
+    FaultReason,
+    Layout,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    Vector,
+    scheme_layout,
+)
+
+PACKAGE = "adacd_hil_msgs/msg"
+DECODED = "/decoded/"
+
+
+class ChannelId(IntEnum):
+    """Numbers of the topics between control process and writer; in the file they may differ."""
+
+    TO_CAN_BUS = 1
+    FROM_CAN_BUS = 2
+    JOINT_STATES = 3
+    SCHEME = 4
+    CONTACT = 5
+    CONTROL = 6
+    CYCLE = 7
+    EVENTS = 8
+    TRUTH = 9
+    DECODED_FIRST = 16  # and up: the messages of the DBC, in its order
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One topic."""
+
+    id: int
+    topic: str
+    type: MessageType
+
+
+class SignalLike(Protocol):
+    """What the table needs to know of a DBC signal."""
+
+    @property
+    def name(self) -> str:
+        """Name in the DBC."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the decoded value."""
+
+
+class MessageLike(Protocol):
+    """What the table needs to know of a DBC message."""
+
+    @property
+    def name(self) -> str:
+        """Name in the DBC."""
+
+    @property
+    def can_id(self) -> int:
+        """Identifier on the bus."""
+
+    @property
+    def length(self) -> int:
+        """Count of data bytes."""
+
+    @property
+    def signals(self) -> "tuple[SignalLike, ...]":
+        """Signals in the order of `decode`."""
+
+    def decode(self, data: bytes, /) -> tuple[float, ...]:
+        """Decode the data bytes to values in SI units, in the order of `signals`."""
+
+
+def _constants(prefix: str, values: type[IntEnum]) -> tuple[tuple[str, int], ...]:
+    return tuple((f"{prefix}_{value.name}", int(value)) for value in values)
+
+
+def _members(layout: Layout) -> tuple[Member, ...]:
+    """Describe the fields of a float64 block."""
+    return tuple(Member(field.name, "float64", field.size, field.unit, field.meaning) for field in layout.fields)
+
+
+_CYCLE_NUMBER = Member("cycle", "uint64", meaning="number of the cycle")
+_SCHEME = (
+    _CYCLE_NUMBER,
+    Member("state", "uint8", meaning="SchemeState", constants=_constants("STATE", SchemeState)),
+    Member("previous_state", "uint8", meaning="SchemeState of the cycle before"),
+    Member("fault", "uint8", meaning="FaultReason", constants=_constants("FAULT", FaultReason)),
+    Member("request", "uint8", meaning="Request", constants=_constants("REQUEST", Request)),
+    Member("contact_joints", "uint8", meaning="bit i: joint i over the threshold"),
+    Member("is_model_valid", "bool", meaning="theta_hat may be fed forward"),
+)
+_CONTACT = (
+    _CYCLE_NUMBER,
+    Member("link", "uint8", meaning="link that was touched"),
+    Member("direction", "int8", 2, meaning="sign of the external torque, 0 below the threshold"),
+    Member("is_final", "bool", meaning="the isolation window has ended"),
+    Member("tau_ext_peak", "float64", 2, "Nm", "largest external torque, filter undone"),
+    Member("impulse", "float64", 2, "Nm s", "integral of the external torque"),
+)
+_CONTROL = (
+    _CYCLE_NUMBER,
+    Member("gate_flags", "uint8", meaning="limits that acted, one bit each"),
+    Member("enable", "bool", meaning="drives are asked to be enabled"),
+    Member("quick_stop", "bool", meaning="drives are asked for a quick stop"),
+)
+_CYCLE = (
+    _CYCLE_NUMBER,
+    Member("lateness_ns", "int64", unit="ns", meaning="wake-up after the grid point"),
+    Member("feedback_ns", "int64", unit="ns", meaning="SYNC sent to last frame decoded"),
+    Member("command_ns", "int64", unit="ns", meaning="SYNC sent to last command handed to the bus"),
+    Member("overruns", "uint64", meaning="periods skipped since the run began"),
+    Member("frames_missing", "uint64", meaning="cyclic frames that did not arrive or failed their checks"),
+)
+_TRUTH = (_CYCLE_NUMBER,)
+
+_SCHEME_HEAD = body_struct(_SCHEME, has_block=True)
+_CONTACT_BODY = body_struct(_CONTACT)
+_CONTROL_HEAD = body_struct(_CONTROL, has_block=True)
+_CYCLE_BODY = body_struct(_CYCLE)
+_TRUTH_HEAD = body_struct(_TRUTH, has_block=True)
+SCHEME_BLOCK = _SCHEME_HEAD.size
+"""Where the block begins in the body of /scheme, bytes."""
+
+
+def run_channels(parameter_count: int, messages: "tuple[MessageLike, ...]" = ()) -> tuple[Channel, ...]:
+    """List the topics of a run for `parameter_count` dynamic parameters and the DBC's messages."""
+    scheme = (*_SCHEME, *_members(scheme_layout(parameter_count)))
+    control = (*_CONTROL, *_members(CONTROL_LAYOUT))
+    own = (
+        Channel(ChannelId.TO_CAN_BUS, "/to_can_bus", CAN_FRAME),
+        Channel(ChannelId.FROM_CAN_BUS, "/from_can_bus", CAN_FRAME),
+        Channel(ChannelId.JOINT_STATES, "/joint_states", JOINT_STATE),
+        Channel(ChannelId.SCHEME, "/scheme", number_type(f"{PACKAGE}/Scheme", scheme)),
+        Channel(ChannelId.CONTACT, "/contact", number_type(f"{PACKAGE}/Contact", _CONTACT)),
+        Channel(ChannelId.CONTROL, "/control", number_type(f"{PACKAGE}/Control", control)),
+        Channel(ChannelId.CYCLE, "/cycle", number_type(f"{PACKAGE}/Cycle", _CYCLE)),
+        Channel(ChannelId.EVENTS, "/events", LOG),
+    )
+    decoded = tuple(
+        _decoded_channel(ChannelId.DECODED_FIRST + index, message) for index, message in enumerate(messages)
+    )
+    _check_names((*own, *decoded))
+    return (*own, *decoded)
+
+
+def truth_channels() -> tuple[Channel, ...]:
+    """List the topics of the emulator's own log."""
+    truth = number_type(f"{PACKAGE}/Truth", (*_TRUTH, *_members(TRUTH_LAYOUT)))
+    return (Channel(ChannelId.TRUTH, "/truth", truth), Channel(ChannelId.EVENTS, "/events", LOG))
+
+
+def _decoded_channel(channel_id: int, message: MessageLike) -> Channel:
+    members = (Member(signal.name, "float64", unit=signal.unit) for signal in message.signals)
+    message_type = number_type(f"{PACKAGE}/{ros_message_name(message.name)}", members)
+    return Channel(channel_id, DECODED + message.name, message_type)
+
+
+def _check_names(channels: tuple[Channel, ...]) -> None:
+    """Raise LogError when two different types carry one name: a viewer would take one for the other."""
+    texts: dict[str, str] = {}
+    for channel in channels:
+        if texts.setdefault(channel.type.name, channel.type.text) != channel.type.text:
+            raise LogError(f"{channel.topic}: the type name {channel.type.name} is taken")
+
+
+def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
+    """Pack the body of /scheme."""
+    return (
+        _SCHEME_HEAD.pack(
+            output.cycle,
+            output.state,
+            output.previous_state,
+            output.fault,
+            request,
+            output.contact_joints,
+            output.is_model_valid,
+        )
+        + output.block.tobytes()
+    )
+
+
+def pack_contact(report: ContactReport) -> bytes:
+    """Pack the body of /contact."""
+    return _CONTACT_BODY.pack(
+        report.cycle, report.link, *report.direction, report.is_final, *report.tau_ext_peak, *report.impulse
+    )
+
+
+def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
+    """Pack the body of /control; `block` is laid out by CONTROL_LAYOUT."""
+    return _CONTROL_HEAD.pack(cycle, gate_flags, enable, quick_stop) + block.tobytes()
+
+
+def pack_cycle(record: CycleRecord) -> bytes:
+    """Pack the body of /cycle."""
+    return _CYCLE_BODY.pack(*record)
+
+
+def pack_truth(cycle: int, block: Vector) -> bytes:
+    """Pack the body of /truth; `block` is laid out by TRUTH_LAYOUT."""
+    return _TRUTH_HEAD.pack(cycle) + block.tobytes()

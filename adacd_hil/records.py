@@ -1,0 +1,233 @@
+"""Values that cross a layer: what was measured, decided, commanded and how the cycle went.
+
+Wide per-cycle values live in float64 *blocks*: one contiguous array whose fields a `Layout` names. The compiled
+step fills a block, the log stores its bytes as they are, replay compares them bit for bit.
+
+Symbols: q, dq rad and rad/s; tau_J measured joint torque, positive drives +q, Nm; tau_ext_hat estimated external
+torque, positive when the environment pushes toward +q, Nm; theta_hat dynamic parameters in the order of
+`PARAMETER_NAMES`. All joint vectors are float64 (2,).
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+JOINTS = 2
+JOINT_NAMES = ("joint1", "joint2")
+
+PARAMETER_NAMES = ("a1", "a2", "a3", "F_v1", "F_v2", "F_c1", "F_c2")
+"""Eq. (19): inertia kg m², viscous friction Nm s/rad, Coulomb friction Nm."""
+GRAVITY_PARAMETER_NAMES = ("a4", "a5")
+"""Appended where the joint axes are not vertical; Nm."""
+PARAMETER_UNITS = {
+    "a1": "kg m²",
+    "a2": "kg m²",
+    "a3": "kg m²",
+    "F_v1": "Nm s/rad",
+    "F_v2": "Nm s/rad",
+    "F_c1": "Nm",
+    "F_c2": "Nm",
+    "a4": "Nm",
+    "a5": "Nm",
+}
+
+
+class Field(NamedTuple):
+    """One field of a block."""
+
+    name: str
+    size: int
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names the fields of a float64 block, in order, without gaps."""
+
+    fields: tuple[Field, ...]
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Map each field name to its place in the block."""
+        places: dict[str, slice] = {}
+        start = 0
+        for field in self.fields:
+            places[field.name] = slice(start, start + field.size)
+            start += field.size
+        return places
+
+    @cached_property
+    def size(self) -> int:
+        """Count the float64 values of a block."""
+        return sum(field.size for field in self.fields)
+
+
+def scheme_layout(parameter_count: int) -> Layout:
+    """Lay out the scheme's per-cycle block for `parameter_count` dynamic parameters (7, or 9 with gravity)."""
+    return Layout(
+        (
+            Field("q", JOINTS, "rad", "measured joint position"),
+            Field("dq", JOINTS, "rad/s", "measured joint velocity"),
+            Field("tau_J", JOINTS, "Nm", "measured joint torque"),
+            Field("tau_f", JOINTS, "Nm", "filtered measured torque, eq. (3)"),
+            Field("tau_f_hat", JOINTS, "Nm", "its prediction by theta_hat, eq. (7)"),
+            Field("tau_f_cad", JOINTS, "Nm", "its prediction by the CAD model"),
+            Field("tau_ext_hat", JOINTS, "Nm", "estimated external torque, filtered, eq. (13) with our sign"),
+            Field("tau_ext_hat_cad", JOINTS, "Nm", "the same with the CAD model"),
+            Field("tau_ext_wide_hat", JOINTS, "Nm", "estimated external torque with the filter undone"),
+            Field("theta_hat", parameter_count, "see PARAMETER_UNITS", "estimated parameters"),
+            Field("threshold", JOINTS, "Nm", "detection threshold in force, inf while detection is off"),
+            Field("quiet_s", 1, "s", "how long eq. (15) has held"),
+            Field("excitation", 1, "Nm² s", "smallest eigenvalue of the scaled information matrix of this adaptation"),
+        )
+    )
+
+
+CONTROL_LAYOUT = Layout(
+    (
+        Field("q_d", JOINTS, "rad", "desired joint position"),
+        Field("dq_d", JOINTS, "rad/s", "desired joint velocity"),
+        Field("ddq_d", JOINTS, "rad/s²", "desired joint acceleration"),
+        Field("tau_d", JOINTS, "Nm", "desired torque, before the limits"),
+        Field("tau_c", JOINTS, "Nm", "commanded torque, after the limits"),
+    )
+)
+
+TRUTH_LAYOUT = Layout(
+    (
+        Field("q", JOINTS, "rad", "true joint position"),
+        Field("dq", JOINTS, "rad/s", "true joint velocity"),
+        Field("tau_J", JOINTS, "Nm", "true joint torque"),
+        Field("tau_ext", JOINTS, "Nm", "true external torque"),
+        Field("tau_friction", JOINTS, "Nm", "true friction torque, positive along +dq"),
+        Field("contact_force", 1, "N", "size of the contact force"),
+        Field("contact_link", 1, "", "link that is touched, 0 for none"),
+        Field("contact_index", 1, "", "index of the scenario's contact in force, -1 for none"),
+        Field("payload", 1, "kg", "payload at the tip"),
+        Field("theta", len(PARAMETER_NAMES), "see PARAMETER_UNITS", "true parameters, payload included"),
+    )
+)
+"""What the emulator knows and the host must not."""
+
+
+class SchemeState(IntEnum):
+    """Where the scheme stands. Each value says how to get out of it."""
+
+    INIT = 0  # the first complete cycle; or FAULT when it doesn't come
+    COMMISSION = 1  # enough complete cycles at rest; or FAULT when they don't come
+    ENABLE = 2  # both drives report Operation enabled; or FAULT on timeout
+    ADAPT = 3  # eq. (15) with excitation proven; or FAULT on timeout
+    MONITOR = 4  # a collision, or the announcement of a payload change
+    REACT = 5  # the arm has come to rest
+    STOPPED = 6  # the user acknowledges
+    PAYLOAD = 7  # the user says that the payload has been changed
+    FAULT = 8  # a new run; latched
+
+
+class Request(IntEnum):
+    """What the user asks of a running arm."""
+
+    NONE = 0
+    ACKNOWLEDGE = 1  # the collision has been seen to; go on
+    PAYLOAD = 2  # park the arm, the payload is about to change
+    PAYLOAD_CHANGED = 3  # the payload has changed; adapt again
+    FINISH = 4  # end the run: come to rest, then disable the drives
+
+
+class FaultReason(IntEnum):
+    """Why the scheme went to FAULT."""
+
+    NONE = 0
+    DATA_AGE = 1  # a signal older than its budget
+    DRIVE = 2  # a drive left Operation enabled by itself
+    SENSOR = 3  # a torque sensor reports an error
+    LIMIT = 4  # position or velocity outside the arm's limits
+    NOT_A_NUMBER = 5  # a value that is not finite
+    COMMISSION_TIMEOUT = 6
+    ENABLE_TIMEOUT = 7
+    ADAPT_TIMEOUT = 8
+
+
+class ArmState(NamedTuple):
+    """What the arm reported in one cycle.
+
+    Ages count cycles since the value was sampled: 0 is this cycle's SYNC. `periods` is how many periods have passed
+    since the previous ArmState, 1 unless the cycle overran.
+    """
+
+    cycle: int
+    t_ns: int
+    periods: int
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+    age_q: tuple[int, int]
+    age_tau_J: tuple[int, int]
+    is_enabled: bool
+    is_complete: bool
+    fault: FaultReason
+
+
+class ArmCommand(NamedTuple):
+    """What the arm is told in one cycle."""
+
+    tau_c: Vector
+    enable: bool
+    quick_stop: bool
+
+
+class ContactReport(NamedTuple):
+    """A collision, as first detected and then refined until the isolation window ends.
+
+    link: 1 or 2. direction: sign of the external torque per joint, 0 where below the threshold. tau_ext_peak: largest
+    external torque with the filter undone, Nm. impulse: integral of the external torque so far, Nm s.
+    """
+
+    cycle: int
+    link: int
+    direction: tuple[int, int]
+    tau_ext_peak: tuple[float, float]
+    impulse: tuple[float, float]
+    is_final: bool
+
+
+class SchemeOutput(NamedTuple):
+    """What the scheme decided in one cycle. `block` is laid out by `scheme_layout`."""
+
+    cycle: int
+    state: SchemeState
+    previous_state: SchemeState
+    fault: FaultReason
+    contact_joints: int  # bit i: joint i over the threshold
+    is_model_valid: bool  # theta_ff may be fed forward
+    theta_hat: Vector
+    theta_ff: Vector  # parameters of the last finished adaptation, zeros before; for the feedforward
+    tau_ext_hat: Vector
+    contact: ContactReport | None  # set in the cycle in which a report begins or becomes final
+    block: Vector
+
+
+class CycleRecord(NamedTuple):
+    """How one cycle went; times in ns. Not part of the decisions."""
+
+    cycle: int
+    lateness_ns: int  # wake-up after the grid point
+    feedback_ns: int  # SYNC sent to last frame decoded
+    command_ns: int  # SYNC sent to last command handed to the bus
+    overruns: int  # periods skipped since the run began
+    frames_missing: int  # cyclic frames of this cycle that did not arrive or failed their checks
+
+
+class Event(NamedTuple):
+    """Something worth a line in the log."""
+
+    level: str  # "info", "warning", "error"
+    name: str
+    message: str

@@ -1,0 +1,1 @@
+"""The adaptation-and-collision-detection scheme, pure: no clock, no I/O."""

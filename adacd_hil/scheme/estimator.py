@@ -1,0 +1,55 @@
+"""The parameter estimator of eq. (10): least squares in recursive form, or the gradient law with constant gain.
+
+The paper's law is in continuous time, P' = -P W_f' W_f P and theta_hat' = P W_f' epsilon. Integrated over a period T
+with W_f and epsilon of its sample, it is the recursive least squares of a measurement of variance R = 1 / T:
+
+    K = P W_f' (R I + W_f P W_f')^-1,    theta_hat += K epsilon,    P = (I - K W_f) P (I - K W_f)' + K R K'
+
+whose solution is theta_tilde = (I + P(0) sum T W_f' W_f)^-1 theta_tilde(0) whatever T is. R = 1 in place of 1 / T would
+be a thousand times the gain at 1 kHz. The two rows of W_f are taken one after the other, which is the same because
+R I is diagonal, and needs no inverse. With v = P w' and s = R + w v the last equation (Joseph's form) is
+
+    P - K v' - v K' + s K K'
+
+written for one triangle and mirrored: P stays symmetric, and an error of K enters only squared.
+
+The gradient law leaves P as it is. In this implicit form it is stable at any gain and any period.
+
+Shapes: W_f (2, p), theta_hat (p,), P (p, p), epsilon = tau_f - W_f theta_hat (2,) in filtered Nm.
+"""
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import Vector
+
+
+@compiled
+def update(
+    W_f: Vector, tau_f: Vector, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
+) -> None:
+    """Correct theta_hat (p,), and P (p, p) if least squares, by one sample in place; v and K (p,) are scratch."""
+    count = theta_hat.shape[0]
+    for i in range(W_f.shape[0]):
+        epsilon = tau_f[i]
+        s = R
+        for j in range(count):
+            v[j] = 0.0
+            for k in range(count):
+                v[j] += P[j, k] * W_f[i, k]
+            s += W_f[i, j] * v[j]
+            epsilon -= W_f[i, j] * theta_hat[j]
+        for j in range(count):
+            K[j] = v[j] / s
+            theta_hat[j] += K[j] * epsilon
+        if is_least_squares:
+            for j in range(count):
+                for k in range(j + 1):
+                    P[j, k] += s * K[j] * K[k] - (K[j] * v[k] + v[j] * K[k])
+                    P[k, j] = P[j, k]
+
+
+@compiled
+def reset_gain(P0: Vector, P: Vector) -> None:
+    """Set P (p, p) to the diagonal P0 (p,)."""
+    P[:] = 0.0
+    for j in range(P0.shape[0]):
+        P[j, j] = P0[j]

@@ -1,0 +1,294 @@
+"""The numbers of one cycle: filters, both predictions, estimator, evidence and contact in one compiled call.
+
+Three structured arrays of one element each carry everything, so that fields have names in compiled code and out of it:
+
+- constants: what the settings say, never written here;
+- memory: what lasts from one cycle to the next and is nobody's business outside;
+- block: `records.scheme_layout`, filled in every cycle. q, dq and tau_J are put there by the caller.
+
+A cycle without fresh data (a lost frame, a value that is not a number) leaves filters and estimate as they were and
+makes a gap; the next fresh sample resumes as `filters` says.
+"""
+
+from enum import IntFlag
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, Layout, Vector, scheme_layout
+from adacd_hil.scheme import contact, detector, estimator, filters, regressor, termination
+
+Structured = np.ndarray[Any, np.dtype[np.void]]
+
+# What a cycle does, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
+LEARN = 1
+ARMED = 2
+REPORTING = 4
+
+
+class Observation(IntFlag):
+    """What one cycle's numbers say, as far as the supervisor needs it."""
+
+    NONE = 0
+    NOT_A_NUMBER = 1  # a measurement is not finite
+    OVER_LIMIT = 2  # |q| or |dq| beyond the arm's limits
+    AT_REST = 4  # every |dq| below the rest velocity
+    UNLOADED = 8  # every |tau_J| below the rest torque
+    ADAPTED = 16  # eq. (15) holds with the evidence for it
+    CONTACT = 32  # a joint is over its threshold
+
+
+_NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
+_OVER_LIMIT = int(Observation.OVER_LIMIT)
+_AT_REST = int(Observation.AT_REST)
+_UNLOADED = int(Observation.UNLOADED)
+_ADAPTED = int(Observation.ADAPTED)
+_CONTACT = int(Observation.CONTACT)
+CONTACT_SHIFT = 8
+"""The joints over their threshold are the bits of `Observation` from here on."""
+
+
+def block_dtype(layout: Layout) -> np.dtype[np.void]:
+    """Describe a block as a structure; its bytes are those of the float64 block."""
+    return np.dtype([(field.name, np.float64, (field.size,)) for field in layout.fields])
+
+
+def constants_of(settings: Settings) -> Structured:
+    """Put the settings into the form that the compiled step reads."""
+    count = len(settings.estimator.parameter_names)
+    period_s = settings.bus.period_s
+    hold = filters.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
+    inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
+    scale = (inertia,) * 3 + (viscous,) * 2 + (coulomb,) * 2 + (gravity,) * 2
+    values: dict[str, Any] = {
+        "period_s": period_s,
+        "a_rad_s": settings.filter.a_rad_s,
+        "b_rad_s": settings.filter.b_rad_s,
+        "dc_gain": settings.filter.b_rad_s / settings.filter.a_rad_s,
+        "decay": hold.decay,
+        "weight_old": hold.weight_old,
+        "weight_new": hold.weight_new,
+        "R": 1.0 / period_s,
+        "is_least_squares": float(settings.estimator.law == "least_squares"),
+        "P0": settings.estimator.P0,
+        "theta_cad": settings.cad_theta if settings.arm.cad_theta else np.zeros(count),
+        "beta_Nm": settings.termination.beta_Nm,
+        "hold_cycles": round(settings.termination.hold_s / period_s),
+        "travel_rad": np.radians(settings.termination.travel_deg),
+        "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
+        "excitation_Nm2s": settings.termination.excitation_Nm2s,
+        "scale": scale[:count],
+        "threshold_Nm": settings.detector.threshold_Nm,
+        "standstill_rad_s": settings.detector.standstill_rad_s,
+        "position_limit_rad": settings.arm.position_limit_rad,
+        "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
+        "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
+        "rest_torque_Nm": settings.safety.rest_torque_Nm,
+    }
+    constants = np.zeros(1, np.dtype([(name, np.float64, np.shape(value)) for name, value in values.items()]))
+    for name, value in values.items():
+        constants[name] = value
+    return constants
+
+
+def new_memory(parameter_count: int) -> Structured:
+    """Return the memory before the first sample: a gap, with tau_f = 0, W_f = 0 and theta_hat = 0."""
+    joint, parameter = (JOINTS,), (parameter_count,)
+    columns, square = (JOINTS, parameter_count), (parameter_count, parameter_count)
+    shapes: dict[str, tuple[int, ...]] = {
+        "has_gap": (),
+        # filters
+        "Y_p": columns,
+        "Y_h": columns,
+        "input_old": columns,
+        "S": columns,
+        "W_f": columns,
+        "tau_old": joint,
+        # estimator
+        "P": square,
+        "v": parameter,
+        "K": parameter,
+        # termination
+        "q_low": joint,
+        "q_high": joint,
+        "dq_low": joint,
+        "dq_high": joint,
+        "information": square,
+        "scratch": square,
+        "samples": (),
+        "quiet_cycles": (),
+        # contact
+        "standstill": joint,
+        "history": (contact.WIDE_SAMPLES + 1, JOINTS),
+        "integral": joint,
+        "peak": joint,
+    }
+    memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
+    memory["has_gap"] = 1.0
+    return memory
+
+
+def new_block(parameter_count: int) -> Structured:
+    """Return a block before the first sample: zeros, and thresholds that nothing exceeds."""
+    block = np.zeros(1, block_dtype(scheme_layout(parameter_count)))
+    block["threshold"] = np.inf
+    return block
+
+
+@compiled
+def begin_adaptation(constants: Structured, memory: Structured, block: Structured) -> None:
+    """Forget the filters' past, the gain and the evidence; keep theta_hat. The arm is at rest.
+
+    Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
+    """
+    c, m, out = constants[0], memory[0], block[0]
+    m["has_gap"] = 1.0
+    m["W_f"][:] = 0.0
+    out["tau_f"][:] = 0.0
+    m["history"][:] = 0.0
+    estimator.reset_gain(c["P0"], m["P"])
+    m["q_low"][:] = np.inf
+    m["q_high"][:] = -np.inf
+    m["dq_low"][:] = np.inf
+    m["dq_high"][:] = -np.inf
+    m["information"][:] = 0.0
+    m["samples"] = 0.0
+    m["quiet_cycles"] = 0.0
+    out["quiet_s"][0] = 0.0
+    out["excitation"][0] = 0.0
+
+
+@compiled
+def step(
+    constants: Structured, memory: Structured, block: Structured, is_complete: int, periods: int, mode: int
+) -> int:
+    """Take in the block's q, dq, tau_J and fill the rest of it; return bits of `Observation`.
+
+    is_complete: 1 if all values are this cycle's. periods: since the previous step. mode: LEARN, ARMED, REPORTING.
+    """
+    c, m, out = constants[0], memory[0], block[0]
+    observation = _observe(c, out)
+    is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
+    if is_fresh:
+        _filter(c, m, out, periods)
+        if mode & LEARN:
+            observation |= _learn(c, m, out)
+        if not (np.all(np.isfinite(out["tau_ext_hat"])) and np.all(np.isfinite(out["theta_hat"]))):
+            observation |= _NOT_A_NUMBER
+    else:
+        m["has_gap"] = 1.0
+    if mode & ARMED:
+        return observation | _watch(c, m, out, is_fresh, mode & REPORTING != 0)
+    out["threshold"][:] = np.inf
+    m["integral"][:] = 0.0
+    m["peak"][:] = 0.0
+    return observation
+
+
+@compiled
+def _observe(c: Any, out: Any) -> int:
+    """Return what the measurements alone say."""
+    observation = _AT_REST | _UNLOADED
+    for i in range(JOINTS):
+        q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
+        if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
+            observation |= _NOT_A_NUMBER
+        if not (abs(q) <= c["position_limit_rad"][i] and abs(dq) <= c["velocity_limit_rad_s"][i]):
+            observation |= _OVER_LIMIT
+        if not (abs(dq) < c["rest_velocity_rad_s"]):
+            observation &= ~_AT_REST
+        if not (abs(tau_J) < c["rest_torque_Nm"]):
+            observation &= ~_UNLOADED
+    return observation
+
+
+@compiled
+def _filter(c: Any, m: Any, out: Any, periods: int) -> None:
+    """Take the filters to this sample and estimate the external torque with both models."""
+    regressor.fill_momentum(out["q"], out["dq"], m["Y_p"])
+    regressor.fill_remainder(out["q"], out["dq"], m["Y_h"])
+    a, b = c["a_rad_s"], c["b_rad_s"]
+    if m["has_gap"] != 0.0 or periods != 1:
+        filters.resume(a, b, m["Y_p"], m["Y_h"], out["tau_J"], m["input_old"], m["tau_old"], m["S"], m["W_f"])
+        m["has_gap"] = 0.0
+    else:
+        decay, old, new = c["decay"], c["weight_old"], c["weight_new"]
+        filters.advance_torque(decay, old, new, m["tau_old"], out["tau_J"], out["tau_f"])
+        filters.advance_regressor(decay, old, new, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
+    detector.follow_standstill(out["dq"], c["standstill_rad_s"], c["decay"], m["standstill"])
+    detector.predict(m["W_f"], out["theta_hat"], out["tau_f_hat"])
+    detector.predict(m["W_f"], c["theta_cad"], out["tau_f_cad"])
+    detector.estimate_external(out["tau_f"], out["tau_f_hat"], c["dc_gain"], out["tau_ext_hat"])
+    detector.estimate_external(out["tau_f"], out["tau_f_cad"], c["dc_gain"], out["tau_ext_hat_cad"])
+    contact.undo_filter(out["tau_ext_hat"], c["decay"], m["history"], out["tau_ext_wide_hat"])
+
+
+@compiled
+def _learn(c: Any, m: Any, out: Any) -> int:
+    """Judge the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
+    termination.widen(out["q"], m["q_low"], m["q_high"])
+    termination.widen(out["dq"], m["dq_low"], m["dq_high"])
+    termination.add_information(m["W_f"], c["period_s"], m["information"])
+    if m["samples"] % termination.EXCITATION_EVERY == termination.EXCITATION_EVERY - 1:
+        out["excitation"][0] = termination.smallest_eigenvalue(m["information"], c["scale"], m["scratch"])
+    m["samples"] += 1.0
+    m["quiet_cycles"] = m["quiet_cycles"] + 1.0 if termination.is_quiet(out["tau_ext_hat"], c["beta_Nm"]) else 0.0
+    out["quiet_s"][0] = m["quiet_cycles"] * c["period_s"]
+    is_over = (
+        m["quiet_cycles"] >= c["hold_cycles"]
+        and out["excitation"][0] >= c["excitation_Nm2s"]
+        and termination.has_moved(
+            m["q_low"], m["q_high"], m["dq_low"], m["dq_high"], c["travel_rad"], c["velocity_rad_s"]
+        )
+    )
+    estimator.update(
+        m["W_f"], out["tau_f"], c["R"], c["is_least_squares"] != 0.0, out["theta_hat"], m["P"], m["v"], m["K"]
+    )
+    return _ADAPTED if is_over else 0
+
+
+@compiled
+def _watch(c: Any, m: Any, out: Any, is_fresh: bool, is_reporting: bool) -> int:
+    """Compare with the thresholds; return CONTACT and the joints that are over, if any."""
+    F_c = out["theta_hat"][regressor.F_C1 : regressor.F_C2 + 1]
+    detector.fill_threshold(c["threshold_Nm"], m["standstill"], F_c, out["threshold"])
+    if is_fresh:
+        contact.follow_contact(
+            out["tau_ext_hat"],
+            out["tau_ext_wide_hat"],
+            out["threshold"],
+            c["period_s"],
+            is_reporting,
+            m["integral"],
+            m["peak"],
+        )
+    joints = detector.joints_over(out["tau_ext_hat"], out["threshold"])
+    return _CONTACT | joints << CONTACT_SHIFT if joints else 0
+
+
+@compiled
+def step_record(
+    constants: Structured,
+    memory: Structured,
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    is_complete: Vector,
+    periods: Vector,
+    mode: int,
+    blocks: Structured,
+) -> None:
+    """Run `step` over n samples in one mode: q, dq, tau_J (n, 2); is_complete, periods (n,) int64; fills blocks (n,).
+
+    blocks[0] must hold the theta_hat to begin with.
+    """
+    for k in range(q.shape[0]):
+        if k > 0:
+            blocks[k] = blocks[k - 1]
+        block = blocks[k : k + 1]
+        block[0]["q"][:] = q[k]
+        block[0]["dq"][:] = dq[k]
+        block[0]["tau_J"][:] = tau_J[k]
+        step(constants, memory, block, is_complete[k], periods[k], mode)

@@ -1,0 +1,103 @@
+"""The scheme: one ArmState in, one SchemeOutput out. No clock, no input or output; the same live and in replay.
+
+A cycle: the state reached so far says what the numbers do (`kernel.step`), the numbers say where the supervisor goes,
+and the new state leaves its traces: an adaptation begins or ends, a collision's report begins or becomes final.
+
+`theta_hat` is the live estimate, after this cycle's correction; tau_f_hat of the same block was predicted before it.
+`theta_ff` is what the last finished adaptation left. `is_model_valid` says that theta_ff may be fed forward: an
+adaptation has finished and its mass matrix is positive definite everywhere. It stays so during later adaptations.
+"""
+
+import numpy as np
+
+from adacd_hil.config import Settings
+from adacd_hil.records import ArmState, ContactReport, Request, SchemeOutput, SchemeState, scheme_layout
+from adacd_hil.scheme import kernel
+from adacd_hil.scheme.contact import Isolation
+from adacd_hil.scheme.regressor import has_positive_definite_mass, inverse_dynamics
+from adacd_hil.scheme.supervisor import Supervisor
+
+_MODES = {
+    state: (kernel.LEARN if state is SchemeState.ADAPT else 0)
+    | (kernel.ARMED if state in (SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED) else 0)
+    for state in SchemeState
+}
+
+
+class Pipeline:
+    """Adaptation and collision detection for one run."""
+
+    def __init__(self, settings: Settings) -> None:
+        count = len(settings.estimator.parameter_names)
+        places = scheme_layout(count).slices
+        self._constants = kernel.constants_of(settings)
+        self._memory = kernel.new_memory(count)
+        self._block = kernel.new_block(count)
+        self._values = self._block.view(np.float64)
+        self._q = self._values[places["q"]]
+        self._dq = self._values[places["dq"]]
+        self._tau_J = self._values[places["tau_J"]]
+        self._theta_hat = places["theta_hat"]
+        self._tau_ext_hat = places["tau_ext_hat"]
+        self._integral = self._memory[0]["integral"]
+        self._peak = self._memory[0]["peak"]
+        self._supervisor = Supervisor(settings)
+        window_cycles = round(settings.detector.isolation_window_s / settings.bus.period_s)
+        self._isolation = Isolation(window_cycles, settings.filter.a_rad_s)
+        self._theta_ff = np.zeros(count)
+        self._is_model_valid = False
+
+    def compile(self) -> None:
+        """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
+        memory, block = self._memory.copy(), self._block.copy()
+        kernel.begin_adaptation(self._constants, memory, block)
+        kernel.step(self._constants, memory, block, 1, 1, kernel.LEARN)
+        inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
+
+    def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
+        """Take in one cycle."""
+        supervisor, isolation = self._supervisor, self._isolation
+        previous = supervisor.state
+        self._q[:] = arm.q
+        self._dq[:] = arm.dq
+        self._tau_J[:] = arm.tau_J
+        mode = _MODES[previous] | (kernel.REPORTING if isolation.is_open else 0)
+        observation = kernel.step(
+            self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), mode
+        )
+        state = supervisor.step(arm, request, observation, isolation.is_open)
+        joints = observation >> kernel.CONTACT_SHIFT
+        block = self._values.copy()
+        if state is not previous:
+            self._enter(state, previous, arm.cycle)
+        contact = self._report(arm.cycle, joints) if isolation.is_open else None
+        return SchemeOutput(
+            cycle=arm.cycle,
+            state=state,
+            previous_state=previous,
+            fault=supervisor.fault,
+            contact_joints=joints,
+            is_model_valid=self._is_model_valid,
+            theta_hat=block[self._theta_hat],
+            theta_ff=self._theta_ff,
+            tau_ext_hat=block[self._tau_ext_hat],
+            contact=contact,
+            block=block,
+        )
+
+    def _enter(self, state: SchemeState, previous: SchemeState, cycle: int) -> None:
+        """Do what a new state begins with, and what the previous one ends with."""
+        if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
+            self._theta_ff = self._values[self._theta_hat].copy()
+            self._is_model_valid = has_positive_definite_mass(self._theta_ff)
+        if state is SchemeState.ADAPT:
+            kernel.begin_adaptation(self._constants, self._memory, self._block)
+        elif state is SchemeState.REACT:
+            self._isolation.begin(cycle)
+        elif state is SchemeState.FAULT:
+            self._isolation.cancel()
+
+    def _report(self, cycle: int, joints: int) -> ContactReport | None:
+        """Return the report that begins or becomes final in this cycle, if one does."""
+        tau_ext_hat = self._values[self._tau_ext_hat]
+        return self._isolation.report(cycle, joints, tau_ext_hat, self._integral, self._peak)

@@ -1,0 +1,119 @@
+"""The withdrawal: away from the collision, along +tau_ext_hat, as fast as the limits allow, to a stop.
+
+Each joint follows the time-optimal profile of a double integrator from its present desired position and velocity to
+rest at its target: to the cruise speed, cruise, brake, each part with the acceleration limit or none. The profile is
+known in closed form and sampled, so that it ends exactly on the target with zero velocity and never chatters.
+
+The target lies along the external torque: the joint with the largest part of it moves its `distance_deg`, the others in
+proportion. It is cut off at the position limits less a margin, but never put against the external torque: a joint
+that is already beyond, or too fast to stop before, stops as soon as it can.
+
+Units: rad, rad/s, rad/s², s. Joint vectors (2,).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, Vector
+
+
+class Profile(NamedTuple):
+    """One joint's way: three parts of constant acceleration, each with its length in s, then rest at the target."""
+
+    position: float
+    velocity: float
+    parts: tuple[tuple[float, float], ...]  # acceleration, duration_s
+    target: float
+
+    def at(self, elapsed_s: float) -> tuple[float, float, float]:
+        """Return position, velocity and acceleration at this time; before the start, those of the start."""
+        position, velocity = self.position, self.velocity
+        remaining_s = max(elapsed_s, 0.0)
+        for acceleration, duration_s in self.parts:
+            if remaining_s < duration_s:
+                return (
+                    position + remaining_s * (velocity + 0.5 * acceleration * remaining_s),
+                    velocity + acceleration * remaining_s,
+                    acceleration,
+                )
+            position += duration_s * (velocity + 0.5 * acceleration * duration_s)
+            velocity += acceleration * duration_s
+            remaining_s -= duration_s
+        return self.target, 0.0, 0.0
+
+    @property
+    def duration_s(self) -> float:
+        """Time until rest."""
+        return sum(duration_s for _, duration_s in self.parts)
+
+
+def time_optimal(
+    position: float, velocity: float, target: float, velocity_limit: float, acceleration_limit: float
+) -> Profile:
+    """Plan the fastest way to rest at `target` within the limits; a velocity over its limit is braked first."""
+    stop = position + velocity * abs(velocity) / (2.0 * acceleration_limit)
+    sign = math.copysign(1.0, target - stop)
+    distance = sign * (target - position)
+    forward = sign * velocity
+    peak = min(velocity_limit, math.sqrt(max(acceleration_limit * distance + 0.5 * forward**2, 0.0)))
+    to_peak_s = abs(peak - forward) / acceleration_limit
+    to_rest_s = peak / acceleration_limit
+    ground = 0.5 * (forward + peak) * to_peak_s + 0.5 * peak * to_rest_s
+    cruise_s = max(distance - ground, 0.0) / peak if peak > 0.0 else 0.0
+    to_peak = sign * math.copysign(acceleration_limit, peak - forward)
+    parts = ((to_peak, to_peak_s), (0.0, cruise_s), (-sign * acceleration_limit, to_rest_s))
+    return Profile(position, velocity, parts, target)
+
+
+class Withdrawal:
+    """The way of all joints from one collision to rest. Made when REACT is entered, then sampled per period."""
+
+    def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, tau_ext_hat: Vector) -> None:
+        """Plan from the present desired motion. Without an external torque the arm just stops."""
+        distance = np.radians(settings.reaction.distance_deg)
+        velocity_limit = np.radians(settings.reaction.velocity_limit_deg_s)
+        acceleration_limit = np.radians(settings.reaction.acceleration_limit_deg_s2)
+        position_limit = settings.arm.position_limit_rad - np.radians(settings.reaction.position_margin_deg)
+        largest = float(np.max(np.abs(tau_ext_hat)))
+        share = tau_ext_hat / largest if largest > 0.0 else np.zeros(JOINTS)
+        self._profiles = tuple(
+            _withdraw(
+                float(q_d[i]),
+                float(dq_d[i]),
+                float(share[i] * distance[i]),
+                float(position_limit[i]),
+                float(velocity_limit[i]),
+                float(acceleration_limit[i]),
+            )
+            for i in range(JOINTS)
+        )
+
+    @property
+    def duration_s(self) -> float:
+        """Time until all joints are at rest."""
+        return max(profile.duration_s for profile in self._profiles)
+
+    def at(self, elapsed_s: float) -> tuple[Vector, Vector, Vector]:
+        """Return desired q_d, dq_d, ddq_d (2,) at this time since the plan was made."""
+        samples = np.array([profile.at(elapsed_s) for profile in self._profiles])
+        return samples[:, 0].copy(), samples[:, 1].copy(), samples[:, 2].copy()
+
+
+def _withdraw(
+    position: float,
+    velocity: float,
+    displacement: float,
+    position_limit: float,
+    velocity_limit: float,
+    acceleration_limit: float,
+) -> Profile:
+    """Plan one joint's way over `displacement`, cut off at the position limit, never back against it."""
+    sign = math.copysign(1.0, displacement or velocity)  # a joint that is not pushed just stops
+    room = position_limit - sign * position
+    forward = sign * velocity
+    stop = forward * abs(forward) / (2.0 * acceleration_limit)
+    target = position + sign * max(min(abs(displacement), room), stop)
+    return time_optimal(position, velocity, target, velocity_limit, acceleration_limit)

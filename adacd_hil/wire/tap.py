@@ -1,0 +1,41 @@
+"""A bus end that remembers what passed, so that the log holds every frame both ways."""
+
+from adacd_hil.clock import Clock
+from adacd_hil.wire.bus import Bus, Frame
+
+
+class Tap:
+    """Wraps a bus; `take` returns and forgets the frames since the last call, oldest first, True for sent.
+
+    `held_ns` stamps sent frames instead of the clock when it is set: the cycle has just read the clock itself.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock) -> None:
+        self.channel = bus.channel
+        self._bus = bus
+        self._clock = clock
+        self._passed: list[tuple[bool, Frame]] = []
+        self.held_ns: int | None = None
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send and remember a frame. Raises BusError."""
+        # Remembered first: on the embedded bus the answers come while `send` runs.
+        t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
+        self._passed.append((True, Frame(can_id, data, t_ns)))
+        self._bus.send(can_id, data)
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        """Receive and remember a frame. Raises BusError."""
+        frame = self._bus.receive(timeout_s)
+        if frame is not None:
+            self._passed.append((False, frame))
+        return frame
+
+    def take(self) -> list[tuple[bool, Frame]]:
+        """Return the frames since the last call."""
+        passed, self._passed = self._passed, []
+        return passed
+
+    def close(self) -> None:
+        """Close the bus behind it."""
+        self._bus.close()

@@ -1,0 +1,267 @@
+"""The emulated arm on the bus: one body, two drives, two torque sensors, and the time that they live in.
+
+At SYNC k:  latch the commands that came since SYNC k − 1 → sample the body → status frames that are due → feedback and
+torque frames, identifiers ascending → truth of k → integrate to k + 1 with the latched torque. The cyclic frames come
+last, so that a host in lockstep, which goes on when it has them, has everything of this SYNC.
+
+Two clocks:
+
+    sync   every SYNC is one period (0x1006), however long it took to come: the same frames in give the same frames
+           out, bit for bit. A lost SYNC is seen by the gap in its counter, and its period is integrated too.
+    wall   the body moves by the given clock on a 100 µs grid and a SYNC samples it where it is. The drives watch that
+           SYNC keeps coming.
+
+The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
+0 for a master that begins at 1; from there the counter 1…240 is unwrapped.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from adacd_hil.records import JOINTS, TRUTH_LAYOUT, Vector
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec import Codec, contract_folder
+from firmware_sim.body import Body
+from firmware_sim.contact import TICK_S
+from firmware_sim.drive_node import DriveNode, Motor
+from firmware_sim.object_dictionary import NEVER_NS, RESET_COMMUNICATION, RESET_NODE, Abort, Device, refuse
+from firmware_sim.scenario import Scenario
+from firmware_sim.sensor_node import SensorNode
+
+ClockMode = Literal["sync", "wall"]
+SYNC_COUNTERS = 240
+
+_TICK_NS = round(TICK_S * 1e9)
+_NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
+_LONGEST_PERIOD_US = 100_000
+
+Handler = Callable[[bytes, int], None]
+
+
+class Bench:
+    """Everything on the device's end of the bus. Single-threaded: it sends from within the calls made to it."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        codec: Codec,
+        send: Callable[[int, bytes], None],
+        *,
+        clock_mode: ClockMode = "sync",
+        seed: int | None = None,
+        on_truth: Callable[[int, int, Vector], None] | None = None,
+    ) -> None:
+        """Build and compile everything; nothing is sent before `boot`.
+
+        send: called with (identifier, data). seed: outweighs the scenario's. on_truth: called each cycle with (cycle,
+        t_ns of the SYNC frame, block by TRUTH_LAYOUT), the block being valid until the next call.
+        Raises CodecError when the DBC lacks a message, OSError when an EDS can't be read.
+        """
+        self.now_ns = 0
+        """The bench's time: of `boot` plus, by SYNC, the periods since then; by wall, the clock's."""
+        self.cycle = -1
+        """Number of the last SYNC, -1 before the first."""
+        self._scenario = scenario
+        self._seed = seed
+        self._is_wall = clock_mode == "wall"
+        self._on_truth = on_truth
+        self._truth = np.zeros(TRUTH_LAYOUT.size)
+        self._counter = 0  # of the last SYNC, 0: none since boot-up
+        self._has_moved = False
+        self._is_started = False
+        self._due_ns = NEVER_NS
+        self._body_ns = 0
+        folder = contract_folder()
+        eds = [folder / ("drive.eds" if name.startswith("Drive") else "torque_sensor.eds") for name in _NODES]
+        ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
+        self.devices = tuple(Device(node_id, path, send) for node_id, path in zip(ids, eds, strict=True))
+        rated_Nm = scenario.arm.rated_torque_Nm
+        self.drives = tuple(
+            DriveNode(self.devices[i], codec, i + 1, self._motor(i), rated_Nm[i], send, self._is_wall)
+            for i in range(JOINTS)
+        )
+        self.sensors = tuple(SensorNode(self.devices[JOINTS + i], codec, i + 1, send) for i in range(JOINTS))
+        self._nodes = (*self.drives, *self.sensors)
+        self._period_ns = self.devices[0].value(0x1006) * 1000
+        for device in self.devices:
+            device.watch(0x1006, 0, check=self._check_period)
+        self.devices[0].watch(0x1006, 0, self._set_period)
+        self._body = self._make_body()
+        self._sync_id = codec.message("Sync").can_id
+        self._host_id = codec.node_id("HostHeartbeat")
+        self._commands: dict[int, Handler] = {
+            codec.message(f"Drive{i + 1}Command").can_id: self.drives[i].on_command for i in range(JOINTS)
+        }
+        self._services: dict[int, Handler] = {
+            codec.message("Nmt").can_id: self._on_nmt,
+            codec.message("HostHeartbeat").can_id: self._on_host_heartbeat,
+            **{
+                codec.message(f"{name}SdoRequest").can_id: device.on_sdo
+                for name, device in zip(_NODES, self.devices, strict=True)
+            },
+        }
+
+    @property
+    def is_operational(self) -> bool:
+        """Whether all nodes are in NMT state Operational."""
+        return all(device.is_operational for device in self.devices)
+
+    @property
+    def is_scenario_started(self) -> bool:
+        """Whether both drives have been in Operation enabled at once."""
+        return self._is_started
+
+    @property
+    def due_ns(self) -> int:
+        """When something is due by time; call `advance_to` then."""
+        return self._due_ns
+
+    def boot(self, t_ns: int = 0) -> None:
+        """Power on at `t_ns`: every node announces itself."""
+        self.now_ns = self._body_ns = t_ns
+        for device in self.devices:
+            device.boot(t_ns)
+        self._poll(t_ns)
+
+    def on_frame(self, frame: Frame) -> None:
+        """Take one frame from the bus."""
+        can_id, data, t_ns, is_error = frame
+        if is_error:
+            return
+        if self._is_wall and t_ns > self.now_ns:
+            self.now_ns = t_ns
+        if can_id == self._sync_id:
+            self._on_sync(data, t_ns)
+        elif can_id in self._commands:
+            self._commands[can_id](data, self.now_ns)
+        elif can_id in self._services:
+            self._services[can_id](data, self.now_ns)
+            self._poll(self.now_ns)
+
+    def advance_to(self, t_ns: int) -> None:
+        """Let time pass without frames: heartbeats, event timers, watchdogs; by wall clock the body moves too."""
+        while self._due_ns <= t_ns:
+            self._move_to(max(self._due_ns, self.now_ns))
+            self._poll(self.now_ns)
+        self._move_to(t_ns)
+
+    def _on_nmt(self, data: bytes, t_ns: int) -> None:
+        for device in self.devices:
+            device.on_nmt(data, t_ns)
+        is_reset = len(data) == 2 and data[0] in (RESET_NODE, RESET_COMMUNICATION)
+        if is_reset and data[1] in (0, self.devices[0].node_id):
+            self._counter = 0
+
+    def _on_host_heartbeat(self, _data: bytes, t_ns: int) -> None:
+        for device in self.devices:
+            device.on_heartbeat(self._host_id, t_ns)
+
+    def _on_sync(self, data: bytes, t_ns: int) -> None:
+        """Run one cycle."""
+        counter = data[0] if data else 0
+        periods = self._count_periods(counter) if counter <= SYNC_COUNTERS else 0
+        if periods == 0:
+            return
+        drive1, drive2 = self.drives
+        sensor1, sensor2 = self.sensors
+        if self._is_wall:
+            self._move_to(self.now_ns)
+        elif self._period_ns != self._body_period_ns:
+            self._body = self._make_body()
+        elif self._has_moved:
+            self._live_through_lost_syncs(periods - 1)
+            self.now_ns += self._period_ns
+        now_ns = self.now_ns
+        body = self._body
+        (position1, position2), (velocity1, velocity2), (torque1, torque2) = body.sample()
+        drive1.on_sync(position1, velocity1, now_ns)
+        drive2.on_sync(position2, velocity2, now_ns)
+        sensor1.on_sync(torque1)
+        sensor2.on_sync(torque2)
+        if now_ns >= self._due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
+            self._poll(now_ns)
+        if not self._is_started and drive1.is_enabled and drive2.is_enabled:
+            self._is_started = True
+            body.start_scenario()
+        drive1.send_feedback()
+        drive2.send_feedback()
+        sensor1.send_torque()
+        sensor2.send_torque()
+        if self._on_truth is not None:
+            body.truth(self._truth)
+            self._on_truth(self.cycle, t_ns, self._truth)
+        if not self._is_wall:
+            self._has_moved = True
+            body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode))
+
+    def _count_periods(self, counter: int) -> int:
+        """Unwrap the SYNC counter; return the periods since the SYNC before, 0 for a repeated one.
+
+        A SYNC without counter (0x1019 = 0) follows the one before.
+        """
+        last = self._counter
+        if last == 0:
+            self._counter = counter or 1
+            self.cycle = self._counter - 1
+            return 1
+        if counter == 0:
+            counter = last % SYNC_COUNTERS + 1
+        periods = (counter - last) % SYNC_COUNTERS
+        self._counter = counter
+        self.cycle += periods
+        return periods
+
+    def _live_through_lost_syncs(self, count: int) -> None:
+        drive1, drive2 = self.drives
+        for _ in range(count):
+            self.now_ns += self._period_ns
+            drive1.on_lost_sync(self.now_ns)
+            drive2.on_lost_sync(self.now_ns)
+            self._body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode))
+
+    def _move_to(self, t_ns: int) -> None:
+        """Let the bench's time reach `t_ns`, by wall clock the body too."""
+        self.now_ns = max(self.now_ns, t_ns)
+        if not self._is_wall:
+            return
+        drive1, drive2 = self.drives
+        torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
+        mode = (drive1.motor_mode, drive2.motor_mode)
+        while self._body_ns + _TICK_NS <= t_ns:
+            self._body_ns += _TICK_NS
+            self._has_moved = True
+            self._body.advance(torque_Nm, mode)
+
+    def _poll(self, t_ns: int) -> None:
+        """Do what is due by time and remember when to look again."""
+        drive1, drive2 = self.drives
+        sensor1, sensor2 = self.sensors
+        self._due_ns = min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
+
+    def _motor(self, joint: int) -> Motor:
+        return Motor(
+            velocity_rad_s=lambda: self._body.drive_velocity_rad_s[joint],
+            torque_Nm=lambda: self._body.motor_torque_Nm[joint],
+        )
+
+    def _make_body(self) -> Body:
+        """Make the arm as at power-on; by SYNC, one that moves by whole periods."""
+        self._body_period_ns = _TICK_NS if self._is_wall else self._period_ns
+        self._has_moved = self._is_started = False
+        return Body(self._scenario, self._body_period_ns * 1e-9, self._seed)
+
+    def _check_period(self, period_us: int) -> None:
+        """Accept whole ticks; by SYNC, once the arm has moved, only the period that it has moved by.
+
+        A reset that restores another period's default makes a new arm at the next SYNC unless it is written again.
+        """
+        is_possible = 0 < period_us <= _LONGEST_PERIOD_US and period_us * 1000 % _TICK_NS == 0
+        if not is_possible:
+            refuse(Abort.VALUE_RANGE)
+        if not self._is_wall and self._has_moved and period_us * 1000 != self._body_period_ns:
+            refuse(Abort.DEVICE_STATE)
+
+    def _set_period(self, period_us: int) -> None:
+        self._period_ns = period_us * 1000

@@ -1,0 +1,338 @@
+"""The emulated arm as one thing: drives' inner loops, rigid body, the person, and the sensors.
+
+Inside a period the body runs on the drives' 100 µs ticks; in each of them
+
+    the person's and the payload's change of this tick → torque target of each drive → integrate → encoder → velocity
+
+Per SYNC k the device nodes `sample` (and record the `truth` of the same instant), then `advance` to SYNC k + 1 with
+the set-point that was latched at SYNC k. All state lies in one vector, so a body is its state, scenario and seed.
+"""
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import TRUTH_LAYOUT, Vector
+from firmware_sim.contact import (
+    END_TICK,
+    LINK,
+    ONSET_TICK,
+    TICK_S,
+    contact_force,
+    contact_table,
+    ticks,
+)
+from firmware_sim.plant import (
+    BRAKE_DAMPING,
+    COULOMB,
+    DQ,
+    INERTIA,
+    MECHANICAL_STATE,
+    PAYLOAD,
+    TAU,
+    TORQUE_LIMIT,
+    VISCOUS,
+    Q,
+    accelerate,
+    decide_slips,
+    external_torque,
+    fit_payload,
+    integrate,
+)
+from firmware_sim.scenario import Scenario
+from firmware_sim.sensing import (
+    POSITION_LSB_RAD,
+    TORQUE_COUNTS,
+    TORQUE_LSB_NM,
+    TORQUE_NOISE_NM,
+    VELOCITY_LSB_RAD_S,
+    TorqueNoise,
+    to_counts,
+    torque_counts,
+    track,
+)
+
+
+class DriveMode(IntEnum):
+    """What a drive does with its motor. The drive node chooses; every mode can follow every other."""
+
+    OFF = 0  # no torque, the arm coasts: Switched on and below, until the node enables
+    TORQUE = 1  # follows the set-point: Operation enabled, until the node disables, stops or faults
+    BRAKE = 2  # torque against the velocity: Quick stop and Fault reaction active, until the node sees standstill
+
+
+SUBSTEPS: Final = 1
+"""Integration steps per tick: RK4 at 10 kHz. Halving the step changes a period's velocity by less than 2e-10 rad/s, and
+by up to 2e-8 rad/s where a joint brushes against standstill (profile M in the paper's experiment)."""
+
+# Places in the state vector after the mechanical state.
+_TICK: Final = MECHANICAL_STATE  # ticks since power-on
+_START_TICK: Final = _TICK + 1  # tick of scenario time 0; -1 before
+_CONTACT: Final = _TICK + 2  # index of the contact in force or the next one
+_CHANGE: Final = _TICK + 3  # index of the next payload change
+_ENCODER: Final = _TICK + 4  # 2: encoder position, rad
+_ESTIMATE: Final = _TICK + 6  # 2: position of the tracking loop, rad
+_VELOCITY: Final = _TICK + 8  # 2: velocity of the tracking loop, rad/s
+_STATE: Final = _TICK + 10
+
+_TORQUE: Final = int(DriveMode.TORQUE)
+_BRAKE: Final = int(DriveMode.BRAKE)
+
+_PLACE: Final = {name: place.start for name, place in TRUTH_LAYOUT.slices.items()}
+_TRUE_Q: Final = _PLACE["q"]
+_TRUE_DQ: Final = _PLACE["dq"]
+_TRUE_TAU_J: Final = _PLACE["tau_J"]
+_TRUE_TAU_EXT: Final = _PLACE["tau_ext"]
+_TRUE_FRICTION: Final = _PLACE["tau_friction"]
+_TRUE_FORCE: Final = _PLACE["contact_force"]
+_TRUE_LINK: Final = _PLACE["contact_link"]
+_TRUE_INDEX: Final = _PLACE["contact_index"]
+_TRUE_PAYLOAD: Final = _PLACE["payload"]
+_TRUE_THETA: Final = _PLACE["theta"]
+
+
+@compiled
+def _contact_in_force(state: Vector, contacts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Give the row of the contact in force at this tick, empty when there is none; steps over those that have ended."""
+    tick = state[_TICK] - state[_START_TICK]
+    index = int(state[_CONTACT])
+    while index < contacts.shape[0] and contacts[index, END_TICK] <= tick:
+        index += 1
+    state[_CONTACT] = index
+    if state[_START_TICK] >= 0.0 and index < contacts.shape[0] and contacts[index, ONSET_TICK] <= tick:
+        row: NDArray[np.float64] = contacts[index]
+        return row
+    return state[:0]
+
+
+@compiled
+def _change_payload(state: Vector, arm: Vector, payloads: NDArray[np.float64]) -> None:
+    """Fit or take off what the scenario says for this tick; payloads (n, 2): tick, kg."""
+    if state[_START_TICK] < 0.0:
+        return
+    tick = state[_TICK] - state[_START_TICK]
+    index = int(state[_CHANGE])
+    while index < payloads.shape[0] and payloads[index, 0] <= tick:
+        fit_payload(state, arm, payloads[index, 1])
+        index += 1
+    state[_CHANGE] = index
+
+
+@compiled
+def _torque_target(arm: Vector, joint: int, mode: int, setpoint_Nm: float, velocity_rad_s: float) -> float:
+    """Say what a drive asks of its torque loop, Nm, within its rated torque."""
+    limit_Nm = arm[TORQUE_LIMIT + joint]
+    if mode == _TORQUE:
+        return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
+    if mode == _BRAKE:
+        return float(min(max(-arm[BRAKE_DAMPING + joint] * velocity_rad_s, -limit_Nm), limit_Nm))
+    return 0.0
+
+
+@compiled
+def _read_encoder(state: Vector, joint: int) -> None:
+    """Take the encoder's position at the end of a tick and advance the drive's velocity."""
+    now_rad = to_counts(state[Q + joint], POSITION_LSB_RAD) * POSITION_LSB_RAD
+    state[_ESTIMATE + joint], state[_VELOCITY + joint] = track(
+        state[_ENCODER + joint], now_rad, state[_ESTIMATE + joint], state[_VELOCITY + joint], TICK_S
+    )
+    state[_ENCODER + joint] = now_rad
+
+
+@compiled
+def _advance(
+    state: Vector,
+    arm: Vector,
+    contacts: NDArray[np.float64],
+    payloads: NDArray[np.float64],
+    setpoint1_Nm: float,
+    setpoint2_Nm: float,
+    mode1: int,
+    mode2: int,
+    tick_count: int,
+    substeps: int,
+) -> None:
+    """Advance the body by `tick_count` ticks."""
+    step_s = TICK_S / substeps
+    for _ in range(tick_count):
+        _change_payload(state, arm, payloads)
+        contact = _contact_in_force(state, contacts)
+        elapsed_s = 0.0
+        if contact.size != 0:
+            elapsed_s = (state[_TICK] - state[_START_TICK] - contact[ONSET_TICK]) * TICK_S
+        target1 = _torque_target(arm, 0, mode1, setpoint1_Nm, state[_VELOCITY])
+        target2 = _torque_target(arm, 1, mode2, setpoint2_Nm, state[_VELOCITY + 1])
+        for substep in range(substeps):
+            integrate(state, arm, contact, elapsed_s + substep * step_s, target1, target2, step_s)
+        _read_encoder(state, 0)
+        _read_encoder(state, 1)
+        state[_TICK] += 1.0
+
+
+@compiled
+def _sample(state: Vector, noise: Vector, offset: Vector, out: NDArray[np.int64]) -> None:
+    """Quantise what the devices measure now: position, velocity, torque counts, two each (6,)."""
+    for joint in range(2):
+        out[joint] = to_counts(state[Q + joint], POSITION_LSB_RAD)
+        out[2 + joint] = to_counts(state[_VELOCITY + joint], VELOCITY_LSB_RAD_S)
+        out[4 + joint] = torque_counts(state[TAU + joint] + offset[joint] + noise[joint])
+
+
+@compiled
+def _fill_truth(
+    state: Vector, arm: Vector, contacts: NDArray[np.float64], payloads: NDArray[np.float64], out: Vector
+) -> None:
+    """Fill a block laid out by TRUTH_LAYOUT with what is true at this instant."""
+    _change_payload(state, arm, payloads)
+    contact = _contact_in_force(state, contacts)
+    elapsed_s = 0.0
+    force_N = 0.0
+    link = 0.0
+    index = -1.0
+    if contact.size != 0:
+        elapsed_s = (state[_TICK] - state[_START_TICK] - contact[ONSET_TICK]) * TICK_S
+        force_N = contact_force(contact, elapsed_s)
+        link = contact[LINK]
+        index = state[_CONTACT]
+    q1, q2, dq1, dq2 = state[Q], state[Q + 1], state[DQ], state[DQ + 1]
+    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
+    torque1 = state[TAU] + ext1
+    torque2 = state[TAU + 1] + ext2
+    slip1, slip2 = decide_slips(state, arm, torque1, torque2, q2, dq1, dq2)
+    _, _, friction1, friction2 = accelerate(state, arm, slip1, slip2, torque1, torque2, q2, dq1, dq2)
+    out[_TRUE_Q], out[_TRUE_Q + 1] = q1, q2
+    out[_TRUE_DQ], out[_TRUE_DQ + 1] = dq1, dq2
+    out[_TRUE_TAU_J], out[_TRUE_TAU_J + 1] = state[TAU], state[TAU + 1]
+    out[_TRUE_TAU_EXT], out[_TRUE_TAU_EXT + 1] = ext1, ext2
+    out[_TRUE_FRICTION] = friction1 + arm[VISCOUS] * dq1
+    out[_TRUE_FRICTION + 1] = friction2 + arm[VISCOUS + 1] * dq2
+    out[_TRUE_FORCE] = force_N
+    out[_TRUE_LINK] = link
+    out[_TRUE_INDEX] = index
+    out[_TRUE_PAYLOAD] = state[PAYLOAD]
+    out[_TRUE_THETA] = state[INERTIA] + state[INERTIA + 2]
+    out[_TRUE_THETA + 1] = state[INERTIA + 1]
+    out[_TRUE_THETA + 2] = state[INERTIA + 2]
+    for joint in range(2):
+        out[_TRUE_THETA + 3 + joint] = arm[VISCOUS + joint]
+        out[_TRUE_THETA + 5 + joint] = arm[COULOMB + joint]
+
+
+class Measurement(NamedTuple):
+    """What the devices measure at one SYNC, as raw counts of the two joints; the properties give SI units."""
+
+    position_counts: tuple[int, int]
+    velocity_counts: tuple[int, int]
+    torque_counts: tuple[int, int]
+
+    @property
+    def q(self) -> Vector:
+        """Measured joint position, rad (2,)."""
+        return np.array(self.position_counts) * POSITION_LSB_RAD
+
+    @property
+    def dq(self) -> Vector:
+        """Measured joint velocity, rad/s (2,)."""
+        return np.array(self.velocity_counts) * VELOCITY_LSB_RAD_S
+
+    @property
+    def tau_J(self) -> Vector:
+        """Measured joint torque, Nm (2,)."""
+        return np.array(self.torque_counts) * TORQUE_LSB_NM
+
+    @property
+    def is_saturated(self) -> tuple[bool, bool]:
+        """Whether each torque sensor is at an end of its range, where its value is a bound only."""
+        return self.torque_counts[0] in TORQUE_COUNTS, self.torque_counts[1] in TORQUE_COUNTS
+
+
+class Body:
+    """One emulated arm, from power-on. Nothing is compiled and nothing large allocated after construction."""
+
+    def __init__(self, scenario: Scenario, period_s: float = 1e-3, seed: int | None = None) -> None:
+        """Put the arm at the scenario's start pose, at rest.
+
+        `seed` outweighs the scenario's. Raises ValueError when the period is no multiple of 100 µs.
+        """
+        self._ticks_per_period = ticks(period_s)
+        if self._ticks_per_period < 1 or not math.isclose(self._ticks_per_period * TICK_S, period_s, rel_tol=1e-9):
+            raise ValueError(f"period_s = {period_s} s is no multiple of {TICK_S} s")
+        self.scenario = scenario
+        self.period_s = period_s
+        self._arm = scenario.arm.numbers()
+        self._contacts = contact_table(scenario.contacts)
+        self._payloads = np.array([(change.tick, change.mass_kg) for change in scenario.payloads], dtype=np.float64)
+        self._payloads = self._payloads.reshape(len(scenario.payloads), 2)
+        self._offset = np.array(scenario.torque_offset_Nm, dtype=np.float64)
+        self._noise = TorqueNoise(scenario.seed if seed is None else seed, TORQUE_NOISE_NM if scenario.noise else 0.0)
+        self._counts = np.zeros(6, dtype=np.int64)
+        self._state = np.zeros(_STATE)
+        self._state[Q : Q + 2] = scenario.start_rad
+        encoder_rad = np.floor(scenario.start_rad / POSITION_LSB_RAD + 0.5) * POSITION_LSB_RAD
+        self._state[_ENCODER : _ENCODER + 2] = encoder_rad
+        self._state[_ESTIMATE : _ESTIMATE + 2] = encoder_rad
+        self._state[_START_TICK] = -1.0
+        fit_payload(self._state, self._arm, scenario.payload_kg)
+        self._compile()
+
+    def _compile(self) -> None:
+        """Run every compiled function once, on a copy of the state."""
+        state = self._state.copy()
+        _advance(state, self._arm, self._contacts, self._payloads, 0.0, 0.0, 0, 0, 1, SUBSTEPS)
+        _sample(state, self._offset, self._offset, self._counts)
+        _fill_truth(state, self._arm, self._contacts, self._payloads, np.zeros(TRUTH_LAYOUT.size))
+
+    def start_scenario(self) -> None:
+        """Let scenario time start now: both drives are in Operation enabled. Later calls change nothing."""
+        if not self.is_started:
+            self._state[_START_TICK] = self._state[_TICK]
+
+    @property
+    def is_started(self) -> bool:
+        """Whether scenario time runs."""
+        return bool(self._state[_START_TICK] >= 0.0)
+
+    @property
+    def scenario_time_s(self) -> float:
+        """Time since the scenario started, 0 before."""
+        return float(self._state[_TICK] - self._state[_START_TICK]) * TICK_S if self.is_started else 0.0
+
+    @property
+    def motor_torque_Nm(self) -> tuple[float, float]:
+        """Torque that the drives know from their motor currents, without the sensor's noise; 0x6077."""
+        return float(self._state[TAU]), float(self._state[TAU + 1])
+
+    @property
+    def drive_velocity_rad_s(self) -> tuple[float, float]:
+        """Velocity that the drives know, not quantised; by this they see standstill."""
+        return float(self._state[_VELOCITY]), float(self._state[_VELOCITY + 1])
+
+    def advance(self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int]) -> None:
+        """Advance by one period. Set-points (2,) and `DriveMode` (2,) hold for the whole of it."""
+        _advance(
+            self._state,
+            self._arm,
+            self._contacts,
+            self._payloads,
+            float(torque_setpoint_Nm[0]),
+            float(torque_setpoint_Nm[1]),
+            int(drive_mode[0]),
+            int(drive_mode[1]),
+            self._ticks_per_period,
+            SUBSTEPS,
+        )
+
+    def sample(self) -> Measurement:
+        """Measure now. Call it once per SYNC: each call draws new noise."""
+        _sample(self._state, self._noise.draw(), self._offset, self._counts)
+        q1, q2, dq1, dq2, tau1, tau2 = self._counts.tolist()
+        return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))
+
+    def truth(self, out: Vector) -> None:
+        """Fill a block laid out by TRUTH_LAYOUT with what is true now; changes nothing that is measured."""
+        _fill_truth(self._state, self._arm, self._contacts, self._payloads, out)

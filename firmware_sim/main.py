@@ -1,0 +1,267 @@
+"""`firmware-sim`: plays the arm on a CAN interface until it is told to stop."""
+
+import json
+import logging
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, NoReturn, get_args
+
+import click
+
+from adacd_hil.clock import Clock, MonotonicClock, wall_ns
+from adacd_hil.config import ConfigError
+from adacd_hil.log.errors import LogError
+from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
+from adacd_hil.wire.codec import CodecError, load_codec
+from firmware_sim.arms import ARMS
+from firmware_sim.bench import Bench, ClockMode
+from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
+from firmware_sim.truth import TRUTH_NAME, TruthLog
+
+_IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
+_LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus
+_SILENCE_NS = 2_000_000_000  # a host that says nothing for this long has gone
+
+
+class ExitCode(IntEnum):
+    """What the exit statuses mean."""
+
+    OK = 0
+    FAILURE = 1
+    USAGE = 2
+    BUS_MISSING = 5
+
+
+EPILOG = (
+    "Exit status: 0 ended by SIGINT, SIGTERM or --once; 1 failure (the bus or the truth log failed); "
+    "2 wrong usage or configuration; 5 bus missing."
+)
+
+_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
+    (click.ClickException, ExitCode.USAGE),
+    (ConfigError, ExitCode.USAGE),
+    (CodecError, ExitCode.USAGE),
+    (BusMissingError, ExitCode.BUS_MISSING),
+    (BusError, ExitCode.FAILURE),
+    (LogError, ExitCode.FAILURE),
+    (OSError, ExitCode.FAILURE),
+)
+
+
+class StopRequest:
+    """Whether the user wants the emulator to end."""
+
+    def __init__(self) -> None:
+        self.is_made = False
+
+    def make(self, *_signal: object) -> None:
+        """Ask for the end; callable as a signal handler."""
+        self.is_made = True
+
+
+class Service:
+    """Carries frames and time to a bench until a stop is requested."""
+
+    def __init__(
+        self, bench: Bench, bus: Bus, clock: Clock, clock_mode: ClockMode, stop: StopRequest, is_once: bool = False
+    ) -> None:
+        """Prepare. `is_once`: also end when the host that started the nodes stops or resets them or falls silent."""
+        self._bench = bench
+        self._bus = bus
+        self._clock = clock
+        self._is_wall = clock_mode == "wall"
+        self._stop = stop
+        self._is_once = is_once
+        self._has_been_operational = False
+        self._time_ns = 0  # up to here the bench's time has followed the clock
+        self._heard_ns = 0  # last frame
+
+    def boot(self) -> None:
+        """Announce the nodes, having dropped what the bus carried before. Raises BusError."""
+        while self._bus.receive(0.0) is not None and not self._stop.is_made:
+            pass
+        self._time_ns = self._heard_ns = self._clock.now_ns()
+        self._bench.boot(self._time_ns)
+
+    def run(self) -> None:
+        """Serve. Raises BusError."""
+        bench, bus = self._bench, self._bus
+        while not self._stop.is_made:
+            cycle = bench.cycle
+            frame = bus.receive(self._patience_s())
+            if frame is not None:
+                self._heard_ns = frame.t_ns
+                bench.on_frame(frame)
+                self._has_been_operational = self._has_been_operational or bench.is_operational
+            if bench.cycle != cycle:
+                self._time_ns = self._heard_ns
+            else:
+                self._pass_time(self._clock.now_ns() if frame is None else frame.t_ns, frame is None)
+            if self._is_once and frame is None and self._is_host_gone():
+                return
+
+    def _patience_s(self) -> float:
+        """Say how long to wait for a frame."""
+        if not self._is_wall:
+            return _IDLE_NS * 1e-9
+        due_ns = self._bench.due_ns - self._clock.now_ns()
+        return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
+
+    def _pass_time(self, now_ns: int, is_idle: bool) -> None:
+        """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when none has come for a while."""
+        if self._is_wall:
+            if is_idle:
+                self._bench.advance_to(now_ns)
+        elif now_ns - self._time_ns >= _IDLE_NS:
+            self._bench.advance_to(self._bench.now_ns + now_ns - self._time_ns)
+            self._time_ns = now_ns
+
+    def _is_host_gone(self) -> bool:
+        is_silent = self._clock.now_ns() - self._heard_ns > _SILENCE_NS
+        return self._has_been_operational and (is_silent or not self._bench.is_operational)
+
+
+_CONTEXT = {"auto_envvar_prefix": "FIRMWARE_SIM", "help_option_names": ["-h", "--help"]}
+
+
+@click.group(epilog=EPILOG, context_settings=_CONTEXT)
+def cli() -> None:
+    """Play the drives, the torque sensors, the arm and the person who touches it, on a CAN bus."""
+
+
+@cli.command(epilog=EPILOG)
+@click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
+@click.option("-c", "--channel", required=True, help="Channel of the interface, such as vcan0.")
+@click.option(
+    "--clock",
+    "clock_mode",
+    type=click.Choice(get_args(ClockMode)),
+    default="sync",
+    show_default=True,
+    help="sync: the arm moves one period per SYNC. wall: it moves by itself, and the drives watch for SYNC.",
+)
+@click.option(
+    "--scenario",
+    default="paper",
+    show_default=True,
+    metavar="NAME|FILE",
+    help=f"One of {', '.join(builtin_scenarios())}, or a TOML file.",
+)
+@click.option("--profile", type=click.Choice(list(ARMS)), help="Arm; default: the scenario's.")
+@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
+@click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), help=f"Folder for {TRUTH_NAME}; default: no log."
+)
+@click.option("--once", "is_once", is_flag=True, help="End with the first host that starts the nodes and goes.")
+@click.option("--json", "as_json", is_flag=True, help="Print how it went as JSON on stdout.")
+def run(
+    interface: str,
+    channel: str,
+    clock_mode: ClockMode,
+    scenario: str,
+    profile: str | None,
+    seed: int | None,
+    out: Path | None,
+    is_once: bool,
+    as_json: bool,
+) -> int:
+    """Run the emulated arm; prints "ready" on stderr once its nodes have announced themselves."""
+    resolved = load_scenario(scenario, profile, seed)
+    codec = load_codec()
+    if out is not None:
+        _make_folder(out)
+    clock = MonotonicClock()
+    with ExitStack() as stack:
+        bus = open_bus(interface, channel, clock, [m.can_id for m in codec.messages.values() if "HOST" in m.senders])
+        stack.callback(bus.close)
+        stop = stack.enter_context(_stop_by_signal())
+        truth = None
+        if out is not None:
+            metadata = {"scenario": resolved.name, "profile": resolved.profile, "seed": str(resolved.seed)}
+            epoch_ns = wall_ns() - clock.now_ns()
+            # By SYNC, time waits for the log; by wall clock nothing may.
+            is_waiting = clock_mode == "sync"
+            truth = TruthLog(out / TRUTH_NAME, blocking=is_waiting, epoch_ns=epoch_ns, metadata=metadata)
+            stack.enter_context(truth)
+        on_truth = None if truth is None else truth.write
+        bench = Bench(resolved, codec, bus.send, clock_mode=clock_mode, on_truth=on_truth)
+        service = Service(bench, bus, clock, clock_mode, stop, is_once)
+        for line in request_realtime().missing:
+            _complain(f"not granted: {line}")
+        freeze_garbage()
+        service.boot()
+        print("ready", file=sys.stderr, flush=True)
+        service.run()
+        return _report(bench, resolved, clock_mode, truth, as_json)
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {path} can't be made a folder: {error.strerror}") from None
+
+
+@contextmanager
+def _stop_by_signal() -> Iterator[StopRequest]:
+    """Let SIGINT and SIGTERM ask for the end instead of ending the process."""
+    stop = StopRequest()
+    previous = {number: signal.signal(number, stop.make) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool) -> ExitCode:
+    """Print how it went, having closed the truth log."""
+    described: dict[str, Any] = {
+        "scenario": scenario.name,
+        "profile": scenario.profile,
+        "seed": scenario.seed,
+        "clock": clock_mode,
+        "cycles": bench.cycle + 1,
+        "rejected_commands": [drive.rejected_commands for drive in bench.drives],
+        "drive_states": [drive.state.value for drive in bench.drives],
+        "error_codes": [drive.error_code for drive in bench.drives],
+    }
+    code = ExitCode.OK
+    if truth is not None:
+        summary = truth.close()
+        described |= {"truth": str(summary.path), "messages": summary.messages, "dropped": summary.dropped}
+        if not summary.is_complete:
+            _complain(summary.error or f"{summary.path} lacks {summary.dropped} cycles: the disk was too slow")
+            code = ExitCode.FAILURE
+    if as_json:
+        print(json.dumps(described))
+    return code
+
+
+def _complain(line: str) -> None:
+    print(f"firmware-sim: {' '.join(line.split())}", file=sys.stderr)
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and exit with a documented status."""
+    logging.getLogger("canopen").addHandler(logging.NullHandler())
+    try:
+        code = cli.main(arguments, prog_name="firmware-sim", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        code = ExitCode.USAGE
+    except (click.Abort, KeyboardInterrupt):
+        code = ExitCode.OK
+    except tuple(kind for kind, _ in _CODES) as error:
+        _complain(error.format_message() if isinstance(error, click.ClickException) else str(error))
+        code = next(code for kind, code in _CODES if isinstance(error, kind))
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

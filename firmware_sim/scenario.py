@@ -1,0 +1,103 @@
+"""A scenario: which arm, where it starts, who touches it when, and when the payload changes.
+
+Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
+package are in the folder `scenarios`.
+"""
+
+import math
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+
+import numpy as np
+
+from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, toml_names
+from adacd_hil.records import Vector
+from firmware_sim.arms import ARMS, Arm
+from firmware_sim.contact import ContactSettings, ticks
+
+
+@dataclass(frozen=True)
+class PayloadSettings:
+    """One change of the payload."""
+
+    at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="since the drives were enabled")
+    mass_kg: float = setting(unit="kg", low=0.0, high=20.0, meaning="payload from then on, at the tip; 0: none")
+
+    @property
+    def tick(self) -> int:
+        """First 100 µs tick, since the drives were enabled, with this payload."""
+        return ticks(self.at_s)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that the emulated arm and the person beside it do, resolved."""
+
+    name: str = setting("", meaning="name of the scenario")
+    profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
+    seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the sensor noise")
+    noise: bool = setting(True, meaning="torque sensor noise; quantisation stays")
+    start_deg: tuple[float, float] = setting(
+        (0.0, 0.0), unit="deg", low=-180.0, high=180.0, meaning="pose at power-on, at rest"
+    )
+    payload_kg: float = setting(0.0, unit="kg", low=0.0, high=20.0, meaning="payload at power-on")
+    torque_offset_Nm: tuple[float, float] = setting(
+        (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="zero error of the torque sensors"
+    )
+    payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
+    contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
+
+    def __post_init__(self) -> None:
+        for index, contact in enumerate(self.contacts):
+            length_m = self.arm.link_length_m[contact.link - 1]
+            if contact.point_m > length_m:
+                raise ConfigError(
+                    f"`contacts[{index}].point_m` = {contact.point_m} m is beyond the end of link {contact.link} "
+                    f"at {length_m} m"
+                )
+        for index, (first, second) in enumerate(zip(self.contacts, self.contacts[1:], strict=False), start=1):
+            if second.onset_tick < first.end_tick:
+                raise ConfigError(
+                    f"`contacts[{index}].at_s` = {second.at_s} s is before the end of the contact before it at "
+                    f"{first.at_s + first.duration_s} s"
+                )
+        for index, (before, after) in enumerate(zip(self.payloads, self.payloads[1:], strict=False), start=1):
+            if after.tick <= before.tick:
+                raise ConfigError(
+                    f"`payloads[{index}].at_s` = {after.at_s} s is not after the change before it at {before.at_s} s"
+                )
+
+    @property
+    def arm(self) -> Arm:
+        """The arm of this profile."""
+        return ARMS[self.profile]
+
+    @property
+    def start_rad(self) -> Vector:
+        """Pose at power-on, rad (2,)."""
+        return np.array([math.radians(angle_deg) for angle_deg in self.start_deg])
+
+
+def builtin_scenarios() -> list[str]:
+    """Name the scenarios that come with the package."""
+    return toml_names(_builtin_folder())
+
+
+def _builtin_folder() -> Traversable:
+    return resources.files("firmware_sim") / "scenarios"
+
+
+def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
+    """Read a scenario: a built-in name or a TOML file. `profile` and `seed` outweigh the file's. Raises ConfigError."""
+    path = find_toml("scenario", name_or_file, _builtin_folder())
+    table = read_toml(path)
+    table.setdefault("name", path.stem)
+    if profile is not None:
+        table["profile"] = profile
+    if seed is not None:
+        table["seed"] = seed
+    try:
+        return parse(Scenario, table)
+    except ConfigError as error:
+        raise ConfigError(f"scenario {name_or_file}: {error}") from None

@@ -1,0 +1,89 @@
+"""What the devices measure: encoder, the drive's velocity, joint torque.
+
+encoder    20 bit per revolution, rounded to the nearest count
+velocity   critically damped tracking loop on the encoder at 10 kHz, v̂/q = ω² s / (s + ω)², ω = 2π · 200 rad/s;
+           it lags a steady acceleration by 2/ω = 1.59 ms; sent with an LSB of 5e-4 rad/s
+torque     white noise of 0.02 Nm rms at the SYNC sample, then a 16-bit converter over ±50 Nm that saturates
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.compiled import compiled
+
+ENCODER_COUNTS: Final = 1 << 20
+"""Per revolution, 0x608F."""
+POSITION_LSB_RAD: Final = 2.0 * math.pi / ENCODER_COUNTS
+VELOCITY_LSB_RAD_S: Final = 5e-4
+TRACKING_RAD_S: Final = 2.0 * math.pi * 200.0
+TORQUE_NOISE_NM: Final = 0.02
+TORQUE_RANGE_NM: Final = 50.0
+TORQUE_LSB_NM: Final = 2.0 * TORQUE_RANGE_NM / (1 << 16)
+"""1.526 mNm."""
+TORQUE_COUNTS: Final = (-(1 << 15), (1 << 15) - 1)
+"""Ends of the converter's range; a value at either end is saturated."""
+
+_LOWEST_COUNT: Final = TORQUE_COUNTS[0]
+_HIGHEST_COUNT: Final = TORQUE_COUNTS[1]
+# Samples drawn at once: large enough to cost nothing per sample, small enough to draw within 10 µs.
+_BLOCK: Final = 256
+
+
+@compiled
+def to_counts(value: float, lsb: float) -> int:
+    """Quantise to the nearest multiple of `lsb`."""
+    return math.floor(value / lsb + 0.5)
+
+
+@compiled
+def torque_counts(torque_Nm: float) -> int:
+    """Convert as the torque sensor's converter does; saturates at TORQUE_COUNTS."""
+    return min(max(to_counts(torque_Nm, TORQUE_LSB_NM), _LOWEST_COUNT), _HIGHEST_COUNT)
+
+
+@compiled
+def track(
+    before_rad: float, now_rad: float, estimate_rad: float, velocity_rad_s: float, tick_s: float
+) -> tuple[float, float]:
+    """Advance the drive's tracking loop by one tick: new position estimate rad, new velocity estimate rad/s.
+
+    before, now: encoder positions at the two ends of the tick, taken as joined by a straight line. Exact for
+
+        p̂' = v̂ + 2ω (p − p̂),  v̂' = ω² (p − p̂)
+
+    The line itself (p̂ = p, v̂ = its slope) is a solution, so only the distance from it decays, by the exponential
+    of a matrix with the double eigenvalue −ω.
+    """
+    slope_rad_s = (now_rad - before_rad) / tick_s
+    away_rad = estimate_rad - before_rad
+    away_rad_s = velocity_rad_s - slope_rad_s
+    turn = TRACKING_RAD_S * tick_s
+    decay = math.exp(-turn)
+    return (
+        now_rad + decay * ((1.0 - turn) * away_rad + tick_s * away_rad_s),
+        slope_rad_s + decay * ((1.0 + turn) * away_rad_s - TRACKING_RAD_S * turn * away_rad),
+    )
+
+
+class TorqueNoise:
+    """The noise of both torque sensors, drawn block by block from one seed."""
+
+    def __init__(self, seed: int, rms_Nm: float) -> None:
+        self._generator = np.random.default_rng(seed)
+        self._rms_Nm = rms_Nm
+        self._block: NDArray[np.float64] = np.zeros((_BLOCK, 2))
+        self._next = _BLOCK
+
+    def draw(self) -> NDArray[np.float64]:
+        """Give the next sample (2,), Nm; valid until the next call."""
+        if self._next == _BLOCK:
+            self._next = 0
+            if self._rms_Nm > 0.0:
+                self._generator.standard_normal(out=self._block)
+                self._block *= self._rms_Nm
+        sample: NDArray[np.float64] = self._block[self._next]
+        self._next += 1
+        return sample

@@ -1,0 +1,111 @@
+"""Small runs made by hand: 1 kHz, a = 10 rad/s, threshold 0.15 Nm, zeros wherever a test doesn't say otherwise."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.analysis.metrics import Run, Timing, Truth
+from adacd_hil.config import Settings, parse
+from adacd_hil.records import ContactReport, SchemeState
+
+CAD_THETA = (0.18, 0.036, 0.019, 0.0, 0.0, 0.0, 0.0)
+THETA = (0.2, 0.04, 0.02, 0.03, 0.015, 0.0375, 0.025)
+
+FIRST_CYCLE = 100
+EPOCH_NS = 5_000_000_000_000
+"""Neither cycles nor times begin at zero, so that a row taken for a cycle or a time shows."""
+
+A, M, R, S, P = SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD
+
+PAPER_LIKE = ((SchemeState.ENABLE, 50), (A, 1000), (M, 4000), (P, 500), (A, 800), (M, 3000))
+"""Sections A to E. Row 50 is motion start, row 1050 enters MONITOR, 5050 PAYLOAD, 5550 ADAPT, 6350 MONITOR."""
+ZERO_ROW = 50
+
+
+def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str = "lockstep", **changes: Any) -> Run:
+    """Make a run that stays in the given states for the given numbers of cycles."""
+    states = [state for state, cycles in stays or PAPER_LIKE for _ in range(cycles)]
+    count = len(states)
+    cycle = FIRST_CYCLE + np.arange(count, dtype=np.int64)
+    threshold = np.full((count, 2), np.inf)
+    threshold[np.isin(states, (M, R, S))] = 0.15
+    zeros = np.zeros(count, dtype=np.int64)
+    truth = Truth(
+        cycle=cycle.copy(),
+        tau_ext=np.zeros((count, 2)),
+        contact_link=np.zeros(count),
+        contact_index=np.full(count, -1.0),
+        payload_kg=np.zeros(count),
+        theta=np.tile(THETA, (count, 1)),
+    )
+    run = Run(
+        cycle=cycle,
+        t_ns=EPOCH_NS + cycle * 1_000_000,
+        state=np.array(states, dtype=np.uint8),
+        fault=np.zeros(count, dtype=np.uint8),
+        tau_ext_hat=np.zeros((count, 2)),
+        tau_ext_hat_cad=np.zeros((count, 2)),
+        theta_hat=np.zeros((count, 7)),
+        threshold=threshold,
+        quiet_s=np.zeros(count),
+        reports=(),
+        timing=Timing(cycle, zeros, zeros, zeros, zeros, zeros),
+        truth=truth if has_truth else None,
+        settings=parse(Settings, {"name": "hand-made", "arm": {"cad_theta": list(CAD_THETA)}}),
+        metadata={"clock": clock, "scheduler": "SCHED_FIFO 80", "config": "hand-made", "profile": "P", "seed": "7"},
+        frames=12,
+        dropped=0,
+    )
+    return replace(run, **changes)
+
+
+def touch(run: Run, row: int, cycles: int, tau_ext: tuple[float, float], link: int = 1, index: int = 0) -> None:
+    """Let a person push for some cycles, from a row on."""
+    assert run.truth is not None
+    rows = slice(row, row + cycles)
+    run.truth.tau_ext[rows] = tau_ext
+    run.truth.contact_link[rows] = link
+    run.truth.contact_index[rows] = index
+
+
+def react(run: Run, row: int, cycles: int = 100, **report: Any) -> Run:
+    """Let the scheme detect in a row and stay in REACT for some cycles, with a final report if one is given."""
+    run.state[row : row + cycles] = R
+    if not report:
+        return run
+    made = [contact_report(int(run.cycle[row]), is_final=is_final, **report) for is_final in (False, True)]
+    return replace(run, reports=(*run.reports, *made))
+
+
+def contact_report(cycle: int, **changes: Any) -> ContactReport:
+    """Make a report of a push on link 1 toward +q."""
+    values: dict[str, Any] = {
+        "cycle": cycle,
+        "link": 1,
+        "direction": (1, 0),
+        "tau_ext_peak": (5.0, 0.0),
+        "impulse": (0.5, 0.0),
+        "is_final": True,
+    }
+    return ContactReport(**{**values, **changes})
+
+
+def touched_run() -> Run:
+    """Make the paper's sections with two detected contacts, a missed one, a false alarm, moving parameters."""
+    run = make_run(clock="realtime")
+    assert run.truth is not None
+    rows = np.arange(len(run.cycle))
+    run.theta_hat[:] = np.minimum(1.0, np.maximum(0, rows - ZERO_ROW) / 800.0)[:, None] * np.array(THETA)
+    run.tau_ext_hat[:] = 0.02 * np.sin(rows / 200.0)[:, None]
+    run.tau_ext_hat_cad[:] = 0.4 * np.sin(rows / 300.0)[:, None]
+    run.truth.payload_kg[5300:] = 1.0
+    touch(run, 2000, 250, (5.0, 0.0), index=0)
+    touch(run, 4000, 250, (-6.0, -3.0), link=2, index=1)
+    touch(run, 7000, 250, (0.1, 0.0), index=2)
+    run = react(run, 2005, tau_ext_peak=(5.2, 0.0))
+    run = react(run, 4004, link=2, direction=(-1, -1), tau_ext_peak=(-6.1, -3.0))
+    run = react(run, 9000)
+    spread = np.arange(len(run.cycle), dtype=np.int64)
+    timing = replace(run.timing, feedback_ns=400_000 + spread, command_ns=600_000 + spread, lateness_ns=spread)
+    return replace(run, timing=timing)

@@ -1,0 +1,56 @@
+"""Decimation for figures: what a reader would look for is still there."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from adacd_hil.analysis.figures import envelope
+
+SERIES = arrays(np.float64, st.integers(1, 400), elements=st.floats(-10.0, 10.0))
+
+
+@given(SERIES, st.integers(1, 50))
+def test_the_envelope_keeps_the_largest_value_of_every_part(y, bins):
+    width = -(-len(y) // bins)
+    kept = envelope(y, bins)
+    largest = [y[kept[(kept >= start) & (kept < start + width)]].max() for start in range(0, len(y), width)]
+    assert largest == [y[start : start + width].max() for start in range(0, len(y), width)]
+
+
+@given(SERIES, st.integers(1, 50))
+def test_the_envelope_keeps_the_smallest_value_of_every_part(y, bins):
+    width = -(-len(y) // bins)
+    kept = envelope(y, bins)
+    smallest = [y[kept[(kept >= start) & (kept < start + width)]].min() for start in range(0, len(y), width)]
+    assert smallest == [y[start : start + width].min() for start in range(0, len(y), width)]
+
+
+@given(SERIES, st.integers(1, 50))
+def test_the_envelope_keeps_the_order_of_time(y, bins):
+    assert np.all(np.diff(envelope(y, bins)) > 0)
+
+
+@given(SERIES, st.integers(1, 50))
+def test_the_envelope_keeps_both_ends(y, bins):
+    assert envelope(y, bins)[[0, -1]].tolist() == [0, len(y) - 1]
+
+
+def test_the_envelope_keeps_a_single_sample_that_a_stride_would_lose():
+    y = np.zeros(50_000)
+    y[31_417] = 1.0
+    assert 31_417 in envelope(y)
+
+
+def test_the_envelope_of_a_long_series_is_short():
+    assert envelope(np.sin(np.arange(50_000.0)), 1000).size <= 2002
+
+
+def test_a_short_series_is_kept_whole():
+    assert envelope(np.zeros(100), 50).tolist() == list(range(100))
+
+
+def test_the_envelope_keeps_an_extreme_beside_a_value_that_is_not_a_number():
+    y = np.zeros(1000)
+    y[100], y[101], y[102] = np.nan, 5.0, -5.0
+    assert set(envelope(y, 10)) >= {101, 102}

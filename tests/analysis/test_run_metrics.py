@@ -1,0 +1,701 @@
+"""What a run achieved, on runs made by hand whose answers are known."""
+
+import math
+from dataclasses import astuple, replace
+
+import numpy as np
+import pytest
+from hand_made_run import (
+    CAD_THETA,
+    FIRST_CYCLE,
+    PAPER_LIKE,
+    THETA,
+    ZERO_ROW,
+    A,
+    M,
+    P,
+    R,
+    S,
+    contact_report,
+    make_run,
+    react,
+    touch,
+    touched_run,
+)
+
+from adacd_hil.analysis.metrics import (
+    detection_delay_s,
+    evaluate,
+    filtered,
+    percentiles,
+    section_label,
+    split_sections,
+)
+from adacd_hil.records import FaultReason, SchemeState
+
+SETTLING_ROWS = 1000
+"""10/a at a = 10 rad/s and 1 kHz."""
+
+
+def test_time_counts_from_the_first_cycle_in_adapt():
+    assert make_run().time_s()[ZERO_ROW] == 0.0
+
+
+def test_cycles_before_motion_start_have_negative_times():
+    assert make_run().time_s()[0] == pytest.approx(-0.05)
+
+
+def test_a_run_that_never_adapts_counts_from_its_first_cycle():
+    assert make_run((SchemeState.COMMISSION, 10)).time_s()[3] == pytest.approx(0.003)
+
+
+def test_skipped_cycles_take_their_time():
+    run = make_run()
+    run.t_ns[60:] += 4_000_000
+    assert run.time_s()[60] == pytest.approx(0.014)
+
+
+def test_the_papers_experiment_has_sections_a_to_e():
+    kinds = {section.label: section.kind for section in split_sections(make_run())}
+    assert kinds == {"A": "adaptation", "B": "detection", "C": "payload", "D": "adaptation", "E": "detection"}
+
+
+def test_sections_begin_where_the_one_before_ends():
+    starts = [section.start_s for section in split_sections(make_run())]
+    assert starts == pytest.approx([0.0, 1.0, 5.0, 5.5, 6.3])
+
+
+def test_the_last_section_ends_with_the_run():
+    assert split_sections(make_run())[-1].end_s == pytest.approx(9.299)
+
+
+def test_a_withdrawal_and_a_stop_belong_to_the_detection_section():
+    sections = split_sections(make_run((A, 10), (M, 10), (R, 5), (S, 5), (M, 10), (P, 3)))
+    assert [section.label for section in sections] == ["A", "B", "C"]
+
+
+def test_a_fault_is_a_section_of_its_own():
+    sections = split_sections(make_run((A, 10), (SchemeState.FAULT, 5)))
+    assert [section.kind for section in sections] == ["adaptation", "fault"]
+
+
+@pytest.mark.parametrize(("index", "label"), [(0, "A"), (25, "Z"), (26, "AA"), (27, "AB"), (52, "BA")])
+def test_sections_are_lettered_beyond_z(index, label):
+    assert section_label(index) == label
+
+
+def test_an_adaptation_lasts_from_adapt_to_monitor():
+    assert evaluate(make_run()).adaptation_s == pytest.approx({"A": 1.0, "D": 0.8})
+
+
+def test_an_adaptation_that_the_run_cuts_off_has_no_time():
+    assert evaluate(make_run((A, 10), (M, 10), (P, 5), (A, 20))).adaptation_s["D"] is None
+
+
+def test_an_adaptation_that_ends_in_a_fault_has_no_time():
+    assert evaluate(make_run((A, 10), (SchemeState.FAULT, 5))).adaptation_s["A"] is None
+
+
+def test_a_fault_is_named():
+    run = make_run((A, 10), (SchemeState.FAULT, 5))
+    run.fault[10:] = FaultReason.ADAPT_TIMEOUT
+    assert evaluate(run).fault == "ADAPT_TIMEOUT"
+
+
+def test_a_fault_has_its_time():
+    assert evaluate(make_run((A, 10), (SchemeState.FAULT, 5))).fault_s == pytest.approx(0.010)
+
+
+@pytest.mark.parametrize(
+    ("tau_ext_Nm", "delay_ms"), [(0.2, 138.6), (0.3, 69.3), (0.5, 35.7), (1.0, 16.3), (2.0, 7.8), (5.0, 3.0)]
+)
+def test_the_law_gives_the_known_delays(tau_ext_Nm, delay_ms):
+    delay_s = detection_delay_s(tau_ext_Nm, 0.15, 10.0)
+    assert delay_s * 1e3 == pytest.approx(delay_ms, abs=0.05)
+
+
+def test_the_law_does_not_care_which_way_the_arm_is_pushed():
+    assert detection_delay_s(-2.0, 0.15, 10.0) == detection_delay_s(2.0, 0.15, 10.0)
+
+
+@pytest.mark.parametrize("tau_ext_Nm", [0.0, 0.1, 0.15])
+def test_the_law_says_never_up_to_the_threshold(tau_ext_Nm):
+    assert detection_delay_s(tau_ext_Nm, 0.15, 10.0) is None
+
+
+def test_a_filtered_step_follows_the_exponential():
+    response = filtered(np.ones((11, 2)), np.arange(11), 1e-3, 10.0)
+    assert response[10, 0] == pytest.approx(1.0 - math.exp(-0.1))
+
+
+def test_a_filtered_step_is_at_rest_at_its_onset():
+    assert filtered(np.ones((3, 2)), np.arange(3), 1e-3, 10.0)[0, 1] == 0.0
+
+
+def test_a_filtered_torque_is_held_over_skipped_cycles():
+    response = filtered(np.ones((2, 2)), np.array([5, 15]), 1e-3, 10.0)
+    assert response[1, 0] == pytest.approx(1.0 - math.exp(-0.1))
+
+
+def one_contact(tau_ext=(5.0, 0.0), link=1, delay=5, cycles=250, **report):
+    run = make_run()
+    touch(run, 2000, cycles, tau_ext, link)
+    return evaluate(react(run, 2000 + delay, **report)).contacts[0]
+
+
+def test_a_contact_begins_with_the_first_true_force():
+    assert one_contact().onset_s == pytest.approx((2000 - ZERO_ROW) * 1e-3)
+
+
+def test_a_contact_ends_with_the_first_cycle_without_force():
+    assert one_contact().end_s == pytest.approx((2250 - ZERO_ROW) * 1e-3)
+
+
+def test_a_contact_knows_its_section():
+    assert one_contact().section == "B"
+
+
+def test_two_contacts_that_follow_at_once_are_two():
+    run = make_run()
+    touch(run, 2000, 100, (5.0, 0.0), index=0)
+    touch(run, 2100, 100, (-5.0, 0.0), index=1)
+    assert len(evaluate(run).contacts) == 2
+
+
+def test_the_delay_counts_from_the_onset_to_the_detection():
+    assert one_contact(delay=7).delay_ms == pytest.approx(7.0)
+
+
+def test_the_delay_counts_skipped_cycles():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    run.t_ns[2003:] += 2_000_000
+    assert evaluate(react(run, 2005)).contacts[0].delay_ms == pytest.approx(7.0)
+
+
+def test_the_onset_of_a_contact_in_a_skipped_cycle_lies_between_its_neighbours():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    kept = np.r_[0:1999, 2001:4000]
+    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
+    run = replace(run, **{name: getattr(run, name)[kept] for name in names})
+    assert evaluate(run).contacts[0].onset_s == pytest.approx((2000 - ZERO_ROW) * 1e-3)
+
+
+def test_the_law_takes_the_faster_joint():
+    assert one_contact(tau_ext=(1.0, -5.0)).law_ms == pytest.approx(3.0459, abs=1e-4)
+
+
+def test_the_law_ignores_what_comes_after_the_detection():
+    run = make_run()
+    touch(run, 2000, 250, (1.0, 0.0))
+    run.truth.tau_ext[2030:2250, 0] = 9.0
+    assert evaluate(react(run, 2020)).contacts[0].law_ms == pytest.approx(16.25, abs=0.01)
+
+
+def test_a_contact_below_the_threshold_has_no_law():
+    assert one_contact(tau_ext=(0.1, 0.0)).law_ms is None
+
+
+@pytest.mark.parametrize(("tau_ext_Nm", "ideal_ms"), [(5.0, 4.0), (1.0, 17.0), (0.2, 139.0)])
+def test_the_ideal_delay_of_a_step_is_the_law_at_the_next_cycle(tau_ext_Nm, ideal_ms):
+    assert one_contact(tau_ext=(tau_ext_Nm, 0.0)).ideal_ms == pytest.approx(ideal_ms)
+
+
+def test_the_ideal_delay_of_a_slow_push_is_longer_than_the_law():
+    run = make_run()
+    touch(run, 2000, 250, (0.0, 0.0))
+    run.truth.tau_ext[2000:2250, 0] = 0.01 * np.arange(250)
+    # 10 Nm/s through the filter is 10 t - (1 - exp(-10 t)), which is 0.15 Nm at t = 60.2 ms.
+    assert evaluate(react(run, 2070)).contacts[0].ideal_ms == pytest.approx(61.0)
+
+
+def test_a_push_too_short_for_the_filter_has_no_ideal_delay():
+    assert one_contact(tau_ext=(1.0, 0.0), cycles=10).ideal_ms is None
+
+
+def test_the_threshold_in_force_counts_not_the_configured_one():
+    run = make_run()
+    run.threshold[1050:5050] = 0.3
+    touch(run, 2000, 250, (1.0, 0.0))
+    assert evaluate(react(run, 2040)).contacts[0].law_ms == pytest.approx(35.67, abs=0.01)
+
+
+def test_a_contact_without_detection_is_missed():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    assert evaluate(run).missed == 1
+
+
+def test_a_detected_contact_is_not_missed():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    assert evaluate(react(run, 2005)).missed == 0
+
+
+@pytest.mark.parametrize("row", [500, 5200, 5700], ids=["first adaptation", "payload", "second adaptation"])
+def test_a_contact_while_detection_is_off_is_not_missed(row):
+    run = make_run()
+    touch(run, row, 100, (5.0, 0.0))
+    assert evaluate(run).missed == 0
+
+
+def test_a_contact_while_detection_is_off_is_not_armed():
+    run = make_run()
+    touch(run, 500, 100, (5.0, 0.0))
+    assert evaluate(run).contacts[0].is_armed is False
+
+
+def test_a_contact_in_the_cycle_that_arms_is_not_armed():
+    run = make_run()
+    touch(run, 1050, 100, (5.0, 0.0))
+    assert evaluate(run).contacts[0].is_armed is False
+
+
+def test_a_contact_one_cycle_after_arming_is_armed():
+    run = make_run()
+    touch(run, 1051, 100, (5.0, 0.0))
+    assert evaluate(run).contacts[0].is_armed is True
+
+
+def test_a_detection_without_contact_is_a_false_alarm():
+    assert evaluate(react(make_run(), 2000)).false_alarms == 1
+
+
+def test_a_false_alarm_has_its_time():
+    assert evaluate(react(make_run(), 2000)).false_alarms_s == pytest.approx([1.95])
+
+
+# Of 5 Nm for 0.25 s 4.59 Nm are in the filter; they are back at 0.15 Nm after 342 ms, and one time constant is 100 ms.
+@pytest.mark.parametrize(
+    ("row", "false_alarms"),
+    [(1999, 1), (2000, 0), (2005, 0), (2690, 0), (2693, 1)],
+    ids=["before", "onset", "during", "decay", "long after"],
+)
+def test_a_detection_belongs_to_a_contact_from_its_onset_until_it_is_forgotten(row, false_alarms):
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    assert evaluate(react(run, row)).false_alarms == false_alarms
+
+
+def test_a_second_detection_of_one_contact_is_no_false_alarm():
+    run = make_run()
+    touch(run, 2000, 400, (5.0, 0.0))
+    assert evaluate(react(react(run, 2005), 2300)).false_alarms == 0
+
+
+def test_the_first_of_two_detections_gives_the_delay():
+    run = make_run()
+    touch(run, 2000, 400, (5.0, 0.0))
+    assert evaluate(react(react(run, 2005), 2300)).contacts[0].delay_ms == pytest.approx(5.0)
+
+
+def test_the_link_is_that_of_the_final_report():
+    run = make_run()
+    touch(run, 2000, 250, (6.0, 3.0), link=2)
+    run = react(run, 2004)
+    cycle = int(run.cycle[2004])
+    reports = (contact_report(cycle, link=1, is_final=False), contact_report(cycle, link=2, direction=(1, 1)))
+    assert evaluate(replace(run, reports=reports)).contacts[0].link_detected == 2
+
+
+def test_the_link_at_the_alarm_is_that_of_the_first_report():
+    run = make_run()
+    touch(run, 2000, 250, (6.0, 3.0), link=2)
+    run = react(run, 2004)
+    cycle = int(run.cycle[2004])
+    reports = (contact_report(cycle, link=1, is_final=False), contact_report(cycle, link=2, direction=(1, 1)))
+    assert evaluate(replace(run, reports=reports)).contacts[0].link_at_alarm == 1
+
+
+def test_a_detection_without_report_has_no_link():
+    assert one_contact().link_detected is None
+
+
+def test_the_true_link_is_told():
+    assert one_contact(tau_ext=(6.0, 3.0), link=2).link == 2
+
+
+@pytest.mark.parametrize(
+    ("direction", "is_right"),
+    [((1, -1), True), ((1, 0), True), ((0, -1), True), ((-1, -1), False), ((1, 1), False), ((0, 0), False)],
+)
+def test_a_direction_is_right_if_every_joint_with_one_was_pushed_that_way(direction, is_right):
+    assert one_contact(tau_ext=(5.0, -3.0), link=2, direction=direction).direction_ok is is_right
+
+
+def test_a_detection_without_report_has_no_direction():
+    assert one_contact().direction_ok is None
+
+
+def test_the_peak_is_compared_at_the_joint_with_more_true_torque():
+    contact = one_contact(tau_ext=(-6.0, 3.0), link=2, direction=(-1, 1), tau_ext_peak=(-6.6, 9.0))
+    assert contact.torque_error_ratio == pytest.approx(1.1)
+
+
+def test_the_true_peak_is_that_of_the_isolation_window():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    run.truth.tau_ext[2100:2250, 0] = 50.0
+    contact = evaluate(react(run, 2005, tau_ext_peak=(5.5, 0.0))).contacts[0]
+    assert contact.torque_error_ratio == pytest.approx(1.1)
+
+
+def residual(run, label="B", model="identified"):
+    return getattr(evaluate(run).frozen_residual_max_Nm[label], model)
+
+
+def test_the_frozen_residual_is_the_largest_of_each_joint():
+    run = make_run()
+    run.tau_ext_hat[2000] = (0.03, -0.01)
+    run.tau_ext_hat[3000] = (-0.04, 0.005)
+    assert residual(run) == (0.04, 0.01)
+
+
+def test_each_section_has_its_own_residual():
+    run = make_run()
+    run.tau_ext_hat[7000] = (0.03, 0.02)
+    assert residual(run, "E") == (0.03, 0.02)
+
+
+def test_an_adaptation_has_no_frozen_residual():
+    assert residual(make_run(), "A") is None
+
+
+def test_an_adaptation_has_the_cad_models_residual():
+    run = make_run()
+    run.tau_ext_hat_cad[100] = (0.4, -0.5)
+    assert residual(run, "A", "cad") == (0.4, 0.5)
+
+
+def test_a_payload_change_has_no_residual():
+    assert "C" not in evaluate(make_run()).frozen_residual_max_Nm
+
+
+def test_without_a_cad_model_it_has_no_residual():
+    run = make_run()
+    settings = replace(run.settings, arm=replace(run.settings.arm, cad_theta=()))
+    assert residual(replace(run, settings=settings), "B", "cad") is None
+
+
+# A contact from row 2000 to 2249, so that 2250 is its end.
+@pytest.mark.parametrize(
+    ("row", "counts"),
+    [
+        (1999, True),
+        (2000, False),
+        (2249, False),
+        (2250 + SETTLING_ROWS - 1, False),
+        (2250 + SETTLING_ROWS + 1, True),
+    ],
+)
+def test_the_residual_leaves_out_a_contact_and_ten_time_constants_after_it(row, counts):
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    run.tau_ext_hat[row] = (1.0, 1.0)
+    assert (residual(run) == (1.0, 1.0)) is counts
+
+
+# REACT from row 2000 to 2099.
+@pytest.mark.parametrize(
+    ("row", "counts"),
+    [(1999, True), (2000, False), (2099, False), (2099 + SETTLING_ROWS - 1, False), (2099 + SETTLING_ROWS + 1, True)],
+)
+def test_the_residual_leaves_out_a_withdrawal_and_ten_time_constants_after_it(row, counts):
+    run = react(make_run(), 2000)
+    run.tau_ext_hat[row] = (1.0, 1.0)
+    assert (residual(run) == (1.0, 1.0)) is counts
+
+
+@pytest.mark.parametrize(("row", "counts"), [(8999, True), (9000, False)])
+def test_the_residual_leaves_out_the_parking_at_the_end(row, counts):
+    run = make_run(finish_cycle=FIRST_CYCLE + 9000)
+    run.tau_ext_hat[row] = [0.09, 0.0]
+    assert (residual(run, "E")[0] == 0.09) is counts
+
+
+def test_the_residual_leaves_out_a_stop():
+    run = make_run((A, 1000), (M, 1000), (R, 100), (S, 3000), (M, 1000))
+    run.tau_ext_hat[4000] = (1.0, 1.0)
+    assert residual(run) == (0.0, 0.0)
+
+
+def test_the_residual_says_over_how_many_cycles():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 0.0))
+    assert evaluate(run).frozen_residual_max_Nm["B"].cycles == 4000 - (250 + SETTLING_ROWS + 1)
+
+
+def test_a_section_that_is_all_contact_has_no_residual():
+    run = make_run((A, 100), (M, 500))
+    touch(run, 100, 500, (0.1, 0.0))
+    assert residual(run) is None
+
+
+def real_arm():
+    return react(make_run(has_truth=False), 3000, link=2, direction=(1, 1))
+
+
+def test_a_real_arm_lists_its_detections():
+    assert evaluate(real_arm()).contacts[0].detected_s == pytest.approx((3000 - ZERO_ROW) * 1e-3)
+
+
+def test_a_real_arm_lists_the_link_it_found():
+    assert evaluate(real_arm()).contacts[0].link_detected == 2
+
+
+@pytest.mark.parametrize(
+    "field",
+    ["link", "onset_s", "end_s", "delay_ms", "law_ms", "ideal_ms", "direction_ok", "tau_ext_Nm", "torque_error_ratio"],
+)
+def test_a_real_arm_knows_no_truth_of_a_contact(field):
+    assert getattr(evaluate(real_arm()).contacts[0], field) is None
+
+
+@pytest.mark.parametrize("field", ["false_alarms", "false_alarms_s", "missed"])
+def test_a_real_arm_cannot_tell_false_alarms_and_misses(field):
+    assert getattr(evaluate(real_arm()), field) is None
+
+
+def test_a_real_arm_has_no_true_parameters():
+    assert evaluate(real_arm()).parameters["A"]["a1"][0] is None
+
+
+@pytest.mark.parametrize(
+    ("row", "counts"),
+    [
+        (3000 - SETTLING_ROWS - 1, True),
+        (3000 - SETTLING_ROWS + 1, False),
+        (3000, False),
+        (3099 + SETTLING_ROWS - 1, False),
+        (3099 + SETTLING_ROWS + 1, True),
+    ],
+)
+def test_a_real_arms_residual_leaves_out_ten_time_constants_around_a_detection(row, counts):
+    run = real_arm()
+    run.tau_ext_hat[row] = (1.0, 1.0)
+    assert (residual(run) == (1.0, 1.0)) is counts
+
+
+def test_the_identified_parameters_include_the_cycle_that_ends_the_adaptation():
+    run = make_run()
+    run.theta_hat[1049, 0] = 0.18
+    run.theta_hat[1050, 0] = 0.19
+    run.theta_hat[1051, 0] = 0.20
+    assert evaluate(run).parameters["A"]["a1"][1] == 0.19
+
+
+def test_the_parameters_of_an_unfinished_adaptation_are_its_last():
+    run = make_run((A, 20))
+    run.theta_hat[19, 0] = 0.17
+    assert evaluate(run).parameters["A"]["a1"][1] == 0.17
+
+
+def test_the_true_parameters_are_those_at_the_end_of_the_adaptation():
+    run = make_run()
+    run.truth.theta[5300:, 0] = 0.4
+    trues = [found["a1"][0] for found in evaluate(run).parameters.values()]
+    assert trues == [THETA[0], 0.4]
+
+
+def test_parameters_are_named_in_their_order():
+    assert list(evaluate(make_run()).parameters["A"]) == ["a1", "a2", "a3", "F_v1", "F_v2", "F_c1", "F_c2"]
+
+
+def test_the_payload_is_that_of_each_adaptation():
+    run = make_run()
+    run.truth.payload_kg[5300:] = 1.0
+    assert evaluate(run).payload_kg == {"A": 0.0, "D": 1.0}
+
+
+def test_percentiles_are_in_microseconds():
+    assert astuple(percentiles(np.arange(1001) * 1000)) == pytest.approx((500.0, 990.0, 999.0, 1000.0))
+
+
+def test_no_cycles_have_no_percentiles():
+    assert percentiles(np.array([])) is None
+
+
+def test_overruns_are_those_of_the_last_cycle():
+    run = make_run()
+    overruns = np.maximum(0, np.arange(len(run.cycle)) - 9000)
+    run = replace(run, timing=replace(run.timing, overruns=overruns))
+    assert evaluate(run).cycle.overruns == overruns[-1]
+
+
+def test_missing_frames_are_counted_over_all_cycles():
+    run = make_run()
+    missing = run.timing.frames_missing.copy()
+    missing[[3, 70]] = (1, 2)
+    run = replace(run, timing=replace(run.timing, frames_missing=missing))
+    assert evaluate(run).cycle.frames_missing == 3
+
+
+def test_lockstep_has_no_lateness():
+    assert evaluate(make_run(clock="lockstep")).cycle.lateness_us is None
+
+
+def test_real_time_has_a_lateness():
+    assert evaluate(make_run(clock="realtime")).cycle.lateness_us is not None
+
+
+def test_clock_and_scheduler_come_from_the_log():
+    cycle = evaluate(make_run(clock="realtime")).cycle
+    assert (cycle.clock, cycle.scheduler) == ("realtime", "SCHED_FIFO 80")
+
+
+def paper_value(run, quantity):
+    return next(row.measured for row in evaluate(run).paper if row.quantity == quantity)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "measured"),
+    [
+        ("First adaptation", "1.00 s"),
+        ("Adaptation after the payload change", "0.80 s"),
+        ("Payload", "1 kg"),
+        ("Frozen residual without payload, joints 1 / 2", "0.020 / 0.020 Nm"),
+        ("The CAD model's, with payload", "0.400 / 0.400 Nm"),
+        ("First contact detected at", "1.96 s"),
+        ("Threshold, joints 1 / 2", "0.15 Nm"),
+        ("Filter a / b", "10 / 10 rad/s"),
+        ("Control rate", "1 kHz"),
+    ],
+)
+def test_the_paper_table_gives_what_was_measured(quantity, measured):
+    assert paper_value(touched_run(), quantity) == measured
+
+
+def test_an_adaptation_that_did_not_finish_says_so_beside_the_paper():
+    assert paper_value(make_run((A, 10)), "First adaptation") == "not finished"
+
+
+def detected_run():
+    run = make_run()
+    run.truth.payload_kg[5300:] = 1.0
+    for index, row in enumerate((2000, 4000)):
+        touch(run, row, 250, (5.0, 0.0), index=index)
+        react(run, row + 5)
+    return run
+
+
+def contact_in_adaptation():
+    run = detected_run()
+    touch(run, 500, 50, (5.0, 0.0), index=7)
+    return run
+
+
+def payload_taken_off():
+    run = make_run()
+    run.truth.payload_kg[:5300] = 1.5
+    return run
+
+
+def one_detected():
+    run = make_run((A, 1000), (M, 4000))
+    touch(run, 2000, 250, (5.0, 0.0))
+    return react(run, 2005)
+
+
+def faulted():
+    run = make_run((A, 1000), (M, 500), (SchemeState.FAULT, 5))
+    run.fault[1500:] = FaultReason.DATA_AGE
+    return run
+
+
+@pytest.mark.parametrize(
+    ("run", "verdict"),
+    [
+        (
+            detected_run(),
+            "All 2 contacts detected, none false; the model was identified in 1.00 s and again in 0.80 s after 1 kg.",
+        ),
+        (
+            touched_run(),
+            "2 of 3 contacts detected, 1 missed, 1 false alarm; the model was identified in 1.00 s and again in "
+            "0.80 s after 1 kg.",
+        ),
+        (
+            contact_in_adaptation(),
+            "All 2 contacts detected, 1 more while it was not armed, none false; the model was identified in 1.00 s "
+            "and again in 0.80 s after 1 kg.",
+        ),
+        (
+            payload_taken_off(),
+            "No contact while detection was armed, no false alarm; the model was identified in 1.00 s and again in "
+            "0.80 s after taking off 1.5 kg.",
+        ),
+        (one_detected(), "The one contact detected, none false; the model was identified in 1.00 s."),
+        (
+            real_arm(),
+            "1 detection, whose truth is not recorded; the model was identified in 1.00 s and again in 0.80 s after "
+            "the payload change.",
+        ),
+        (
+            make_run((A, 1000)),
+            "No contact while detection was armed, no false alarm; the model was not identified.",
+        ),
+        (
+            make_run((A, 1000), (M, 10), (P, 10), (A, 10)),
+            "No contact while detection was armed, no false alarm; the model was identified in 1.00 s, but not again "
+            "after the payload change.",
+        ),
+        (
+            faulted(),
+            "The run ended in FAULT (DATA_AGE) at 1.50 s; no contact while detection was armed, no false alarm; the "
+            "model was identified in 1.00 s.",
+        ),
+        (
+            make_run((SchemeState.COMMISSION, 10)),
+            "No contact while detection was armed, no false alarm; the arm never moved to adapt.",
+        ),
+    ],
+)
+def test_the_verdict_says_how_it_went(run, verdict):
+    assert evaluate(run).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("run", "is_clean"),
+    [
+        (detected_run(), True),
+        (touched_run(), False),
+        (react(detected_run(), 8000), False),
+        (faulted(), False),
+        (make_run((A, 1000)), False),
+        (make_run((SchemeState.COMMISSION, 10)), False),
+        (real_arm(), True),
+    ],
+    ids=["all detected", "missed", "false alarm", "fault", "not identified", "never moved", "real arm"],
+)
+def test_a_run_is_clean_if_nothing_went_wrong(run, is_clean):
+    assert evaluate(run).is_clean is is_clean
+
+
+def test_a_missed_contact_alone_makes_a_run_unclean():
+    run = detected_run()
+    touch(run, 8000, 250, (5.0, 0.0), index=5)
+    assert evaluate(run).is_clean is False
+
+
+def empty_run():
+    run = make_run((A, 1))
+    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
+    timing = replace(run.timing, **{name: np.zeros(0, dtype=np.int64) for name in vars(run.timing)})
+    return replace(run, timing=timing, **{name: getattr(run, name)[:0] for name in names})
+
+
+def test_a_log_without_cycles_has_no_sections():
+    assert evaluate(empty_run()).sections == ()
+
+
+def test_a_log_without_cycles_counts_none():
+    assert evaluate(empty_run()).cycle.count == 0
+
+
+def test_the_hand_made_run_differs_from_its_cad_model():
+    assert THETA != CAD_THETA
+
+
+def test_the_hand_made_run_has_the_papers_order():
+    assert [state for state, _ in PAPER_LIKE] == [SchemeState.ENABLE, A, M, P, A, M]

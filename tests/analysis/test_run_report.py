@@ -1,0 +1,353 @@
+"""The report as a whole: JSON that is complete, a page that needs and allows nothing from outside."""
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hand_made_run import A, M, make_run, react, touched_run
+
+from adacd_hil.analysis.report import write_report, write_run_report
+from adacd_hil.config import to_toml
+from adacd_hil.log.channels import ChannelId, pack_contact, pack_scheme, pack_truth
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import TRUTH_LAYOUT, FaultReason, Request, SchemeOutput, SchemeState, scheme_layout
+
+pytestmark = pytest.mark.slow
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), log_name="run.mcap")
+
+
+@pytest.fixture(scope="module")
+def table(report):
+    return json.loads(report.json_path.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def html(report):
+    return report.html_path.read_text(encoding="utf-8")
+
+
+def test_a_report_is_a_page_a_table_and_three_pictures(report):
+    names = sorted(path.name for path in report.html_path.parent.iterdir())
+    assert names == ["fig5.png", "fig6.png", "fig7.png", "report.html", "report.json"]
+
+
+def test_a_report_names_its_pictures(report):
+    assert [path.is_file() for path in report.figure_paths] == [True] * 3
+
+
+KEYS = {
+    "": "schema verdict is_clean time_zero adaptation_s sections frozen_residual_max_Nm contacts false_alarms "
+    "false_alarms_s missed parameters payload_kg fault cycle log paper run",
+    "sections.A": "label kind start_s end_s is_complete duration_s",
+    "frozen_residual_max_Nm.B": "identified cad cycles",
+    "contacts.0": "number section link onset_s end_s is_armed detected_s delay_ms law_ms ideal_ms link_at_alarm "
+    "link_detected direction direction_ok tau_ext_Nm tau_ext_peak_hat_Nm torque_error_ratio",
+    "parameters.A": "a1 a2 a3 F_v1 F_v2 F_c1 F_c2",
+    "cycle": "count duration_s overruns frames_missing latency_us lateness_us clock scheduler",
+    "cycle.latency_us": "feedback command",
+    "cycle.latency_us.feedback": "p50 p99 p999 max",
+    "cycle.lateness_us": "p50 p99 p999 max",
+    "log": "name frames dropped is_complete problem",
+    "paper.0": "quantity paper measured",
+}
+
+
+def at(table, path):
+    for key in filter(None, path.split(".")):
+        table = table[int(key)] if key.isdigit() else table[key]
+    return table
+
+
+@pytest.mark.parametrize("path", KEYS)
+def test_the_table_has_the_documented_keys(table, path):
+    assert set(at(table, path)) == set(KEYS[path].split())
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("adaptation_s", {"A": 1.0, "D": 0.8}),
+        ("sections.C.start_s", 5.0),
+        ("frozen_residual_max_Nm.A.identified", None),
+        ("contacts.0.delay_ms", 5.0),
+        ("contacts.1.direction", [-1, -1]),
+        ("contacts.1.link_detected", 2),
+        ("contacts.2.detected_s", None),
+        ("false_alarms", 1),
+        ("false_alarms_s", [8.95]),
+        ("missed", 1),
+        ("parameters.A.a1", [0.2, 0.2]),
+        ("payload_kg", {"A": 0.0, "D": 1.0}),
+        ("fault", None),
+        ("cycle.count", 9350),
+        ("cycle.latency_us.feedback.max", 409.349),
+        ("cycle.latency_us.command.max", 609.349),
+        ("cycle.lateness_us.p50", 4.6745),
+        ("log", {"name": "run.mcap", "frames": 12, "dropped": 0, "is_complete": True, "problem": ""}),
+        ("run.seed", "7"),
+    ],
+)
+def test_the_table_says_what_happened(table, path, value):
+    assert at(table, path) == value
+
+
+def test_the_table_in_the_file_is_the_reports(report, table):
+    assert table == report.as_json()
+
+
+def test_a_real_arm_has_null_where_only_the_truth_could_tell(tmp_path):
+    run = react(make_run(has_truth=False), 3000)
+    table = write_run_report(run, tmp_path, log_name="run.mcap").as_json()
+    assert [table[key] for key in ("false_alarms", "false_alarms_s", "missed")] == [None] * 3
+
+
+def test_a_value_that_is_not_finite_becomes_null(tmp_path):
+    run = make_run((A, 100), (M, 100))
+    run.tau_ext_hat[150, 0] = float("nan")
+    table = write_run_report(run, tmp_path, log_name="run.mcap").as_json()
+    assert table["frozen_residual_max_Nm"]["B"]["identified"] == [None, 0.0]
+
+
+def test_a_fault_is_in_the_table(tmp_path):
+    run = make_run((A, 100), (SchemeState.FAULT, 5))
+    run.fault[100:] = FaultReason.DATA_AGE
+    assert write_run_report(run, tmp_path, log_name="run.mcap").as_json()["fault"] == {
+        "reason": "DATA_AGE",
+        "at_s": 0.1,
+    }
+
+
+def test_the_text_begins_with_the_verdict(report):
+    assert report.as_text().splitlines()[0] == report.metrics.verdict
+
+
+def test_the_text_ends_with_the_place_of_the_page(report):
+    assert report.as_text().splitlines()[-1] == f"Report: {report.html_path}"
+
+
+def test_the_text_says_what_the_log_lacks(report):
+    text = replace(report, problem="cut after 12 s").as_text()
+    assert text.splitlines()[1] == "The log is not whole: cut after 12 s"
+
+
+VOID = {"meta", "br", "link", "img", "hr", "input"}
+
+
+class Page(HTMLParser):
+    """Checks that tags are balanced and collects what a page may not have."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open = []
+        self.unbalanced = []
+        self.tags = set()
+        self.attributes = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes += attrs
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes += attrs
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.unbalanced.append(tag)
+
+
+def test_the_page_is_well_formed(html):
+    page = Page(html)
+    assert (page.unbalanced, page.open) == ([], [])
+
+
+def test_the_page_refers_to_nothing_outside(html):
+    assert re.search(r"https?://|url\((?!#)|@import|src=", html) is None
+
+
+def test_the_page_has_no_script_and_no_inline_style(html):
+    page = Page(html)
+    assert (
+        page.tags & {"script", "iframe", "object", "img", "link"},
+        [n for n, _ in page.attributes if n == "style"],
+    ) == (
+        set(),
+        [],
+    )
+
+
+def test_the_pages_ids_are_there_once(html):
+    ids = [value for name, value in Page(html).attributes if name == "id"]
+    assert len(ids) == len(set(ids))
+
+
+def test_the_policy_allows_the_pages_own_style_and_nothing_else(html):
+    style = re.search(r"<style>(.*?)</style>", html, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', html)[1]
+    assert policy == f"default-src 'none'; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
+
+
+def test_the_verdict_is_the_pages_heading(html, report):
+    heading = re.search(r"<h1>(.*?)</h1>", html)[1]
+    assert heading.replace("&nbsp;", " ") == report.metrics.verdict
+
+
+def test_the_heading_does_not_part_a_number_from_its_unit(html):
+    assert "1.00&nbsp;s and again in 0.80&nbsp;s after 1&nbsp;kg." in html
+
+
+def test_a_run_with_a_missed_contact_looks_bad(html):
+    assert '<header class="bad">' in html
+
+
+def test_a_run_without_fault_looks_good(tmp_path):
+    html = write_run_report(make_run(), tmp_path, log_name="run.mcap").html_path.read_text(encoding="utf-8")
+    assert '<header class="good">' in html
+
+
+def test_the_page_shows_every_figure(html):
+    assert re.findall(r'<figure id="([^"]*)"', html) == ["fig5", "contacts", "fig6", "fig7", "cycle"]
+
+
+def test_the_page_says_what_the_log_lacks(tmp_path):
+    report = write_run_report(make_run((A, 10)), tmp_path, log_name="run.mcap", problem="cut after 12 s")
+    assert "The log is not whole: cut after 12 s" in report.html_path.read_text(encoding="utf-8")
+
+
+def test_the_page_says_how_many_packets_were_dropped(tmp_path):
+    report = write_run_report(replace(make_run((A, 10)), dropped=3), tmp_path, log_name="run.mcap")
+    assert "3 packets are not in the log" in report.html_path.read_text(encoding="utf-8")
+
+
+def test_metadata_cannot_become_markup(tmp_path):
+    run = make_run((A, 10))
+    evil = '<script>alert("1")</script>'
+    run = replace(run, metadata={**run.metadata, "config": evil, "profile": evil, evil: evil})
+    html = write_run_report(run, tmp_path, log_name=evil, problem=evil).html_path.read_text(encoding="utf-8")
+    assert "<script" not in html
+
+
+def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
+    run = make_run((A, 1))
+    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
+    run = replace(run, **{name: getattr(run, name)[:0] for name in names})
+    page = Page(write_run_report(run, tmp_path, log_name="run.mcap").html_path.read_text(encoding="utf-8"))
+    assert page.unbalanced == []
+
+
+def test_the_same_run_gives_the_same_page(html, tmp_path):
+    again = write_run_report(touched_run(), tmp_path, log_name="run.mcap")
+    assert again.html_path.read_text(encoding="utf-8") == html
+
+
+def test_the_page_is_small(html):
+    assert len(html.encode()) < 5_000_000
+
+
+def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(LogError, match=r"report in .*taken can't be written"):
+        write_run_report(make_run((A, 10)), tmp_path / "taken", log_name="run.mcap")
+
+
+def record(path, run, attachments):
+    """Write a log with the scheme's topic of a hand-made run."""
+    layout = scheme_layout(7)
+    with Recorder(path, attachments=attachments, metadata={"clock": "lockstep"}, blocking=True) as recorder:
+        for row, cycle in enumerate(run.cycle.tolist()):
+            block = np.zeros(layout.size)
+            block[layout.slices["tau_ext_hat"]] = run.tau_ext_hat[row]
+            block[layout.slices["theta_hat"]] = run.theta_hat[row]
+            block[layout.slices["threshold"]] = run.threshold[row]
+            state = SchemeState(run.state[row])
+            output = SchemeOutput(
+                cycle, state, state, FaultReason.NONE, 0, False, run.theta_hat[row], run.theta_hat[row],
+                run.tau_ext_hat[row], None, block,
+            )  # fmt: skip
+            messages = [(ChannelId.SCHEME, pack_scheme(output, Request.NONE))]
+            messages += [(ChannelId.CONTACT, pack_contact(report)) for report in run.reports if report.cycle == cycle]
+            recorder.cycle(int(run.t_ns[row]), messages)
+
+
+def record_truth(path, run):
+    with Recorder(path, metadata={"seed": "7"}, blocking=True, is_truth=True) as recorder:
+        for row, cycle in enumerate(run.truth.cycle.tolist()):
+            block = np.zeros(TRUTH_LAYOUT.size)
+            block[TRUTH_LAYOUT.slices["tau_ext"]] = run.truth.tau_ext[row]
+            block[TRUTH_LAYOUT.slices["contact_link"]] = run.truth.contact_link[row]
+            block[TRUTH_LAYOUT.slices["contact_index"]] = run.truth.contact_index[row]
+            block[TRUTH_LAYOUT.slices["payload"]] = run.truth.payload_kg[row]
+            block[TRUTH_LAYOUT.slices["theta"]] = run.truth.theta[row]
+            recorder.cycle(int(run.t_ns[row]), [(ChannelId.TRUTH, pack_truth(cycle, block))])
+
+
+def without_cycle_times(table):
+    """Leave out what the recorded run doesn't have, and what describes the file."""
+    skipped = ("cycle", "log", "run")
+    return {key: value for key, value in table.items() if key not in skipped}
+
+
+def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
+    run = replace(touched_run(), tau_ext_hat_cad=touched_run().tau_ext_hat_cad * 0.0)
+    record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
+    record_truth(tmp_path / "truth.mcap", run)
+    from_files = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path / "a").as_json()
+    from_memory = write_run_report(run, tmp_path / "b", log_name="run.mcap").as_json()
+    assert without_cycle_times(from_files) == without_cycle_times(from_memory)
+
+
+def test_a_report_from_files_knows_the_emulators_seed(tmp_path):
+    run = make_run((A, 10), (M, 10))
+    record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
+    record_truth(tmp_path / "truth.mcap", run)
+    report = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path)
+    assert report.metadata["emulator_seed"] == "7"
+
+
+def test_a_log_without_configuration_cannot_be_reported(tmp_path):
+    record(tmp_path / "run.mcap", make_run((A, 10)), {})
+    with pytest.raises(LogError, match=r"run\.mcap has no attachment config\.toml"):
+        write_report(tmp_path / "run.mcap", None, tmp_path)
+
+
+def test_a_configuration_that_is_wrong_is_named(tmp_path):
+    record(tmp_path / "run.mcap", make_run((A, 10)), {"config.toml": b"[fliter]\n"})
+    with pytest.raises(LogError, match=r"config\.toml: unknown key `fliter`; did you mean `filter`"):
+        write_report(tmp_path / "run.mcap", None, tmp_path)
+
+
+def test_a_log_that_does_not_exist_cannot_be_reported(tmp_path):
+    with pytest.raises(LogError):
+        write_report(tmp_path / "run.mcap", None, tmp_path)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page in")
+def test_a_browser_opens_the_page_without_a_word(report, tmp_path):
+    done = subprocess.run(
+        [
+            CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync",
+            "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path}", "--enable-logging=stderr",
+            "--dump-dom", report.html_path.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []

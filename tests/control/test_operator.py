@@ -1,0 +1,65 @@
+"""The user of a running arm."""
+
+import io
+
+import pytest
+
+from adacd_hil.config import OperatorSettings, RequestSettings
+from adacd_hil.control.operator import ConsoleOperator, ScriptedOperator
+from adacd_hil.records import Request, SchemeState
+
+
+def script(*entries: tuple[float, str], acknowledge_after_s: float = 0.0) -> ScriptedOperator:
+    requests = tuple(RequestSettings(at_s=at_s, request=request) for at_s, request in entries)
+    return ScriptedOperator(OperatorSettings(script=requests, acknowledge_after_s=acknowledge_after_s))
+
+
+def test_a_script_asks_once_at_its_time() -> None:
+    operator = script((2.0, "finish"))
+    asked = [operator.request(t, SchemeState.MONITOR) for t in (1.999, 2.0, 2.001)]
+    assert asked == [Request.NONE, Request.FINISH, Request.NONE]
+
+
+def test_a_script_asks_in_the_order_of_time() -> None:
+    operator = script((2.0, "payload_changed"), (1.0, "payload"))
+    asked = [operator.request(t, SchemeState.MONITOR) for t in (1.0, 2.0)]
+    assert asked == [Request.PAYLOAD, Request.PAYLOAD_CHANGED]
+
+
+def test_nothing_is_asked_before_the_drives_are_enabled() -> None:
+    assert script((0.0, "finish")).request(None, SchemeState.ENABLE) is Request.NONE
+
+
+def test_a_stop_is_acknowledged_after_its_time() -> None:
+    operator = script(acknowledge_after_s=0.5)
+    asked = [operator.request(t, SchemeState.STOPPED) for t in (1.0, 1.4, 1.5)]
+    assert asked == [Request.NONE, Request.NONE, Request.ACKNOWLEDGE]
+
+
+def test_each_stop_is_acknowledged_anew() -> None:
+    operator = script(acknowledge_after_s=0.5)
+    for t, state in ((1.0, SchemeState.STOPPED), (1.5, SchemeState.STOPPED), (1.6, SchemeState.MONITOR)):
+        operator.request(t, state)
+    asked = [operator.request(t, SchemeState.STOPPED) for t in (3.0, 3.4, 3.5)]
+    assert asked == [Request.NONE, Request.NONE, Request.ACKNOWLEDGE]
+
+
+def test_without_a_time_no_stop_is_acknowledged() -> None:
+    operator = script()
+    assert {operator.request(float(t), SchemeState.STOPPED) for t in range(100)} == {Request.NONE}
+
+
+@pytest.mark.parametrize(
+    ("word", "request_"),
+    [
+        ("ack", Request.ACKNOWLEDGE),
+        (" Payload ", Request.PAYLOAD),
+        ("changed", Request.PAYLOAD_CHANGED),
+        ("finish", Request.FINISH),
+        ("jump", Request.NONE),
+    ],
+)
+def test_the_console_takes_a_word_a_line(word: str, request_: Request) -> None:
+    operator = ConsoleOperator(script(), io.StringIO(f"{word}\n"))
+    operator.join(1.0)
+    assert operator.request(1.0, SchemeState.STOPPED) is request_

@@ -1,0 +1,53 @@
+"""When cycles begin."""
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.control.realtime import GridPacer, LockstepPacer, Tick
+
+PERIOD_NS = 1_000_000
+
+
+class LateClock(VirtualClock):
+    """A clock whose sleeper is woken late by what a test says, once each."""
+
+    def __init__(self, lateness_ns: list[int]) -> None:
+        super().__init__()
+        self._lateness_ns = lateness_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        super().sleep_until_ns(t_ns + (self._lateness_ns.pop(0) if self._lateness_ns else 0))
+
+
+def test_lockstep_cycles_are_one_period_apart_in_virtual_time() -> None:
+    pacer = LockstepPacer(VirtualClock(), PERIOD_NS)
+    assert [pacer.next() for _ in range(3)] == [Tick(k, k * PERIOD_NS, 1, 0) for k in range(3)]
+
+
+def test_a_late_tick_does_not_move_the_grid() -> None:
+    pacer = GridPacer(LateClock([0, 400_000, 0]), PERIOD_NS)
+    ticks = [pacer.next() for _ in range(3)]
+    assert [tick.t_ns - ticks[0].t_ns for tick in ticks] == [0, 1_400_000, 2_000_000]
+
+
+def test_lateness_is_counted_from_the_grid() -> None:
+    pacer = GridPacer(LateClock([0, 400_000, 0]), PERIOD_NS)
+    assert [pacer.next().lateness_ns for _ in range(3)] == [0, 400_000, 0]
+
+
+def test_an_overrun_skips_whole_periods_and_keeps_phase() -> None:
+    pacer = GridPacer(LateClock([0, 2_300_000, 0]), PERIOD_NS)
+    ticks = [pacer.next() for _ in range(3)]
+    assert [(tick.cycle, tick.periods, tick.lateness_ns) for tick in ticks] == [(0, 1, 0), (3, 3, 300_000), (4, 1, 0)]
+
+
+def test_skipped_periods_are_counted() -> None:
+    pacer = GridPacer(LateClock([0, 2_300_000, 0, 1_000_000]), PERIOD_NS)
+    for _ in range(4):
+        pacer.next()
+    assert pacer.overruns == 3
+
+
+def test_being_late_by_just_less_than_a_period_is_no_overrun() -> None:
+    pacer = GridPacer(LateClock([0, 999_999]), PERIOD_NS)
+    for _ in range(2):
+        pacer.next()
+    assert pacer.overruns == 0

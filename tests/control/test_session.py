@@ -1,0 +1,183 @@
+"""Whole runs against the emulator in one process, with something going wrong; torque is judged on the wire."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.config import OperatorSettings, RequestSettings, load_settings
+from adacd_hil.control.gate import GateFlag
+from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.codec import load_codec
+from firmware_sim.bench import Bench
+from firmware_sim.scenario import load_scenario
+
+pytestmark = pytest.mark.slow
+
+CODEC = load_codec()
+ENABLED_CYCLE = 203  # in lockstep always the same
+TROUBLE_CYCLE = 1000
+QUICK_STOP, DISABLE_VOLTAGE, ENABLE_OPERATION = 0x0002, 0x0000, 0x000F
+
+
+class Rig:
+    """Host and emulator on a bus on which a test can drop or change the devices' frames, or do something in a cycle."""
+
+    def __init__(self, folder: Path, finish_s: float = 2.0) -> None:
+        script = (RequestSettings(at_s=finish_s, request="finish"),)
+        settings = dataclasses.replace(load_settings("paper"), operator=OperatorSettings(script=script))
+        clock = VirtualClock()
+        bus = EmbeddedBus(clock)
+        self.tamper: Callable[[int, int, bytes], bytes | None] = lambda cycle, can_id, data: data
+        self.in_cycle: dict[int, Callable[[], None]] = {}
+        self.bench = Bench(load_scenario("idle", "P"), CODEC, self._deliver)
+        self._bus = bus
+        bus.attach(self._on_frame)
+        self.bench.boot()
+        operator = ScriptedOperator(settings.operator)
+        self.session = Session(settings, CODEC, bus, clock, operator, folder, "embedded")
+
+    def _deliver(self, can_id: int, data: bytes) -> None:
+        kept = self.tamper(self.bench.cycle, can_id, data)
+        if kept is not None:
+            self._bus.deliver(can_id, kept)
+
+    def _on_frame(self, frame: Frame) -> None:
+        if frame.can_id == 0x080:
+            self.in_cycle.pop(self.bench.cycle, lambda: None)()
+        self.bench.on_frame(frame)
+
+    def run(self) -> tuple[SessionSummary, RunLog]:
+        summary = self.session.run()
+        return summary, read_log(summary.log.path)
+
+
+def torques_from(log: RunLog, cycle: int) -> np.ndarray:
+    """Return the target torques on the wire from this cycle on."""
+    start_ns = cycle * 1_000_000
+    commands = [log.decoded[name] for name in ("Drive1Command", "Drive2Command")]
+    return np.concatenate([command["target_torque"][command.t_ns >= start_ns] for command in commands])
+
+
+def controlwords(log: RunLog) -> np.ndarray:
+    return log.decoded["Drive1Command"]["controlword"]
+
+
+def test_a_run_that_nothing_disturbs_ends_parked_and_disabled(tmp_path: Path) -> None:
+    summary, log = Rig(tmp_path).run()
+    assert summary.result is not None
+    assert (summary.result.fault, summary.result.is_interrupted, summary.error) == (FaultReason.NONE, False, "")
+    assert controlwords(log)[-1] == DISABLE_VOLTAGE
+    assert np.abs(log.scheme["dq"][-1]).max() < 0.01
+
+
+def test_the_gate_is_closed_until_the_arm_is_enabled(tmp_path: Path) -> None:
+    _, log = Rig(tmp_path).run()
+    assert np.count_nonzero(log.control["tau_c"][:ENABLED_CYCLE]) == 0
+    assert set(log.control["gate_flags"][:ENABLED_CYCLE].tolist()) == {int(GateFlag.CLOSED)}
+
+
+@pytest.mark.parametrize("can_id", [0x181, 0x182, 0x183, 0x184])
+def test_a_device_that_falls_silent_faults_the_run_after_its_age_budget(tmp_path: Path, can_id: int) -> None:
+    rig = Rig(tmp_path)
+    rig.tamper = lambda cycle, i, data: None if i == can_id and cycle >= TROUBLE_CYCLE else data
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.DATA_AGE
+    first = int(np.argmax(log.scheme["state"] == SchemeState.FAULT))
+    assert first == TROUBLE_CYCLE + 3
+
+
+def test_after_a_fault_there_is_no_torque_on_the_wire_and_drives_are_stopped(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle >= TROUBLE_CYCLE else data
+    _, log = rig.run()
+    assert np.any(torques_from(log, ENABLED_CYCLE)[:700] != 0)
+    assert np.count_nonzero(torques_from(log, TROUBLE_CYCLE + 3)) == 0
+    assert set(controlwords(log)[TROUBLE_CYCLE + 4 : -21].tolist()) == {QUICK_STOP}
+
+
+def test_a_fault_is_latched_though_the_data_come_back(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    gap = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 20)
+    rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle in gap else data
+    _, log = rig.run()
+    assert set(log.scheme["state"][TROUBLE_CYCLE + 3 :].tolist()) == {int(SchemeState.FAULT)}
+
+
+def test_two_lost_torque_frames_are_forgiven(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    gap = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 2)
+    rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle in gap else data
+    summary, _ = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
+
+
+def test_corrupted_torque_frames_count_as_lost_and_change_no_value(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+
+    def corrupt(cycle: int, can_id: int, data: bytes) -> bytes:
+        is_hit = can_id == 0x183 and cycle == TROUBLE_CYCLE
+        return bytes((*data[:5], data[5] ^ 0x40)) if is_hit else data
+
+    rig.tamper = corrupt
+    _, log = rig.run()
+    assert log.cycle["frames_missing"][TROUBLE_CYCLE] == 1
+    (tally,) = [entry.event.message for entry in log.events if entry.event.message.startswith("Sensor1: ")][-1:]
+    assert "1 WRONG_CRC" in tally
+    assert "1 OK_SOME_LOST" in tally
+    assert log.scheme["tau_J"][TROUBLE_CYCLE][0] == log.scheme["tau_J"][TROUBLE_CYCLE - 1][0]
+
+
+def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, finish_s=30.0)
+    rig.in_cycle[TROUBLE_CYCLE] = rig.session.interrupt
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.is_interrupted
+    assert set(controlwords(log)[300:-20].tolist()) == {ENABLE_OPERATION}
+    np.testing.assert_allclose(np.degrees(log.scheme["q"][-1]), [-30.0, -60.0], atol=1.0)
+
+
+def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, finish_s=30.0)
+    rig.in_cycle[TROUBLE_CYCLE] = rig.session.interrupt
+    rig.in_cycle[TROUBLE_CYCLE + 50] = rig.session.interrupt
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.cycles < TROUBLE_CYCLE + 50 + 30
+    assert set(controlwords(log)[-20:].tolist()) == {QUICK_STOP}
+
+
+def test_an_arm_that_moves_before_it_is_enabled_is_never_enabled(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    feedback = CODEC.message("Drive1Feedback")
+
+    def push(cycle: int, can_id: int, data: bytes) -> bytes:
+        if can_id != 0x181:
+            return data
+        position, _ = feedback.decode_values(data)
+        return bytes(feedback.encode(position, 0.2))
+
+    rig.tamper = push
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.COMMISSION_TIMEOUT
+    assert ENABLE_OPERATION not in controlwords(log)
+
+
+def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bench.on_frame(Frame(0x000, bytes((0x80, 1)), 0))  # NMT to drive 1
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault in (FaultReason.DRIVE, FaultReason.DATA_AGE)
+    assert any(entry.event.name == "Drive1" and "EMCY 0x8100" in entry.event.message for entry in log.events)

@@ -1,0 +1,140 @@
+"""Drives and sensors joined into one arm."""
+
+import numpy as np
+import pytest
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.config import Settings, parse
+from adacd_hil.device.arm import Arm
+from adacd_hil.records import ArmCommand, FaultReason
+from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.e2e import E2eSender
+
+CODEC = load_codec()
+
+
+class Devices:
+    """Answers with what a test wants, and keeps what the host sent."""
+
+    def __init__(self, arm_table: dict[str, object] | None = None) -> None:
+        self.sent: list[Frame] = []
+        bus = EmbeddedBus(VirtualClock())
+        bus.attach(self.sent.append)
+        self.arm = Arm(parse(Settings, {"arm": arm_table or {}}), CODEC, bus)
+        self._senders: dict[str, E2eSender] = {n: CODEC.message(n).sender() for n in ("Sensor1Torque", "Sensor2Torque")}
+
+    def send(self, name: str, *values: float) -> None:
+        frame = CODEC.message(name).encode(*values)
+        data = self._senders[name].protect(frame) if name in self._senders else bytes(frame)
+        self.arm.accept(Frame(CODEC.message(name).can_id, data, 0))
+
+    def answer(self, without: tuple[str, ...] = ()) -> None:
+        values = {
+            "Drive1Feedback": (0.1, 0.01),
+            "Drive2Feedback": (-0.2, -0.02),
+            "Sensor1Torque": (1.5,),
+            "Sensor2Torque": (-2.5,),
+        }
+        for name in values.keys() - set(without):
+            self.send(name, *values[name])
+
+    def enable(self) -> None:
+        for name in ("Drive1Status", "Drive2Status"):
+            self.send(name, 0x0237, 10, 0, 0)
+
+
+def test_a_cycle_is_complete_when_all_four_frames_are_in() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    assert devices.arm.state().is_complete
+
+
+@pytest.mark.parametrize("missing", ["Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque"])
+def test_a_missing_frame_makes_the_cycle_incomplete_and_is_named(missing: str) -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer(without=(missing,))
+    assert devices.arm.missing_names() == [missing.removesuffix("Feedback").removesuffix("Torque")]
+
+
+def test_values_arrive_in_joint_order() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    state = devices.arm.state()
+    np.testing.assert_allclose([*state.q, *state.dq, *state.tau_J], [0.1, -0.2, 0.01, -0.02, 1.5, -2.5], atol=3e-6)
+
+
+def test_sign_and_offset_are_applied_here_and_only_here() -> None:
+    devices = Devices({"sign": [1, -1], "torque_offset_Nm": [0.5, 0.25]})
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    state = devices.arm.state()
+    np.testing.assert_allclose([*state.q, *state.dq, *state.tau_J], [0.1, 0.2, 0.01, 0.02, 1.0, 2.25], atol=3e-6)
+
+
+def test_ages_count_cycles_since_the_sample() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    devices.arm.synchronise(2, 0, 2)
+    devices.answer(without=("Drive2Feedback", "Sensor1Torque"))
+    state = devices.arm.state()
+    assert (state.age_q, state.age_tau_J, state.periods) == ((0, 2), (2, 0), 2)
+
+
+def test_a_frame_with_a_wrong_crc_counts_as_seen_but_changes_nothing() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer(without=("Sensor2Torque",))
+    devices.arm.accept(Frame(CODEC.message("Sensor2Torque").can_id, bytes(6), 0))
+    assert (devices.arm.has_all_frames, devices.arm.is_complete, devices.arm.missing_frames) == (True, False, 1)
+
+
+def test_the_sync_counter_runs_from_1_to_240() -> None:
+    devices = Devices()
+    for cycle in (0, 239, 240, 481):
+        devices.arm.synchronise(cycle, 0, 1)
+    assert [frame.data[0] for frame in devices.sent] == [1, 240, 1, 2]
+
+
+def test_torque_goes_out_per_mille_of_rated_torque_with_the_joints_sign() -> None:
+    devices = Devices({"sign": [1, -1], "rated_torque_Nm": [12.0, 6.0]})
+    devices.enable()
+    devices.arm.write(ArmCommand(np.array((3.0, 1.5)), enable=True, quick_stop=False))
+    values = [CODEC.by_id[frame.can_id].decode_values(frame.data) for frame in devices.sent]
+    assert values == [(15.0, 250.0), (15.0, -250.0)]
+
+
+def test_both_drives_must_be_enabled() -> None:
+    devices = Devices()
+    devices.send("Drive1Status", 0x0237, 10, 0, 0)
+    assert not devices.arm.state().is_enabled
+
+
+def test_a_drive_that_drops_out_is_a_fault() -> None:
+    devices = Devices()
+    devices.enable()
+    devices.arm.state()
+    devices.send("Drive2Status", 0x0218, 10, 0, 0x8250)
+    assert devices.arm.state().fault is FaultReason.DRIVE
+
+
+def test_a_drive_that_was_never_enabled_has_not_dropped_out() -> None:
+    devices = Devices()
+    devices.send("Drive2Status", 0x0218, 10, 0, 0x8250)
+    assert devices.arm.state().fault is FaultReason.NONE
+
+
+def test_a_sensor_that_says_its_value_is_not_valid_is_a_fault() -> None:
+    devices = Devices()
+    devices.send("Sensor1Status", 1, 0)
+    assert devices.arm.state().fault is FaultReason.SENSOR
+
+
+def test_faults_are_described_with_the_device_and_its_code() -> None:
+    devices = Devices()
+    devices.send("Drive2Status", 0x0218, 10, 0, 0x8250)
+    assert devices.arm.describe_faults() == ["Drive2: FAULT, error code 0x8250"]

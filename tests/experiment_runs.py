@@ -1,0 +1,85 @@
+"""Plays experiments for the tests: in one process, and as two processes on a bus."""
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+BIN = Path(sys.executable).parent
+LIMIT_S = 280
+
+
+@dataclass(frozen=True)
+class Played:
+    """A command that has ended."""
+
+    folder: Path
+    status: int
+    stdout: str
+    stderr: str
+
+    @property
+    def json(self) -> Any:
+        """What it printed, with --json."""
+        return json.loads(self.stdout)
+
+    @property
+    def log(self) -> Path:
+        return self.folder / "run.mcap"
+
+    @property
+    def error_lines(self) -> list[str]:
+        """What it complained about."""
+        return [line for line in self.stderr.splitlines() if line.startswith(("adacd-hil:", "firmware-sim:"))]
+
+
+def adacd_hil(folder: Path, *arguments: str) -> Played:
+    """Run `adacd-hil` with its output in `folder` where the command takes one."""
+    done = subprocess.run(
+        [BIN / "adacd-hil", *arguments], capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=folder
+    )
+    return Played(folder, done.returncode, done.stdout, done.stderr)
+
+
+def demo(folder: Path, *arguments: str) -> Played:
+    """Play the experiment in one process."""
+    return adacd_hil(folder, "demo", "--out", str(folder), "--json", *arguments)
+
+
+@contextlib.contextmanager
+def emulator(folder: Path, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
+    """Run `firmware-sim` on vcan while the block lasts; it is ready when the block begins."""
+    command = [BIN / "firmware-sim", "run", "-i", "socketcan", "-c", "vcan0", "--out", str(folder), *arguments]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            for line in process.stderr:
+                if line.strip() == "ready":
+                    break
+            yield process
+        finally:
+            process.terminate()
+            process.communicate(timeout=30)
+
+
+def run_on_vcan(folder: Path, *arguments: str) -> Played:
+    """Run the host on vcan0."""
+    return adacd_hil(folder, "run", "-i", "socketcan", "-c", "vcan0", "--out", str(folder), "--json", *arguments)
+
+
+def run_while_killing(folder: Path, victim: "subprocess.Popen[str]", *arguments: str) -> Played:
+    """Run the host on vcan0 and kill the emulator as soon as the arm moves."""
+    command = [BIN / "adacd-hil", "run", "-i", "socketcan", "-c", "vcan0", "--out", folder, "--json", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder) as host:
+        assert host.stderr is not None
+        lines = []
+        for line in host.stderr:
+            lines.append(line)
+            if "-> ADAPT" in line:
+                victim.kill()
+        stdout, _ = host.communicate(timeout=LIMIT_S)
+    return Played(folder, host.returncode, stdout, "".join(lines))

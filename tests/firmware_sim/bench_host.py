@@ -1,0 +1,153 @@
+"""A host for tests of the emulated devices: frames by hand, SDO by canopen, virtual time, no threads."""
+
+import struct
+from functools import cache, cached_property
+from typing import Any
+
+import canopen
+import numpy as np
+
+from adacd_hil.config import parse
+from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec import contract_folder, load_codec
+from firmware_sim.bench import Bench
+from firmware_sim.scenario import Scenario
+
+CODEC = load_codec()
+EDS = {1: "drive.eds", 2: "drive.eds", 3: "torque_sensor.eds", 4: "torque_sensor.eds"}
+PERIOD_NS = 1_000_000
+START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
+SHUTDOWN, SWITCH_ON, ENABLE = 0x06, 0x07, 0x0F
+DISABLE_VOLTAGE, QUICK_STOP, FAULT_RESET = 0x00, 0x02, 0x80
+
+
+def quiet_scenario(**changes: Any) -> Scenario:
+    """Nobody touches the arm; no noise unless asked for."""
+    return parse(Scenario, {"name": "test", "noise": False} | changes)
+
+
+@cache
+def _dictionary(node: int) -> canopen.ObjectDictionary:
+    """Read the EDS of a node; the client's side never changes it."""
+    return canopen.import_od(str(contract_folder() / EDS[node]), node)
+
+
+class _ClientNetwork(canopen.Network):
+    """Delivers to the bench and feeds its replies back before `send_message` returns."""
+
+    def __init__(self, host: "BenchHost") -> None:
+        super().__init__()
+        self._host = host
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        before = len(self._host.frames)
+        self._host.put(can_id, data)
+        for reply_id, reply in self._host.frames[before:]:
+            self.notify(reply_id, bytearray(reply), 0.0)
+
+
+class BenchHost:
+    """Host's end of a bench. `frames`: everything the devices sent, oldest first."""
+
+    def __init__(self, scenario: Scenario | None = None, clock_mode: str = "sync", seed: int | None = None) -> None:
+        self.frames: list[tuple[int, bytes]] = []
+        self.truths: list[tuple[int, int, np.ndarray]] = []
+        self.bench = Bench(
+            scenario or quiet_scenario(),
+            CODEC,
+            lambda can_id, data: self.frames.append((can_id, data)),
+            clock_mode=clock_mode,
+            seed=seed,
+            on_truth=lambda cycle, t_ns, block: self.truths.append((cycle, t_ns, block.copy())),
+        )
+        self.t_ns = 0
+        self.cycle = 0
+        self.senders = {joint: CODEC.message(f"Drive{joint}Command").sender() for joint in (1, 2)}
+        self.bench.boot()
+
+    @cached_property
+    def nodes(self) -> dict[int, canopen.RemoteNode]:
+        """canopen's own view of the devices."""
+        network = _ClientNetwork(self)
+        return {n: network.add_node(n, _dictionary(n)) for n in EDS}
+
+    def put(self, can_id: int, data: bytes) -> None:
+        self.bench.on_frame(Frame(can_id, bytes(data), self.t_ns))
+
+    def take(self) -> list[tuple[int, bytes]]:
+        """Return what came since the last call."""
+        taken = self.frames[:]
+        self.frames.clear()
+        return taken
+
+    def taken(self, can_id: int) -> list[bytes]:
+        """Return the frames with one identifier that came since the last `take`, and take everything."""
+        return [data for got_id, data in self.take() if got_id == can_id]
+
+    def nmt(self, command: int, node: int = 0) -> None:
+        self.put(0x000, bytes([command, node]))
+
+    def read(self, node: int, index: int, sub: int = 0) -> int:
+        data = self.nodes[node].sdo.upload(index, sub)
+        variable = self.nodes[node].object_dictionary.get_variable(index, sub)
+        return variable.decode_raw(data)
+
+    def write(self, node: int, index: int, sub: int, value: int) -> None:
+        variable = self.nodes[node].object_dictionary.get_variable(index, sub)
+        self.nodes[node].sdo.download(index, sub, variable.encode_raw(value))
+
+    def abort_code(self, action: Any) -> int:
+        """Run an SDO transfer that must be aborted; return the code."""
+        try:
+            action()
+        except canopen.SdoAbortedError as error:
+            return error.code
+        raise AssertionError("the transfer was not aborted")
+
+    def command_frame(self, joint: int, controlword: int, target: int = 0) -> bytes:
+        """Make the next protected command frame of a joint."""
+        return self.senders[joint].protect(bytearray(2) + struct.pack("<Hh", controlword, target))
+
+    def command(self, controlword: int, target: int = 0, joints: tuple[int, ...] = (1, 2)) -> None:
+        for joint in joints:
+            self.put(0x200 + joint, self.command_frame(joint, controlword, target))
+
+    def sync(self) -> None:
+        """Send the next SYNC; time moves by one period."""
+        self.t_ns += PERIOD_NS
+        self.put(0x080, bytes([1 + self.cycle % 240]))
+        self.cycle += 1
+
+    def step(self, controlword: int, target: int = 0, joints: tuple[int, ...] = (1, 2)) -> None:
+        """Command, then SYNC, so that the command acts at this SYNC."""
+        self.command(controlword, target, joints)
+        self.sync()
+
+    def start(self, mode: int = 10) -> None:
+        """Choose the mode and enter Operational."""
+        for joint in (1, 2):
+            self.write(joint, 0x6060, 0, mode)
+        self.nmt(START)
+
+    def enable(self, mode: int = 10) -> None:
+        """Bring both drives to Operation enabled."""
+        self.start(mode)
+        for controlword in (SHUTDOWN, SWITCH_ON, ENABLE):
+            self.step(controlword)
+
+    def statusword(self, joint: int = 1) -> int:
+        return self.read(joint, 0x6041)
+
+    def state_bits(self, joint: int = 1) -> int:
+        """The statusword's bits that name the state, bit 5 (quick stop) included."""
+        return self.statusword(joint) & 0x6F
+
+    def true(self, name: str) -> np.ndarray:
+        """A field of the latest truth block."""
+        return self.truths[-1][2][TRUTH_LAYOUT.slices[name]]
+
+    def wait_until_at_rest(self, controlword: int = ENABLE) -> None:
+        """Send SYNCs until a braking drive has surely finished."""
+        for _ in range(1100):
+            self.step(controlword)

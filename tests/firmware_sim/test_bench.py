@@ -1,0 +1,339 @@
+"""The bench: order within a cycle, time, lost SYNCs, resets, determinism, and the contract's two descriptions."""
+
+import cantools
+import numpy as np
+import pytest
+from bench_host import (
+    CODEC,
+    DISABLE_VOLTAGE,
+    EDS,
+    ENABLE,
+    FAULT_RESET,
+    PERIOD_NS,
+    RESET_COMMUNICATION,
+    START,
+    BenchHost,
+    quiet_scenario,
+)
+from test_object_dictionary import default_of, eds_rows
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.codec import contract_folder
+from firmware_sim.bench import Bench
+
+TWITCH = [{"at_s": 0.02, "link": 2, "point_m": 0.3, "force_N": 20.0, "duration_s": 0.02}]
+DATABASE = cantools.database.load_file(contract_folder() / "arm.dbc")
+
+
+def play(host: BenchHost, cycles: int = 300) -> None:
+    """Enable and move; the targets depend on the cycle only."""
+    host.enable()
+    for k in range(cycles):
+        host.step(ENABLE, round(80 * np.sin(0.05 * k)))
+
+
+PDOS = [(1, 0x1400), (1, 0x1800), (1, 0x1801), (2, 0x1400), (2, 0x1800), (2, 0x1801)]
+PDOS += [(3, 0x1800), (3, 0x1801), (4, 0x1800), (4, 0x1801)]
+
+
+@pytest.mark.parametrize(("node", "record"), PDOS)
+def test_dbc_layout_and_eds_mapping_agree(node, record):
+    values = {(index, sub): default_of(default, node) for index, sub, _, default in eds_rows(node)}
+    types = _data_types(node)
+    message = DATABASE.get_message_by_frame_id(values[record, 1])
+    mapped = []
+    start = 0
+    for sub in range(1, values[record + 0x200, 0] + 1):
+        entry = values[record + 0x200, sub]
+        index, object_sub, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
+        assert types[index, object_sub][0] == bits
+        mapped.append((start, bits, types[index, object_sub][1]))
+        start += bits
+    assert message.length * 8 == start
+    signals = sorted(message.signals, key=lambda signal: signal.start)
+    laid_out = [(signal.start, signal.length, signal.is_signed) for signal in signals]
+    if any(signal.name == "e2e_counter" for signal in signals):
+        # One mapped byte (0x2100:2) holds both nibbles.
+        assert laid_out[1:3] == [(8, 4, False), (12, 4, False)]
+        laid_out[1:3] = [(8, 8, False)]
+    assert laid_out == mapped
+
+
+def _data_types(node: int) -> dict[tuple[int, int], tuple[int, bool]]:
+    """Map objects to (bits, is signed) by their CiA 301 data type."""
+    import configparser
+
+    sizes = {2: (8, True), 3: (16, True), 4: (32, True), 5: (8, False), 6: (16, False), 7: (32, False)}
+    parser = configparser.ConfigParser()
+    parser.read(contract_folder() / EDS[node])
+    types = {}
+    for section in parser.sections():
+        index, _, sub = section.partition("sub")
+        if len(index) == 4 and int(parser[section].get("DataType", "9"), 16) in sizes:
+            types[int(index, 16), int(sub or "0", 16)] = sizes[int(parser[section]["DataType"], 16)]
+    return types
+
+
+def test_a_sync_is_answered_by_feedback_and_torque_with_identifiers_ascending():
+    host = BenchHost()
+    play(host, 20)
+    host.take()
+    host.sync()
+    assert [can_id for can_id, _ in host.take()] == [0x181, 0x182, 0x183, 0x184]
+
+
+def test_the_cyclic_frames_come_last_so_that_a_host_in_lockstep_has_everything():
+    host = BenchHost()
+    play(host, 5)
+    host.take()
+    host.step(DISABLE_VOLTAGE)
+    assert [can_id for can_id, _ in host.take()] == [0x281, 0x282, 0x181, 0x182, 0x183, 0x184]
+
+
+def test_truth_comes_every_cycle_with_its_number_and_the_syncs_time():
+    host = BenchHost()
+    play(host, 500)
+    assert [cycle for cycle, _, _ in host.truths] == list(range(503))
+    assert [t_ns for _, t_ns, _ in host.truths] == [(k + 1) * PERIOD_NS for k in range(503)]
+
+
+def test_scenario_time_starts_when_both_drives_are_first_enabled():
+    host = BenchHost(quiet_scenario(contacts=TWITCH))
+    host.start()
+    for controlword in (0x06, 0x07, 0x0F):
+        host.step(controlword, joints=(1,))
+    assert not host.bench.is_scenario_started
+    for controlword in (0x06, 0x07, 0x0F):
+        host.command(ENABLE, joints=(1,))
+        host.command(controlword, joints=(2,))
+        host.sync()
+    assert host.bench.is_scenario_started
+    enabled_at = host.truths[-1][0]
+    for _ in range(30):
+        host.step(ENABLE)
+    touched = [cycle for cycle, _, _ in host.truths if _field(host, cycle, "contact_force") > 0.0]
+    assert touched[0] == enabled_at + 20
+
+
+def _field(host: BenchHost, cycle: int, name: str) -> float:
+    from adacd_hil.records import TRUTH_LAYOUT
+
+    return float(host.truths[cycle][2][TRUTH_LAYOUT.slices[name]][0])
+
+
+def test_by_sync_the_arm_moves_one_period_per_sync_however_long_it_takes():
+    quick, slow = BenchHost(), BenchHost()
+    play(quick)
+    slow.put = lambda can_id, data: slow.bench.on_frame(Frame(can_id, bytes(data), slow.t_ns * 977))  # type: ignore
+    play(slow)
+    assert quick.frames == slow.frames
+    assert quick.bench.now_ns == 302 * PERIOD_NS
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_a_lost_sync_keeps_the_arms_time(lost):
+    whole, holed = BenchHost(), BenchHost()
+    for host in (whole, holed):
+        play(host, 100)
+        host.step(ENABLE, 50)
+    for _ in range(lost + 1):
+        whole.sync()
+    holed.cycle += lost
+    holed.sync()
+    assert holed.bench.cycle == whole.bench.cycle
+    assert np.array_equal(holed.truths[-1][2], whole.truths[-1][2])
+    assert holed.bench.now_ns == whole.bench.now_ns
+
+
+def test_lost_syncs_count_as_syncs_without_command():
+    host = BenchHost()
+    play(host, 100)
+    host.cycle += 3
+    host.sync()
+    assert host.read(1, 0x603F) == 0x8250
+
+
+def test_a_repeated_sync_is_ignored():
+    host = BenchHost()
+    play(host, 10)
+    host.take()
+    host.put(0x080, bytes([1 + (host.cycle - 1) % 240]))
+    assert host.take() == []
+    assert len(host.truths) == 13
+
+
+def test_the_counter_is_unwrapped_over_its_overflow():
+    host = BenchHost()
+    for _ in range(1000):
+        host.sync()
+    assert host.bench.cycle == 999
+
+
+def test_a_sync_without_counter_is_the_next_cycle():
+    host = BenchHost()
+    for _ in range(5):
+        host.put(0x080, b"")
+    assert host.bench.cycle == 4
+
+
+def test_reset_communication_begins_a_new_count_of_cycles_and_leaves_the_arm_where_it_is():
+    host = BenchHost()
+    play(host, 100)
+    position = host.true("q").copy()
+    host.nmt(RESET_COMMUNICATION)
+    host.cycle = 0
+    host.sync()
+    assert host.bench.cycle == 0
+    assert host.truths[-1][0] == 0
+    assert np.abs(host.true("q") - position).max() < 0.01
+    assert np.abs(position).max() > 0.01
+
+
+def test_a_first_sync_that_is_lost_does_not_shift_the_count():
+    host = BenchHost()
+    host.cycle = 1
+    host.sync()
+    assert host.bench.cycle == 1
+
+
+def test_another_period_takes_effect_before_the_arm_has_moved():
+    host, reference = BenchHost(), BenchHost()
+    for node in (1, 2, 3, 4):
+        host.write(node, 0x1006, 0, 2000)
+    host.enable()
+    reference.enable()
+    for _ in range(50):
+        host.step(ENABLE, 50)
+    for _ in range(100):
+        reference.step(ENABLE, 50)
+    assert host.bench.now_ns == 52 * 2 * PERIOD_NS
+    assert host.true("dq")[0] == pytest.approx(reference.true("dq")[0], rel=0.05)
+
+
+def test_a_second_host_with_the_same_period_finds_the_arm_where_the_first_left_it():
+    host = BenchHost()
+    host.write(1, 0x1006, 0, 2000)
+    play(host, 50)
+    position = host.true("q").copy()
+    host.nmt(RESET_COMMUNICATION)
+    assert host.read(1, 0x1006) == 1000
+    host.write(1, 0x1006, 0, 2000)
+    host.sync()
+    assert np.abs(host.true("q") - position).max() < 0.02
+    assert np.abs(position).max() > 0.02
+
+
+def test_a_second_host_that_leaves_the_default_period_begins_with_the_arm_as_at_power_on():
+    host = BenchHost()
+    host.write(1, 0x1006, 0, 2000)
+    play(host, 50)
+    host.nmt(RESET_COMMUNICATION)
+    host.cycle = 0
+    host.sync()
+    assert host.true("q").tolist() == [0.0, 0.0]
+    now_ns = host.bench.now_ns
+    host.sync()
+    assert host.bench.now_ns == now_ns + PERIOD_NS
+
+
+@pytest.mark.parametrize("counter", [241, 255])
+def test_a_sync_counter_beyond_its_overflow_is_ignored(counter):
+    host = BenchHost()
+    host.take()
+    host.nmt(START)
+    host.take()
+    host.put(0x080, bytes([counter]))
+    assert host.take() == []
+    assert host.bench.cycle == -1
+
+
+def test_another_period_is_refused_once_the_arm_has_moved():
+    host = BenchHost()
+    host.sync()
+    assert host.abort_code(lambda: host.write(1, 0x1006, 0, 2000)) == 0x08000022
+    host.write(1, 0x1006, 0, 1000)
+
+
+def test_by_wall_clock_the_arm_moves_without_sync_and_a_sync_samples_it():
+    contact = [{"at_s": 0.0, "link": 2, "point_m": 0.3, "force_N": 20.0, "duration_s": 1.0}]
+    host = BenchHost(quiet_scenario(contacts=contact), clock_mode="wall")
+    host.enable()
+    host.t_ns += 20 * PERIOD_NS
+    host.bench.advance_to(host.t_ns)
+    host.put(0x080, bytes([1 + host.cycle]))
+    assert host.true("dq")[1] > 0.1
+    assert host.truths[-1][1] == host.t_ns
+
+
+def test_by_wall_clock_a_sync_that_waited_in_the_queue_is_no_lost_sync():
+    host = BenchHost(clock_mode="wall")
+    host.enable()
+    host.command(ENABLE)
+    host.t_ns += 5 * PERIOD_NS
+    host.put(0x080, bytes([1 + host.cycle]))
+    assert host.read(1, 0x603F) == 0
+
+
+def test_by_wall_clock_lost_syncs_do_not_move_the_arm_twice():
+    host = BenchHost(clock_mode="wall")
+    host.enable()
+    host.cycle += 2
+    host.step(ENABLE)
+    assert host.bench.now_ns == host.t_ns
+    assert host.bench.cycle == 5
+
+
+def run_twice_over() -> tuple[list[tuple[int, bytes]], list[bytes]]:
+    host = BenchHost(quiet_scenario(noise=True, contacts=TWITCH), seed=3)
+    for node in (1, 2, 3, 4):
+        host.write(node, 0x1017, 0, 10)
+    play(host, 400)
+    host.nmt(RESET_COMMUNICATION)
+    host.start()
+    host.cycle = 0
+    for controlword in (FAULT_RESET, 0x06, 0x07, 0x0F, 0x0F):
+        host.step(controlword)
+    return host.frames, [block.tobytes() for _, _, block in host.truths]
+
+
+def test_the_same_inputs_give_the_same_frames_and_the_same_truth_bit_for_bit():
+    first_frames, first_truths = run_twice_over()
+    second_frames, second_truths = run_twice_over()
+    assert len(first_frames) > 1800
+    assert first_frames == second_frames
+    assert first_truths == second_truths
+
+
+def test_another_seed_gives_other_noise():
+    torques = []
+    for seed in (1, 2):
+        host = BenchHost(quiet_scenario(noise=True), seed=seed)
+        host.nmt(START)
+        host.take()
+        host.sync()
+        torques.append(host.taken(0x183)[0][2:])
+    assert torques[0] != torques[1]
+
+
+def test_on_the_embedded_bus_the_answers_are_there_when_send_returns():
+    bus = EmbeddedBus(VirtualClock())
+    bench = Bench(quiet_scenario(), CODEC, bus.deliver)
+    bus.attach(bench.on_frame)
+    bench.boot()
+    bus.send(0x000, bytes([START, 0]))
+    bus.send(0x080, b"\x01")
+    received = []
+    while (frame := bus.receive(0.0)) is not None:
+        received.append(frame.can_id)
+    assert received[:4] == [0x701, 0x702, 0x703, 0x704]
+    assert received[-6:] == [0x283, 0x284, 0x181, 0x182, 0x183, 0x184]
+
+
+def test_error_frames_and_strangers_frames_are_ignored():
+    host = BenchHost()
+    host.take()
+    host.bench.on_frame(Frame(0x080, b"\x01", 0, is_error=True))
+    host.put(0x7E5, bytes(8))
+    assert host.take() == []
+    assert host.bench.cycle == -1

@@ -1,0 +1,288 @@
+"""The emulator's command line: bad input, serving frames and time, how it ends."""
+
+import itertools
+import json
+import signal
+import subprocess
+import sys
+from collections import deque
+from pathlib import Path
+
+import pytest
+from bench_host import CODEC, ENABLE, RESET_COMMUNICATION, START, STOP, BenchHost, quiet_scenario
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.wire.bus import Frame
+from firmware_sim.bench import Bench
+from firmware_sim.main import EPILOG, Service, StopRequest, main
+
+SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
+
+
+def run_main(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    return int(ended.value.code)
+
+
+BAD_TOML = {
+    "not TOML": "name = ",
+    "unknown key": "contact_forces = 3",
+    "wrong type": "payload_kg = 'heavy'",
+    "out of bounds": "payload_kg = -1.0",
+}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("run",), 2, "--interface"),
+        (("run", "-i", "socketcan"), 2, "--channel"),
+        (("rum",), 2, "rum"),
+        ((*SOCKETCAN, "--clock", "moon"), 2, "moon"),
+        ((*SOCKETCAN, "--profile", "X"), 2, "'X'"),
+        ((*SOCKETCAN, "--seed", "-1"), 2, "--seed"),
+        ((*SOCKETCAN, "--seed", "one"), 2, "--seed"),
+        ((*SOCKETCAN, "--scenario", "papper"), 2, "did you mean 'paper'"),
+        ((*SOCKETCAN, "--scenario", "missing.toml"), 2, "missing.toml"),
+        ((*SOCKETCAN, "--out", "/dev/null"), 2, "/dev/null"),
+        ((*SOCKETCAN, "--out", "/dev/null/runs"), 2, "/dev/null/runs"),
+        ((*SOCKETCAN, "--out", __file__), 2, "test_main.py"),
+        (SOCKETCAN, 5, "no_such_can0"),
+        (("run", "-i", "sockedcan", "-c", "can0"), 5, "did you mean 'socketcan'"),
+        (("run", "-i", "udp_multicast", "-c", "239.0.0.1"), 5, "echoes"),
+    ],
+)
+def test_bad_input_ends_with_one_line_and_its_exit_code(capsys, arguments, code, words):
+    assert run_main(*arguments) == code
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    assert printed.err.startswith("firmware-sim: ")
+    assert words in printed.err
+
+
+@pytest.mark.parametrize("kind", BAD_TOML)
+def test_a_bad_scenario_file_ends_with_one_line(capsys, tmp_path, kind):
+    path = tmp_path / "scenario.toml"
+    path.write_text(BAD_TOML[kind])
+    assert run_main(*SOCKETCAN, "--scenario", str(path)) == 2
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert "scenario.toml" in printed
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("run", "--help")])
+def test_help_documents_the_exit_codes(capsys, arguments):
+    assert run_main(*arguments) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert EPILOG in printed
+    for code in ("0 ended", "1 failure", "2 wrong usage", "5 bus missing"):
+        assert code in EPILOG
+
+
+def test_no_arguments_show_the_help_as_wrong_usage(capsys):
+    assert run_main() == 2
+    assert "Usage: firmware-sim" in capsys.readouterr().err
+
+
+class ScriptedBus:
+    """A bus whose frames come at scripted times of a virtual clock; the end of the script stops the service."""
+
+    channel = "scripted"
+
+    def __init__(self, clock: VirtualClock, stop: StopRequest, end_ns: int) -> None:
+        self.sent: list[tuple[int, int, bytes]] = []
+        self.script: deque[tuple[int, int, bytes]] = deque()
+        self.stall_at_ns = -1  # the process is held up for 5 ms when it takes the frame of this time
+        self._clock = clock
+        self._stop = stop
+        self._end_ns = end_ns
+
+    def send(self, can_id: int, data: bytes) -> None:
+        self.sent.append((self._clock.now_ns(), can_id, data))
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        if self.script and self.script[0][0] <= until_ns:
+            t_ns, can_id, data = self.script.popleft()
+            self._clock.sleep_until_ns(t_ns)
+            if t_ns == self.stall_at_ns:
+                self._clock.sleep_until_ns(t_ns + 5 * MS)
+            return Frame(can_id, data, self._clock.now_ns())
+        self._clock.sleep_until_ns(until_ns)
+        if self._clock.now_ns() >= self._end_ns:
+            self._stop.make()
+        return None
+
+    def close(self) -> None:
+        pass
+
+
+MS = 1_000_000
+
+
+def serve(
+    script: list[tuple[int, int, bytes]],
+    end_ms: int,
+    clock_mode: str = "sync",
+    is_once: bool = False,
+    stall_at_ms: int = -1,
+) -> tuple[ScriptedBus, Bench, VirtualClock]:
+    clock, stop = VirtualClock(), StopRequest()
+    bus = ScriptedBus(clock, stop, end_ms * MS)
+    bench = Bench(quiet_scenario(), CODEC, bus.send, clock_mode=clock_mode)
+    service = Service(bench, bus, clock, clock_mode, stop, is_once)
+    service.boot()
+    bus.stall_at_ns = stall_at_ms * MS
+    bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in script)
+    service.run()
+    return bus, bench, clock
+
+
+HEARTBEAT_100_MS = (0x601, bytes([0x2B, 0x17, 0x10, 0, 100, 0, 0, 0]))
+START_ALL = (0x000, bytes([START, 0]))
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_heartbeats_come_by_the_clock_while_no_sync_does(clock_mode):
+    bus, _, _ = serve([(0, *HEARTBEAT_100_MS)], 1000, clock_mode)
+    beats = [t_ns for t_ns, can_id, data in bus.sent if can_id == 0x701 and data == b"\x7f"]
+    assert len(beats) in (9, 10)
+    assert max(later - earlier for earlier, later in itertools.pairwise(beats)) <= 111 * MS
+
+
+def test_by_sync_a_steady_sync_alone_moves_the_benchs_time():
+    script = [(0, *START_ALL), *((k, 0x080, bytes([1 + k % 240])) for k in range(500))]
+    _, bench, _ = serve(script, 500)
+    assert bench.cycle == 499
+    assert bench.now_ns == 499 * MS + 10 * MS  # and one idle wait at the end
+
+
+def enabling_script(cycles: int) -> list[tuple[int, int, bytes]]:
+    """Make what a host sends to enable the drives and keep them so: a cycle every ms from 1 ms on."""
+    host = BenchHost()  # for its frames only
+    script = [(0, *START_ALL)]
+    for joint in (1, 2):
+        script.append((0, 0x600 + joint, bytes([0x2F, 0x60, 0x60, 0, 10, 0, 0, 0])))
+    for k in range(cycles):
+        controlword = (0x06, 0x07, 0x0F)[min(k, 2)]
+        script.extend((k + 1, 0x200 + joint, host.command_frame(joint, controlword, 0)) for joint in (1, 2))
+        script.append((k + 1, 0x080, bytes([1 + k])))
+    return script
+
+
+def test_by_wall_clock_frames_that_wait_while_the_process_is_held_up_are_no_silence():
+    bus, _, _ = serve(enabling_script(50), 51, "wall", stall_at_ms=30)
+    emergencies = [(t_ns, can_id) for t_ns, can_id, _ in bus.sent if can_id in (0x081, 0x082)]
+    assert emergencies == [(51_500_000, 0x081), (51_500_000, 0x082)]  # after the last SYNC, at 50 ms
+
+
+def test_by_wall_clock_a_host_that_goes_silent_faults_the_drives_within_two_periods():
+    bus, bench, _ = serve(enabling_script(5), 500, "wall")
+    emergencies = [(t_ns, can_id, data[:2]) for t_ns, can_id, data in bus.sent if can_id in (0x081, 0x082)]
+    assert emergencies == [(6_500_000, 0x081, b"\x00\x87"), (6_500_000, 0x082, b"\x00\x87")]
+    assert [drive.state.value for drive in bench.drives] == ["fault", "fault"]
+
+
+def test_frames_that_waited_since_before_power_on_are_dropped():
+    clock, stop = VirtualClock(), StopRequest()
+    bus = ScriptedBus(clock, stop, 50 * MS)
+    bench = Bench(quiet_scenario(), CODEC, bus.send)
+    bus.script.extend([(0, 0x080, b"\x05"), (0, *START_ALL)])
+    service = Service(bench, bus, clock, "sync", stop)
+    service.boot()
+    service.run()
+    assert bench.cycle == -1
+    assert not bench.is_operational
+
+
+@pytest.mark.parametrize("command", [STOP, RESET_COMMUNICATION])
+def test_once_ends_when_the_host_stops_or_resets_the_nodes(command):
+    script = [(100, 0x000, bytes([RESET_COMMUNICATION, 0])), (3000, *START_ALL), (3500, 0x000, bytes([command, 0]))]
+    _, _, clock = serve(script, 60_000, is_once=True)
+    assert 3500 * MS <= clock.now_ns() <= 3520 * MS
+
+
+def test_once_notices_a_host_that_starts_and_stops_without_a_pause():
+    script = [(100, *START_ALL), (101, 0x080, b"\x01"), (102, 0x000, bytes([STOP, 0]))]
+    _, _, clock = serve(script, 60_000, is_once=True)
+    assert clock.now_ns() <= 120 * MS
+
+
+def test_once_ends_two_seconds_after_the_last_word_of_a_host_that_started_the_nodes():
+    _, _, clock = serve([(3000, *START_ALL), (4000, 0x080, b"\x01")], 60_000, is_once=True)
+    assert 6000 * MS < clock.now_ns() <= 6020 * MS
+
+
+def test_without_once_a_silent_host_is_waited_for():
+    _, _, clock = serve([(0, *START_ALL)], 20_000)
+    assert clock.now_ns() >= 20_000 * MS
+
+
+def spawn(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "firmware_sim.main", "run", *arguments, "--out", str(folder), "--json"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+@pytest.mark.wallclock
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_with_exit_code_0_and_the_truth_log_closed(tmp_path, number):
+    process = spawn(tmp_path / "out", "-i", "virtual", "-c", "test", "--scenario", "idle")
+    try:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "ready\n"
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (0, "")
+    report = json.loads(out)
+    assert report["cycles"] == 0
+    truth = (tmp_path / "out" / "truth.mcap").read_bytes()
+    assert truth[:8] == truth[-8:] == b"\x89MCAP0\r\n"
+
+
+@pytest.mark.slow
+@pytest.mark.wallclock
+@pytest.mark.vcan
+def test_on_socketcan_it_answers_a_host_and_ends_with_it(tmp_path, vcan_channel):
+    from adacd_hil.clock import MonotonicClock
+    from adacd_hil.wire.bus import open_bus
+
+    clock = MonotonicClock()
+    process = spawn(tmp_path / "out", "-i", "socketcan", "-c", vcan_channel, "--once")
+    try:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "ready\n"
+        bus = open_bus("socketcan", vcan_channel, clock)
+        frames = BenchHost()
+        bus.send(*START_ALL)
+        seen = set()
+        for k in range(300):
+            for joint in (1, 2):
+                bus.send(0x200 + joint, frames.command_frame(joint, ENABLE))
+            bus.send(0x080, bytes([1 + k % 240]))
+            while (frame := bus.receive(0.002)) is not None:
+                seen.add(frame.can_id)
+        bus.send(0x000, bytes([STOP, 0]))
+        bus.close()
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (0, "")
+    assert {0x181, 0x182, 0x183, 0x184, 0x281, 0x282, 0x283, 0x284} <= seen
+    report = json.loads(out)
+    assert report["cycles"] == 300
+    assert report["messages"] == 300
+
+
+@pytest.fixture
+def vcan_channel() -> str:
+    from adacd_hil.wire.bus import can_interfaces
+
+    names = [name for name in can_interfaces() if name.startswith("vcan")]
+    if not names:
+        pytest.skip("no vcan interface; tools/with-vcan provides one")
+    return names[0]

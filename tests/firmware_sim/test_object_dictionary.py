@@ -1,0 +1,301 @@
+"""The devices' CANopen side, as canopen's own client and bare frames see it."""
+
+import configparser
+import random
+import struct
+
+import canopen
+import pytest
+from bench_host import (
+    CODEC,
+    EDS,
+    PRE_OPERATIONAL,
+    RESET_COMMUNICATION,
+    RESET_NODE,
+    START,
+    STOP,
+    BenchHost,
+)
+
+from adacd_hil.wire.codec import contract_folder
+from firmware_sim.object_dictionary import NmtState
+
+NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
+WRONG_LENGTH, VALUE_RANGE, NO_DATA = 0x06070010, 0x06090030, 0x08000024
+NOT_MAPPABLE, INCOMPATIBLE, CANNOT_STORE, DEVICE_STATE = 0x06040041, 0x06040043, 0x08000020, 0x08000022
+
+# What differs from the EDS default right after boot-up: live values.
+LIVE = {
+    (1, 0x2000, 1): CODEC.wire_version,
+    (1, 0x2000, 2): CODEC.layout_digest,
+    (1, 0x6041, 0): 0x0250,
+    (3, 0x2000, 1): CODEC.wire_version,
+    (3, 0x2000, 2): CODEC.layout_digest,
+    (3, 0x6150, 1): 1,
+}
+
+
+def eds_rows(node: int) -> list[tuple[int, int, str, str]]:
+    """Read index, sub-index, access and default of every variable of an EDS, without canopen."""
+    parser = configparser.ConfigParser()
+    parser.read(contract_folder() / EDS[node])
+    rows = []
+    for section in parser.sections():
+        index, _, sub = section.partition("sub")
+        if len(index) == 4 and "DataType" in parser[section]:
+            row = parser[section]
+            rows.append((int(index, 16), int(sub or "0", 16), row["AccessType"], row["DefaultValue"]))
+    return rows
+
+
+def default_of(text: str, node: int) -> int | str:
+    if text.startswith("$NODEID+"):
+        return node + int(text.removeprefix("$NODEID+"), 0)
+    try:
+        return int(text, 0)
+    except ValueError:
+        return text
+
+
+@pytest.fixture
+def host() -> BenchHost:
+    return BenchHost()
+
+
+@pytest.mark.parametrize("node", [1, 3])
+def test_every_listed_object_is_served_with_its_default_or_live_value(host, node):
+    rows = eds_rows(node)
+    assert len(rows) > 60
+    for index, sub, access, default in rows:
+        if access == "wo":
+            assert host.abort_code(lambda i=index, s=sub: host.read(node, i, s)) == WRITE_ONLY
+        elif index == 0x1003 and sub > 0:
+            assert host.abort_code(lambda i=index, s=sub: host.read(node, i, s)) == NO_DATA
+        else:
+            expected = LIVE.get((node, index, sub), default_of(default, node))
+            assert (index, sub, host.read(node, index, sub)) == (index, sub, expected)
+
+
+@pytest.mark.parametrize("node", [1, 3])
+def test_writing_back_what_was_read_is_accepted_for_every_writable_object(host, node):
+    for index, sub, access, default in eds_rows(node):
+        if access in ("rw", "rww") and (index, sub) != (0x1003, 0):
+            host.write(node, index, sub, default_of(default, node))
+            assert (index, sub, host.read(node, index, sub)) == (index, sub, default_of(default, node))
+
+
+def test_each_device_has_its_own_identity(host):
+    assert [host.read(node, 0x1018, 4) for node in (1, 2, 3, 4)] == [1, 2, 3, 4]
+    assert [host.read(node, 0x1018, 2) for node in (1, 2, 3, 4)] == [0x402, 0x402, 0x404, 0x404]
+
+
+@pytest.mark.parametrize(
+    ("node", "index", "sub", "code"),
+    [
+        (1, 0x1029, 0, NO_OBJECT),
+        (1, 0x6064, 1, NO_SUBINDEX),
+        (1, 0x1018, 5, NO_SUBINDEX),
+        (1, 0x1003, 5, NO_SUBINDEX),
+        (1, 0x1800, 4, NO_SUBINDEX),
+        (3, 0x6040, 0, NO_OBJECT),
+        (3, 0x9130, 2, NO_SUBINDEX),
+    ],
+)
+def test_reading_what_is_not_there_is_aborted(host, node, index, sub, code):
+    assert host.abort_code(lambda: host.nodes[node].sdo.upload(index, sub)) == code
+
+
+@pytest.mark.parametrize(
+    ("node", "index", "sub", "data", "code"),
+    [
+        (1, 0x1000, 0, b"\0\0\0\0", READ_ONLY),
+        (1, 0x6041, 0, b"\0\0", READ_ONLY),
+        (1, 0x6040, 0, b"\0", WRONG_LENGTH),
+        (1, 0x1006, 0, b"\0\0\0\0", VALUE_RANGE),
+        (1, 0x1006, 0, struct.pack("<I", 1050), VALUE_RANGE),
+        (1, 0x6060, 0, b"\x08", VALUE_RANGE),
+        (1, 0x6076, 0, struct.pack("<I", 11999), VALUE_RANGE),
+        (1, 0x605A, 0, struct.pack("<h", 3), VALUE_RANGE),
+        (1, 0x1400, 1, struct.pack("<I", 0x202), VALUE_RANGE),
+        (1, 0x1800, 2, b"\xff", VALUE_RANGE),
+        (1, 0x1A00, 1, struct.pack("<I", 0x60770010), NOT_MAPPABLE),
+        (1, 0x1A00, 0, b"\x01", INCOMPATIBLE),
+        (1, 0x1003, 0, b"\x01", VALUE_RANGE),
+        (1, 0x1014, 0, struct.pack("<I", 0x85), VALUE_RANGE),
+        (3, 0x6125, 1, b"nero", CANNOT_STORE),
+        (3, 0x6132, 1, b"\x03", VALUE_RANGE),
+    ],
+)
+def test_a_write_that_the_device_would_not_obey_is_aborted_and_changes_nothing(host, node, index, sub, data, code):
+    before = None if index == 0x6125 else host.nodes[node].sdo.upload(index, sub)
+    assert host.abort_code(lambda: host.nodes[node].sdo.download(index, sub, data)) == code
+    assert before is None or host.nodes[node].sdo.upload(index, sub) == before
+
+
+def test_all_devices_announce_themselves_at_power_on(host):
+    assert host.take() == [(0x701, b"\0"), (0x702, b"\0"), (0x703, b"\0"), (0x704, b"\0")]
+
+
+STATES = {START: 5, STOP: 4, PRE_OPERATIONAL: 127, RESET_NODE: 127, RESET_COMMUNICATION: 127}
+
+
+@pytest.mark.parametrize("first", STATES)
+@pytest.mark.parametrize("second", STATES)
+def test_every_nmt_command_leads_from_every_state_to_its_own(host, first, second):
+    host.nmt(first)
+    host.take()
+    host.nmt(second)
+    assert [device.state for device in host.bench.devices] == [STATES[second]] * 4
+    boot_ups = [can_id for can_id, _ in host.take() if can_id >= 0x700]
+    assert boot_ups == ([0x701, 0x702, 0x703, 0x704] if second in (RESET_NODE, RESET_COMMUNICATION) else [])
+
+
+def test_an_nmt_command_for_one_node_leaves_the_others_alone(host):
+    host.nmt(START, 3)
+    assert [device.state for device in host.bench.devices] == [127, 127, 5, 127]
+
+
+@pytest.mark.parametrize("data", [b"", b"\x01", b"\x01\x00\x00", b"\x07\x00"])
+def test_an_nmt_frame_that_makes_no_sense_changes_nothing(host, data):
+    host.put(0x000, data)
+    assert {device.state for device in host.bench.devices} == {NmtState.PRE_OPERATIONAL}
+
+
+def test_a_stopped_device_answers_no_sdo(host):
+    host.nmt(STOP)
+    host.take()
+    host.put(0x601, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]))
+    assert host.take() == []
+
+
+def test_heartbeats_come_by_bench_time_with_the_nmt_state(host):
+    host.write(1, 0x1017, 0, 100)
+    host.take()
+    host.bench.advance_to(99_999_999)
+    assert host.take() == []
+    host.bench.advance_to(100_000_000)
+    assert host.take() == [(0x701, b"\x7f")]
+    host.nmt(STOP)
+    host.bench.advance_to(450_000_000)
+    assert host.take() == [(0x701, b"\x04")] * 3
+
+
+def test_a_heartbeat_time_of_zero_ends_the_heartbeats(host):
+    host.write(1, 0x1017, 0, 100)
+    host.write(1, 0x1017, 0, 0)
+    host.take()
+    host.bench.advance_to(1_000_000_000)
+    assert host.take() == []
+
+
+def test_reset_communication_restores_the_communication_profile_only(host):
+    host.write(1, 0x1017, 0, 100)
+    host.write(1, 0x6072, 0, 500)
+    host.nmt(RESET_COMMUNICATION)
+    assert host.read(1, 0x1017) == 0
+    assert host.read(1, 0x6072) == 500
+    host.take()
+    host.bench.advance_to(1_000_000_000)
+    assert host.take() == []
+
+
+def test_reset_node_restores_everything(host):
+    host.write(1, 0x6072, 0, 500)
+    host.write(1, 0x6060, 0, 10)
+    host.nmt(RESET_NODE)
+    assert host.read(1, 0x6072) == 1000
+    assert host.read(1, 0x6061) == 0
+
+
+def test_another_masters_pdo_configuration_of_the_same_contract_is_accepted(host):
+    for node in (1, 3):
+        remote = host.nodes[node]
+        remote.tpdo.read()
+        remote.rpdo.read()
+        remote.tpdo.save()
+        remote.rpdo.save()
+    host.nmt(START)
+    host.take()
+    host.sync()
+    assert [can_id for can_id, _ in host.take()][-4:] == [0x181, 0x182, 0x183, 0x184]
+
+
+@pytest.mark.parametrize(("index", "sub", "off"), [(0x1800, 1, 0x80000181), (0x1A00, 0, 0)])
+def test_a_pdo_that_is_switched_off_is_not_sent_until_it_is_switched_on(host, index, sub, off):
+    on = host.read(1, index, sub)
+    host.nmt(START)
+    host.write(1, index, sub, off)
+    host.take()
+    host.sync()
+    assert host.taken(0x181) == []
+    host.write(1, index, sub, on)
+    host.take()
+    host.sync()
+    assert len(host.taken(0x181)) == 1
+
+
+def test_the_loss_of_the_masters_heartbeat_is_reported_and_ends_operational(host):
+    host.write(3, 0x1016, 1, (127 << 16) | 300)
+    host.nmt(START)
+    host.bench.advance_to(10_000_000_000)
+    assert host.bench.devices[2].is_operational  # monitoring begins with the first heartbeat
+    host.put(0x77F, b"\x05")
+    host.take()
+    host.bench.advance_to(10_299_999_999)
+    assert host.taken(0x083) == []
+    host.bench.advance_to(10_300_000_000)
+    assert host.taken(0x083) == [bytes([0x30, 0x81, 0x11, 0, 0, 0, 0, 0])]
+    assert host.bench.devices[2].state == NmtState.PRE_OPERATIONAL
+    assert host.read(3, 0x1001) == 0x11
+    assert host.read(3, 0x1003, 1) == 0x8130
+    host.put(0x77F, b"\x05")
+    assert host.taken(0x083) == [bytes(8)]
+    assert host.read(3, 0x1001) == 0
+
+
+def test_the_error_history_holds_the_last_four_newest_first_and_can_be_cleared(host):
+    device = host.bench.devices[0]
+    for code in (0x8130, 0x8250, 0x8700, 0x8100, 0x8210):
+        device.report_error(code, 0)
+    assert host.read(1, 0x1003, 0) == 4
+    assert [host.read(1, 0x1003, sub) for sub in (1, 2, 3, 4)] == [0x8210, 0x8100, 0x8700, 0x8250]
+    host.write(1, 0x1003, 0, 0)
+    assert host.read(1, 0x1003, 0) == 0
+
+
+def test_emergency_messages_keep_their_inhibit_time_and_none_is_lost(host):
+    host.write(1, 0x1015, 0, 50)
+    host.take()
+    for code in (0x8130, 0x8250, 0x8700):
+        host.bench.devices[0].report_error(code, 0)
+    sent = []
+    for t_ms in range(12):
+        host.bench._poll(t_ms * 1_000_000)
+        sent.extend((t_ms, struct.unpack_from("<H", data)[0]) for data in host.taken(0x081))
+    assert sent == [(0, 0x8130), (5, 0x8250), (10, 0x8700)]
+
+
+def test_a_stopped_device_sends_no_emergency_message(host):
+    host.nmt(STOP)
+    host.take()
+    host.bench.devices[0].report_error(0x8130, 0)
+    assert host.take() == []
+
+
+def test_no_sdo_frame_however_strange_breaks_the_server(host):
+    random_source = random.Random(7)
+    for _ in range(3000):
+        length = 8 if random_source.random() < 0.9 else random_source.randrange(8)
+        host.put(0x601, bytes(random_source.randrange(256) for _ in range(length)))
+    host.nmt(RESET_NODE)
+    assert host.read(1, 0x1018, 1) == 0x41444143
+
+
+def test_a_long_string_is_read_in_segments(host):
+    assert host.nodes[1].sdo.upload(0x1008, 0) == b"adacd-hil torque drive"
+
+
+def test_the_devices_need_no_thread(host):
+    with pytest.raises(RuntimeError, match="timers belong to the bench"):
+        host.bench.devices[0]._node.network.send_periodic(0x701, b"\x7f", 0.1)
+    assert isinstance(host.bench.devices[0]._node, canopen.LocalNode)

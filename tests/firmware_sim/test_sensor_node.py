@@ -1,0 +1,133 @@
+"""The emulated torque sensor: protected frames, status, zero; checked with cantools where it has an opinion."""
+
+import struct
+
+import cantools
+import numpy as np
+import pytest
+from bench_host import CODEC, ENABLE, PRE_OPERATIONAL, RESET_COMMUNICATION, START, BenchHost, quiet_scenario
+from cantools.autosar import end_to_end
+
+from adacd_hil.wire.codec import contract_folder
+
+ZERO = int.from_bytes(b"zero", "little")
+DATABASE = cantools.database.load_file(contract_folder() / "arm.dbc")
+
+
+def torque_frames(host: BenchHost, count: int, node: int = 3) -> list[bytes]:
+    host.take()
+    for _ in range(count):
+        host.sync()
+    return host.taken(0x180 + node)
+
+
+def torque_uNm(frame: bytes) -> int:
+    return struct.unpack_from("<i", frame, 2)[0]
+
+
+@pytest.mark.parametrize("node", [3, 4])
+def test_an_independent_implementation_accepts_the_header_of_every_frame(node):
+    host = BenchHost(quiet_scenario(noise=True))
+    host.nmt(START)
+    name = f"Sensor{node - 2}Torque"
+    data_ids = CODEC.message(name).data_ids
+    frames = torque_frames(host, 40, node)
+    assert [frame[1] & 0x0F for frame in frames] == [k % 16 for k in range(40)]
+    for frame in frames:
+        decoded = DATABASE.get_message_by_name(name).decode(frame)
+        data_id = data_ids[decoded["e2e_counter"]]
+        assert decoded["e2e_crc"] == end_to_end.compute_profile2_crc(frame, data_id)
+
+
+def test_the_value_is_the_converters_count_in_micronewtonmetres():
+    host = BenchHost(quiet_scenario(torque_offset_Nm=[1.0, -2.0]))
+    host.nmt(START)
+    lsb_uNm = 100e6 / 65536
+    assert torque_uNm(torque_frames(host, 1, 3)[0]) == round(round(1e6 / lsb_uNm) * lsb_uNm)
+    assert torque_uNm(torque_frames(host, 1, 4)[0]) == round(round(-2e6 / lsb_uNm) * lsb_uNm)
+    assert host.read(3, 0x9130, 1) == pytest.approx(1e6, abs=lsb_uNm)
+
+
+def test_the_value_is_the_joint_torque_of_the_same_sync():
+    host = BenchHost()
+    host.enable()
+    for _ in range(10):
+        host.step(ENABLE, 100)
+    host.take()
+    host.sync()
+    assert torque_uNm(host.taken(0x183)[0]) * 1e-6 == pytest.approx(host.true("tau_J")[0], abs=0.8e-3)
+
+
+@pytest.mark.parametrize(
+    ("offset_Nm", "status", "value_uNm"),
+    [(49.9, 0x00, 49.9e6), (50.0, 0x03, 50e6), (-49.9, 0x00, -49.9e6), (-50.0, 0x05, -50e6)],
+)
+def test_an_overload_is_flagged_in_the_frame_itself_and_in_the_status(offset_Nm, status, value_uNm):
+    host = BenchHost(quiet_scenario(torque_offset_Nm=[offset_Nm, 0.0]))
+    host.nmt(START)
+    host.take()
+    host.sync()
+    frames = host.take()
+    torque = next(data for can_id, data in frames if can_id == 0x183)
+    assert torque[1] >> 4 == status
+    assert torque_uNm(torque) == pytest.approx(value_uNm, abs=1600)
+    assert host.read(3, 0x6150, 1) == status
+    assert [data for can_id, data in frames if can_id == 0x283] == [bytes([status, 0])]
+
+
+def test_before_the_first_sample_the_value_is_not_valid():
+    host = BenchHost()
+    host.nmt(START)
+    assert host.taken(0x283) == [b"\x01\x00"]
+    host.sync()
+    assert host.taken(0x283) == [b"\x00\x00"]
+
+
+def test_status_comes_every_100_ms():
+    host = BenchHost()
+    host.nmt(START)
+    host.sync()
+    host.take()
+    for _ in range(1000):
+        host.sync()
+    assert len(host.taken(0x284)) == 10
+
+
+def test_frames_come_in_operational_only():
+    host = BenchHost()
+    assert torque_frames(host, 3) == []
+    host.nmt(START)
+    assert len(torque_frames(host, 3)) == 3
+    host.nmt(PRE_OPERATIONAL)
+    assert torque_frames(host, 3) == []
+
+
+def test_the_counter_goes_on_over_a_pause_and_begins_anew_after_reset_communication():
+    host = BenchHost()
+    host.nmt(START)
+    torque_frames(host, 3)
+    host.nmt(PRE_OPERATIONAL)
+    torque_frames(host, 5)
+    host.nmt(START)
+    assert torque_frames(host, 1)[0][1] & 0x0F == 3
+    host.nmt(RESET_COMMUNICATION)
+    host.nmt(START)
+    assert torque_frames(host, 1)[0][1] & 0x0F == 0
+
+
+def test_autozero_takes_the_mean_of_64_samples_for_zero():
+    host = BenchHost(quiet_scenario(noise=True, torque_offset_Nm=[3.0, 0.0]), seed=5)
+    host.nmt(START)
+    before = torque_frames(host, 200)
+    assert np.mean([torque_uNm(frame) for frame in before]) == pytest.approx(3e6, abs=10e3)
+    host.write(3, 0x6125, 1, ZERO)
+    torque_frames(host, 64)
+    after = torque_frames(host, 1000)
+    assert np.mean([torque_uNm(frame) for frame in after]) == pytest.approx(0.0, abs=4 * 20e3 / 64**0.5)
+
+
+def test_a_zeroed_sensor_still_reports_the_overload_of_its_converter():
+    host = BenchHost(quiet_scenario(torque_offset_Nm=[50.0, 0.0]))
+    host.nmt(START)
+    host.write(3, 0x6125, 1, ZERO)
+    assert torque_frames(host, 65)[-1][1] >> 4 == 0x03

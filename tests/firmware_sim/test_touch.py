@@ -1,0 +1,114 @@
+"""The person's force: its torque by virtual work, its course over time, its place on the grid."""
+
+import math
+
+import numpy as np
+import pytest
+
+from adacd_hil.config import ConfigError, parse
+from firmware_sim.contact import TICK_S, ContactSettings, contact_force, contact_torque
+
+L1_M, L2_M = 0.35, 0.30
+
+
+def contact(**changes) -> ContactSettings:
+    values = {"at_s": 1.0, "link": 2, "point_m": 0.2, "force_N": 20.0, "duration_s": 0.05} | changes
+    return ContactSettings(**values)
+
+
+def touched_point(link: int, point_m: float, q: np.ndarray) -> np.ndarray:
+    """Where the arm is touched, world x and y."""
+    if link == 1:
+        return point_m * np.array([math.cos(q[0]), math.sin(q[0])])
+    elbow = L1_M * np.array([math.cos(q[0]), math.sin(q[0])])
+    return elbow + point_m * np.array([math.cos(q[0] + q[1]), math.sin(q[0] + q[1])])
+
+
+@pytest.mark.parametrize("link", [1, 2])
+@pytest.mark.parametrize("frame", ["link", "world"])
+def test_the_torque_of_a_contact_is_its_virtual_work(link, frame):
+    generator = np.random.default_rng(3)
+    for _ in range(100):
+        q = generator.uniform(-3, 3, 2)
+        point_m, angle_deg = generator.uniform(0, 0.3), generator.uniform(-360, 360)
+        row = np.array(contact(link=link, frame=frame, point_m=point_m, angle_deg=angle_deg).row())
+        found = contact_torque(row, 20.0, L1_M, q[0], q[1])
+        link_angle = q[0] if link == 1 else q[0] + q[1]
+        psi = math.radians(angle_deg) + (link_angle if frame == "link" else 0.0)
+        force = 20.0 * np.array([math.cos(psi), math.sin(psi)])
+        for joint in range(2):
+            ahead, behind = q.copy(), q.copy()
+            ahead[joint] += 1e-5
+            behind[joint] -= 1e-5
+            moved = touched_point(link, point_m, ahead) - touched_point(link, point_m, behind)
+            assert found[joint] == pytest.approx(force @ moved / 2e-5, abs=1e-8)
+
+
+def test_a_push_along_the_normal_of_a_link_turns_its_joint_forward():
+    assert contact_torque(np.array(contact(link=1).row()), 20.0, L1_M, 0.7, -0.3) == pytest.approx((4.0, 0.0))
+    forward = contact_torque(np.array(contact(link=2).row()), 20.0, L1_M, 0.7, 0.0)
+    assert forward == pytest.approx((20.0 * (0.35 + 0.2), 4.0))
+
+
+def test_a_push_along_link_2_is_not_felt_by_joint_2():
+    row = np.array(contact(link=2, angle_deg=0.0).row())
+    assert contact_torque(row, 20.0, L1_M, 0.7, -0.3)[1] == 0.0
+
+
+def test_the_force_and_lever_of_a_link_2_contact_follow_from_both_torques():
+    """Closed form for a frictionless contact: F = (tau1 − tau2) / (l1 cos q2), lever tau2 / F."""
+    tau1, tau2 = contact_torque(np.array(contact(link=2).row()), 17.0, L1_M, -0.4, 0.9)
+    force_N = (tau1 - tau2) / (L1_M * math.cos(0.9))
+    assert force_N == pytest.approx(17.0, rel=1e-12)
+    assert tau2 / force_N == pytest.approx(0.2, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "impulse_N_s"),
+    [
+        ({"shape": "step"}, 1.0),
+        ({"shape": "half_sine"}, 2.0 / math.pi),
+        ({"shape": "push"}, 0.75),
+        ({"shape": "push", "ramp_s": 0.02}, 0.6),
+        ({"shape": "push", "ramp_s": 0.025}, 0.5),
+    ],
+)
+def test_a_contact_gives_the_impulse_of_its_shape(changes, impulse_N_s):
+    one = contact(**changes)
+    times_s = np.linspace(0.0, one.duration_s, 20_001)
+    forces_N = [contact_force(np.array(one.row()), elapsed_s) for elapsed_s in times_s]
+    assert np.trapezoid(forces_N, times_s) == pytest.approx(impulse_N_s, rel=1e-6)
+    assert one.impulse_N_s == pytest.approx(impulse_N_s, rel=1e-12)
+    assert max(forces_N) == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize("shape", ["half_sine", "push"])
+def test_soft_shapes_begin_and_end_without_force(shape):
+    row = np.array(contact(shape=shape).row())
+    assert contact_force(row, 0.0) == 0.0
+    assert contact_force(row, 0.05) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_onset_and_end_lie_on_the_drives_ticks():
+    one = contact(at_s=10.00004, duration_s=0.25)
+    assert (one.onset_tick, one.end_tick) == (100_000, 102_500)
+    assert contact(at_s=0.3).onset_tick * TICK_S == pytest.approx(0.3, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"link": 3}, "`link` = 3 is above 2"),
+        ({"shape": "sine"}, "did you mean 'half_sine'"),
+        ({"frame": "tool"}, "`frame` = 'tool' must be one of link, world"),
+        ({"force_N": 0.0}, "`force_N` = 0.0 N is below 0.01 N"),
+        ({"duration_s": 0.0}, "`duration_s` = 0.0 s is below 0.0001 s"),
+        ({"ramp_s": 0.01}, "ramp_s = 0.01 s belongs to shape 'push'"),
+        ({"shape": "push", "ramp_s": 0.03}, "ramp_s = 0.03 s is above half of duration_s = 0.05 s"),
+    ],
+)
+def test_a_contact_that_cannot_be_is_refused(changes, message):
+    table = {"at_s": 1.0, "link": 2, "point_m": 0.2, "force_N": 20.0, "duration_s": 0.05} | changes
+    with pytest.raises(ConfigError) as refusal:
+        parse(ContactSettings, table)
+    assert message in str(refusal.value)

@@ -1,0 +1,169 @@
+"""A run made of random numbers, and a recorder that is fed with it; every field has a value of its own."""
+
+import fcntl
+import os
+import struct
+import termios
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_scheme
+from adacd_hil.log.recorder import LogSummary, Recorder
+from adacd_hil.records import (
+    CONTROL_LAYOUT,
+    ContactReport,
+    CycleRecord,
+    Event,
+    FaultReason,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    scheme_layout,
+)
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec import load_codec
+
+PERIOD_NS = 1_000_000
+CODEC = load_codec()
+CYCLIC = (
+    "Sync",
+    "Drive1Command",
+    "Drive2Command",
+    "Drive1Feedback",
+    "Drive2Feedback",
+    "Sensor1Torque",
+    "Sensor2Torque",
+)
+UNKNOWN_ID = 0x7A5
+
+
+@dataclass
+class Cycle:
+    t_ns: int
+    output: SchemeOutput
+    request: Request
+    control: np.ndarray
+    gate_flags: int
+    record: CycleRecord
+    frames: list[tuple[bool, Frame]]
+    contact: ContactReport | None = None
+    event: Event | None = None
+
+    def messages(self):
+        messages = [
+            (ChannelId.SCHEME, pack_scheme(self.output, self.request)),
+            (ChannelId.CONTROL, pack_control(self.output.cycle, self.control, self.gate_flags, True, False)),
+            (ChannelId.CYCLE, pack_cycle(self.record)),
+        ]
+        if self.contact is not None:
+            messages.append((ChannelId.CONTACT, pack_contact(self.contact)))
+        return messages
+
+
+@dataclass
+class Run:
+    cycles: list[Cycle]
+    parameter_count: int = 7
+    attachments: dict[str, bytes] = field(default_factory=lambda: {"arm.dbc": CODEC.text, "run.toml": b'name = "x"\n'})
+    metadata: dict[str, str] = field(default_factory=lambda: {"interface": "embedded", "name": "Prüfung"})
+
+    @property
+    def blocks(self):
+        return np.array([cycle.output.block for cycle in self.cycles])
+
+    @property
+    def frames(self):
+        return [(is_tx, frame) for cycle in self.cycles for is_tx, frame in cycle.frames]
+
+
+def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123):
+    generator = np.random.default_rng(seed)
+    layout = scheme_layout(parameter_count)
+    cycles = []
+    for number in range(count):
+        t_ns = start_ns + number * PERIOD_NS
+        block = generator.normal(size=layout.size)
+        block[layout.slices["threshold"]] = np.inf if number % 7 else np.nan
+        output = SchemeOutput(
+            cycle=number,
+            state=SchemeState(number % len(SchemeState)),
+            previous_state=SchemeState((number + 3) % len(SchemeState)),
+            fault=FaultReason((number + 1) % len(FaultReason)),
+            contact_joints=number % 4,
+            is_model_valid=number % 2 == 1,
+            theta_hat=block[:parameter_count],
+            theta_ff=block[:parameter_count],
+            tau_ext_hat=block[:2],
+            contact=None,
+            block=block,
+        )
+        cycle = Cycle(
+            t_ns=t_ns,
+            output=output,
+            request=Request(number % len(Request)),
+            control=generator.normal(size=CONTROL_LAYOUT.size),
+            gate_flags=number % 251,
+            record=CycleRecord(number, -number, 3 * number, 2**40 + number, 7, number % 5),
+            frames=_frames(generator, t_ns, number),
+        )
+        if number % 50 == 20:
+            cycle.contact = ContactReport(number, 2, (-1, 1), (1.5, -2.5), (0.25, number), number % 100 == 20)
+        if number % 40 == 10:
+            level = ("info", "warning", "error")[number // 40 % 3]
+            cycle.event = Event(level, f"name{number}", f"Nachricht {number}: θ̂ ok")
+        cycles.append(cycle)
+    return Run(cycles, parameter_count)
+
+
+def _frames(generator, t_ns, number):
+    frames = []
+    for place, name in enumerate(CYCLIC):
+        message = CODEC.messages[name]
+        frames.append((place < 3, Frame(message.can_id, generator.bytes(message.length), t_ns + 10 * place)))
+    if number % 10 == 3:
+        frames.append((False, Frame(UNKNOWN_ID, b"\x01\x02\x03", t_ns + 100)))
+    if number % 10 == 5:
+        frames.append((False, Frame(0x181, generator.bytes(8), t_ns + 200, is_error=True)))
+    if number % 10 == 6:
+        frames.append((False, Frame(0x181, b"short", t_ns + 300)))
+    if number % 10 == 7:
+        frames.append((False, Frame(0x18DAF110, bytearray(b"extended"), t_ns - 5_000_000)))  # stamped late
+    return frames
+
+
+def start(path: Path, run: Run, **options) -> Recorder:
+    options = {"blocking": True, **options}
+    return Recorder(
+        path,
+        parameter_count=run.parameter_count,
+        attachments=run.attachments,
+        metadata=run.metadata,
+        **options,
+    )
+
+
+def feed(recorder: Recorder, cycles: list[Cycle]) -> None:
+    for cycle in cycles:
+        recorder.cycle(cycle.t_ns, cycle.messages(), cycle.frames)
+        if cycle.event is not None:
+            recorder.event(cycle.t_ns, cycle.event)
+
+
+def record(path: Path, run: Run, **options) -> LogSummary:
+    recorder = start(path, run, **options)
+    feed(recorder, run.cycles)
+    return recorder.close()
+
+
+def waiting_bytes(recorder: Recorder) -> int:
+    """Count what the writer hasn't taken from the socket yet, as the kernel accounts for it; 0 when it is dead."""
+    (waiting,) = struct.unpack("i", fcntl.ioctl(recorder._socket, termios.TIOCOUTQ, bytes(4)))
+    return waiting
+
+
+def wait_until_taken(recorder: Recorder) -> None:
+    """Wait until the writer has taken every packet from the socket, or is dead."""
+    while waiting_bytes(recorder) > 0:
+        os.sched_yield()

@@ -1,0 +1,175 @@
+"""The table of topics: types that others can parse, and bodies that are laid out as their types say."""
+
+import struct
+
+import numpy as np
+import pytest
+from mcap_ros2._dynamic import generate_dynamic
+from recorded_run import CODEC
+
+from adacd_hil.log.cdr import ENCAPSULATION, Member, number_type, payload_dtype, ros_field_name, ros_message_name
+from adacd_hil.log.channels import (
+    ChannelId,
+    pack_contact,
+    pack_control,
+    pack_cycle,
+    pack_scheme,
+    pack_truth,
+    run_channels,
+    truth_channels,
+)
+from adacd_hil.log.errors import LogError
+from adacd_hil.records import (
+    CONTROL_LAYOUT,
+    TRUTH_LAYOUT,
+    ContactReport,
+    CycleRecord,
+    FaultReason,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    scheme_layout,
+)
+
+CHANNELS = (*run_channels(9, tuple(CODEC.messages.values())), *truth_channels())
+STAMP = struct.pack("<II", 12, 34)
+
+
+def decode(channel_id, body):
+    channel = next(channel for channel in CHANNELS if channel.id == channel_id)
+    return generate_dynamic(channel.type.name, channel.type.text)[channel.type.name](ENCAPSULATION + STAMP + body)
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.topic)
+def test_a_parser_of_others_reads_every_type(channel):
+    assert channel.type.name in generate_dynamic(channel.type.name, channel.type.text)
+
+
+def test_every_dbc_message_has_a_topic_with_its_signals():
+    topics = {channel.topic: channel.type.fields for channel in CHANNELS}
+    for name, message in CODEC.messages.items():
+        assert topics[f"/decoded/{name}"] == tuple(signal.name for signal in message.signals)
+
+
+def test_numbers_of_topics_are_unique():
+    run_ids = [channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))]
+    assert len(set(run_ids)) == len(run_ids)
+
+
+@pytest.mark.parametrize(
+    ("name", "spelled"),
+    [
+        ("tau_J", "tau_j"),
+        ("F_v1", "f_v1"),
+        ("q", "q"),
+        ("StatusWord", "status_word"),
+        ("TorqueNm", "torque_nm"),
+        ("_private__name_", "private_name"),
+        ("2nd", "n2nd"),
+    ],
+)
+def test_a_field_is_spelled_as_ros_demands(name, spelled):
+    assert ros_field_name(name) == spelled
+
+
+@pytest.mark.parametrize(
+    ("name", "spelled"), [("Drive1Feedback", "Drive1Feedback"), ("DRIVE1_feedback", "DRIVE1Feedback"), ("sync", "Sync")]
+)
+def test_a_message_is_spelled_as_ros_demands(name, spelled):
+    assert ros_message_name(name) == spelled
+
+
+def test_two_fields_with_one_ros_name_are_refused():
+    with pytest.raises(LogError, match="two fields are named p in ROS"):
+        number_type("a/msg/B", (Member("P", "float64"), Member("p", "float64")))
+
+
+def test_a_dbc_message_may_not_take_the_name_of_our_own_type():
+    class Scheme:
+        name = "Scheme"
+        can_id = 1
+        length = 0
+        signals = ()
+
+    with pytest.raises(LogError, match="the type name adacd_hil_msgs/msg/Scheme is taken"):
+        run_channels(7, (Scheme(),))
+
+
+def test_the_layout_of_a_type_is_aligned_as_cdr_demands():
+    text = number_type(
+        "a/msg/B", (Member("u", "uint8"), Member("f", "float64", 2), Member("s", "int16"), Member("i", "int32"))
+    ).text
+    layout = payload_dtype(text)
+    offsets = {name: layout.fields[name][1] for name in layout.names}
+    assert offsets == {"sec": 4, "nanosec": 8, "u": 12, "f": 20, "s": 36, "i": 40}
+    assert layout.itemsize == 44
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["float64 x\n", "builtin_interfaces/Time stamp\nstring s\n", "builtin_interfaces/Time stamp\nfloat64[] x\n", ""],
+)
+def test_a_type_of_varying_size_has_no_layout(text):
+    with pytest.raises(LogError):
+        payload_dtype(text)
+
+
+def test_scheme_is_laid_out_as_its_type_says():
+    layout = scheme_layout(9)
+    block = np.arange(layout.size) + 0.5
+    output = SchemeOutput(
+        cycle=2**40,
+        state=SchemeState.STOPPED,
+        previous_state=SchemeState.REACT,
+        fault=FaultReason.LIMIT,
+        contact_joints=3,
+        is_model_valid=True,
+        theta_hat=block,
+        theta_ff=block,
+        tau_ext_hat=block,
+        contact=None,
+        block=block,
+    )
+    message = decode(ChannelId.SCHEME, pack_scheme(output, Request.PAYLOAD))
+    assert (message.stamp.sec, message.stamp.nanosec) == (12, 34)
+    head = (message.cycle, message.state, message.previous_state, message.fault, message.request)
+    assert head == (2**40, 6, 5, 4, 2)
+    assert (message.contact_joints, message.is_model_valid) == (3, True)
+    for name, place in layout.slices.items():
+        assert np.atleast_1d(getattr(message, name.lower())).tolist() == block[place].tolist()
+
+
+def test_control_is_laid_out_as_its_type_says():
+    block = np.arange(CONTROL_LAYOUT.size) - 3.25
+    message = decode(ChannelId.CONTROL, pack_control(5, block, 0xA1, False, True))
+    assert (message.cycle, message.gate_flags, message.enable, message.quick_stop) == (5, 0xA1, False, True)
+    for name, place in CONTROL_LAYOUT.slices.items():
+        assert getattr(message, name.lower()) == block[place].tolist()
+
+
+def test_truth_is_laid_out_as_its_type_says():
+    block = np.arange(TRUTH_LAYOUT.size) * 1.5
+    message = decode(ChannelId.TRUTH, pack_truth(77, block))
+    assert message.cycle == 77
+    for name, place in TRUTH_LAYOUT.slices.items():
+        assert np.atleast_1d(getattr(message, name.lower())).tolist() == block[place].tolist()
+
+
+def test_contact_is_laid_out_as_its_type_says():
+    message = decode(ChannelId.CONTACT, pack_contact(ContactReport(9, 2, (-1, 1), (1.5, -2.5), (0.25, 0.75), True)))
+    assert (message.cycle, message.link, message.direction, message.is_final) == (9, 2, [-1, 1], True)
+    assert (message.tau_ext_peak, message.impulse) == ([1.5, -2.5], [0.25, 0.75])
+
+
+def test_cycle_is_laid_out_as_its_type_says():
+    message = decode(ChannelId.CYCLE, pack_cycle(CycleRecord(1, -2, 3, 4, 5, 6)))
+    values = (message.cycle, message.lateness_ns, message.feedback_ns, message.command_ns)
+    assert values == (1, -2, 3, 4)
+    assert (message.overruns, message.frames_missing) == (5, 6)
+
+
+def test_states_are_named_before_the_field_that_holds_them():
+    text = next(channel.type.text for channel in CHANNELS if channel.id == ChannelId.SCHEME)
+    lines = text.splitlines()
+    state = next(index for index, line in enumerate(lines) if line.startswith("uint8 state "))
+    assert lines[state - len(SchemeState) : state] == [f"uint8 STATE_{s.name}={s.value}" for s in SchemeState]

@@ -1,0 +1,347 @@
+"""What survives when a process is killed, the disk is full, or the file is cut or damaged."""
+
+import os
+import re
+import resource
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from recorded_run import feed, make_run, record, start, wait_until_taken, waiting_bytes
+
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import read_log
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import Event
+from adacd_hil.wire.bus import Frame
+
+CONTROL_PROCESS = """
+import sys
+import threading
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from recorded_run import feed, make_run, start
+run = make_run(400)
+recorder = start(Path(sys.argv[1]), run, blocking=sys.argv[3] == "lockstep")
+feed(recorder, run.cycles)
+print(recorder.pid, recorder.dropped, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module")
+def run():
+    return make_run(300)
+
+
+@pytest.fixture(scope="module")
+def whole(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "run.mcap"
+    record(path, run)
+    return path.read_bytes()
+
+
+def wait_for_end(pid):
+    descriptor = os.pidfd_open(pid)
+    ended, _, _ = select.select([descriptor], [], [], 30)
+    os.close(descriptor)
+    return bool(ended)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_killed_control_process_leaves_a_finished_log(mode, tmp_path):
+    path = tmp_path / "run.mcap"
+    command = [sys.executable, "-c", CONTROL_PROCESS, str(path), str(Path(__file__).parent), mode]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as control:
+        writer_pid, dropped = map(int, control.stdout.readline().split())
+        control.kill()
+        assert wait_for_end(writer_pid)
+    log = read_log(path)
+    assert log.problem == ""
+    assert log.summary["ending"] == "control process died"
+    assert int(log.summary["dropped"]) == dropped == 0
+    assert log.scheme.block.tobytes() == make_run(400).blocks.tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blocking", [True, False])
+def test_a_killed_writer_costs_the_log_its_end_and_the_control_process_nothing(blocking, tmp_path):
+    run = make_run(2000)
+    recorder = start(tmp_path / "run.mcap", run, blocking=blocking)
+    feed(recorder, run.cycles[:1500])
+    wait_until_taken(recorder)
+    os.kill(recorder.pid, signal.SIGKILL)
+    assert wait_for_end(recorder.pid)
+    feed(recorder, run.cycles[1500:])
+    lost = 500 + sum(cycle.event is not None for cycle in run.cycles[1500:])
+    summary = recorder.close()
+    assert summary.dropped == recorder.dropped == lost
+    assert not summary.is_complete
+    assert summary.error == "the writer died (exit status -9)"
+    log = read_log(tmp_path / "run.mcap")
+    assert re.fullmatch(r"cut after \d+ bytes", log.problem)
+    assert not log.is_complete
+    count = len(log.scheme)
+    assert 1000 < count < 1500
+    assert log.scheme.block.tobytes() == run.blocks[:count].tobytes()
+    assert log.attachments["run.toml"] == run.attachments["run.toml"]
+
+
+@pytest.mark.slow
+@pytest.mark.wallclock
+def test_what_is_logged_reaches_the_disk_though_nothing_follows(tmp_path):
+    run = make_run(10)
+    recorder = start(tmp_path / "run.mcap", run, blocking=False)
+    feed(recorder, run.cycles)
+    while len(read_log(tmp_path / "run.mcap").scheme) < 10:  # the test's time limit ends it
+        os.sched_yield()
+    os.kill(recorder.pid, signal.SIGKILL)
+    assert not recorder.close().is_complete
+    assert read_log(tmp_path / "run.mcap").scheme.block.tobytes() == run.blocks.tobytes()
+
+
+@pytest.mark.slow
+def test_a_writer_that_is_behind_costs_packets_not_time(tmp_path):
+    run = make_run(50)
+    packets = 50 + sum(cycle.event is not None for cycle in run.cycles)
+    recorder = start(tmp_path / "run.mcap", run, blocking=False)
+    os.kill(recorder.pid, signal.SIGSTOP)
+    sent = 0
+    while recorder.dropped < 50:
+        feed(recorder, run.cycles)
+        sent += packets
+    os.kill(recorder.pid, signal.SIGCONT)
+    wait_until_taken(recorder)
+    dropped = recorder.dropped
+    feed(recorder, run.cycles)
+    sent += packets
+    summary = recorder.close()
+    assert summary.dropped == dropped
+    assert not summary.is_complete
+    log = read_log(tmp_path / "run.mcap")
+    assert log.problem == ""
+    assert not log.is_complete
+    assert log.summary["dropped"] == str(dropped)
+    notices = [event.message for _, event in log.events if event.name == "log"]
+    assert notices == [f"{dropped} packets are missing before this"]
+    assert len(log.scheme) + len(log.events) - len(notices) + dropped == sent
+
+
+@pytest.mark.slow
+def test_in_lockstep_a_writer_that_is_behind_is_waited_for(tmp_path):
+    recorder = start(tmp_path / "run.mcap", make_run(0))
+    has_continued = threading.Event()
+    sent = []
+
+    def send():
+        while not has_continued.is_set() or len(sent) < 10:
+            recorder.event(len(sent), Event("info", "n", ""))
+            sent.append(len(sent))
+
+    os.kill(recorder.pid, signal.SIGSTOP)
+    sender = threading.Thread(target=send)
+    sender.start()
+    room = recorder._socket.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+    while waiting_bytes(recorder) < room:
+        os.sched_yield()
+    for _ in range(1000):  # lets the sender run against it
+        os.sched_yield()
+    os.kill(recorder.pid, signal.SIGCONT)
+    has_continued.set()
+    sender.join()
+    assert recorder.close().is_complete
+    assert [t_ns for t_ns, _ in read_log(tmp_path / "run.mcap").events] == sent
+
+
+@pytest.mark.slow
+def test_a_disk_that_fails_at_the_very_end_is_reported(tmp_path):
+    run = make_run(20)
+    recorder = start(tmp_path / "run.mcap", run)
+    written = recorder.path.stat().st_size
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (written + 100, written + 100))
+    feed(recorder, run.cycles)
+    summary = recorder.close()
+    assert summary.error == f"File too large after {written} bytes"
+    assert summary.dropped == 0
+    assert not summary.is_complete
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "least"), [(30_000, 0), (200_000, 50), (400_000, 150)])
+def test_a_full_disk_is_reported_and_stops_nobody(limit, least, tmp_path):
+    run = make_run(2000)
+    recorder = start(tmp_path / "run.mcap", run)
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (limit, limit))
+    feed(recorder, run.cycles)
+    assert recorder.dropped == 0
+    summary = recorder.close()
+    assert re.fullmatch(r"File too large after \d+ bytes", summary.error)
+    assert not summary.is_complete
+    assert summary.dropped > 0
+    log = read_log(tmp_path / "run.mcap")
+    assert (tmp_path / "run.mcap").stat().st_size <= limit
+    assert re.fullmatch(r"cut after \d+ bytes", log.problem)
+    count = len(log.scheme)
+    assert count >= least
+    assert log.attachments["run.toml"] == run.attachments["run.toml"]
+    assert log.scheme.block.tobytes() == run.blocks[:count].tobytes()
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_from_the_start_is_an_error_before_the_run():
+    with pytest.raises(LogError, match=r"^log /dev/full can't be written: No space left on device after 0 bytes$"):
+        Recorder(Path("/dev/full"))
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("missing/run.mcap", "No such file or directory"), ("folder", "Is a directory")]
+)
+def test_a_path_that_can_not_be_created_is_an_error_before_the_run(name, reason, tmp_path):
+    (tmp_path / "folder").mkdir()
+    path = tmp_path / name
+    with pytest.raises(LogError, match=f"^log {path} can't be created: {reason}$"):
+        Recorder(path)
+
+
+@pytest.mark.slow
+def test_a_dbc_that_can_not_be_read_is_an_error_before_the_run_and_leaves_no_file(tmp_path):
+    dbc = tmp_path / "bad.dbc"
+    with pytest.raises(LogError, match=f"can't be written: DBC {dbc}: No such file"):
+        Recorder(tmp_path / "run.mcap", codec_path=dbc)
+    assert not (tmp_path / "run.mcap").exists()
+
+
+@pytest.mark.slow
+def test_a_packet_that_makes_no_sense_is_dropped_alone(tmp_path):
+    run = make_run(10)
+    recorder = start(tmp_path / "run.mcap", run)
+    feed(recorder, run.cycles[:5])
+    recorder.cycle(1, [], [(True, Frame(1, bytes(12), 0))])
+    recorder.cycle(1, [(9999, b"no such channel")])
+    recorder._send(b"\x01")
+    feed(recorder, run.cycles[5:])
+    summary = recorder.close()
+    assert (summary.dropped, summary.is_complete) == (3, False)
+    assert read_log(tmp_path / "run.mcap").scheme.block.tobytes() == run.blocks.tobytes()
+
+
+def cuts(size):
+    generator = np.random.default_rng(7)
+    return sorted({*range(60), *range(size - 60, size), *generator.integers(0, size, 250).tolist()})
+
+
+@pytest.mark.slow
+def test_a_log_cut_anywhere_gives_what_came_before(run, whole, tmp_path):
+    path = tmp_path / "cut.mcap"
+    times = [frame.t_ns for _, frame in run.frames]
+    counts = []
+    for size in cuts(len(whole)):
+        path.write_bytes(whole[:size])
+        log = read_log(path)
+        count = len(log.scheme)
+        counts.append(count)
+        assert log.problem == f"cut after {size} bytes"
+        assert not log.is_complete
+        assert log.scheme.block.tobytes() == run.blocks[:count].tobytes()
+        assert log.frames["t_ns"].tolist() == times[: len(log.frames)]
+    assert counts == sorted(counts)
+    assert counts[0] == 0
+    assert counts[-1] == 300
+    assert len(set(counts)) > 2
+
+
+@pytest.mark.slow
+def test_a_flipped_bit_is_noticed_or_harmless(run, whole, tmp_path):
+    path = tmp_path / "flipped.mcap"
+    generator = np.random.default_rng(11)
+    noticed = 0
+    for place in (*range(8, 60), *generator.integers(8, len(whole), 200).tolist()):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(generator.integers(8))
+        path.write_bytes(damaged)
+        log = read_log(path)
+        noticed += not log.is_complete
+        if log.is_complete:
+            assert log.scheme.block.tobytes() == run.blocks.tobytes(), place
+            assert len(log.frames) == len(run.frames), place
+            assert {name: log.attachments[name] for name in run.attachments} == run.attachments, place
+    assert noticed > 150
+
+
+@pytest.mark.slow
+def test_a_damaged_chunk_costs_only_itself(whole, run, tmp_path):
+    """Also when it is the first, which holds the definitions of all topics."""
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(whole)
+    with path.open("rb") as file:
+        chunks = [r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk)]
+    assert len(chunks) >= 2
+    for chunk in chunks:
+        damaged = bytearray(whole)
+        place = whole.index(chunk.data)
+        damaged[place + len(chunk.data) // 2] ^= 0x10
+        path.write_bytes(damaged)
+        log = read_log(path)
+        times = log.scheme.t_ns.tolist()
+        outside = {c.t_ns for c in run.cycles if not chunk.message_start_time <= c.t_ns <= chunk.message_end_time}
+        assert log.problem.startswith("damaged at byte ")
+        assert not log.is_complete
+        assert outside
+        assert outside <= set(times)
+        assert len(times) < 300
+
+
+@pytest.mark.slow
+def test_a_damaged_attachment_is_not_handed_out(whole, run, tmp_path):
+    damaged = bytearray(whole)
+    damaged[whole.index(run.attachments["run.toml"])] ^= 1
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(damaged)
+    log = read_log(path)
+    assert "run.toml" not in log.attachments
+    assert log.attachments["arm.dbc"] == run.attachments["arm.dbc"]
+    assert log.problem.startswith("damaged at byte ")
+
+
+@pytest.mark.slow
+def test_a_chunk_that_claims_to_be_huge_is_damage_not_memory(whole, tmp_path):
+    path = tmp_path / "huge.mcap"
+    path.write_bytes(whole)
+    with path.open("rb") as file:
+        chunk = next(r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk))
+    head = chunk.message_start_time.to_bytes(8, "little") + chunk.message_end_time.to_bytes(8, "little")
+    place = whole.index(head) + len(head)
+    path.write_bytes(whole[:place] + (1 << 60).to_bytes(8, "little") + whole[place + 8 :])
+    log = read_log(path)
+    assert log.problem.startswith("damaged at byte ")
+    assert zstandard.get_frame_parameters(chunk.data).content_size == chunk.uncompressed_size
+
+
+def test_a_file_that_is_not_mcap_is_an_error_of_one_line(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("hello, this is text\n" * 10)
+    with pytest.raises(LogError, match=f"^{path} is not an MCAP file$"):
+        read_log(path)
+
+
+def test_a_file_that_does_not_exist_is_an_error_of_one_line(tmp_path):
+    with pytest.raises(LogError, match=f"^log {tmp_path / 'none.mcap'} can't be read: No such file or directory$"):
+        read_log(tmp_path / "none.mcap")
+
+
+def test_an_empty_file_is_a_log_cut_at_once(tmp_path):
+    (tmp_path / "empty.mcap").touch()
+    log = read_log(tmp_path / "empty.mcap")
+    assert log.problem == "cut after 0 bytes"
+    assert len(log.scheme) == len(log.frames) == len(log.events) == len(log.contacts) == 0
+    assert log.scheme["tau_ext_hat"].shape == (0, 2)

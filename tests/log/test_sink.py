@@ -1,0 +1,55 @@
+"""The file behind a thread: order, position and failure."""
+
+import os
+import resource
+
+from adacd_hil.log.sink import Sink
+
+
+def test_what_is_written_is_in_the_file_in_order(tmp_path):
+    path = tmp_path / "file"
+    sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT))
+    pieces = [bytes([number % 256]) * number for number in range(2000)]
+    for piece in pieces:
+        sink.write(piece)
+    assert sink.tell() == sum(map(len, pieces))
+    sink.close()
+    assert path.read_bytes() == b"".join(pieces)
+    assert sink.error == ""
+
+
+def test_a_settled_sink_knows_whether_writing_failed():
+    sink = Sink(os.open("/dev/full", os.O_WRONLY))
+    sink.write(b"data")
+    sink.settle()
+    assert sink.error == "No space left on device after 0 bytes"
+    sink.write(b"more")
+    sink.close()
+    assert sink.tell() == 8
+
+
+def test_a_file_that_can_not_be_closed_is_reported(tmp_path):
+    descriptor = os.open(tmp_path / "file", os.O_WRONLY | os.O_CREAT)
+    sink = Sink(descriptor)
+    sink.write(b"data")
+    sink.settle()
+    os.close(descriptor)
+    sink.close()
+    assert sink.error == "Bad file descriptor after 4 bytes"
+
+
+def test_a_failure_ends_the_file_at_the_last_whole_write_though_there_is_room_again(tmp_path):
+    path = tmp_path / "file"
+    sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))
+    try:
+        sink.write(b"a" * 100)
+        sink.write(b"b" * 100)
+        sink.settle()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    sink.write(b"c")
+    sink.close()
+    assert sink.error == "File too large after 100 bytes"
+    assert path.read_bytes() == b"a" * 100

@@ -1,0 +1,57 @@
+"""A motion in closed form, the torque that goes with it, and the compiled step run over it."""
+
+import numpy as np
+
+from adacd_hil.config import Settings, load_settings, merge, parse
+from adacd_hil.records import scheme_layout
+from adacd_hil.scheme import kernel
+from adacd_hil.scheme.regressor import inverse_dynamics
+
+PLACES = scheme_layout(7).slices
+
+
+def settings_with(**sections) -> Settings:
+    """Resolve the paper's settings with some replaced, each section a dict."""
+    table = {"estimator": {"P0": [8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5]}, "arm": {}}
+    paper = load_settings("paper", "P")
+    table["arm"]["cad_theta"] = list(paper.arm.cad_theta)
+    return parse(Settings, merge(table, sections))
+
+
+def smooth_motion(t_s, speed=1.0):
+    """Return q, dq, ddq (n, 2): two sines per joint, of no common period."""
+    amplitudes, rates = np.array([[0.5, 0.9], [0.15, 0.2]]), speed * np.array([[1.7, 1.1], [4.1, 3.3]])
+    phase = rates[:, None, :] * t_s[None, :, None] + np.array([[[0.3, 1.0]], [[0.0, 2.0]]])
+    q = np.sum(amplitudes[:, None, :] * np.sin(phase), axis=0)
+    dq = np.sum((amplitudes * rates)[:, None, :] * np.cos(phase), axis=0)
+    ddq = np.sum((-amplitudes * rates**2)[:, None, :] * np.sin(phase), axis=0)
+    return q, dq, ddq
+
+
+def torque_of(q, dq, ddq, theta, tau_ext=None):
+    """Return the joint torque (n, 2) that makes the arm move like this against the external torque (n, 2)."""
+    tau = np.array([inverse_dynamics(*row, theta) for row in zip(q, dq, ddq, strict=True)])
+    return tau if tau_ext is None else tau - tau_ext
+
+
+def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, periods=None):
+    """Run the compiled step over a record; return blocks (n, size)."""
+    count = q.shape[0]
+    ones = np.ones(count, dtype=np.int64)
+    memory = kernel.new_memory(7)
+    blocks = np.repeat(kernel.new_block(7), count)
+    constants = kernel.constants_of(settings)
+    kernel.begin_adaptation(constants, memory, blocks[:1])
+    blocks[0]["theta_hat"] = theta_hat
+    kernel.step_record(
+        constants,
+        memory,
+        np.ascontiguousarray(q),
+        np.ascontiguousarray(dq),
+        np.ascontiguousarray(tau_J),
+        ones if is_complete is None else is_complete,
+        ones if periods is None else periods,
+        mode,
+        blocks,
+    )
+    return blocks.view(np.float64).reshape(count, -1)

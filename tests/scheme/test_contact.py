@@ -1,0 +1,173 @@
+"""What is told of a collision: strength and link."""
+
+import numpy as np
+import pytest
+from smooth_motion import PLACES, run_kernel, settings_with
+
+from adacd_hil.scheme import kernel
+from adacd_hil.scheme.contact import Isolation, follow_contact
+
+T = 1e-3
+
+
+def half_sine(size, duration_s, samples=1000, begin=100):
+    t_s = (np.arange(samples) - begin) * T
+    inside = (t_s >= 0.0) & (t_s <= duration_s)
+    return np.where(inside, size * np.sin(np.pi * t_s / duration_s), 0.0)
+
+
+def wide_of(tau_ext):
+    tau_ext = np.column_stack((tau_ext, -0.5 * tau_ext))
+    still = np.zeros_like(tau_ext)
+    return run_kernel(settings_with(), still, still, -tau_ext, np.zeros(7), 0)[:, PLACES["tau_ext_wide_hat"]]
+
+
+def test_a_torque_step_is_seen_in_full_after_five_samples():
+    wide = wide_of(np.where(np.arange(300) >= 100, 2.0, 0.0))
+    np.testing.assert_allclose(wide[106:], np.full((194, 2), (2.0, -1.0)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("duration_s", [0.02, 0.05, 0.1])
+def test_the_peak_of_a_half_sine_is_right_within_four_percent(duration_s):
+    assert abs(np.max(wide_of(half_sine(3.0, duration_s))[:, 0]) / 3.0 - 1.0) < 0.04
+
+
+@pytest.mark.parametrize(("a", "b"), [(10.0, 2.0), (50.0, 50.0)])
+def test_the_strength_does_not_depend_on_the_filter(a, b):
+    tau_ext = np.column_stack((half_sine(3.0, 0.1),) * 2)
+    still = np.zeros_like(tau_ext)
+    settings = settings_with(filter={"a_rad_s": a, "b_rad_s": b})
+    blocks = run_kernel(settings, still, still, -tau_ext, np.zeros(7), 0)
+    assert abs(np.max(blocks[:, PLACES["tau_ext_wide_hat"]]) / 3.0 - 1.0) < 0.04
+
+
+class Touch:
+    """An arm at rest in MONITOR that is touched; steps the compiled kernel and the isolation together."""
+
+    def __init__(self, window_cycles=50):
+        settings = settings_with()
+        self.constants, self.memory, self.block = (
+            kernel.constants_of(settings),
+            kernel.new_memory(7),
+            kernel.new_block(7),
+        )
+        self.isolation = Isolation(window_cycles, settings.filter.a_rad_s)
+        self.reports = []
+
+    def run(self, tau_ext):
+        has_begun = False
+        for cycle, torque in enumerate(tau_ext):
+            self.block[0]["tau_J"][:] = -torque
+            mode = kernel.ARMED | (kernel.REPORTING if self.isolation.is_open else 0)
+            joints = kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> kernel.CONTACT_SHIFT
+            if joints and not has_begun:
+                has_begun = True
+                self.isolation.begin(cycle)
+            if self.isolation.is_open:
+                memory = self.memory[0]
+                tau_ext_hat = self.block[0]["tau_ext_hat"]
+                report = self.isolation.report(cycle, joints, tau_ext_hat, memory["integral"], memory["peak"])
+                if report is not None:
+                    self.reports.append(report)
+        return self.reports
+
+
+def on_joints(first, second):
+    return np.column_stack((first, second))
+
+
+STEP = np.where(np.arange(400) >= 100, 1.0, 0.0)
+
+
+def test_a_report_is_given_at_once_and_again_when_the_window_ends():
+    reports = Touch().run(on_joints(STEP, 0.0 * STEP))
+    assert [report.is_final for report in reports] == [False, True]
+
+
+def test_both_reports_carry_the_cycle_of_detection():
+    reports = Touch().run(on_joints(STEP, 0.0 * STEP))
+    assert [report.cycle for report in reports] == [116, 116]  # 16.3 ms after the step, which is between 99 and 100
+
+
+def test_without_a_window_the_first_report_is_final():
+    reports = Touch(window_cycles=0).run(on_joints(STEP, 0.0 * STEP))
+    assert [report.is_final for report in reports] == [True]
+
+
+def test_torque_on_joint_1_alone_is_a_contact_of_link_1():
+    reports = Touch().run(on_joints(STEP, 0.1 * STEP))
+    assert [report.link for report in reports] == [1, 1]
+
+
+def test_torque_on_joint_2_that_crosses_later_makes_it_link_2():
+    reports = Touch().run(on_joints(STEP, 0.5 * STEP))
+    assert [report.link for report in reports] == [1, 2]
+
+
+def test_torque_on_joint_2_that_crosses_after_the_window_comes_too_late():
+    reports = Touch(window_cycles=10).run(on_joints(STEP, 0.5 * STEP))
+    assert [report.link for report in reports] == [1, 1]
+
+
+def test_torque_on_joint_2_that_is_gone_before_the_window_ends_still_counts():
+    """0.3 Nm for 80 ms is over the threshold from 69 ms to 100 ms only."""
+    brief = np.where((np.arange(400) >= 40) & (np.arange(400) < 120), 0.3, 0.0)
+    reports = Touch(window_cycles=100).run(on_joints(STEP, brief))
+    assert reports[-1].link == 2
+
+
+@pytest.mark.parametrize(("first", "second"), [(1.0, 0.5), (-1.0, 0.5), (1.0, -0.5), (-1.0, -0.5), (1.0, 0.0)])
+def test_the_direction_is_the_sign_of_each_joint_torque(first, second):
+    reports = Touch().run(on_joints(first * STEP, second * STEP))
+    assert reports[-1].direction == (np.sign(first), np.sign(second))
+
+
+def test_the_first_report_says_nothing_of_a_joint_below_its_threshold():
+    reports = Touch().run(on_joints(STEP, -0.5 * STEP))
+    assert reports[0].direction == (1, 0)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("duration_s", [0.02, 0.05])
+def test_the_final_report_has_the_peak_of_the_contact(duration_s, sign):
+    reports = Touch().run(on_joints(sign * half_sine(5.0, duration_s), 0.0 * half_sine(5.0, duration_s)))
+    assert abs(reports[-1].tau_ext_peak[0] / (sign * 5.0) - 1.0) < 0.04
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("duration_s", [0.005, 0.02, 0.05])
+def test_the_final_report_has_the_impulse_of_the_contact(duration_s, sign):
+    """Within 6 %: what passed before |tau_ext_hat| reached half of the threshold is in the filter state only."""
+    push = half_sine(10.0, duration_s)
+    reports = Touch().run(on_joints(sign * push, 0.0 * push))
+    assert abs(reports[-1].impulse[0] / (sign * np.sum(push) * T) - 1.0) < 0.06
+
+
+def test_the_impulse_of_a_short_touch_is_kept_until_the_window_ends():
+    """0.02 Nms raises tau_ext_hat to 0.2 Nm; 120 ms later it is below half of the threshold."""
+    push = half_sine(0.02 / (0.004 * 2.0 / np.pi), 0.004)
+    reports = Touch(window_cycles=200).run(on_joints(push, 0.0 * push))
+    assert abs(reports[-1].impulse[0] / 0.02 - 1.0) < 0.06
+
+
+def test_a_cancelled_isolation_has_no_open_report():
+    isolation = Isolation(50, 10.0)
+    isolation.begin(3)
+    isolation.cancel()
+    assert not isolation.is_open
+
+
+def test_the_direction_is_that_of_the_first_contact_of_the_joint():
+    """A person who lets go and is pulled along does not turn it round."""
+    push = np.where(np.arange(400) < 130, STEP * 3.0, -20.0 * STEP)
+    reports = Touch().run(on_joints(push, 0.0 * push))
+    assert [report.direction for report in reports] == [(1, 0), (1, 0)]
+
+
+@pytest.mark.parametrize(("share", "integral"), [(0.4, 0.0), (0.6, 0.06)])
+def test_a_contact_begins_at_half_of_the_threshold(share, integral):
+    found, peak = np.zeros(2), np.zeros(2)
+    tau_ext_hat = np.full(2, share)
+    for _ in range(100):
+        follow_contact(tau_ext_hat, tau_ext_hat, np.ones(2), T, False, found, peak)
+    np.testing.assert_allclose(found, integral, rtol=1e-9)

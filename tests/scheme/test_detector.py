@@ -1,0 +1,138 @@
+"""When a collision is detected: the delay law, the smallest impulse, the sign."""
+
+import numpy as np
+import pytest
+from smooth_motion import PLACES, run_kernel, settings_with
+
+from adacd_hil.scheme import kernel
+from adacd_hil.scheme.detector import follow_standstill, joints_over
+
+T = 1e-3
+BEGIN = 100
+
+
+def alarms(tau_ext, settings=None):
+    """Let the arm stand still under tau_ext (n, 2); return the joints that are over per sample as (n, 2)."""
+    still = np.zeros_like(tau_ext)
+    settings = settings_with() if settings is None else settings
+    blocks = run_kernel(settings, still, still, -tau_ext, np.zeros(7), kernel.ARMED)
+    return np.abs(blocks[:, PLACES["tau_ext_hat"]]) > blocks[:, PLACES["threshold"]]
+
+
+def step_at(joint, size, samples=3000):
+    tau_ext = np.zeros((samples, 2))
+    tau_ext[BEGIN:, joint] = size
+    return tau_ext
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("size_Nm", "delay_ms"),
+    [(0.2, 138.6), (0.3, 69.3), (0.5, 35.7), (1.0, 16.3), (2.0, 7.8), (5.0, 3.0)],
+)
+def test_a_torque_step_is_detected_by_the_delay_law(size_Nm, delay_ms, sign, joint):
+    over = alarms(step_at(joint, sign * size_Nm))
+    assert abs(np.argmax(over[:, joint]) - BEGIN - delay_ms) <= 1.0
+
+
+@pytest.mark.parametrize("size_Nm", [0.15, 0.149, 0.05])
+def test_a_torque_step_up_to_the_threshold_is_never_detected(size_Nm):
+    assert not np.any(alarms(step_at(0, size_Nm)))
+
+
+def test_a_push_on_one_joint_raises_no_alarm_on_the_other():
+    assert not np.any(alarms(step_at(1, 5.0))[:, 0])
+
+
+@pytest.mark.parametrize(("a", "b"), [(10.0, 1.0), (10.0, 100.0), (50.0, 10.0)])
+def test_a_dc_gain_other_than_one_does_not_move_the_threshold(a, b):
+    settings = settings_with(filter={"a_rad_s": a, "b_rad_s": b})
+    over = alarms(step_at(0, 0.3), settings)
+    assert abs((np.argmax(over[:, 0]) - BEGIN) * T - np.log(2.0) / a) <= T
+
+
+def test_thresholds_are_per_joint():
+    settings = settings_with(detector={"threshold_Nm": [0.4, 0.1]})
+    over = alarms(step_at(0, 0.3) + step_at(1, 0.3), settings)
+    assert np.any(over, axis=0).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("impulse_Nms", "is_detected"), [(0.0148, False), (0.0152, True)])
+def test_the_smallest_impulse_is_the_threshold_over_the_cutoff(impulse_Nms, is_detected):
+    """Within 0.5 %: the impulse takes two periods, in which the filter forgets as much."""
+    tau_ext = np.zeros((500, 2))
+    tau_ext[BEGIN, 0] = impulse_Nms / T
+    assert bool(np.any(alarms(tau_ext))) is is_detected
+
+
+def test_the_environment_pushing_toward_positive_q_is_a_positive_external_torque():
+    """An arm that is held still by its drives against a push toward +q needs a negative joint torque."""
+    tau_J = np.full((2000, 2), (-0.7, -0.3))
+    still = np.zeros_like(tau_J)
+    blocks = run_kernel(settings_with(), still, still, tau_J, np.zeros(7), 0)
+    np.testing.assert_allclose(blocks[-1, PLACES["tau_ext_hat"]], [0.7, 0.3], rtol=1e-6)
+
+
+def test_thresholds_are_out_of_force_while_disarmed():
+    still = np.zeros((5, 2))
+    blocks = run_kernel(settings_with(), still, still, still, np.zeros(7), kernel.LEARN)
+    assert np.all(np.isposinf(blocks[:, PLACES["threshold"]]))
+
+
+@pytest.mark.parametrize(
+    ("tau_ext_hat", "joints"),
+    [
+        ((0.0, 0.0), 0b00),
+        ((0.2, 0.0), 0b01),
+        ((0.0, -0.2), 0b10),
+        ((-0.2, 0.2), 0b11),
+        ((0.15, -0.15), 0b00),
+        ((np.nextafter(0.15, 1.0), 0.0), 0b01),
+        ((np.nan, 0.0), 0b01),
+        ((0.0, np.nan), 0b10),
+        ((np.inf, -np.inf), 0b11),
+    ],
+)
+def test_the_joints_over_their_threshold_are_named(tau_ext_hat, joints):
+    assert joints_over(np.array(tau_ext_hat), np.array([0.15, 0.15])) == joints
+
+
+def test_each_joint_is_compared_with_its_own_threshold():
+    assert joints_over(np.array([0.3, 0.3]), np.array([0.4, 0.1])) == 0b10
+    assert joints_over(np.array([0.3, 0.3]), np.array([0.1, 0.4])) == 0b01
+
+
+def test_thresholds_go_out_of_force_when_the_scheme_disarms():
+    memory, block, constants = kernel.new_memory(7), kernel.new_block(7), kernel.constants_of(settings_with())
+    kernel.step(constants, memory, block, 1, 1, kernel.ARMED)
+    assert block[0]["threshold"].tolist() == [0.15, 0.15]
+    kernel.step(constants, memory, block, 1, 1, 0)
+    assert np.all(np.isposinf(block[0]["threshold"]))
+
+
+def thresholds(dq, F_c, samples=1000):
+    """Return the thresholds in force (n, 2) at constant velocity, with a model of this Coulomb friction."""
+    dq = np.tile(np.asarray(dq, float), (samples, 1))
+    theta = np.zeros(7)
+    theta[5:] = F_c
+    blocks = run_kernel(settings_with(), np.zeros_like(dq), dq, np.zeros_like(dq), theta, kernel.ARMED)
+    return blocks[:, PLACES["threshold"]]
+
+
+def test_a_joint_that_stands_still_may_hold_its_coulomb_friction():
+    np.testing.assert_allclose(thresholds([0.0, 0.0], [0.15, 0.08])[-1], [0.30, 0.23], rtol=1e-4)
+
+
+def test_a_joint_that_moves_has_the_threshold_of_the_settings():
+    np.testing.assert_array_equal(thresholds([0.02, -0.02], [0.15, 0.08]), 0.15)
+
+
+def test_the_standstill_is_forgotten_as_the_filter_forgets():
+    standstill = np.ones(2)
+    follow_standstill(np.array([1.0, 0.0]), 0.01, np.exp(-10.0 * T), standstill)
+    np.testing.assert_allclose(standstill, [np.exp(-10.0 * T), 1.0], rtol=1e-12)
+
+
+def test_a_model_with_negative_friction_lowers_no_threshold():
+    np.testing.assert_array_equal(thresholds([0.0, 0.0], [-0.1, -0.1]), 0.15)

@@ -1,0 +1,336 @@
+"""The state machine: its table against one written by hand, and the conditions that raise its events."""
+
+import itertools
+
+import numpy as np
+import pytest
+from smooth_motion import settings_with
+
+from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
+from adacd_hil.scheme.kernel import Observation
+from adacd_hil.scheme.supervisor import REST_HOLD_S, SchemeEvent, Supervisor, next_state
+
+# What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens.
+EVENTS = "FAULT COMPLETE COMMISSIONED ENABLED ADAPTED COLLISION AT_REST ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED"
+EXPECTED = """
+INIT        FAULT  COMMISSION  .       .      .        .      .        .        .        .
+COMMISSION  FAULT  .           ENABLE  .      .        .      .        .        .        .
+ENABLE      FAULT  .           .       ADAPT  .        .      .        .        .        .
+ADAPT       FAULT  .           .       .      MONITOR  .      .        .        .        .
+MONITOR     FAULT  .           .       .      .        REACT  .        .        PAYLOAD  .
+REACT       FAULT  .           .       .      .        .      STOPPED  .        .        .
+STOPPED     FAULT  .           .       .      .        .      .        MONITOR  PAYLOAD  .
+PAYLOAD     FAULT  .           .       .      .        .      .        .        .        ADAPT
+FAULT       .      .           .       .      .        .      .        .        .        .
+"""
+
+
+def expectations():
+    names = EVENTS.split()
+    for line in EXPECTED.strip().splitlines():
+        state, *cells = line.split()
+        for event, cell in zip(names, cells, strict=True):
+            yield state, event, state if cell == "." else cell
+
+
+@pytest.mark.parametrize(("state", "event", "expected"), list(expectations()))
+def test_every_event_in_every_state_leads_where_the_hand_written_table_says(state, event, expected):
+    assert next_state(SchemeState[state], SchemeEvent[event]) is SchemeState[expected]
+
+
+@pytest.mark.parametrize("state", SchemeState)
+def test_no_event_leaves_every_state_as_it_is(state):
+    assert next_state(state, SchemeEvent.NONE) is state
+
+
+def test_the_hand_written_table_covers_all_states_and_events():
+    covered = {(state, event) for state, event, _ in expectations()}
+    named = {event.name for event in SchemeEvent} - {"NONE"}
+    assert covered == set(itertools.product((state.name for state in SchemeState), named))
+
+
+SETTINGS = settings_with(
+    safety={"commission_cycles": 20, "phase_timeout_s": 0.1},
+    termination={"timeout_s": 1.0},
+    bus={"max_age_cycles": 3},
+)
+REST_CYCLES = round(REST_HOLD_S / SETTINGS.bus.period_s)
+RESTING = Observation.AT_REST | Observation.UNLOADED
+
+GOOD = ArmState(
+    cycle=0,
+    t_ns=0,
+    periods=1,
+    q=np.zeros(2),
+    dq=np.zeros(2),
+    tau_J=np.zeros(2),
+    age_q=(0, 0),
+    age_tau_J=(0, 0),
+    is_enabled=True,
+    is_complete=True,
+    fault=FaultReason.NONE,
+)
+DISABLED = GOOD._replace(is_enabled=False)
+
+
+class Run:
+    """A supervisor driven cycle by cycle."""
+
+    def __init__(self):
+        self.supervisor = Supervisor(SETTINGS)
+
+    @property
+    def state(self):
+        return self.supervisor.state
+
+    def step(self, arm=GOOD, request=Request.NONE, observation=Observation.NONE, is_reporting=False, cycles=1):
+        for _ in range(cycles):
+            self.supervisor.step(arm, request, int(observation), is_reporting)
+        return self.state
+
+    def to(self, state):
+        """Walk to a state the usual way."""
+        if state is SchemeState.FAULT:
+            self.to(SchemeState.MONITOR).step(GOOD._replace(fault=FaultReason.SENSOR))
+            return self
+        next_step = {
+            SchemeState.INIT: lambda: self.step(DISABLED),
+            SchemeState.COMMISSION: lambda: self.step(DISABLED, observation=RESTING, cycles=20),
+            SchemeState.ENABLE: self.step,
+            SchemeState.ADAPT: lambda: self.step(observation=Observation.ADAPTED),
+            SchemeState.MONITOR: lambda: self.step(observation=Observation.CONTACT),
+            SchemeState.REACT: lambda: self.step(observation=Observation.AT_REST, cycles=REST_CYCLES),
+            SchemeState.STOPPED: lambda: self.step(request=Request.PAYLOAD),
+        }
+        for _ in next_step:
+            if self.state is not state:
+                next_step[self.state]()
+        assert self.state is state
+        return self
+
+
+def run_in(state):
+    return Run().to(state)
+
+
+POWERED = (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
+CHECKED = (SchemeState.ENABLE, *POWERED)
+BAD = [
+    (GOOD._replace(is_enabled=False), Observation.NONE, FaultReason.DRIVE),
+    (GOOD._replace(fault=FaultReason.DRIVE), Observation.NONE, FaultReason.DRIVE),
+    (GOOD._replace(fault=FaultReason.SENSOR), Observation.NONE, FaultReason.SENSOR),
+    (GOOD, Observation.NOT_A_NUMBER, FaultReason.NOT_A_NUMBER),
+    (GOOD, Observation.OVER_LIMIT, FaultReason.LIMIT),
+    (GOOD._replace(age_q=(4, 0)), Observation.NONE, FaultReason.DATA_AGE),
+    (GOOD._replace(age_q=(0, 4)), Observation.NONE, FaultReason.DATA_AGE),
+    (GOOD._replace(age_tau_J=(4, 0)), Observation.NONE, FaultReason.DATA_AGE),
+    (GOOD._replace(age_tau_J=(0, 4)), Observation.NONE, FaultReason.DATA_AGE),
+]
+
+
+@pytest.mark.parametrize("state", POWERED)
+@pytest.mark.parametrize(("arm", "observation", "reason"), BAD)
+def test_a_powered_arm_that_is_not_well_faults(state, arm, observation, reason):
+    run = run_in(state)
+    assert run.step(arm, observation=observation) is SchemeState.FAULT
+    assert run.supervisor.fault is reason
+
+
+@pytest.mark.parametrize(("arm", "observation", "reason"), BAD[1:])
+def test_an_arm_that_is_not_well_while_its_drives_enable_faults(arm, observation, reason):
+    run = run_in(SchemeState.ENABLE)
+    run.step(arm._replace(is_enabled=False), observation=observation)
+    assert run.supervisor.fault is reason
+
+
+@pytest.mark.parametrize("state", CHECKED)
+def test_data_as_old_as_allowed_is_no_fault(state):
+    run = run_in(state)
+    assert run.step(GOOD._replace(age_q=(3, 3), age_tau_J=(3, 3))) is not SchemeState.FAULT
+
+
+@pytest.mark.parametrize("state", POWERED)
+def test_a_fault_outranks_everything_else_in_its_cycle(state):
+    run = run_in(state)
+    everything = Observation.CONTACT | Observation.ADAPTED | Observation.AT_REST | Observation.OVER_LIMIT
+    assert run.step(observation=everything, request=Request.ACKNOWLEDGE) is SchemeState.FAULT
+
+
+@pytest.mark.parametrize("request_", Request)
+def test_a_faulted_run_stays_faulted(request_):
+    run = run_in(SchemeState.FAULT)
+    good_news = RESTING | Observation.ADAPTED
+    assert run.step(observation=good_news, request=request_, cycles=300) is SchemeState.FAULT
+
+
+def test_a_fault_keeps_its_first_reason():
+    run = run_in(SchemeState.FAULT)
+    run.step(observation=Observation.OVER_LIMIT)
+    assert run.supervisor.fault is FaultReason.SENSOR
+
+
+@pytest.mark.parametrize("state", [SchemeState.INIT, SchemeState.COMMISSION, SchemeState.ENABLE, *POWERED])
+def test_without_a_fault_there_is_no_reason(state):
+    assert run_in(state).supervisor.fault is FaultReason.NONE
+
+
+def test_the_first_complete_cycle_begins_commissioning():
+    run = Run()
+    assert run.step(DISABLED._replace(is_complete=False), cycles=50) is SchemeState.INIT
+    assert run.step(DISABLED) is SchemeState.COMMISSION
+
+
+def test_commissioning_takes_as_many_good_cycles_as_asked():
+    run = run_in(SchemeState.COMMISSION)
+    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
+    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
+
+
+@pytest.mark.parametrize(
+    ("arm", "observation"),
+    [
+        (DISABLED._replace(is_complete=False), RESTING),
+        (DISABLED, Observation.AT_REST),
+        (DISABLED, Observation.UNLOADED),
+        (DISABLED._replace(fault=FaultReason.SENSOR), RESTING),
+        (DISABLED._replace(age_tau_J=(9, 0)), RESTING),
+        (DISABLED, RESTING | Observation.NOT_A_NUMBER),
+        (DISABLED, RESTING | Observation.OVER_LIMIT),
+    ],
+)
+def test_one_bad_cycle_begins_commissioning_anew(arm, observation):
+    run = run_in(SchemeState.COMMISSION)
+    run.step(DISABLED, observation=RESTING, cycles=19)
+    run.step(arm, observation=observation)
+    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
+    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
+
+
+@pytest.mark.parametrize(
+    ("state", "cycles", "reason"),
+    [
+        (SchemeState.COMMISSION, 100, FaultReason.COMMISSION_TIMEOUT),
+        (SchemeState.ENABLE, 100, FaultReason.ENABLE_TIMEOUT),
+        (SchemeState.ADAPT, 1000, FaultReason.ADAPT_TIMEOUT),
+    ],
+)
+def test_a_phase_that_takes_too_long_faults(state, cycles, reason):
+    run = run_in(state)
+    arm = GOOD if state is SchemeState.ADAPT else DISABLED
+    assert run.step(arm, cycles=cycles - 1) is state
+    assert run.step(arm) is SchemeState.FAULT
+    assert run.supervisor.fault is reason
+
+
+def test_skipped_periods_count_toward_a_timeout():
+    run = run_in(SchemeState.ADAPT)
+    assert run.step(GOOD._replace(periods=999)) is SchemeState.ADAPT
+    assert run.step() is SchemeState.FAULT
+
+
+def test_success_in_the_last_moment_is_no_timeout():
+    run = run_in(SchemeState.ADAPT)
+    run.step(cycles=999)
+    assert run.step(observation=Observation.ADAPTED) is SchemeState.MONITOR
+
+
+@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD])
+def test_a_state_without_a_time_limit_lasts(state):
+    assert run_in(state).step(cycles=5000) is state
+
+
+@pytest.mark.parametrize("state", [SchemeState.ADAPT, SchemeState.PAYLOAD])
+def test_a_touch_while_disarmed_is_no_collision(state):
+    assert run_in(state).step(observation=Observation.CONTACT) is state
+
+
+def test_a_collision_outranks_the_announcement_of_a_payload():
+    run = run_in(SchemeState.MONITOR)
+    assert run.step(request=Request.PAYLOAD, observation=Observation.CONTACT) is SchemeState.REACT
+
+
+def test_the_arm_counts_as_stopped_after_fifty_milliseconds_at_rest():
+    run = run_in(SchemeState.REACT)
+    assert run.step(observation=Observation.AT_REST, cycles=49) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
+
+
+def test_a_twitch_begins_the_fifty_milliseconds_anew():
+    run = run_in(SchemeState.REACT)
+    run.step(observation=Observation.AT_REST, cycles=49)
+    run.step()
+    assert run.step(observation=Observation.AT_REST, cycles=49) is SchemeState.REACT
+
+
+def test_skipped_periods_do_not_count_as_rest():
+    run = run_in(SchemeState.REACT)
+    assert run.step(GOOD._replace(periods=60), observation=Observation.AT_REST) is SchemeState.REACT
+
+
+def test_the_arm_is_not_stopped_before_the_report_is_final():
+    run = run_in(SchemeState.REACT)
+    assert run.step(observation=Observation.AT_REST, is_reporting=True, cycles=500) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
+
+
+def test_an_acknowledged_stop_goes_on():
+    assert run_in(SchemeState.STOPPED).step(request=Request.ACKNOWLEDGE) is SchemeState.MONITOR
+
+
+def test_an_acknowledgement_waits_until_nothing_pushes():
+    run = run_in(SchemeState.STOPPED)
+    assert run.step(request=Request.ACKNOWLEDGE, observation=Observation.CONTACT) is SchemeState.STOPPED
+    assert run.step(observation=Observation.CONTACT, cycles=300) is SchemeState.STOPPED
+    assert run.step() is SchemeState.MONITOR
+
+
+@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.REACT])
+def test_an_acknowledgement_before_the_stop_does_not_release_it(state):
+    run = run_in(state)
+    run.step(request=Request.ACKNOWLEDGE)
+    run.to(SchemeState.STOPPED)
+    assert run.step(cycles=100) is SchemeState.STOPPED
+
+
+def test_an_acknowledgement_is_good_for_one_stop():
+    run = run_in(SchemeState.STOPPED)
+    run.step(request=Request.ACKNOWLEDGE)
+    run.to(SchemeState.STOPPED)
+    assert run.step(cycles=100) is SchemeState.STOPPED
+
+
+@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.STOPPED])
+def test_a_payload_is_announced_to_an_arm_that_monitors_or_is_stopped(state):
+    assert run_in(state).step(request=Request.PAYLOAD) is SchemeState.PAYLOAD
+
+
+def test_a_payload_announced_during_adaptation_waits_for_its_end():
+    run = run_in(SchemeState.ADAPT)
+    assert run.step(request=Request.PAYLOAD) is SchemeState.ADAPT
+    assert run.step(observation=Observation.ADAPTED) is SchemeState.MONITOR
+    assert run.step() is SchemeState.PAYLOAD
+
+
+def test_a_payload_announced_during_the_withdrawal_waits_for_the_stop():
+    run = run_in(SchemeState.REACT)
+    run.step(request=Request.PAYLOAD)
+    assert run.step(observation=Observation.AT_REST, cycles=50) is SchemeState.STOPPED
+    assert run.step() is SchemeState.PAYLOAD
+
+
+def test_a_changed_payload_waits_until_the_arm_rests():
+    run = run_in(SchemeState.PAYLOAD)
+    run.step(cycles=10)
+    assert run.step(request=Request.PAYLOAD_CHANGED) is SchemeState.PAYLOAD
+    assert run.step(observation=Observation.AT_REST, cycles=49) is SchemeState.PAYLOAD
+    assert run.step(observation=Observation.AT_REST) is SchemeState.ADAPT
+
+
+@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.STOPPED])
+def test_a_changed_payload_that_was_not_announced_is_ignored(state):
+    assert run_in(state).step(request=Request.PAYLOAD_CHANGED, observation=Observation.AT_REST, cycles=200) is state
+
+
+@pytest.mark.parametrize("state", [SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.STOPPED, SchemeState.PAYLOAD])
+def test_the_end_of_the_run_is_left_to_the_control_layer(state):
+    assert run_in(state).step(request=Request.FINISH, cycles=10) is state

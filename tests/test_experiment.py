@@ -1,0 +1,103 @@
+"""The paper's experiment in one process: the figures it must reach, and that it can be repeated bit for bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from experiment_runs import Played, demo
+
+from adacd_hil.log.reader import read_log, topic_bytes
+from adacd_hil.records import SchemeState
+
+pytestmark = pytest.mark.slow
+
+SEED = "7"
+# profile, first adaptation s, second adaptation s
+TIMES = [("P", 5.20, 0.02, 5.28, 0.02), ("S", 5.26, 0.35, 5.25, 0.02), ("M", 7.5, 0.5, 5.25, 0.03)]
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Played]:
+    return {
+        profile: demo(tmp_path_factory.mktemp(profile), "--profile", profile, "--seed", SEED)
+        for profile in ("P", "S", "M")
+    }
+
+
+@pytest.mark.parametrize(("profile", "first_s", "first_within_s", "second_s", "second_within_s"), TIMES)
+def test_both_adaptations_take_their_time(
+    played: dict[str, Played],
+    profile: str,
+    first_s: float,
+    first_within_s: float,
+    second_s: float,
+    second_within_s: float,
+) -> None:
+    took_s = played[profile].json["adaptation_s"]
+    assert took_s["A"] == pytest.approx(first_s, abs=first_within_s)
+    assert took_s["D"] == pytest.approx(second_s, abs=second_within_s)
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_every_contact_is_detected_and_none_is_false(played: dict[str, Played], profile: str) -> None:
+    report = played[profile].json
+    assert (len(report["contacts"]), report["missed"], report["false_alarms"]) == (8, 0, 0)
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_link_and_direction_are_right_in_the_end(played: dict[str, Played], profile: str) -> None:
+    contacts = played[profile].json["contacts"]
+    assert [contact["link_detected"] for contact in contacts] == [contact["link"] for contact in contacts]
+    assert all(contact["direction_ok"] for contact in contacts)
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_a_step_is_detected_within_the_law_and_the_bus(played: dict[str, Played], profile: str) -> None:
+    excess_ms = [contact["delay_ms"] - contact["law_ms"] for contact in played[profile].json["contacts"]]
+    assert max(excess_ms) <= 2.5 + 1.0
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_the_frozen_model_is_quiet_where_nobody_touches_the_arm(played: dict[str, Played], profile: str) -> None:
+    residuals = played[profile].json["frozen_residual_max_Nm"]
+    assert max(*residuals["B"]["identified"], *residuals["E"]["identified"]) <= 0.07
+
+
+def test_the_cad_model_is_far_off_with_a_payload(played: dict[str, Played]) -> None:
+    assert max(played["M"].json["frozen_residual_max_Nm"]["E"]["cad"]) >= 1.0
+
+
+def test_the_identified_inertia_follows_the_payload(played: dict[str, Played]) -> None:
+    parameters = played["P"].json["parameters"]
+    true, identified = zip(*[parameters["D"][name] for name in ("a1", "a2", "a3")], strict=True)
+    np.testing.assert_allclose(identified, true, rtol=0.12)
+
+
+def test_the_experiment_ends_well_and_its_log_is_whole(played: dict[str, Played]) -> None:
+    assert {profile: run.status for profile, run in played.items()} == {"P": 0, "S": 0, "M": 0}
+    assert played["P"].json["log"]["dropped"] == 0
+
+
+def test_every_file_of_the_report_is_there(played: dict[str, Played]) -> None:
+    names = {path.name for path in played["P"].folder.iterdir()}
+    assert names >= {"run.mcap", "truth.mcap", "report.html", "report.json", "fig5.png", "fig6.png", "fig7.png"}
+
+
+def test_there_is_no_torque_on_the_wire_before_the_checks_have_passed(played: dict[str, Played]) -> None:
+    log = read_log(played["P"].log)
+    start_cycle = log.scheme["cycle"][np.argmax(log.scheme["state"] == SchemeState.ADAPT)]
+    start_ns = log.scheme.t_ns[start_cycle]
+    for name in ("Drive1Command", "Drive2Command"):
+        command = log.decoded[name]
+        assert np.count_nonzero(command["target_torque"][command.t_ns < start_ns]) == 0
+
+
+def test_the_same_seed_twice_gives_the_same_decisions_bit_for_bit(played: dict[str, Played], tmp_path: Path) -> None:
+    again = demo(tmp_path, "--seed", SEED)
+    for topic in ("/scheme", "/control", "/contact", "/from_can_bus", "/to_can_bus"):
+        assert topic_bytes(again.log, topic) == topic_bytes(played["P"].log, topic)
+
+
+def test_another_seed_gives_other_numbers(played: dict[str, Played], tmp_path: Path) -> None:
+    other = demo(tmp_path, "--seed", "8")
+    assert topic_bytes(other.log, "/scheme") != topic_bytes(played["P"].log, "/scheme")

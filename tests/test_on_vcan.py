@@ -1,0 +1,90 @@
+"""Host and emulated arm as two processes on real SocketCAN."""
+
+import contextlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from experiment_runs import BIN, Played, demo, emulator, run_on_vcan
+
+from adacd_hil.log.reader import read_log, topic_bytes
+from adacd_hil.wire.codec import contract_folder
+
+pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+
+SEED = "7"
+DECISIONS = ("/scheme", "/control", "/contact")
+
+
+@pytest.fixture(scope="module")
+def lockstep(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    """Play the experiment in lockstep, with candump listening."""
+    folder = tmp_path_factory.mktemp("lockstep")
+    dump = folder / "candump.log"
+    with contextlib.ExitStack() as stack:
+        if shutil.which("candump"):
+            command = ["candump", "-L", "-r", "16777216", "vcan0"]  # room for what it can't write down at once
+            listener = subprocess.Popen(command, stdout=stack.enter_context(dump.open("w")))
+            stack.callback(listener.wait, 10)
+            stack.callback(listener.terminate)
+        stack.enter_context(emulator(folder, "--seed", SEED))
+        return run_on_vcan(folder, "--clock", "lockstep")
+
+
+def test_lockstep_on_vcan_decides_the_same_as_the_embedded_bus_bit_for_bit(lockstep: Played, tmp_path: Path) -> None:
+    embedded = demo(tmp_path, "--seed", SEED)
+    for topic in DECISIONS:
+        assert topic_bytes(lockstep.log, topic) == topic_bytes(embedded.log, topic)
+
+
+def test_the_experiment_ends_well_on_vcan(lockstep: Played) -> None:
+    assert (lockstep.status, lockstep.json["state"], lockstep.json["dropped"]) == (0, "MONITOR", 0)
+
+
+def test_candump_sees_the_frames_and_cantools_decodes_every_one(lockstep: Played) -> None:
+    dump = lockstep.folder / "candump.log"
+    if not dump.exists():
+        pytest.skip("candump (Debian package can-utils) is not installed")
+    text = dump.read_text()
+    done = subprocess.run(
+        [BIN / "python", "-m", "cantools", "decode", "--single-line", str(contract_folder() / "arm.dbc")],
+        input=text,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    decoded = done.stdout.splitlines()
+    assert len(decoded) == len(text.splitlines())
+    assert [line for line in decoded if not re.search(r":: \w+\(.*\)$", line)] == []
+
+
+def test_candump_sees_all_that_the_log_holds(lockstep: Played) -> None:
+    dump = lockstep.folder / "candump.log"
+    if not dump.exists():
+        pytest.skip("candump (Debian package can-utils) is not installed")
+    log = read_log(lockstep.log)
+    assert len(dump.read_text().splitlines()) >= len(log.frames)
+
+
+@pytest.mark.wallclock
+def test_real_time_at_1_khz_detects_the_same_contacts(tmp_path: Path) -> None:
+    # A shared machine stalls for longer than an arm's drives would forgive; the stalls are counted, not hidden.
+    config = tmp_path / "patient.toml"
+    config.write_text("[bus]\ncommand_patience_cycles = 200\n")
+    with emulator(tmp_path, "--seed", SEED):
+        played = run_on_vcan(tmp_path, "--config", str(config), "--clock", "realtime")
+    assert played.status == 0, played.stderr
+    report = subprocess.run(
+        [BIN / "adacd-hil", "report", str(tmp_path), "--json"], capture_output=True, text=True, check=True
+    )
+    (described,) = json.loads(report.stdout)
+    print(described["cycle"], file=sys.stderr)
+    contacts = described["contacts"]
+    assert (len(contacts), described["missed"], described["false_alarms"]) == (8, 0, 0)
+    assert [contact["link_detected"] for contact in contacts] == [1, 1, 2, 2, 1, 1, 2, 2]
+    assert all(contact["direction_ok"] for contact in contacts)
+    assert described["cycle"]["clock"] == "realtime"

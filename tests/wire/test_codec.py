@@ -1,0 +1,159 @@
+"""The codec: written by hand, against cantools bit for bit, and what it refuses."""
+
+from pathlib import Path
+
+import cantools
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
+
+CODEC = load_codec()
+PEER = cantools.database.load_file(contract_folder() / "arm.dbc")
+
+# message, bytes on the wire, values after the end-to-end header; every field a different value
+FRAMES = [
+    ("Sync", "a5", (165.0,)),
+    ("Nmt", "8203", (130.0, 3.0)),
+    ("Drive1Feedback", "40420f0018fcffff", (1_000_000 * 5.9921124526782858e-06, -0.5)),
+    ("Drive2Status", "37120a9cff1f86", (4663.0, 10.0, -100.0, 34335.0)),
+    ("Sensor1Torque", "a7c960e31600", (1.5,)),
+    ("Drive1Command", "31020f0085ff", (15.0, -123.0)),
+    ("Sensor2Status", "0581", (5.0, 129.0)),
+    ("Drive2Emcy", "50822107ddccbbaa", (33360.0, 33.0, 7.0, 2864434397.0)),
+    ("Sensor2SdoRequest", "2317100501020304", (35.0, 4119.0, 5.0, 67305985.0)),
+    ("HostHeartbeat", "05", (5.0,)),
+]
+
+
+@pytest.mark.parametrize(("name", "wire", "values"), FRAMES)
+def test_a_frame_written_by_hand_decodes_to_its_values(name: str, wire: str, values: tuple[float, ...]) -> None:
+    assert CODEC.message(name).decode_values(bytes.fromhex(wire)) == pytest.approx(values, rel=1e-12)
+
+
+@pytest.mark.parametrize(("name", "wire", "values"), FRAMES)
+def test_values_encode_to_the_frame_written_by_hand(name: str, wire: str, values: tuple[float, ...]) -> None:
+    message = CODEC.message(name)
+    header = 2 if message.is_protected else 0
+    assert bytes(message.encode(*values))[header:] == bytes.fromhex(wire)[header:]
+
+
+def raw_values(message: str) -> st.SearchStrategy[dict[str, int]]:
+    return st.fixed_dictionaries(
+        {signal.name: st.integers(signal.raw_low, signal.raw_high) for signal in CODEC.message(message).signals}
+    )
+
+
+@pytest.mark.parametrize("name", sorted(CODEC.messages))
+@given(data=st.data())
+def test_cantools_decodes_every_frame_to_the_same_values(name: str, data: st.DataObject) -> None:
+    message = CODEC.message(name)
+    wire = data.draw(st.binary(min_size=message.length, max_size=message.length))
+    theirs = PEER.decode_message(name, wire, decode_choices=False)
+    assert message.decode(wire) == tuple(theirs[signal.name] for signal in message.signals)
+
+
+@pytest.mark.parametrize("name", sorted(CODEC.messages))
+@given(data=st.data())
+def test_cantools_encodes_the_same_bits(name: str, data: st.DataObject) -> None:
+    message = CODEC.message(name)
+    raw = data.draw(raw_values(name))
+    if message.is_protected:
+        raw |= {"e2e_crc": 0, "e2e_counter": 0, "e2e_status": 0}
+    physical = [raw[signal.name] * signal.scale + signal.offset for signal in message.values]
+    assert bytes(message.encode(*physical)) == PEER.get_message_by_name(name).encode(raw, scaling=False, strict=False)
+
+
+@given(controlword=st.integers(0, 0xFFFF), torque=st.integers(-32768, 32767))
+def test_the_hot_path_encodes_what_the_general_path_encodes(controlword: int, torque: int) -> None:
+    message = CODEC.message("Drive2Command")
+    assert message.encode_raw(controlword, torque) == message.encode(controlword, torque)
+
+
+def test_a_value_beyond_its_signal_is_refused_with_the_bound() -> None:
+    with pytest.raises(CodecError, match=r"target_torque = 40000 permille exceeds 32767"):
+        CODEC.message("Drive1Command").encode(15, 40000)
+
+
+def test_a_frame_of_the_wrong_length_is_refused() -> None:
+    with pytest.raises(CodecError, match=r"Drive1Feedback has 7 bytes, 8 expected"):
+        CODEC.message("Drive1Feedback").decode(bytes(7))
+
+
+def test_node_ids_are_those_of_the_identifiers() -> None:
+    assert [CODEC.node_id(name) for name in ("Drive1Feedback", "Sensor2Torque")] == [1, 4]
+
+
+def edited(tmp_path: Path, old: str, new: str) -> Path:
+    text = (contract_folder() / "arm.dbc").read_text()
+    assert old in text
+    path = tmp_path / "edited.dbc"
+    path.write_text(text.replace(old, new))
+    return path
+
+
+def test_a_signed_bit_field_keeps_its_sign(tmp_path: Path) -> None:
+    path = edited(tmp_path, "SG_ e2e_status : 12|4@1+ (1,0) [0|15]", "SG_ e2e_status : 12|4@1- (1,0) [-8|7]")
+    assert load_codec(path).message("Sensor1Torque").decode(bytes.fromhex("008000000000"))[2] == -8.0
+
+
+def test_the_layout_digest_ignores_comments(tmp_path: Path) -> None:
+    path = edited(tmp_path, "RPDO1, acts at the next SYNC", "Another comment")
+    assert load_codec(path).layout_digest == CODEC.layout_digest
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("SG_ torque : 16|32@1- (1e-06,0)", "SG_ torque : 16|32@1- (1e-05,0)"),
+        ("BO_ 1793 Drive1Heartbeat", "BO_ 1798 Drive1Heartbeat"),
+        ("728145e7085e7852626d872b902e3d3c", "738145e7085e7852626d872b902e3d3c"),
+    ],
+    ids=["scale", "identifier", "data id"],
+)
+def test_the_layout_digest_changes_with(tmp_path: Path, old: str, new: str) -> None:
+    text = edited(tmp_path, old, new).read_text().replace("_ 1793 ", "_ 1798 " if "1798" in new else "_ 1793 ")
+    path = tmp_path / "whole.dbc"
+    path.write_text(text)
+    assert load_codec(path).layout_digest != CODEC.layout_digest
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("controlword : 16|16@1+", "controlword : 23|16@0+", r"Drive1Command.controlword: only plain little-endian"),
+        ("SG_ velocity : 32|32@1-", "SG_ velocity : 32|31@1-", r"Drive1Feedback.velocity: bits 32\+31 overlap"),
+        (' SG_ error_register : 8|8@1+ (1,0) [0|255] "" HOST\n', "", r"Sensor1Status: signals cover 8 of 16 bits"),
+        ("SG_ e2e_crc : 0|8@1+", "SG_ other : 0|8@1+", r"Sensor1Torque: a protected message begins with e2e_crc"),
+        ('BO_ 387 "', 'BO_ 387 "00', r"Sensor1Torque: E2EDataIdList has 17 bytes, 16 expected"),
+        ("728145e7", "zz8145e7", r"E2EDataIdList = 'zz8145e7.*' is not hexadecimal"),
+    ],
+    ids=["big endian", "31 bits", "a gap", "no header", "17 data ids", "no hex"],
+)
+def test_a_dbc_that_cant_be_cyclic_is_refused_by_name(tmp_path: Path, old: str, new: str, reason: str) -> None:
+    with pytest.raises(CodecError, match=reason):
+        load_codec(edited(tmp_path, old, new))
+
+
+def test_a_dbc_without_a_needed_message_is_refused_by_name() -> None:
+    with pytest.raises(CodecError, match="message Drive3Feedback is missing in the DBC"):
+        CODEC.message("Drive3Feedback")
+
+
+def test_a_file_that_is_not_a_dbc_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "not.dbc"
+    path.write_text("hello\nworld")
+    with pytest.raises(CodecError) as caught:
+        load_codec(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_dbc_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CodecError, match=r"none.dbc: No such file"):
+        load_codec(tmp_path / "none.dbc")
+
+
+def test_a_codec_knows_the_same_identifiers_as_the_dbc() -> None:
+    assert isinstance(CODEC, Codec)
+    assert sorted(CODEC.by_id) == sorted(message.frame_id for message in PEER.messages)

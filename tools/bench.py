@@ -1,0 +1,208 @@
+"""Prints what one step, one cycle, the codec, the plant and the log hand-off cost: percentiles in µs, no verdict.
+
+    python tools/bench.py           in this process, then the cycle over vcan through tools/with-vcan
+    python tools/bench.py --vcan    the cycle over vcan0 only: emulator and host as two processes
+
+Absolute figures are this machine's; compare ratios of one run. numpy's percentiles, linear interpolation.
+"""
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cantools
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.config import load_settings
+from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.control.session import Session
+from adacd_hil.log.channels import ChannelId, pack_scheme
+from adacd_hil.log.reader import read_log
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import ArmState, FaultReason, Request
+from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.codec import contract_folder, load_codec
+from firmware_sim.bench import Bench
+from firmware_sim.body import Body, DriveMode
+from firmware_sim.scenario import load_scenario
+
+ROOT = Path(__file__).resolve().parent.parent
+BIN = Path(sys.executable).parent
+REPEATS = 20_000
+WARM_UP = 1_000
+SHORT_RUN = '[operator]\nscript = [{ at_s = 10.0, request = "finish" }]\n'
+
+
+def main() -> int:
+    """Run what was asked for."""
+    parser = argparse.ArgumentParser(description="Benchmarks; prints percentiles in µs.")
+    parser.add_argument("--vcan", action="store_true", help="the cycle over vcan0 only")
+    if parser.parse_args().vcan:
+        return bench_vcan()
+    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}")
+    print(f"{'µs':44} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}")
+    bench_in_process()
+    sys.stdout.flush()
+    return subprocess.run([ROOT / "tools/with-vcan", "--", sys.executable, __file__, "--vcan"], check=False).returncode
+
+
+def show(name: str, times_us: NDArray[np.float64]) -> None:
+    """Print one row."""
+    p50, p99, p999 = np.percentile(times_us, [50.0, 99.0, 99.9])
+    print(f"{name:44} {p50:8.2f} {p99:8.2f} {p999:8.2f} {times_us.max():8.1f}")
+
+
+def time_calls(name: str, call: Callable[[], object]) -> None:
+    """Time single calls, the clock's own cost taken off."""
+    clock = time.perf_counter_ns
+    times_ns = np.empty(REPEATS)
+    for _ in range(WARM_UP):
+        call()
+    for index in range(REPEATS):
+        start_ns = clock()
+        call()
+        times_ns[index] = clock() - start_ns
+    overhead_ns = min(clock() - clock() for _ in range(1000)) * -1
+    show(name, np.maximum(times_ns - overhead_ns, 0.0) * 1e-3)
+
+
+def bench_in_process() -> None:
+    """Time the parts that need no second process but the logger's."""
+    codec = load_codec()
+    peer = cantools.database.load_file(contract_folder() / "arm.dbc")
+    feedback, command = codec.message("Drive1Feedback"), codec.message("Drive1Command")
+    their_feedback, their_command = (
+        peer.get_message_by_name("Drive1Feedback"),
+        peer.get_message_by_name("Drive1Command"),
+    )
+    wire = bytes(feedback.encode(0.3, -1.2))
+    sender = command.sender()
+    fields = {"e2e_crc": 0, "e2e_counter": 0, "e2e_status": 0, "controlword": 15, "target_torque": -123}
+    time_calls("codec: decode feedback", lambda: feedback.decode_values(wire))
+    time_calls("cantools: decode feedback", lambda: their_feedback.decode(wire))
+    time_calls("codec: encode and protect command", lambda: sender.protect(command.encode_raw(15, -123)))
+    time_calls("cantools: encode command, no protection", lambda: their_command.encode(fields))
+
+    settings = load_settings("paper")
+    pipeline = Pipeline(settings)
+    pipeline.compile()
+    arm = ArmState(
+        0, 0, 1, np.array((0.1, 0.2)), np.array((0.01, 0.02)), np.zeros(2), (0, 0), (0, 0), True, True, FaultReason.NONE
+    )
+    time_calls("scheme: one step", lambda: pipeline.step(arm))
+
+    scenario = load_scenario("paper", "P")
+    body = Body(scenario, settings.bus.period_s, 1)
+    torques, modes = (0.1, 0.05), (DriveMode.TORQUE, DriveMode.TORQUE)
+    time_calls("plant: 1 ms of arm, drives and sensors", lambda: (body.advance(torques, modes), body.sample()))
+    bench_log(pipeline.step(arm), wire)
+    bench_embedded()
+
+
+def bench_log(output: object, wire: bytes) -> None:
+    """Time handing a cycle with seven frames to the logger's process, without waiting for it."""
+    frames = [(False, Frame(0x181, wire, 0))] * 7
+    with tempfile.TemporaryDirectory() as folder:
+        recorder = Recorder(Path(folder) / "bench.mcap", blocking=False)
+        message = pack_scheme(output, Request.NONE)  # type: ignore[arg-type]
+
+        def hand_over() -> None:
+            recorder.cycle(0, [(ChannelId.SCHEME, message)], frames)
+
+        for _ in range(WARM_UP):
+            hand_over()
+        times_ns = np.empty(5000)
+        for index in range(times_ns.size):
+            time.sleep(200e-6)  # the writer keeps up, as it does at 1 kHz
+            start_ns = time.perf_counter_ns()
+            hand_over()
+            times_ns[index] = time.perf_counter_ns() - start_ns
+        dropped = recorder.close().dropped
+    show(f"log: hand over a cycle with 7 frames ({dropped} lost)", times_ns * 1e-3)
+
+
+def bench_embedded() -> None:
+    """Run ten seconds in lockstep on the embedded bus and print the pace."""
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "short.toml").write_text(SHORT_RUN)
+        settings = load_settings(str(Path(folder) / "short.toml"), "P")
+        clock = VirtualClock()
+        bus = EmbeddedBus(clock)
+        codec = load_codec()
+        bench = Bench(load_scenario("idle", "P"), codec, bus.deliver)
+        bus.attach(bench.on_frame)
+        bench.boot()
+        operator = ScriptedOperator(settings.operator)
+        session = Session(settings, codec, bus, clock, operator, Path(folder), "embedded")
+        start_s = time.perf_counter()
+        session.run()
+        elapsed_s = time.perf_counter() - start_s
+        show_log("embedded bus, lockstep", Path(folder) / "run.mcap", elapsed_s)
+
+
+def bench_vcan() -> int:
+    """Run host and emulator as two processes on vcan0, in lockstep and in real time."""
+    for clock in ("lockstep", "realtime"):
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "short.toml").write_text(SHORT_RUN)
+            where = ["-i", "socketcan", "-c", "vcan0"]
+            emulator = subprocess.Popen(
+                [BIN / "firmware-sim", "run", *where, "--scenario", "idle"], stderr=subprocess.PIPE, text=True
+            )
+            assert emulator.stderr is not None
+            emulator.stderr.readline()
+            start_s = time.perf_counter()
+            host = subprocess.run(
+                [
+                    BIN / "adacd-hil",
+                    "run",
+                    *where,
+                    "--config",
+                    f"{folder}/short.toml",
+                    "--clock",
+                    clock,
+                    "--out",
+                    folder,
+                ],
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            elapsed_s = time.perf_counter() - start_s
+            emulator.terminate()
+            emulator.communicate()
+            if host.returncode != 0:
+                print(host.stderr, file=sys.stderr)
+                return host.returncode
+            show_log(f"vcan, {clock}", Path(folder) / "run.mcap", elapsed_s)
+    return 0
+
+
+def show_log(name: str, path: Path, elapsed_s: float) -> None:
+    """Print the cycle's percentiles from a log."""
+    log = read_log(path)
+    cycle = log.cycle
+    feedback_us = np.asarray(cycle["feedback_ns"]) * 1e-3
+    command_us = np.asarray(cycle["command_ns"]) * 1e-3
+    scheduler = log.metadata.get("scheduler", "")
+    count = len(feedback_us)
+    overruns = int(cycle["overruns"][-1])
+    print(f"{name}: {count} cycles in {elapsed_s:.1f} s with start-up, {scheduler}, {overruns} overruns")
+    show("  SYNC out to last frame decoded", feedback_us)
+    show("  last frame in to last command out", command_us - feedback_us)
+    show("  SYNC out to last command out", command_us)
+    if name.endswith("realtime"):
+        show("  lateness of wake-up", np.asarray(cycle["lateness_ns"]) * 1e-3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
