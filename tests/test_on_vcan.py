@@ -5,12 +5,13 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from experiment_runs import BIN, Played, demo, emulator, run_on_vcan
 
+from adacd_hil.config import load_settings
 from adacd_hil.log.reader import read_log, topic_bytes
 from adacd_hil.wire.codec import contract_folder
 
@@ -72,19 +73,32 @@ def test_candump_sees_all_that_the_log_holds(lockstep: Played) -> None:
 
 @pytest.mark.wallclock
 def test_real_time_at_1_khz_detects_the_same_contacts(tmp_path: Path) -> None:
-    # A shared machine stalls for longer than an arm's drives would forgive; the stalls are counted, not hidden.
+    # A shared machine stalls for longer than an arm should forgive. Here it may: stalls are counted, not hidden, and
+    # contacts are judged only where the bus kept up as it has to on an arm.
     config = tmp_path / "patient.toml"
-    config.write_text("[bus]\ncommand_patience_cycles = 200\n")
+    config.write_text("[bus]\ncommand_patience_cycles = 250\nmax_age_cycles = 100\n")
     with emulator(tmp_path, "--seed", SEED):
         played = run_on_vcan(tmp_path, "--config", str(config), "--clock", "realtime")
-    assert played.status == 0, played.stderr
+    stall = longest_stall_cycles(played.log)
+    if stall > load_settings().bus.max_age_cycles:
+        assert played.status in (0, 3, 4), played.stderr  # through, with a gap in the log, or stopped
+        pytest.skip(
+            f"the machine stalled for {stall} ms, so the contacts can't be compared; exit status {played.status}"
+        )
+    assert (played.status, played.json["dropped"]) == (0, 0), played.stderr
     report = subprocess.run(
         [BIN / "adacd-hil", "report", str(tmp_path), "--json"], capture_output=True, text=True, check=True
     )
     (described,) = json.loads(report.stdout)
-    print(described["cycle"], file=sys.stderr)
     contacts = described["contacts"]
     assert (len(contacts), described["missed"], described["false_alarms"]) == (8, 0, 0)
     assert [contact["link_detected"] for contact in contacts] == [1, 1, 2, 2, 1, 1, 2, 2]
     assert all(contact["direction_ok"] for contact in contacts)
     assert described["cycle"]["clock"] == "realtime"
+
+
+def longest_stall_cycles(path: Path) -> int:
+    """Return the longest time without complete data in a log, in cycles, skipped ones included."""
+    cycles = read_log(path).topics["/cycle"]
+    complete = cycles["cycle"][cycles["frames_missing"] == 0]
+    return int(np.diff(complete).max(initial=1)) - 1
