@@ -13,7 +13,8 @@ from adacd_hil.control.cycle import Cycle, RunResult, SilenceError
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import GridPacer, LockstepPacer, Pacer
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.network import DeviceError, Identity, Master
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.network import Identity, Master
 from adacd_hil.log.recorder import LogSummary, Recorder
 from adacd_hil.records import Event
 from adacd_hil.scheduling import RealtimeGrant, freeze_garbage, request_realtime, scheduler_name

@@ -1,0 +1,98 @@
+"""canopen over our own bus: NMT, SDO, EMCY and heartbeats of any node. The host's only door to `canopen`.
+
+No threads: a request is sent, then the bus is read until its answer is in. What arrives meanwhile goes to whom it
+concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
+"""
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import canopen
+from canopen.emcy import EmcyError
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
+
+from adacd_hil.wire.bus import Bus, Frame
+
+ANSWER_TIMEOUT_S = 0.5
+"""Longest silence while waiting for an answer. CiA 301 gives none; drives answer within 100 ms."""
+_MAX_UNRELATED_FRAMES = 10_000
+_SDO_ABORT = 0x80
+
+# canopen reports what it also raises; the raised form is ours to print.
+logging.getLogger("canopen").addHandler(logging.NullHandler())
+logging.getLogger("canopen").propagate = False
+
+
+class DeviceError(RuntimeError):
+    """A device is missing, not the expected one, or refuses its set-up; one line."""
+
+
+class _Network(canopen.Network):
+    """canopen's network over our bus, without its receiving thread."""
+
+    def __init__(self, send: Callable[[int, bytes], None]) -> None:
+        super().__init__()
+        self._send = send
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
+        self._send(can_id, bytes(data))
+
+
+class CanopenBus:
+    """Speaks CANopen over one end of a bus, as master."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.channel = bus.channel
+        self._bus = bus
+        self._network = _Network(self._send)
+
+    def add_node(self, node_id: int, eds: Path | None, on_emergency: Callable[[EmcyError], None] | None = None) -> Any:
+        """Return canopen's node; without an EDS it has no objects, and SDO goes by index through `node.sdo.upload`."""
+        node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if eds is None else str(eds))  # type: ignore[no-untyped-call]
+        self._network.add_node(node)
+        node.sdo.RESPONSE_TIMEOUT = 0.0005  # the answer is in the queue when `_send` returns, or never comes
+        if on_emergency is not None:
+            node.emcy.add_callback(on_emergency)
+        return node
+
+    def command(self, nmt_command: int, node_id: int = 0) -> None:
+        """Send an NMT command to one node, or to all. Raises BusError."""
+        self._bus.send(0x000, bytes((nmt_command, node_id)))
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        self._bus.send(can_id, data)
+        is_request = can_id & 0x780 == 0x600 and data[0] != _SDO_ABORT
+        if is_request:
+            self.pump(lambda frame: frame.can_id == can_id - 0x80, ANSWER_TIMEOUT_S)
+
+    def pump(self, is_answer: Callable[[Frame], bool], timeout_s: float) -> bool:
+        """Read the bus until an answer is in; False after a silence of `timeout_s`."""
+        for _ in range(_MAX_UNRELATED_FRAMES):
+            frame = self._bus.receive(timeout_s)
+            if frame is None:
+                return False
+            self.accept(frame)
+            if is_answer(frame):
+                return True
+        return False
+
+    def accept(self, frame: Frame) -> None:
+        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY."""
+        if not frame.is_error and frame.data:
+            self._network.notify(frame.can_id, bytearray(frame.data), frame.t_ns * 1e-9)
+
+
+@contextmanager
+def explained(name: str, node_id: int, what: str) -> Iterator[None]:
+    """Turn canopen's SDO errors into a DeviceError of one line."""
+    try:
+        yield
+    except SdoAbortedError as error:
+        raise DeviceError(f"{name} (node {node_id}): {what} refused: {error}") from None
+    except SdoCommunicationError:
+        raise DeviceError(f"{name} (node {node_id}): no SDO answer within {ANSWER_TIMEOUT_S:g} s ({what})") from None
+    except (SdoError, KeyError) as error:
+        raise DeviceError(f"{name} (node {node_id}): {what}: {error}") from None
