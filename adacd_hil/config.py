@@ -309,6 +309,10 @@ class OperatorSettings:
     acknowledge_after_s: float = setting(
         0.0, unit="s", low=0.0, high=3600.0, meaning="acknowledge a stop by itself after this time; 0: never"
     )
+    acknowledge_faults: int = setting(0, low=0, high=1000, meaning="how many faults are acknowledged by themselves")
+    acknowledge_fault_after_s: float = setting(
+        1.0, unit="s", low=0.0, high=3600.0, meaning="how long after a fault it is acknowledged by itself"
+    )
 
 
 @dataclass(frozen=True)

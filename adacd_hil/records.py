@@ -128,7 +128,7 @@ class SchemeState(IntEnum):
     REACT = 5  # the arm has come to rest
     STOPPED = 6  # the user acknowledges
     PAYLOAD = 7  # the user says that the payload has been changed
-    FAULT = 8  # a new run; latched
+    FAULT = 8  # latched; the user acknowledges, and everything begins again with INIT
 
 
 class Request(IntEnum):
@@ -153,6 +153,7 @@ class FaultReason(IntEnum):
     COMMISSION_TIMEOUT = 6
     ENABLE_TIMEOUT = 7
     ADAPT_TIMEOUT = 8
+    HEARTBEAT = 9  # a device has fallen silent or left Operational
 
 
 class ArmState(NamedTuple):

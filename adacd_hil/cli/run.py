@@ -82,6 +82,7 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
             "overruns": summary.result.overruns,
             "state": summary.result.state.name,
             "fault": summary.result.fault.name,
+            "recoveries": summary.recoveries,
         }
     log = summary.log
     return described | {"frames": log.frames, "messages": log.messages, "dropped": log.dropped, "log_error": log.error}

@@ -3,6 +3,7 @@
 import sys
 import threading
 from collections import deque
+from enum import Enum
 from typing import Protocol, TextIO
 
 from adacd_hil.config import OperatorSettings
@@ -16,11 +17,22 @@ CONSOLE_WORDS = {
 }
 
 
+class FaultAnswer(Enum):
+    """What the user says to a fault."""
+
+    WAIT = "nothing yet"
+    RECOVER = "the cause is gone, begin again"
+    END = "end the run, or nobody is there to ask"
+
+
 class Operator(Protocol):
     """Somebody who may ask something of the arm in each cycle."""
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return this cycle's request. `elapsed_s`: since the drives were enabled, None before."""
+
+    def answer_fault(self, elapsed_s: float) -> FaultAnswer:
+        """Say how a faulted run goes on; asked again until the answer is not WAIT. `elapsed_s`: since the fault."""
 
 
 class ScriptedOperator:
@@ -30,6 +42,17 @@ class ScriptedOperator:
         self._script = deque(sorted(settings.script, key=lambda entry: entry.at_s))
         self._acknowledge_after_s = settings.acknowledge_after_s
         self._stopped_since_s: float | None = None
+        self._faults_left = settings.acknowledge_faults
+        self._acknowledge_fault_after_s = settings.acknowledge_fault_after_s
+
+    def answer_fault(self, elapsed_s: float) -> FaultAnswer:
+        """Acknowledge as many faults as the settings say, each after its time."""
+        if self._faults_left == 0:
+            return FaultAnswer.END
+        if elapsed_s < self._acknowledge_fault_after_s:
+            return FaultAnswer.WAIT
+        self._faults_left -= 1
+        return FaultAnswer.RECOVER
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return what the script asks at this time."""
@@ -76,3 +99,13 @@ class ConsoleOperator:
         if self._asked:
             return self._asked.popleft()
         return self._script.request(elapsed_s, state)
+
+    def answer_fault(self, elapsed_s: float) -> FaultAnswer:
+        """Wait for `ack` or `finish` while somebody may still type; what was asked for otherwise is forgotten."""
+        while self._asked:
+            request = self._asked.popleft()
+            if request is Request.ACKNOWLEDGE:
+                return FaultAnswer.RECOVER
+            if request is Request.FINISH:
+                return FaultAnswer.END
+        return FaultAnswer.WAIT if self._thread.is_alive() else self._script.answer_fault(elapsed_s)

@@ -22,6 +22,9 @@ class Pacer(Protocol):
     def next(self) -> Tick:
         """Wait for the next cycle and return its beginning."""
 
+    def resume(self) -> None:
+        """Go on after a pause that was meant: its periods are passed over and not counted as overruns."""
+
 
 class LockstepPacer:
     """Begins a cycle as soon as it is asked, and moves the virtual clock by one period each time."""
@@ -38,6 +41,10 @@ class LockstepPacer:
         t_ns = self._cycle * self._period_ns
         self._clock.sleep_until_ns(t_ns)
         return Tick(self._cycle, t_ns, 1, 0)
+
+    def resume(self) -> None:
+        """Let the next cycle begin at the first multiple of the period that the clock has not passed."""
+        self._cycle = max(self._cycle, -(-self._clock.now_ns() // self._period_ns) - 1)
 
 
 class GridPacer:
@@ -65,3 +72,8 @@ class GridPacer:
             self._cycle += skipped
             due_ns += skipped * self._period_ns
         return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)
+
+    def resume(self) -> None:
+        """Let the next cycle begin on the next grid point that is ahead."""
+        if self._start_ns is not None:
+            self._cycle = max(self._cycle, (self._clock.now_ns() - self._start_ns) // self._period_ns)

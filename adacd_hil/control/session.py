@@ -5,6 +5,7 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
@@ -12,11 +13,12 @@ from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult, SilenceError
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import GridPacer, LockstepPacer, Pacer
+from adacd_hil.control.recovery import Recovery
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.log.recorder import LogSummary, Recorder
-from adacd_hil.records import Event
+from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, freeze_garbage, request_realtime, scheduler_name
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec, contract_folder
@@ -29,8 +31,9 @@ LOG_NAME = "run.mcap"
 class SessionSummary:
     """How a session ended. `error`: empty, or the one line that ended the run early.
 
-    `has_started`: whether the devices had been put into operation, so that the arm may have moved. `elapsed_s`: by
-    the host's clock, from the first frame to the last, without compiling.
+    `has_started`: whether the devices had been put into operation, so that the arm may have moved. `recoveries`: how
+    often a fault was acknowledged and the run begun again. `elapsed_s`: by the host's clock, from the first frame to
+    the last, without compiling.
     """
 
     result: RunResult | None
@@ -38,7 +41,29 @@ class SessionSummary:
     grant: RealtimeGrant
     error: str
     has_started: bool
+    recoveries: int
     elapsed_s: float
+
+
+class Attempt(NamedTuple):
+    """What one attempt to run the arm works with; nothing of it survives a fault."""
+
+    arm: Arm
+    master: Master
+    cycle: Cycle
+
+
+class Ending(NamedTuple):
+    """How an attempt ended. `error`: empty, or the one line that ended it."""
+
+    result: RunResult | None
+    error: str
+    is_bus_failed: bool
+
+    @property
+    def is_faulted(self) -> bool:
+        """Whether it ended by a fault that the user may acknowledge."""
+        return self.result is None or self.result.fault is not FaultReason.NONE
 
 
 @dataclass
@@ -75,37 +100,61 @@ class Session:
         Raises LogError when the log can't be created.
         """
         tap = Tap(self.bus, self.clock)
-        arm = Arm(self.settings, self.codec, tap)
-        master = Master(self.settings, self.codec, tap)
-        cycle = Cycle(self.settings, tap, arm, master, self._pacer(), self.operator, self.progress, self.is_lockstep)
-        self._cycle = cycle
-        if self._is_interrupted:
-            cycle.interrupt()
+        pacer = self._pacer()
         self.progress("compiling")
-        cycle.compile()
+        attempt = self._prepare(tap, pacer)
         # After compiling: a second of work at real-time priority would be paid back by 50 ms of throttling later.
         grant = RealtimeGrant(scheduler_name(), ()) if self.is_lockstep else request_realtime()
         for line in grant.missing:
             self.progress(f"not granted: {line}")
         recorder = self._open_log(grant)
-        result, error = None, ""
+        recovery = Recovery(tap, self.clock, self.operator, recorder, self.progress, lambda: self._is_interrupted)
         stopwatch = MonotonicClock()
         start_ns = stopwatch.now_ns()
+        recoveries = 0
+        try:
+            while True:
+                ending = self._attempt(attempt, recorder, tap)
+                if ending.is_bus_failed:
+                    recovery.empty()
+                if not (self._has_started and ending.is_faulted and recovery.await_acknowledgement()):
+                    break
+                recoveries += 1
+                pacer.resume()
+                attempt = self._prepare(tap, pacer)
+        finally:
+            log = recorder.close()
+        elapsed_s = (stopwatch.now_ns() - start_ns) * 1e-9
+        return SessionSummary(ending.result, log, grant, ending.error, self._has_started, recoveries, elapsed_s)
+
+    def _prepare(self, tap: Tap, pacer: Pacer) -> Attempt:
+        """Build and compile everything that must know nothing of an attempt before."""
+        arm = Arm(self.settings, self.codec, tap)
+        master = Master(self.settings, self.codec, tap)
+        cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.is_lockstep)
+        cycle.compile()
+        self._cycle = cycle
+        if self._is_interrupted:
+            cycle.interrupt()
+        return Attempt(arm, master, cycle)
+
+    def _attempt(self, attempt: Attempt, recorder: Recorder, tap: Tap) -> Ending:
+        """Boot the devices and run until the run is finished, interrupted or faulted."""
+        arm, master, cycle = attempt
+        ending = Ending(None, "", is_bus_failed=False)
         try:
             self.progress(f"looking for the arm on {tap.channel}")
             self._boot(master, recorder, tap)
             self.progress("running")
-            result = self._run(cycle, master, recorder, tap)
-            for line in arm.describe_checks():
-                recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
+            ending = Ending(self._run(cycle, master, recorder, tap), "", is_bus_failed=False)
         except (BusError, DeviceError, SilenceError) as reason:
-            error = str(reason)
+            ending = Ending(None, str(reason), isinstance(reason, BusError))
             recorder.cycle(self.clock.now_ns(), [], tap.take())
-            recorder.event(self.clock.now_ns(), Event("error", "run", error))
-        finally:
-            log = recorder.close()
-        elapsed_s = (stopwatch.now_ns() - start_ns) * 1e-9
-        return SessionSummary(result, log, grant, error, self._has_started, elapsed_s)
+            recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))
+            self.progress(ending.error)
+        for line in arm.describe_checks():
+            recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
+        return ending
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
         """Bring the devices from whatever they were in to pre-operational and configured. Raises DeviceError."""

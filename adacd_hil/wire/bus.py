@@ -58,6 +58,9 @@ class Bus(Protocol):
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, or None when none came within `timeout_s`. Raises BusError."""
 
+    def recover(self) -> None:
+        """Drop everything that is queued both ways. Raises BusError."""
+
     def close(self) -> None:
         """Release the bus; twice is once."""
 
@@ -91,6 +94,10 @@ class EmbeddedBus:
     def receive(self, timeout_s: float) -> Frame | None:  # noqa: ARG002 (the protocol's signature)
         """Return the next frame, or None."""
         return self._received.popleft() if self._received else None
+
+    def recover(self) -> None:
+        """Drop what the device sent."""
+        self._received.clear()
 
     def close(self) -> None:
         """Disconnect the device."""
@@ -175,6 +182,10 @@ class SocketCanBus:
             self._stamp_ns = None
         return packed
 
+    def recover(self) -> None:
+        """Drop everything that is queued both ways. Raises BusError."""
+        raise BusError("x")
+
     def close(self) -> None:
         """Close the socket."""
         if not self._is_closed:
@@ -217,6 +228,10 @@ class PythonCanBus:
         if message is None:
             return None
         return Frame(message.arbitration_id, bytes(message.data), self._clock.now_ns(), message.is_error_frame)
+
+    def recover(self) -> None:
+        """Drop everything that is queued both ways. Raises BusError."""
+        raise BusError("x")
 
     def close(self) -> None:
         """Shut the interface down."""

@@ -36,6 +36,10 @@ class Tap:
         passed, self._passed = self._passed, []
         return passed
 
+    def recover(self) -> None:
+        """Drop everything that is queued both ways. Raises BusError."""
+        self._bus.recover()
+
     def close(self) -> None:
         """Close the bus behind it."""
         self._bus.close()

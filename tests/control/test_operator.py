@@ -1,11 +1,12 @@
 """The user of a running arm."""
 
 import io
+import os
 
 import pytest
 
 from adacd_hil.config import OperatorSettings, RequestSettings
-from adacd_hil.control.operator import ConsoleOperator, ScriptedOperator
+from adacd_hil.control.operator import ConsoleOperator, FaultAnswer, ScriptedOperator
 from adacd_hil.records import Request, SchemeState
 
 
@@ -63,3 +64,53 @@ def test_the_console_takes_a_word_a_line(word: str, request_: Request) -> None:
     operator = ConsoleOperator(script(), io.StringIO(f"{word}\n"))
     operator.join(1.0)
     assert operator.request(1.0, SchemeState.STOPPED) is request_
+
+
+def faults(count: int) -> ScriptedOperator:
+    return ScriptedOperator(OperatorSettings(acknowledge_faults=count, acknowledge_fault_after_s=0.5))
+
+
+def test_a_script_acknowledges_a_fault_after_its_time() -> None:
+    operator = faults(1)
+    assert [operator.answer_fault(t) for t in (0.0, 0.49, 0.5)] == [
+        FaultAnswer.WAIT,
+        FaultAnswer.WAIT,
+        FaultAnswer.RECOVER,
+    ]
+
+
+def test_a_script_acknowledges_so_many_faults_and_no_more() -> None:
+    operator = faults(2)
+    assert [operator.answer_fault(1.0) for _ in range(3)] == [
+        FaultAnswer.RECOVER,
+        FaultAnswer.RECOVER,
+        FaultAnswer.END,
+    ]
+
+
+def test_by_default_nobody_acknowledges_a_fault() -> None:
+    assert script().answer_fault(1000.0) is FaultAnswer.END
+
+
+@pytest.mark.parametrize(
+    ("typed", "answer"),
+    [
+        ("ack\n", FaultAnswer.RECOVER),
+        ("finish\n", FaultAnswer.END),
+        ("payload\nack\n", FaultAnswer.RECOVER),
+        ("payload\n", FaultAnswer.END),  # the stream has ended: nobody is there to ask
+    ],
+)
+def test_the_console_answers_a_fault(typed: str, answer: FaultAnswer) -> None:
+    operator = ConsoleOperator(script(), io.StringIO(typed))
+    operator.join(1.0)
+    assert operator.answer_fault(0.0) is answer
+
+
+def test_a_fault_waits_while_somebody_may_still_type() -> None:
+    read_end, write_end = os.pipe()
+    with os.fdopen(read_end) as stream:
+        operator = ConsoleOperator(script(), stream)
+        assert operator.answer_fault(1000.0) is FaultAnswer.WAIT
+        os.close(write_end)
+        operator.join(1.0)

@@ -51,3 +51,22 @@ def test_being_late_by_just_less_than_a_period_is_no_overrun() -> None:
     for _ in range(2):
         pacer.next()
     assert pacer.overruns == 0
+
+
+def test_a_pause_that_is_meant_is_no_overrun_and_keeps_the_grid() -> None:
+    clock = LateClock([])
+    pacer = GridPacer(clock, PERIOD_NS)
+    first = pacer.next()
+    clock.sleep_until_ns(first.t_ns + 5_300_000)
+    pacer.resume()
+    assert pacer.next() == Tick(6, first.t_ns + 6_000_000, 1, 0)
+    assert pacer.overruns == 0
+
+
+def test_lockstep_goes_on_where_its_clock_has_come_to() -> None:
+    clock = VirtualClock()
+    pacer = LockstepPacer(clock, PERIOD_NS)
+    pacer.next()
+    clock.sleep_until_ns(5_300_000)
+    pacer.resume()
+    assert pacer.next() == Tick(6, 6_000_000, 1, 0)

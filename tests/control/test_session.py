@@ -1,73 +1,26 @@
 """Whole runs against the emulator in one process, with something going wrong; torque is judged on the wire."""
 
-import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from session_rig import (
+    CODEC,
+    DISABLE_VOLTAGE,
+    ENABLE_OPERATION,
+    ENABLED_CYCLE,
+    QUICK_STOP,
+    TROUBLE_CYCLE,
+    Rig,
+    controlwords,
+    torques_from,
+)
 
-from adacd_hil.clock import VirtualClock
-from adacd_hil.config import OperatorSettings, RequestSettings, load_settings
 from adacd_hil.control.gate import GateFlag
-from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.session import Session, SessionSummary
-from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.wire.bus import EmbeddedBus, Frame
-from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
+from adacd_hil.wire.bus import Frame
 
 pytestmark = pytest.mark.slow
-
-CODEC = load_codec()
-ENABLED_CYCLE = 203  # in lockstep always the same
-TROUBLE_CYCLE = 1000
-QUICK_STOP, DISABLE_VOLTAGE, ENABLE_OPERATION = 0x0002, 0x0000, 0x000F
-
-
-class Rig:
-    """Host and emulator on a bus on which a test can drop or change the devices' frames, or do something in a cycle."""
-
-    def __init__(self, folder: Path, finish_s: float = 2.0) -> None:
-        script = (RequestSettings(at_s=finish_s, request="finish"),)
-        settings = dataclasses.replace(load_settings("paper"), operator=OperatorSettings(script=script))
-        clock = VirtualClock()
-        bus = EmbeddedBus(clock)
-        self.tamper: Callable[[int, int, bytes], bytes | None] = lambda cycle, can_id, data: data
-        self.in_cycle: dict[int, Callable[[], None]] = {}
-        self.bench = Bench(load_scenario("idle", "P"), CODEC, self._deliver)
-        self._bus = bus
-        bus.attach(self._on_frame)
-        self.bench.boot()
-        operator = ScriptedOperator(settings.operator)
-        self.session = Session(settings, CODEC, bus, clock, operator, folder, "embedded")
-
-    def _deliver(self, can_id: int, data: bytes) -> None:
-        kept = self.tamper(self.bench.cycle, can_id, data)
-        if kept is not None:
-            self._bus.deliver(can_id, kept)
-
-    def _on_frame(self, frame: Frame) -> None:
-        if frame.can_id == 0x080:
-            self.in_cycle.pop(self.bench.cycle, lambda: None)()
-        self.bench.on_frame(frame)
-
-    def run(self) -> tuple[SessionSummary, RunLog]:
-        summary = self.session.run()
-        return summary, read_log(summary.log.path)
-
-
-def torques_from(log: RunLog, cycle: int) -> np.ndarray:
-    """Return the target torques on the wire from this cycle on."""
-    start_ns = cycle * 1_000_000
-    commands = [log.decoded[name] for name in ("Drive1Command", "Drive2Command")]
-    return np.concatenate([command["target_torque"][command.t_ns >= start_ns] for command in commands])
-
-
-def controlwords(log: RunLog) -> np.ndarray:
-    return log.decoded["Drive1Command"]["controlword"]
 
 
 def test_a_run_that_nothing_disturbs_ends_parked_and_disabled(tmp_path: Path) -> None:

@@ -1,0 +1,89 @@
+"""The way out of a latched fault: the user acknowledges, the bus is emptied, and everything begins again.
+
+Nothing of before the fault survives: what waits in the socket and in the interface's transmit queue is dropped, so that
+no old command reaches a drive when the bus comes back; then the devices are booted anew, fresh feedback is awaited, and
+the drives are enabled at the present position with zero torque first.
+"""
+
+from collections.abc import Callable
+
+from adacd_hil.clock import Clock
+from adacd_hil.control.operator import FaultAnswer, Operator
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import Event
+from adacd_hil.wire.bus import BusError
+from adacd_hil.wire.tap import Tap
+
+_LOOK_NS = 10_000_000
+"""How often the user is asked and the bus is read while a fault is latched."""
+_RETRY_NS = 500_000_000
+"""How often a bus that can't be emptied yet, such as an interface that is down, is tried again."""
+_MOST_FRAMES = 1000
+"""Frames taken in one look: more than a full bus carries in that time."""
+
+
+class Recovery:
+    """Waits for the user and for the bus."""
+
+    def __init__(
+        self,
+        tap: Tap,
+        clock: Clock,
+        operator: Operator,
+        recorder: Recorder,
+        progress: Callable[[str], None],
+        is_interrupted: Callable[[], bool],
+    ) -> None:
+        self._tap, self._clock, self._operator = tap, clock, operator
+        self._recorder, self._progress = recorder, progress
+        self._is_interrupted = is_interrupted
+
+    def empty(self) -> bool:
+        """Drop what waits in the bus; False, with the reason in the log, when that isn't possible yet."""
+        try:
+            self._tap.recover()
+        except BusError as error:
+            self._say("error", f"the transmit queue could not be emptied: {error}")
+            return False
+        self._say("info", "transmit queue emptied")
+        return True
+
+    def await_acknowledgement(self) -> bool:
+        """Wait for the user's answer to a fault; True when the run is to begin again, on an emptied bus."""
+        start_ns = self._clock.now_ns()
+        is_announced = False
+        while not self._is_interrupted():
+            answer = self._operator.answer_fault((self._clock.now_ns() - start_ns) * 1e-9)
+            if answer is FaultAnswer.END:
+                return False
+            if answer is FaultAnswer.RECOVER:
+                return self._await_bus()
+            if not is_announced:
+                self._progress("the fault is latched: `ack` begins again, `finish` ends the run")
+                is_announced = True
+            self._idle(_LOOK_NS)
+        return False
+
+    def _await_bus(self) -> bool:
+        self._say("info", "fault acknowledged")
+        while not self._is_interrupted():
+            if self.empty():
+                return True
+            self._idle(_RETRY_NS)
+        return False
+
+    def _idle(self, duration_ns: int) -> None:
+        """Let time pass; what the bus still carries goes to the log."""
+        self._clock.sleep_until_ns(self._clock.now_ns() + duration_ns)
+        self._tap.held_ns = None
+        try:
+            for _ in range(_MOST_FRAMES):
+                if self._tap.receive(0.0) is None:
+                    break
+        except BusError:
+            pass  # said when it ended the run, and again when it is to be emptied
+        self._recorder.cycle(self._clock.now_ns(), [], self._tap.take())
+
+    def _say(self, level: str, line: str) -> None:
+        self._recorder.event(self._clock.now_ns(), Event(level, "recovery", line))
+        self._progress(line)

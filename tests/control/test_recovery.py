@@ -1,0 +1,123 @@
+"""After a fault: latched until it is acknowledged, then everything from the beginning, at the present position."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from session_rig import ENABLE_OPERATION, TROUBLE_CYCLE, Rig, controlwords, torques_from
+
+from adacd_hil.log.reader import RunLog
+from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.wire.bus import BusError, Frame
+
+pytestmark = pytest.mark.slow
+
+NMT_PRE_OPERATIONAL_DRIVE_1 = Frame(0x000, bytes((0x80, 1)), 0)
+
+
+def faulting_rig(folder: Path, acknowledge_faults: int) -> Rig:
+    """Make a run whose drive 1 drops out at the trouble cycle."""
+    rig = Rig(folder, acknowledge_faults=acknowledge_faults)
+    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bench.on_frame(NMT_PRE_OPERATIONAL_DRIVE_1)
+    return rig
+
+
+def states(log: RunLog) -> list[int]:
+    """Return the states in the order in which they were entered."""
+    state = log.scheme["state"]
+    return state[np.insert(np.diff(state) != 0, 0, True)].tolist()
+
+
+def messages(log: RunLog, name: str) -> list[str]:
+    return [entry.event.message for entry in log.events if entry.event.name == name]
+
+
+def test_an_acknowledged_fault_begins_again_with_the_first_check(tmp_path: Path) -> None:
+    summary, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+    assert summary.recoveries == 1
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
+    way_up = [SchemeState.COMMISSION, SchemeState.ENABLE, SchemeState.ADAPT]
+    assert states(log) == [*way_up, SchemeState.FAULT, *way_up]
+
+
+def test_a_fault_that_nobody_acknowledges_ends_the_run(tmp_path: Path) -> None:
+    summary, log = faulting_rig(tmp_path, acknowledge_faults=0).run()
+    assert (summary.recoveries, states(log)[-1]) == (0, SchemeState.FAULT)
+
+
+def test_the_second_fault_is_latched_when_one_may_be_acknowledged(tmp_path: Path) -> None:
+    rig = faulting_rig(tmp_path, acknowledge_faults=1)
+
+    def fail_again(cycle: int, can_id: int, data: bytes) -> bytes | None:
+        return None if can_id == 0x183 and rig.bench.now_ns > 2_500_000_000 else data
+
+    rig.tamper = fail_again
+    summary, log = rig.run()
+    assert (summary.recoveries, states(log)[-1]) == (1, SchemeState.FAULT)
+
+
+def test_after_a_recovery_there_is_no_torque_until_the_drives_are_enabled_again(tmp_path: Path) -> None:
+    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+    state = log.scheme["state"]
+    fault = int(np.flatnonzero(state == SchemeState.FAULT)[0])
+    second_adapt = fault + int(np.flatnonzero(state[fault:] == SchemeState.ADAPT)[0])
+    quiet = slice(log.scheme.t_ns[fault], log.scheme.t_ns[second_adapt])
+    command = log.decoded["Drive1Command"]
+    is_quiet = (command.t_ns >= quiet.start) & (command.t_ns < quiet.stop)
+    assert np.count_nonzero(is_quiet) > 200
+    assert np.count_nonzero(command["target_torque"][is_quiet]) == 0
+
+
+def test_the_arm_is_enabled_where_it_is_with_zero_torque_first(tmp_path: Path) -> None:
+    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+    state = log.scheme["state"]
+    fault = int(np.flatnonzero(state == SchemeState.FAULT)[0])
+    start = fault + int(np.flatnonzero(state[fault:] == SchemeState.ADAPT)[0])
+    np.testing.assert_allclose(log.control["q_d"][start], log.scheme["q"][start], atol=1e-4)
+    assert np.abs(log.control["tau_c"][start]).max() < 0.2
+    assert np.degrees(np.abs(log.scheme["q"][start])).max() > 5.0  # not the place where the run began
+
+
+def test_the_bus_is_emptied_before_the_devices_are_booted_again(tmp_path: Path) -> None:
+    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+    assert messages(log, "recovery") == ["fault acknowledged", "transmit queue emptied"]
+
+
+def test_a_bus_that_fails_in_operation_is_emptied_at_once_and_comes_back_after_an_acknowledgement(
+    tmp_path: Path,
+) -> None:
+    rig = Rig(tmp_path, acknowledge_faults=1)
+
+    def fail() -> None:
+        raise BusError("transmit queue of can0 stayed full")
+
+    rig.in_cycle[TROUBLE_CYCLE] = fail
+    summary, log = rig.run()
+    assert (summary.recoveries, summary.error) == (1, "")
+    assert messages(log, "run") == ["transmit queue of can0 stayed full"]
+    assert messages(log, "recovery") == ["transmit queue emptied", "fault acknowledged", "transmit queue emptied"]
+    assert controlwords(log)[-40] == ENABLE_OPERATION
+
+
+def test_what_the_devices_said_before_the_recovery_is_not_taken_for_fresh(tmp_path: Path) -> None:
+    rig = faulting_rig(tmp_path, acknowledge_faults=1)
+    _, log = rig.run()
+    state = log.scheme["state"]
+    fault = int(np.flatnonzero(state == SchemeState.FAULT)[0])
+    first = fault + int(np.flatnonzero(state[fault:] != SchemeState.FAULT)[0])
+    assert state[first] == SchemeState.COMMISSION
+    assert log.cycle["frames_missing"][log.cycle["cycle"] == log.scheme["cycle"][first]] == [0]
+
+
+def test_torque_flows_again_after_the_recovery(tmp_path: Path) -> None:
+    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+    last_cycle = int(log.cycle["cycle"][-1])
+    assert np.any(torques_from(log, last_cycle - 1500) != 0)
+
+
+def test_the_time_of_the_wait_is_not_lived_through_twice(tmp_path: Path) -> None:
+    _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
+    (acknowledged,) = [entry.t_ns for entry in log.events if entry.event.message == "fault acknowledged"]
+    gap = int(np.argmax(np.diff(log.cycle.t_ns)))
+    assert log.cycle.t_ns[gap] < acknowledged <= log.cycle.t_ns[gap + 1]
