@@ -78,7 +78,9 @@ class Cycle:
         operator: Operator,
         progress: Callable[[str], None],
         is_lockstep: bool,
+        stopwatch: Clock | None = None,
     ) -> None:
+        """Prepare. `stopwatch`: what durations within a cycle are measured by, default the host's clock."""
         self._period_s = settings.bus.period_s
         self._heartbeat_cycles = max(1, round(settings.bus.heartbeat_ms * 1e-3 / self._period_s))
         self._patience_s = (
@@ -88,7 +90,8 @@ class Cycle:
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
-        self._stopwatch: Clock = MonotonicClock()
+        self._stopwatch: Clock = stopwatch or MonotonicClock()
+        self._stale_ns = None if is_lockstep else settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
         self._controller = Controller(settings)
         self._gate = Gate(settings.arm, self._period_s)
@@ -182,10 +185,14 @@ class Cycle:
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
         self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
-        is_open = output.state in _POWERED and arm.is_enabled
+        is_open = output.state in _POWERED and arm.is_enabled and not self._is_stale()
         flags = self._gate.limit(self._tau_d, is_open, self._tau_c)
         quick_stop = output.state is SchemeState.FAULT or bool(flags & GateFlag.NOT_A_NUMBER)
         return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
+
+    def _is_stale(self) -> bool:
+        """Whether this cycle took so long, as when the process was stopped, that its torque belongs to the past."""
+        return self._stale_ns is not None and self._stopwatch.now_ns() - self._sync_ns > self._stale_ns
 
     def _record(
         self,
