@@ -174,6 +174,9 @@ class BusSettings:
     command_patience_cycles: int = setting(
         10, low=1, high=255, meaning="SYNCs without a new command until a drive faults by itself, 0x2200"
     )
+    sync_patience_periods: float = setting(
+        1.5, low=1.1, high=25.5, meaning="periods without SYNC until a drive faults by itself, 0x2201 in tenths"
+    )
     max_age_cycles: int = setting(3, low=1, high=100, meaning="oldest usable value; older faults the run")
     feedback_timeout_ms: int = setting(
         1000, unit="ms", low=1, high=60_000, meaning="lockstep: longest wait for one cycle's feedback"

@@ -13,6 +13,7 @@ import numpy as np
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
+from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import Pacer, Tick
@@ -33,12 +34,8 @@ from adacd_hil.records import (
     SchemeState,
 )
 from adacd_hil.scheme.pipeline import Pipeline
-from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.tap import Tap
 
-FEEDBACK_SHARE = 0.7
-"""Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
-the worst, and two commands need 230 µs before the next SYNC."""
 FAULT_LINGER_S = 0.5
 """How long a faulted run goes on, so that the drives' quick stop is in the log."""
 DISABLE_CYCLES = 20
@@ -48,10 +45,6 @@ _POWERED = frozenset(
     (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
 )
 _ENABLING = _POWERED | {SchemeState.ENABLE}
-
-
-class SilenceError(RuntimeError):
-    """No device answered a SYNC in lockstep; one line."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +76,11 @@ class Cycle:
         """Prepare. `stopwatch`: what durations within a cycle are measured by, default the host's clock."""
         self._period_s = settings.bus.period_s
         self._heartbeat_cycles = max(1, round(settings.bus.heartbeat_ms * 1e-3 / self._period_s))
-        self._patience_s = (
-            settings.bus.feedback_timeout_ms * 1e-3 if is_lockstep else FEEDBACK_SHARE * settings.bus.period_s
-        )
-        self._is_lockstep = is_lockstep
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
         self._stopwatch: Clock = stopwatch or MonotonicClock()
+        self._exchange = Exchange(settings, bus, arm, master, self._stopwatch, is_lockstep)
         self._stale_ns = None if is_lockstep else settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
         self._controller = Controller(settings)
@@ -105,8 +95,6 @@ class Cycle:
         self._faulted_cycle: int | None = None
         self._interrupts = 0
         self._is_finishing = False
-        self._sync_ns = 0
-        self._feedback_ns = 0
 
     def compile(self) -> None:
         """Compile everything the loop calls; to be done before the drives are enabled."""
@@ -126,7 +114,7 @@ class Cycle:
         output = None
         while not self._is_over(output):
             tick = self._pacer.next()
-            arm = self._read(tick)
+            arm = self._exchange.read(tick)
             request = self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
@@ -138,33 +126,6 @@ class Cycle:
         fault = output.fault if output is not None else FaultReason.NONE
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
-
-    def _read(self, tick: Tick) -> ArmState:
-        """Send SYNC and take in what the devices sampled on it."""
-        bus, arm = self._bus, self._arm
-        while (late := bus.receive(0.0)) is not None:  # belongs to the cycle before
-            self._accept(late)
-        self._sync_ns = self._stopwatch.now_ns()
-        bus.held_ns = tick.t_ns if self._is_lockstep else self._sync_ns
-        arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
-        patience_s = self._patience_s
-        while not arm.has_all_frames and (frame := bus.receive(patience_s)) is not None:
-            self._accept(frame)
-            if not self._is_lockstep:
-                patience_s = self._patience_s - (frame.t_ns - self._sync_ns) * 1e-9
-        self._feedback_ns = self._stopwatch.now_ns()
-        if not self._is_lockstep:
-            bus.held_ns = self._feedback_ns
-        if self._is_lockstep and arm.missing_frames == len(arm.drives) + len(arm.sensors):
-            raise SilenceError(
-                f"no answer from {', '.join(arm.missing_names())} to SYNC of cycle {tick.cycle} on {bus.channel} "
-                f"within {self._patience_s:g} s"
-            )
-        return arm.state()
-
-    def _accept(self, frame: Frame) -> None:
-        if not self._arm.accept(frame):
-            self._master.accept(frame)
 
     def _request(self, tick: Tick) -> Request:
         """Ask the operator; what concerns the end of the run stays here."""
@@ -192,7 +153,7 @@ class Cycle:
 
     def _is_stale(self) -> bool:
         """Whether this cycle took so long, as when the process was stopped, that its torque belongs to the past."""
-        return self._stale_ns is not None and self._stopwatch.now_ns() - self._sync_ns > self._stale_ns
+        return self._stale_ns is not None and self._stopwatch.now_ns() - self._exchange.sync_ns > self._stale_ns
 
     def _record(
         self,
@@ -209,8 +170,8 @@ class Cycle:
         record = CycleRecord(
             cycle=tick.cycle,
             lateness_ns=tick.lateness_ns,
-            feedback_ns=self._feedback_ns - self._sync_ns,
-            command_ns=self._stopwatch.now_ns() - self._sync_ns,
+            feedback_ns=self._exchange.feedback_ns - self._exchange.sync_ns,
+            command_ns=self._stopwatch.now_ns() - self._exchange.sync_ns,
             overruns=self._pacer.overruns,
             frames_missing=self._arm.missing_frames,
         )
@@ -259,6 +220,6 @@ class Cycle:
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
         for _ in range(DISABLE_CYCLES):
             tick = self._pacer.next()
-            self._read(tick)
+            self._exchange.read(tick)
             self._arm.write(command)
             recorder.cycle(tick.t_ns, [], self._bus.take())

@@ -10,7 +10,8 @@ from typing import NamedTuple
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.config import Settings, to_toml
-from adacd_hil.control.cycle import Cycle, RunResult, SilenceError
+from adacd_hil.control.cycle import Cycle, RunResult
+from adacd_hil.control.exchange import SilenceError
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import GridPacer, LockstepPacer, Pacer
 from adacd_hil.control.recovery import Recovery

@@ -1,0 +1,72 @@
+"""One exchange with the arm: SYNC out, feedback and torque in. The first half of every cycle, torque or no torque."""
+
+from adacd_hil.clock import Clock
+from adacd_hil.config import Settings
+from adacd_hil.control.realtime import Tick
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.network import Master
+from adacd_hil.records import ArmState
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.tap import Tap
+
+FEEDBACK_SHARE = 0.7
+"""Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
+the worst, and two commands need 230 µs before the next SYNC."""
+_MOST_FRAMES = 1000
+"""Frames taken at once, so that a bus that somebody floods can't hold up the cycle: a classic one carries 21 per ms."""
+
+
+class SilenceError(RuntimeError):
+    """No device answered a SYNC in lockstep; one line."""
+
+
+class Exchange:
+    """Reads the arm once per cycle. `sync_ns`, `feedback_ns`: when SYNC went out, when the last frame was decoded."""
+
+    def __init__(
+        self, settings: Settings, bus: Tap, arm: Arm, master: Master, stopwatch: Clock, is_lockstep: bool
+    ) -> None:
+        self.sync_ns = 0
+        self.feedback_ns = 0
+        self._bus, self._arm, self._master = bus, arm, master
+        self._stopwatch = stopwatch
+        self._is_lockstep = is_lockstep
+        self._patience_s = (
+            settings.bus.feedback_timeout_ms * 1e-3 if is_lockstep else FEEDBACK_SHARE * settings.bus.period_s
+        )
+
+    def read(self, tick: Tick) -> ArmState:
+        """Send SYNC and take in what the devices sampled on it. Raises BusError, and SilenceError in lockstep."""
+        bus, arm = self._bus, self._arm
+        self._take_late_frames()
+        self.sync_ns = self._stopwatch.now_ns()
+        bus.held_ns = tick.t_ns if self._is_lockstep else self.sync_ns
+        arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
+        patience_s = self._patience_s
+        for _ in range(_MOST_FRAMES):
+            if arm.has_all_frames or (frame := bus.receive(patience_s)) is None:
+                break
+            self._accept(frame)
+            if not self._is_lockstep:
+                patience_s = self._patience_s - (frame.t_ns - self.sync_ns) * 1e-9
+        self.feedback_ns = self._stopwatch.now_ns()
+        if not self._is_lockstep:
+            bus.held_ns = self.feedback_ns
+        if self._is_lockstep and arm.missing_frames == len(arm.drives) + len(arm.sensors):
+            raise SilenceError(
+                f"no answer from {', '.join(arm.missing_names())} to SYNC of cycle {tick.cycle} on {bus.channel} "
+                f"within {self._patience_s:g} s"
+            )
+        return arm.state()
+
+    def _take_late_frames(self) -> None:
+        """Take what came after the cycle before was over; it belongs to that cycle."""
+        for _ in range(_MOST_FRAMES):
+            late = self._bus.receive(0.0)
+            if late is None:
+                return
+            self._accept(late)
+
+    def _accept(self, frame: Frame) -> None:
+        if not self._arm.accept(frame):
+            self._master.accept(frame)

@@ -1,0 +1,221 @@
+"""What happens on the wire when a process, an interface or a device goes away: candump is the witness.
+
+SYNC comes every 10 ms here and the drives forgive ten missing ones, because the machines that run this stall for
+milliseconds; the exact times of every watchdog are tested in virtual time.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from experiment_runs import BIN, emulator
+
+from adacd_hil.log.reader import read_log
+
+pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.wallclock]
+
+AGE_CYCLES = 10
+WATCHDOG_S = 0.100
+MARGIN_S = 0.150  # a stall of the machine
+CONFIG = f"""
+[bus]
+period_us = 10000
+max_age_cycles = {AGE_CYCLES}
+command_patience_cycles = 10
+sync_patience_periods = 10.0
+
+
+[safety]
+commission_cycles = 20
+
+[controller]
+Kp = [40.0, 6.0]
+Kd = [3.0, 0.3]
+
+[operator]
+script = [{{ at_s = 60.0, request = "finish" }}]
+"""
+ENABLED = (0x27, 0x6F)
+
+
+class Witnessed(NamedTuple):
+    """A frame as candump saw it."""
+
+    t_s: float
+    can_id: int
+    data: bytes
+
+
+class Scene:
+    """Host, emulator and witness on vcan0, with the arm moving."""
+
+    def __init__(self, folder: Path, emulator_process: "subprocess.Popen[str]", extra: str) -> None:
+        self.emulator = emulator_process
+        self.folder = folder
+        self._dump = folder / "candump.log"
+        config = folder / "campaign.toml"
+        config.write_text(CONFIG + extra)
+        with self._dump.open("w") as sink:
+            self._witness = subprocess.Popen(["candump", "-D", "-L", "-r", "16777216", "vcan0"], stdout=sink)
+        command = [BIN / "adacd-hil", "run", "-i", "socketcan", "-c", "vcan0", "--config", config, "--out", folder]
+        self.host = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        self.said: list[str] = []
+
+    def wait_for(self, words: str) -> None:
+        """Read the host's progress until a line has these words."""
+        assert self.host.stderr is not None
+        for line in self.host.stderr:
+            self.said.append(line)
+            if words in line:
+                return
+        raise AssertionError(f"the host never said {words!r}: {''.join(self.said)}")
+
+    def wait_until_moving(self) -> None:
+        self.wait_for("-> ADAPT")
+        self.wait_on_wire(lambda frame: torque_of(frame) != 0, "a torque")
+
+    def wait_on_wire(self, is_it, what: str, since_s: float = 0.0, timeout_s: float = 10.0) -> Witnessed:
+        """Return the first frame that is it; the witness writes at once."""
+        deadline_s = time.monotonic() + timeout_s
+        while time.monotonic() < deadline_s:
+            for frame in self.frames(since_s):
+                if is_it(frame):
+                    return frame
+            time.sleep(0.05)
+        raise AssertionError(f"never saw {what}")
+
+    def frames(self, since_s: float = 0.0) -> list[Witnessed]:
+        """Return what the witness has written down since a time."""
+        lines = self._dump.read_text().splitlines()
+        return [frame for line in lines if (frame := parse(line)) is not None and frame.t_s >= since_s]
+
+    def finish(self) -> int:
+        """Wait for the host's end and return its exit status."""
+        assert self.host.stderr is not None
+        self.said.extend(self.host.stderr)
+        return self.host.wait(30)
+
+    def close(self) -> None:
+        for process in (self.host, self._witness):
+            if process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+            process.wait(30)
+        assert self.host.stderr is not None
+        self.host.stderr.close()
+
+
+def parse(line: str) -> Witnessed | None:
+    """Read a line of candump -L; None for one that is still being written."""
+    parts = line.split()
+    if len(parts) < 3 or "#" not in parts[2]:
+        return None
+    can_id, _, data = parts[2].partition("#")
+    try:
+        return Witnessed(float(parts[0].strip("()")), int(can_id, 16), bytes.fromhex(data))
+    except ValueError:
+        return None
+
+
+def torque_of(frame: Witnessed) -> int:
+    """Return the target torque of a command frame, 0 of any other."""
+    is_command = frame.can_id in (0x201, 0x202) and len(frame.data) == 6
+    return int.from_bytes(frame.data[4:6], "little", signed=True) if is_command else 0
+
+
+def is_drive_off(frame: Witnessed) -> bool:
+    """Whether a status frame says that its drive is not in Operation enabled."""
+    value, mask = ENABLED
+    return frame.can_id in (0x281, 0x282) and int.from_bytes(frame.data[:2], "little") & mask != value
+
+
+def is_emergency(frame: Witnessed, code: int) -> bool:
+    return 0x081 <= frame.can_id <= 0x084 and int.from_bytes(frame.data[:2], "little") == code
+
+
+def assert_torque_ends_with(played: Scene, can_id: int) -> None:
+    """Check that the host went on to command zero torque within the age budget after the last frame of this kind."""
+    frames = played.frames()
+    (*_, last) = (index for index, frame in enumerate(frames) if frame.can_id == can_id)
+    commands = [frame for frame in frames[last:] if frame.can_id == 0x201]
+    assert len(commands) > AGE_CYCLES + 10
+    assert [frame for frame in commands[AGE_CYCLES + 2 :] if torque_of(frame)] == []
+
+
+@contextlib.contextmanager
+def scene(folder: Path, extra: str = "") -> Iterator[Scene]:
+    with emulator(folder, "--clock", "wall", "--scenario", "idle") as process:
+        played = Scene(folder, process, extra)
+        try:
+            yield played
+        finally:
+            played.close()
+            process.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_drives_stop_by_themselves_when_the_host_goes_away(tmp_path: Path, number: signal.Signals) -> None:
+    with scene(tmp_path) as played:
+        played.wait_until_moving()
+        last = played.frames()[-1]
+        os.kill(played.host.pid, number)
+        off = played.wait_on_wire(is_drive_off, "a drive off", last.t_s)
+        sync = [frame for frame in played.frames() if frame.can_id == 0x080][-1]
+        assert off.t_s - sync.t_s < WATCHDOG_S + MARGIN_S
+        played.wait_on_wire(lambda frame: is_emergency(frame, 0x8700), "EMCY 0x8700", last.t_s)
+
+
+def test_a_host_that_wakes_up_again_sends_no_torque(tmp_path: Path) -> None:
+    with scene(tmp_path) as played:
+        played.wait_until_moving()
+        last = played.frames()[-1]
+        os.kill(played.host.pid, signal.SIGSTOP)
+        off = played.wait_on_wire(is_drive_off, "a drive off", last.t_s)
+        os.kill(played.host.pid, signal.SIGCONT)
+        assert played.finish() == 4
+        assert [frame for frame in played.frames(off.t_s) if torque_of(frame)] == []
+        assert any("FAULT: " in line for line in played.said)
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_the_host_sends_no_torque_to_an_arm_that_went_away(tmp_path: Path, number: signal.Signals) -> None:
+    with scene(tmp_path) as played:
+        played.wait_until_moving()
+        os.kill(played.emulator.pid, number)
+        assert played.finish() == 4
+        assert_torque_ends_with(played, 0x181)
+        assert any("DATA_AGE" in line for line in played.said)
+
+
+def test_a_node_that_falls_silent_is_named_and_torque_ends(tmp_path: Path) -> None:
+    with scene(tmp_path) as played:
+        played.wait_until_moving()
+        subprocess.run(["cansend", "vcan0", "000#0203"], check=True)  # NMT stop, node 3: sensor 1
+        assert played.finish() == 4
+        assert_torque_ends_with(played, 0x183)
+        assert any("FAULT: " in line and "Sensor1" in line for line in played.said), played.said
+
+
+def test_an_interface_that_goes_down_and_comes_back_needs_an_acknowledgement(tmp_path: Path) -> None:
+    with scene(tmp_path, "acknowledge_faults = 1\nacknowledge_fault_after_s = 0.5\n") as played:
+        played.wait_until_moving()
+        subprocess.run(["ip", "link", "set", "vcan0", "down"], check=True)
+        went_down = played.frames()[-1]
+        played.wait_for("could not be emptied")
+        subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
+        played.wait_for("-> ENABLE")
+        played.wait_for("-> ADAPT")
+        after = played.frames(went_down.t_s + 0.001)
+        first_torque = next((i for i, frame in enumerate(after) if torque_of(frame)), len(after))
+        first_reset = next(i for i, frame in enumerate(after) if frame.can_id == 0x000)
+        assert first_reset < first_torque
+        played.host.send_signal(signal.SIGINT)
+        assert played.finish() == 130
+    events = [entry.event.message for entry in read_log(tmp_path / "run.mcap").events]
+    assert any("is down" in message for message in events), events
