@@ -155,7 +155,7 @@ class DriveNode:
     @property
     def rejected_commands(self) -> int:
         """Command frames so far that failed the end-to-end check."""
-        return sum(self._receiver.counts[status] for status in E2eStatus if not status.is_valid)
+        return self._receiver.rejected
 
     @property
     def statusword(self) -> int:

@@ -3,6 +3,9 @@
 Only what the hot path can do quickly is accepted: little-endian integers of 8, 16, 32 or 64 bits on byte borders, and
 bit fields within one byte. A DBC that asks for more is refused with the signal's name. A frame is decoded all or
 nothing: length first, then (for protected messages) counter and CRC, by `adacd_hil.wire.e2e`.
+
+A message of more than 8 bytes is a CAN FD frame and says so in the DBC (VFrameFormat); its length is one that ISO
+11898-1 has a data length code for.
 """
 
 import struct
@@ -14,7 +17,15 @@ import cantools
 from cantools.database.can import Database, Message, Signal
 from cantools.database.errors import Error as DatabaseError
 
-from adacd_hil.wire.e2e import HEADER_BYTES, E2eReceiver, E2eSender
+from adacd_hil.wire.e2e import (
+    E2eReceiver,
+    E2eSender,
+    Profile2Receiver,
+    Profile2Sender,
+    Profile5Receiver,
+    Profile5Sender,
+    Protection,
+)
 
 _FORMATS = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h"} | {
     (32, False): "I",
@@ -22,7 +33,14 @@ _FORMATS = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h"} 
     (64, False): "Q",
     (64, True): "q",
 }
+CLASSIC_BYTES = 8
+FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 E2E_SIGNALS = ("e2e_crc", "e2e_counter", "e2e_status")
+_E2E_BITS = {
+    Protection.PROFILE_2: ((0, 8), (8, 4), (12, 4)),
+    Protection.PROFILE_5: ((0, 16), (16, 8), (24, 8)),
+}
+"""First bit and number of bits of each header signal."""
 
 
 class CodecError(ValueError):
@@ -60,7 +78,9 @@ class MessageCodec:
         self.can_id: int = message.frame_id
         self.length: int = message.length
         self.senders: tuple[str, ...] = tuple(message.senders)
-        self.data_ids = _data_ids(message)
+        _check_length(message)
+        self.protection, self.data_ids = _protection(message)
+        """How the frames are protected; Profile 2: the list of 16 bytes, Profile 5: two bytes, the low one first."""
         ordered = sorted(message.signals, key=lambda signal: signal.start)
         self._struct, self.signals = _lay_out(message, ordered)
         self._signed = [signal.is_signed for signal in ordered]
@@ -71,20 +91,38 @@ class MessageCodec:
         is_plain = all(signal.mask == 0 for signal in self.values)
         self._scales = tuple((signal.scale, signal.offset) for signal in self.values)
         self._body = struct.Struct("<" + _body_format(ordered[first:])) if is_plain else None
-        self._body_offset = HEADER_BYTES if self.is_protected else 0
+        self._body_offset = self.header_bytes
 
     @property
     def is_protected(self) -> bool:
         """Whether the frames carry an end-to-end header."""
-        return bool(self.data_ids)
+        return self.protection is not Protection.NONE
+
+    @property
+    def header_bytes(self) -> int:
+        """How many bytes the end-to-end header takes: 0, 2 or 4."""
+        return self.protection.header_bytes
+
+    @property
+    def is_fd(self) -> bool:
+        """Whether the frames are CAN FD: those of up to 8 bytes are classic on every bus."""
+        return self.length > CLASSIC_BYTES
 
     def sender(self) -> E2eSender:
-        """Make the end-to-end sender of this message."""
-        return E2eSender(self.data_ids)
+        """Make the end-to-end sender of this message; without protection it changes nothing."""
+        if self.protection is Protection.PROFILE_2:
+            return Profile2Sender(self.data_ids)
+        if self.protection is Protection.PROFILE_5:
+            return Profile5Sender(self.data_ids)
+        return E2eSender()
 
     def receiver(self) -> E2eReceiver:
-        """Make the end-to-end receiver of this message."""
-        return E2eReceiver(self.data_ids)
+        """Make the end-to-end receiver of this message; without protection it says OK of every frame."""
+        if self.protection is Protection.PROFILE_2:
+            return Profile2Receiver(self.data_ids, self.length)
+        if self.protection is Protection.PROFILE_5:
+            return Profile5Receiver(self.data_ids, self.length)
+        return E2eReceiver()
 
     def encode(self, *values: float) -> bytearray:
         """Encode physical values in the order of `values`; the end-to-end header is left zero.
@@ -137,21 +175,64 @@ def _body_format(signals: list[Signal]) -> str:
     return "".join(_FORMATS[(signal.length, signal.is_signed)] for signal in signals)
 
 
-def _data_ids(message: Message) -> bytes:
+def _check_length(message: Message) -> None:
+    """Refuse a length that no frame can have, and a frame format that doesn't fit the length."""
+    if message.length > CLASSIC_BYTES and message.length not in FD_LENGTHS:
+        lengths = ", ".join(map(str, FD_LENGTHS))
+        raise CodecError(f"{message.name}: no CAN frame has {message.length} bytes; beyond 8 there are {lengths}")
+    if message.length > CLASSIC_BYTES and not message.is_fd:
+        raise CodecError(f"{message.name}: {message.length} bytes need VFrameFormat StandardCAN_FD")
+    if message.length <= CLASSIC_BYTES and message.is_fd:
+        raise CodecError(f"{message.name}: {message.length} bytes go in a classic frame; VFrameFormat says CAN FD")
+
+
+def _protection(message: Message) -> tuple[Protection, bytes]:
+    """Read the attributes E2EProfile, E2EDataIdList (Profile 2; alone it means Profile 2) and E2EDataId (Profile 5)."""
     attributes = message.dbc.attributes if message.dbc else {}
-    text = str(attributes["E2EDataIdList"].value) if "E2EDataIdList" in attributes else ""
-    if not text:
-        return b""
+    values = {name: attribute.value for name, attribute in attributes.items()}
+    id_list = str(values.get("E2EDataIdList", ""))
+    profile = str(values.get("E2EProfile", "")) or ("P02" if id_list else "")
+    try:
+        protection = Protection(profile)
+    except ValueError:
+        raise CodecError(f"{message.name}: E2EProfile = {profile!r} is none of '', 'P02', 'P05'") from None
+    if protection is Protection.PROFILE_2:
+        data_ids = _data_id_list(message.name, id_list)
+    elif protection is Protection.PROFILE_5:
+        data_ids = _data_id(message.name, values.get("E2EDataId"))
+    elif "E2EDataId" in values:
+        raise CodecError(f"{message.name}: E2EDataId without E2EProfile")
+    else:
+        return protection, b""
+    _check_header(message, protection)
+    return protection, data_ids
+
+
+def _data_id_list(name: str, text: str) -> bytes:
     try:
         ids = bytes.fromhex(text)
     except ValueError:
-        raise CodecError(f"{message.name}: E2EDataIdList = {text!r} is not hexadecimal") from None
+        raise CodecError(f"{name}: E2EDataIdList = {text!r} is not hexadecimal") from None
     if len(ids) != 16:
-        raise CodecError(f"{message.name}: E2EDataIdList has {len(ids)} bytes, 16 expected")
-    names = tuple(signal.name for signal in sorted(message.signals, key=lambda signal: signal.start))
-    if names[: len(E2E_SIGNALS)] != E2E_SIGNALS:
-        raise CodecError(f"{message.name}: a protected message begins with {', '.join(E2E_SIGNALS)}")
+        raise CodecError(f"{name}: E2EDataIdList has {len(ids)} bytes, 16 expected")
     return ids
+
+
+def _data_id(name: str, value: float | str | None) -> bytes:
+    if value is None:
+        raise CodecError(f"{name}: E2EProfile P05 without E2EDataId")
+    if not isinstance(value, int) or not 0 <= value <= 0xFFFF:
+        raise CodecError(f"{name}: E2EDataId = {value!r} is no integer of 0..65535")
+    return value.to_bytes(2, "little")
+
+
+def _check_header(message: Message, protection: Protection) -> None:
+    first = sorted(message.signals, key=lambda signal: signal.start)[: len(E2E_SIGNALS)]
+    places = tuple((signal.name, (signal.start, signal.length), signal.is_signed) for signal in first)
+    bits = _E2E_BITS[protection]
+    if places != tuple((name, place, False) for name, place in zip(E2E_SIGNALS, bits, strict=True)):
+        header = ", ".join(f"{name} ({length} bits)" for name, (_, length) in zip(E2E_SIGNALS, bits, strict=True))
+        raise CodecError(f"{message.name}: a message protected by {protection.value} begins with unsigned {header}")
 
 
 def _lay_out(message: Message, signals: list[Signal]) -> tuple[struct.Struct, tuple[SignalCodec, ...]]:
@@ -198,9 +279,11 @@ class Codec:
         attributes = database.dbc.attributes if database.dbc else {}
         if "WireVersion" not in attributes:
             raise CodecError("the DBC has no WireVersion attribute")
+        self.is_fd = any(message.is_fd for message in self.messages.values())
+        """Whether any message needs CAN FD."""
         self.wire_version = int(attributes["WireVersion"].value)
         self.layout_digest = zlib.crc32(_describe(self.messages).encode())
-        """CRC-32 of every identifier, length, signal place, scale and data id; comments don't count."""
+        """CRC-32 of every identifier, length, protection, signal place, scale and data id; nothing else counts."""
 
     def message(self, name: str) -> MessageCodec:
         """Return a message by name. Raises CodecError when the DBC lacks it."""
@@ -217,7 +300,8 @@ class Codec:
 def _describe(messages: dict[str, MessageCodec]) -> str:
     lines = []
     for message in sorted(messages.values(), key=lambda message: message.can_id):
-        lines.append(f"{message.can_id:x} {message.name} {message.length} {message.data_ids.hex()}")
+        profile = "P05 " if message.protection is Protection.PROFILE_5 else ""  # the list of 16 ids says Profile 2
+        lines.append(f"{message.can_id:x} {message.name} {message.length} {profile}{message.data_ids.hex()}")
         lines.extend(
             f" {s.name} {s.container} {s.shift} {s.mask} {s.raw_low} {s.scale!r} {s.offset!r}" for s in message.signals
         )

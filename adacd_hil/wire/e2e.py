@@ -1,47 +1,74 @@
-"""AUTOSAR end-to-end protection, Profile 2: a CRC and an alive counter in the first two bytes of a frame.
+"""AUTOSAR end-to-end protection of single frames, Profiles 2 and 5: a CRC and a counter in the first bytes of a frame.
 
-Byte 0 is the CRC-8 (polynomial 0x2F, initial and final XOR 0xFF) over bytes 1… and one byte of the message's data id
-list, picked by the counter. The low nibble of byte 1 is the alive counter 0…15; the high nibble is the sender's.
-Source: AUTOSAR FO PRS E2E Protocol, chapter 6.3 (Profile 2).
+Profile 2, two bytes. Byte 0 is the CRC-8 (polynomial 0x2F, initial and final XOR 0xFF) over bytes 1… and one byte of
+the message's data id list, picked by the counter. The low nibble of byte 1 is the counter 0…15.
+
+Profile 5, four bytes. Bytes 0 and 1 are the CRC-16 (polynomial 0x1021, initial 0xFFFF, no final XOR; little-endian)
+over bytes 2… and the data id, low byte first. Byte 2 is the counter 0…255.
+
+What the header has left, the high nibble of byte 1 and the whole of byte 3, is the sender's status. The CRC covers it.
+Source: AUTOSAR FO PRS E2E Protocol, specifications of E2E Profile 2 and Profile 5.
 """
 
-from enum import IntEnum
+from binascii import crc_hqx
+from dataclasses import dataclass
+from enum import Enum, IntEnum
 
-POLYNOMIAL = 0x2F
-HEADER_BYTES = 2
-COUNTER_MODULUS = 16
+_POLYNOMIAL_8 = 0x2F
+_COUNTER_MASK_2 = 0x0F
+_COUNTER_MASK_5 = 0xFF
 
 
-def _crc_table() -> bytes:
+def _crc8_table() -> bytes:
     table = bytearray(256)
     for byte in range(256):
         crc = byte
         for _ in range(8):
-            crc = ((crc << 1) ^ POLYNOMIAL) & 0xFF if crc & 0x80 else (crc << 1) & 0xFF
+            crc = ((crc << 1) ^ _POLYNOMIAL_8) & 0xFF if crc & 0x80 else (crc << 1) & 0xFF
         table[byte] = crc
     return bytes(table)
 
 
-_TABLE = _crc_table()
+_TABLE_8 = _crc8_table()
 
 
 def crc8(data: bytes | bytearray, data_id: int) -> int:
     """Compute the Profile 2 CRC of a frame whose bytes 1… are `data[1:]`."""
-    table = _TABLE
+    table = _TABLE_8
     crc = 0xFF
     for byte in data[1:]:
         crc = table[crc ^ byte]
     return table[crc ^ data_id] ^ 0xFF
 
 
-class E2eStatus(IntEnum):
-    """What the receiver's check says of one frame."""
+def crc16(data: bytes | bytearray, data_id: bytes) -> int:
+    """Compute the Profile 5 CRC of a frame whose bytes 2… are `data[2:]`; `data_id`: two bytes, the low one first."""
+    return crc_hqx(data_id, crc_hqx(data[2:], 0xFFFF))
 
-    OK = 0
+
+class Protection(Enum):
+    """How a message's frames are protected; the values are those of the DBC attribute `E2EProfile`."""
+
+    NONE = ""
+    PROFILE_2 = "P02"
+    PROFILE_5 = "P05"
+
+    @property
+    def header_bytes(self) -> int:
+        """How many bytes of each frame the header takes."""
+        return {Protection.NONE: 0, Protection.PROFILE_2: 2, Protection.PROFILE_5: 4}[self]
+
+
+class E2eStatus(IntEnum):
+    """What the receiver's check says of one cycle of one message. The numbers are logged."""
+
+    OK = 0  # also the first frame of all: it sets the sequence
     OK_SOME_LOST = 1  # the counter jumped, within the tolerance
-    REPEATED = 2  # the counter stands still
-    WRONG_SEQUENCE = 3  # the counter jumped too far; this frame becomes the new reference
-    WRONG_CRC = 4
+    REPEATED = 2  # the counter stands still; left when it moves
+    WRONG_SEQUENCE = 3  # the counter jumped too far; left through SYNC from this frame on
+    WRONG_CRC = 4  # CRC or length; left with the next right frame
+    NO_NEW_DATA = 5  # no frame in this cycle; left with the next frame
+    SYNC = 6  # in sequence, but too soon after a silence or a wrong sequence; left after a few frames in sequence
 
     @property
     def is_valid(self) -> bool:
@@ -49,54 +76,215 @@ class E2eStatus(IntEnum):
         return self <= E2eStatus.OK_SOME_LOST
 
 
+@dataclass(frozen=True)
+class Tolerance:
+    """How much loss a receiver forgives. The names in brackets are the standard's."""
+
+    max_delta: int
+    """Largest step of the counter that is loss and not a wrong sequence. Profile 2 (MaxDeltaCounterInit): one more, and
+    one more again for each cycle since the last frame in sequence. Profile 5 (MaxDeltaCounter): as it stands."""
+    max_missing: int
+    """Cycles in a row without a new frame, after which the sequence counts as lost [MaxNoNewOrRepeatedData]."""
+    sync_frames: int
+    """Frames in sequence that only show the sequence, after it was lost [SyncCounterInit]."""
+
+
+# A run ends when a value is older than `bus.max_age_cycles`, 3 unless set otherwise. So a frame after 3 lost ones must
+# be usable at once, and after a single wrong sequence the third frame. Four missing cycles let Profile 2 take steps up
+# to 7, less than half the counter's circle: none of the last 8 frames is taken for a new one. One frame of SYNC is the
+# least that confirms a new sequence before it is used: a stray old frame has no successor.
+# Profile 5's step is what four missing cycles amount to.
+PROFILE_2_TOLERANCE = Tolerance(max_delta=2, max_missing=4, sync_frames=1)
+PROFILE_5_TOLERANCE = Tolerance(max_delta=5, max_missing=4, sync_frames=1)
+
+
 class E2eSender:
-    """Counts and signs the frames of one message."""
+    """Sends the frames of one message as they are; a profile's sender counts and signs them."""
+
+    def protect(self, frame: bytearray) -> bytes:
+        """Fill in the header of `frame`, but for the sender's status, and return it as bytes."""
+        return bytes(frame)
+
+
+class Profile2Sender(E2eSender):
+    """Counts and signs the frames of one message by Profile 2."""
 
     def __init__(self, data_ids: bytes) -> None:
+        """`data_ids`: 16 bytes, one for each counter."""
         self._data_ids = data_ids
-        self._counter = COUNTER_MODULUS - 1
+        self._counter = 0
 
     def protect(self, frame: bytearray) -> bytes:
         """Fill in the header of `frame` (bytes 0 and low nibble of 1) and return it as bytes."""
-        counter = (self._counter + 1) % COUNTER_MODULUS
-        self._counter = counter
+        counter = self._counter
+        self._counter = (counter + 1) & _COUNTER_MASK_2
         frame[1] = (frame[1] & 0xF0) | counter
         frame[0] = crc8(frame, self._data_ids[counter])
         return bytes(frame)
 
 
-class E2eReceiver:
-    """Checks the frames of one message and counts what it found."""
+class Profile5Sender(E2eSender):
+    """Counts and signs the frames of one message by Profile 5."""
 
-    def __init__(self, data_ids: bytes, max_delta: int = 3) -> None:
-        """`max_delta` is the largest step of the counter that still counts as loss, not as a wrong sequence."""
-        self._data_ids = data_ids
-        self._max_delta = max_delta
-        self._last: int | None = None
+    def __init__(self, data_id: bytes) -> None:
+        """`data_id`: two bytes, the low one first."""
+        self._data_id = data_id
+        self._counter = 0
+
+    def protect(self, frame: bytearray) -> bytes:
+        """Fill in the header of `frame` (bytes 0 to 2) and return it as bytes."""
+        frame[2] = self._counter
+        self._counter = (self._counter + 1) & _COUNTER_MASK_5
+        crc = crc16(frame, self._data_id)
+        frame[0] = crc & 0xFF
+        frame[1] = crc >> 8
+        return bytes(frame)
+
+
+class E2eReceiver:
+    """Takes the frames of one message as they are, and counts; a profile's receiver checks them."""
+
+    def __init__(self) -> None:
         self.counts = [0] * len(E2eStatus)
+        """How often each status was found; the index is its number."""
 
     def check(self, frame: bytes) -> E2eStatus:
-        """Check one frame; the first one with a right CRC sets the sequence."""
+        """Check one frame; only a valid one may change a value."""
         status = self._judge(frame)
         self.counts[status] += 1
         return status
+
+    def miss(self) -> E2eStatus:
+        """Note a cycle in which no frame came."""
+        self._note_silence()
+        self.counts[E2eStatus.NO_NEW_DATA] += 1
+        return E2eStatus.NO_NEW_DATA
+
+    @property
+    def rejected(self) -> int:
+        """How many frames came and weren't valid."""
+        return sum(self.counts[s] for s in E2eStatus if not s.is_valid) - self.counts[E2eStatus.NO_NEW_DATA]
 
     def tally(self) -> list[tuple[E2eStatus, int]]:
         """Return how often each status was found so far."""
         return list(zip(E2eStatus, self.counts, strict=True))
 
-    def _judge(self, frame: bytes) -> E2eStatus:
-        counter = frame[1] & 0x0F
-        if frame[0] != crc8(frame, self._data_ids[counter]):
-            return E2eStatus.WRONG_CRC
-        last, self._last = self._last, counter
-        delta = 1 if last is None else (counter - last) % COUNTER_MODULUS
-        if delta == 1:
-            return E2eStatus.OK
-        if delta == 0:
-            return E2eStatus.REPEATED
-        return E2eStatus.OK_SOME_LOST if delta <= self._max_delta else E2eStatus.WRONG_SEQUENCE
+    def restart(self) -> None:
+        """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
+
+    def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
+        return E2eStatus.OK
+
+    def _note_silence(self) -> None:
+        pass
+
+
+class _SequenceReceiver(E2eReceiver):
+    """What the receivers of both profiles do once a frame is in sequence, and after a silence."""
+
+    def __init__(self, length: int, tolerance: Tolerance) -> None:
+        super().__init__()
+        self._length = length
+        self._tolerance = tolerance
+        self.restart()
 
     def restart(self) -> None:
-        """Forget the sequence; the counts stay."""
-        self._last = None
+        """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
+        self._last: int | None = None
+        self._missing = 0
+        self._to_sync = 0
+
+    def _note_silence(self) -> None:
+        self._missing += 1
+
+    def _begin(self, counter: int) -> E2eStatus:
+        """Take the first frame. The standard calls it INITIAL; here it may be used, and silence before it is none."""
+        self._last = counter
+        self._missing = 0
+        return E2eStatus.OK
+
+    def _lose_sequence(self) -> E2eStatus:
+        self._missing = 0
+        self._to_sync = self._tolerance.sync_frames
+        return E2eStatus.WRONG_SEQUENCE
+
+    def _accept(self, delta: int) -> E2eStatus:
+        """Judge a frame in sequence by what went before it."""
+        missing, self._missing = self._missing, 0
+        if missing > self._tolerance.max_missing:
+            self._to_sync = self._tolerance.sync_frames
+            return E2eStatus.SYNC
+        if self._to_sync > 0:
+            self._to_sync -= 1
+            return E2eStatus.SYNC
+        return E2eStatus.OK if delta == 1 else E2eStatus.OK_SOME_LOST
+
+
+class Profile2Receiver(_SequenceReceiver):
+    """Checks the frames of one message by Profile 2 (E2E_P02Check).
+
+    As in the standard the tolerated step grows with each cycle that brings nothing usable, wrong CRCs included.
+    """
+
+    def __init__(self, data_ids: bytes, length: int, tolerance: Tolerance = PROFILE_2_TOLERANCE) -> None:
+        """`data_ids`: 16 bytes, one for each counter; `length`: bytes of a frame, at least 2."""
+        super().__init__(length, tolerance)
+        self._data_ids = data_ids
+
+    def restart(self) -> None:
+        """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
+        super().restart()
+        self._max_delta = self._tolerance.max_delta
+
+    def _note_silence(self) -> None:
+        self._widen()
+        self._missing += 1
+
+    def _widen(self) -> None:
+        if self._max_delta < _COUNTER_MASK_2:
+            self._max_delta += 1
+
+    def _judge(self, frame: bytes) -> E2eStatus:
+        self._widen()
+        if len(frame) != self._length:
+            return E2eStatus.WRONG_CRC
+        counter = frame[1] & _COUNTER_MASK_2
+        if frame[0] != crc8(frame, self._data_ids[counter]):
+            return E2eStatus.WRONG_CRC
+        if self._last is None:
+            self._max_delta = self._tolerance.max_delta
+            return self._begin(counter)
+        delta = (counter - self._last) & _COUNTER_MASK_2
+        if delta == 0:
+            self._missing += 1
+            return E2eStatus.REPEATED
+        is_in_sequence = delta <= self._max_delta
+        if is_in_sequence or self._tolerance.sync_frames:  # without SYNC only a wider tolerance leads back
+            self._last = counter
+            self._max_delta = self._tolerance.max_delta
+        return self._accept(delta) if is_in_sequence else self._lose_sequence()
+
+
+class Profile5Receiver(_SequenceReceiver):
+    """Checks the frames of one message by Profile 5 (E2E_P05Check).
+
+    The standard's check has no SYNC: it leaves that to a state machine over it. Here the SYNC of Profile 2 stands for
+    it, so that both profiles answer a silence alike.
+    """
+
+    def __init__(self, data_id: bytes, length: int, tolerance: Tolerance = PROFILE_5_TOLERANCE) -> None:
+        """`data_id`: two bytes, the low one first; `length`: bytes of a frame, at least 4."""
+        super().__init__(length, tolerance)
+        self._data_id = data_id
+
+    def _judge(self, frame: bytes) -> E2eStatus:
+        if len(frame) != self._length or frame[0] | frame[1] << 8 != crc16(frame, self._data_id):
+            return E2eStatus.WRONG_CRC
+        last, self._last = self._last, frame[2]
+        if last is None:
+            return self._begin(frame[2])
+        delta = (frame[2] - last) & _COUNTER_MASK_5
+        if delta == 0:
+            self._missing += 1
+            return E2eStatus.REPEATED
+        return self._accept(delta) if delta <= self._tolerance.max_delta else self._lose_sequence()

@@ -4,13 +4,22 @@ from pathlib import Path
 
 import cantools
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
+from adacd_hil.wire.codec import Codec, CodecError, MessageCodec, contract_folder, load_codec
+from adacd_hil.wire.e2e import E2eStatus
 
 CODEC = load_codec()
-PEER = cantools.database.load_file(contract_folder() / "arm.dbc")
+CONTRACTS = ("arm", "arm_fd", "arm_fd_500us")
+CODECS = {name: load_codec(contract_folder() / f"{name}.dbc") for name in CONTRACTS}
+PEERS = {name: cantools.database.load_file(contract_folder() / f"{name}.dbc") for name in CONTRACTS}
+MESSAGES = [  # what isn't protected is the same in all contracts
+    (contract, name)
+    for contract in CONTRACTS
+    for name, message in sorted(CODECS[contract].messages.items())
+    if contract == "arm" or message.is_protected
+]
 
 # message, bytes on the wire, values after the end-to-end header; every field a different value
 FRAMES = [
@@ -35,34 +44,52 @@ def test_a_frame_written_by_hand_decodes_to_its_values(name: str, wire: str, val
 @pytest.mark.parametrize(("name", "wire", "values"), FRAMES)
 def test_values_encode_to_the_frame_written_by_hand(name: str, wire: str, values: tuple[float, ...]) -> None:
     message = CODEC.message(name)
-    header = 2 if message.is_protected else 0
-    assert bytes(message.encode(*values))[header:] == bytes.fromhex(wire)[header:]
+    assert bytes(message.encode(*values))[message.header_bytes :] == bytes.fromhex(wire)[message.header_bytes :]
 
 
-def raw_values(message: str) -> st.SearchStrategy[dict[str, int]]:
+def raw_values(message: MessageCodec) -> st.SearchStrategy[dict[str, int]]:
     return st.fixed_dictionaries(
-        {signal.name: st.integers(signal.raw_low, signal.raw_high) for signal in CODEC.message(message).signals}
+        {signal.name: st.integers(signal.raw_low, signal.raw_high) for signal in message.signals}
     )
 
 
-@pytest.mark.parametrize("name", sorted(CODEC.messages))
+@pytest.mark.parametrize(("contract", "name"), MESSAGES)
+@settings(max_examples=50)
 @given(data=st.data())
-def test_cantools_decodes_every_frame_to_the_same_values(name: str, data: st.DataObject) -> None:
-    message = CODEC.message(name)
+def test_cantools_decodes_every_frame_to_the_same_values(contract: str, name: str, data: st.DataObject) -> None:
+    message = CODECS[contract].message(name)
     wire = data.draw(st.binary(min_size=message.length, max_size=message.length))
-    theirs = PEER.decode_message(name, wire, decode_choices=False)
+    theirs = PEERS[contract].decode_message(name, wire, decode_choices=False)
     assert message.decode(wire) == tuple(theirs[signal.name] for signal in message.signals)
+    assert message.decode_values(wire) == tuple(theirs[signal.name] for signal in message.values)
 
 
-@pytest.mark.parametrize("name", sorted(CODEC.messages))
+@pytest.mark.parametrize(("contract", "name"), MESSAGES)
+@settings(max_examples=50)
 @given(data=st.data())
-def test_cantools_encodes_the_same_bits(name: str, data: st.DataObject) -> None:
-    message = CODEC.message(name)
-    raw = data.draw(raw_values(name))
+def test_cantools_encodes_the_same_bits(contract: str, name: str, data: st.DataObject) -> None:
+    message = CODECS[contract].message(name)
+    raw = data.draw(raw_values(message))
     if message.is_protected:
         raw |= {"e2e_crc": 0, "e2e_counter": 0, "e2e_status": 0}
+    theirs = PEERS[contract].get_message_by_name(name).encode(raw, scaling=False, strict=False)
     physical = [raw[signal.name] * signal.scale + signal.offset for signal in message.values]
-    assert bytes(message.encode(*physical)) == PEER.get_message_by_name(name).encode(raw, scaling=False, strict=False)
+    assert bytes(message.encode(*physical)) == theirs
+    assert bytes(message.encode_raw(*(raw[signal.name] for signal in message.values))) == theirs
+
+
+@pytest.mark.parametrize(("contract", "name"), MESSAGES)
+@settings(max_examples=50)
+@given(data=st.data())
+def test_what_is_encoded_protected_and_checked_decodes_to_itself(contract: str, name: str, data: st.DataObject) -> None:
+    message = CODECS[contract].message(name)
+    raw = data.draw(raw_values(message))
+    values = tuple(raw[signal.name] * signal.scale + signal.offset for signal in message.values)
+    sender, receiver = message.sender(), message.receiver()
+    for _ in range(3):
+        frame = sender.protect(message.encode(*values))
+        assert receiver.check(frame) is E2eStatus.OK
+        assert message.decode_values(frame) == values
 
 
 @given(controlword=st.integers(0, 0xFFFF), torque=st.integers(-32768, 32767))
@@ -94,8 +121,13 @@ def edited(tmp_path: Path, old: str, new: str) -> Path:
 
 
 def test_a_signed_bit_field_keeps_its_sign(tmp_path: Path) -> None:
-    path = edited(tmp_path, "SG_ e2e_status : 12|4@1+ (1,0) [0|15]", "SG_ e2e_status : 12|4@1- (1,0) [-8|7]")
-    assert load_codec(path).message("Sensor1Torque").decode(bytes.fromhex("008000000000"))[2] == -8.0
+    whole = ' SG_ counter : 0|8@1+ (1,0) [1|240] ""'
+    halves = ' SG_ counter : 0|4@1+ (1,0) [0|15] "" HOST\n SG_ turn : 4|4@1- (1,0) [-8|7] ""'
+    message = load_codec(edited(tmp_path, whole, halves)).message("Sync")
+    assert message.decode(b"\x83") == (3.0, -8.0)
+    assert message.decode_values(b"\xf5") == (5.0, -1.0)
+    with pytest.raises(CodecError, match="Sync has bit fields: encode physical values instead"):
+        message.encode_raw(3, -8)
 
 
 def test_the_layout_digest_ignores_comments(tmp_path: Path) -> None:
@@ -125,11 +157,18 @@ def test_the_layout_digest_changes_with(tmp_path: Path, old: str, new: str) -> N
         ("controlword : 16|16@1+", "controlword : 23|16@0+", r"Drive1Command.controlword: only plain little-endian"),
         ("SG_ velocity : 32|32@1-", "SG_ velocity : 32|31@1-", r"Drive1Feedback.velocity: bits 32\+31 overlap"),
         (' SG_ error_register : 8|8@1+ (1,0) [0|255] "" HOST\n', "", r"Sensor1Status: signals cover 8 of 16 bits"),
-        ("SG_ e2e_crc : 0|8@1+", "SG_ other : 0|8@1+", r"Sensor1Torque: a protected message begins with e2e_crc"),
+        (
+            "SG_ e2e_crc : 0|8@1+",
+            "SG_ other : 0|8@1+",
+            r"Sensor1Torque: a message protected by P02 begins with unsigned e2e_crc \(8 bits\), e2e_counter \(4",
+        ),
         ('BO_ 387 "', 'BO_ 387 "00', r"Sensor1Torque: E2EDataIdList has 17 bytes, 16 expected"),
         ("728145e7", "zz8145e7", r"E2EDataIdList = 'zz8145e7.*' is not hexadecimal"),
+        ("e2e_status : 12|4@1+", "e2e_status : 12|4@1-", r"a message protected by P02 begins with unsigned"),
+        ("BO_ 1793 Drive1Heartbeat: 1 ", "BO_ 1793 Drive1Heartbeat: 9 ", r"Drive1Heartbeat: no CAN frame has 9 bytes"),
+        ("BO_ 1793 Drive1Heartbeat: 1 ", "BO_ 1793 Drive1Heartbeat: 12 ", r"12 bytes need VFrameFormat StandardCAN_FD"),
     ],
-    ids=["big endian", "31 bits", "a gap", "no header", "17 data ids", "no hex"],
+    ids=["big endian", "31 bits", "a gap", "no header", "17 data ids", "no hex", "signed header", "9 bytes", "no FD"],
 )
 def test_a_dbc_that_cant_be_cyclic_is_refused_by_name(tmp_path: Path, old: str, new: str, reason: str) -> None:
     with pytest.raises(CodecError, match=reason):
@@ -156,4 +195,5 @@ def test_a_missing_dbc_is_named(tmp_path: Path) -> None:
 
 def test_a_codec_knows_the_same_identifiers_as_the_dbc() -> None:
     assert isinstance(CODEC, Codec)
-    assert sorted(CODEC.by_id) == sorted(message.frame_id for message in PEER.messages)
+    for contract, codec in CODECS.items():
+        assert sorted(codec.by_id) == sorted(message.frame_id for message in PEERS[contract].messages)

@@ -1,101 +1,381 @@
-"""End-to-end protection: against cantools' independent implementation, and what the receiver accepts."""
+"""End-to-end protection: the CRCs against the standard's examples and cantools, and what the receivers accept."""
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import pytest
-from cantools.autosar.end_to_end import compute_profile2_crc
+from cantools.autosar.end_to_end import compute_profile2_crc, compute_profile5_crc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.wire.e2e import E2eReceiver, E2eSender, E2eStatus, crc8
+from adacd_hil.wire.e2e import (
+    E2eReceiver,
+    E2eSender,
+    E2eStatus,
+    Profile2Receiver,
+    Profile2Sender,
+    Profile5Receiver,
+    Profile5Sender,
+    Protection,
+    crc8,
+    crc16,
+)
 
 DATA_IDS = bytes(range(10, 26))
+OTHER_DATA_IDS = bytes(range(100, 116))
 
 
-def frames(count: int) -> list[bytes]:
-    sender = E2eSender(DATA_IDS)
-    return [sender.protect(bytearray((0, 0, index, 2, 3, 4))) for index in range(count)]
+class Profile(NamedTuple):
+    """One profile with frames of one length."""
+
+    sender: Callable[[], E2eSender]
+    receiver: Callable[[], E2eReceiver]
+    stranger: Callable[[], E2eReceiver]
+    """A receiver of another message of this length."""
+    length: int
+    counter_byte: int
+    modulus: int
+
+
+def profile_2(length: int) -> Profile:
+    return Profile(
+        lambda: Profile2Sender(DATA_IDS),
+        lambda: Profile2Receiver(DATA_IDS, length),
+        lambda: Profile2Receiver(OTHER_DATA_IDS, length),
+        length,
+        counter_byte=1,
+        modulus=16,
+    )
+
+
+def profile_5(length: int) -> Profile:
+    return Profile(
+        lambda: Profile5Sender(b"\x34\x12"),
+        lambda: Profile5Receiver(b"\x34\x12", length),
+        lambda: Profile5Receiver(b"\x34\x13", length),
+        length,
+        counter_byte=2,
+        modulus=256,
+    )
+
+
+BOTH = pytest.mark.parametrize("profile", [profile_2(6), profile_5(24)], ids=["P02", "P05"])
+
+
+def frames(profile: Profile, count: int) -> list[bytes]:
+    """Protect a row of frames; their payload is their number."""
+    sender = profile.sender()
+    empty = bytes(profile.length - 5)
+    return [sender.protect(bytearray(4) + bytes([index % 256]) + empty) for index in range(count)]
 
 
 @given(payload=st.binary(min_size=2, max_size=8), data_id=st.integers(0, 255))
-def test_the_crc_equals_cantools(payload: bytes, data_id: int) -> None:
+def test_the_profile_2_crc_equals_cantools(payload: bytes, data_id: int) -> None:
     assert crc8(payload, data_id) == compute_profile2_crc(payload, data_id)
 
 
-def test_the_counter_runs_from_0_to_15_and_wraps() -> None:
-    assert [frame[1] & 0x0F for frame in frames(18)] == [*range(16), 0, 1]
-
-
-def test_the_status_nibble_passes_through() -> None:
-    assert E2eSender(DATA_IDS).protect(bytearray((0, 0x50, 1)))[1] & 0xF0 == 0x50
-
-
-def test_an_unbroken_sequence_is_ok() -> None:
-    receiver = E2eReceiver(DATA_IDS)
-    assert {receiver.check(frame) for frame in frames(40)} == {E2eStatus.OK}
+@given(payload=st.binary(min_size=4, max_size=64), data_id=st.integers(0, 0xFFFF))
+def test_the_profile_5_crc_equals_cantools(payload: bytes, data_id: int) -> None:
+    assert crc16(payload, data_id.to_bytes(2, "little")) == compute_profile5_crc(payload, data_id)
 
 
 @pytest.mark.parametrize(
-    ("lost", "status"),
-    [(0, E2eStatus.OK), (1, E2eStatus.OK_SOME_LOST), (2, E2eStatus.OK_SOME_LOST), (3, E2eStatus.WRONG_SEQUENCE)],
-)
-def test_losses_are_tolerated_up_to_a_step_of_three(lost: int, status: E2eStatus) -> None:
-    receiver = E2eReceiver(DATA_IDS)
-    sent = frames(8)
-    receiver.check(sent[0])
-    assert receiver.check(sent[1 + lost]) is status
-
-
-def test_after_a_wrong_sequence_the_next_frame_is_ok() -> None:
-    receiver = E2eReceiver(DATA_IDS)
-    sent = frames(10)
-    receiver.check(sent[0])
-    receiver.check(sent[7])
-    assert receiver.check(sent[8]) is E2eStatus.OK
-
-
-def test_a_repeated_frame_is_not_valid() -> None:
-    receiver = E2eReceiver(DATA_IDS)
-    frame = frames(1)[0]
-    receiver.check(frame)
-    assert receiver.check(frame) is E2eStatus.REPEATED
-
-
-@given(bit=st.integers(0, 47), index=st.integers(0, 15))
-def test_every_flipped_bit_is_found(bit: int, index: int) -> None:
-    frame = bytearray(frames(16)[index])
-    frame[bit // 8] ^= 1 << bit % 8
-    assert E2eReceiver(DATA_IDS).check(bytes(frame)) is E2eStatus.WRONG_CRC
-
-
-def test_a_frame_of_another_message_is_not_taken() -> None:
-    other = E2eReceiver(bytes(range(100, 116)))
-    assert other.check(frames(1)[0]) is E2eStatus.WRONG_CRC
-
-
-def test_every_check_is_counted() -> None:
-    receiver = E2eReceiver(DATA_IDS)
-    sent = frames(6)
-    for frame in (sent[0], sent[1], sent[1], sent[5], bytes(6)):
-        receiver.check(frame)
-    assert receiver.counts == [2, 0, 1, 1, 1]
-
-
-def test_a_restart_forgets_the_sequence() -> None:
-    receiver = E2eReceiver(DATA_IDS)
-    sent = frames(9)
-    receiver.check(sent[0])
-    receiver.restart()
-    assert receiver.check(sent[8]) is E2eStatus.OK
-
-
-@pytest.mark.parametrize(
-    ("status", "is_valid"),
+    ("covered", "crc"),
     [
-        (E2eStatus.OK, True),
-        (E2eStatus.OK_SOME_LOST, True),
-        (E2eStatus.REPEATED, False),
-        (E2eStatus.WRONG_SEQUENCE, False),
-        (E2eStatus.WRONG_CRC, False),
+        ("00000000", 0x12),
+        ("f20183", 0xC2),
+        ("0faa0055", 0xC6),
+        ("00ff5511", 0x77),
+        ("332255aabbccddeeff", 0x11),
+        ("926b55", 0x33),
+        ("ffffffff", 0x6C),
     ],
 )
-def test_only_ok_frames_may_be_used(status: E2eStatus, is_valid: bool) -> None:
+def test_the_profile_2_crc_is_that_of_the_standard_crc_library(covered: str, crc: int) -> None:
+    # AUTOSAR SWS CRC Library, table of Crc_CalculateCRC8H2F: the last byte stands where the data id is
+    data = bytes.fromhex(covered)
+    assert crc8(b"\0" + data[:-1], data[-1]) == crc
+
+
+@pytest.mark.parametrize(
+    ("covered", "crc"),
+    [
+        ("00000000", 0x84C0),
+        ("f20183", 0xD374),
+        ("0faa0055", 0x2023),
+        ("00ff5511", 0xB8F9),
+        ("332255aabbccddeeff", 0xF53F),
+        ("926b55", 0x0745),
+        ("ffffffff", 0x1D0F),
+        (b"123456789".hex(), 0x29B1),
+    ],
+)
+def test_the_profile_5_crc_is_that_of_the_standard_crc_library(covered: str, crc: int) -> None:
+    # AUTOSAR SWS CRC Library, table of Crc_CalculateCRC16: the last two bytes stand where the data id is
+    data = bytes.fromhex(covered)
+    assert crc16(b"\0\0" + data[:-2], data[-2:]) == crc
+
+
+def test_the_profile_5_example_of_the_standard_comes_out() -> None:
+    # AUTOSAR FO PRS E2E Protocol, Profile 5 protocol examples, "short": data id 0x1234, counter 0, 8 bytes of zero
+    assert Profile5Sender(b"\x34\x12").protect(bytearray(8)).hex() == "1cca000000000000"
+
+
+@pytest.mark.parametrize(
+    ("sender", "sent"),
+    [
+        (Profile2Sender(DATA_IDS), ["575001020304", "2c5101020304", "1d5201020304"]),
+        (
+            Profile5Sender(b"\x34\x12"),
+            ["cad60050010203040506070a", "bfd50150010203040506070a", "20d00250010203040506070a"],
+        ),
+    ],
+    ids=["P02", "P05"],
+)
+def test_frames_worked_out_by_long_division_come_out(sender: E2eSender, sent: list[str]) -> None:
+    status_and_payload = "0050" + sent[0][4:] if len(sent[0]) == 12 else "000000" + sent[0][6:]
+    assert [sender.protect(bytearray.fromhex(status_and_payload)).hex() for _ in sent] == sent
+
+
+@BOTH
+def test_the_counter_begins_at_0_and_wraps(profile: Profile) -> None:
+    sent = frames(profile, profile.modulus + 2)
+    assert [frame[profile.counter_byte] for frame in sent] == [*range(profile.modulus), 0, 1]
+
+
+def test_the_status_of_profile_2_passes_through() -> None:
+    assert Profile2Sender(DATA_IDS).protect(bytearray((0, 0x50, 1)))[1] & 0xF0 == 0x50
+
+
+def test_the_status_of_profile_5_passes_through() -> None:
+    assert Profile5Sender(b"\x34\x12").protect(bytearray((0, 0, 0, 0xA5, 1)))[3] == 0xA5
+
+
+@BOTH
+def test_an_unbroken_sequence_is_ok(profile: Profile) -> None:
+    receiver = profile.receiver()
+    assert {receiver.check(frame) for frame in frames(profile, 2 * profile.modulus + 5)} == {E2eStatus.OK}
+
+
+@BOTH
+def test_the_first_frame_may_come_in_the_middle_of_the_sequence(profile: Profile) -> None:
+    assert profile.receiver().check(frames(profile, 12)[11]) is E2eStatus.OK
+
+
+@BOTH
+def test_silence_before_the_first_frame_is_none(profile: Profile) -> None:
+    receiver = profile.receiver()
+    for _ in range(30):
+        receiver.miss()
+    sent = frames(profile, 2)
+    assert [receiver.check(frame) for frame in sent] == [E2eStatus.OK, E2eStatus.OK]
+
+
+@pytest.mark.parametrize(
+    ("profile", "tolerated"), [(profile_2(6), 2), (profile_5(24), 4)], ids=["P02 without miss", "P05"]
+)
+def test_a_jump_of_the_counter_is_loss_up_to_the_tolerance(profile: Profile, tolerated: int) -> None:
+    sent = frames(profile, 9)
+    for lost in range(7):
+        receiver = profile.receiver()
+        receiver.check(sent[0])
+        expected = E2eStatus.OK_SOME_LOST if lost <= tolerated else E2eStatus.WRONG_SEQUENCE
+        assert receiver.check(sent[1 + lost]) is (expected if lost else E2eStatus.OK)
+
+
+@BOTH
+@pytest.mark.parametrize("lost", [1, 2, 3, 4])
+def test_a_short_burst_of_lost_frames_leaves_the_next_one_usable(profile: Profile, lost: int) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 10)
+    receiver.check(sent[0])
+    assert [receiver.miss() for _ in range(lost)] == [E2eStatus.NO_NEW_DATA] * lost
+    assert receiver.check(sent[1 + lost]) is E2eStatus.OK_SOME_LOST
+    assert receiver.check(sent[2 + lost]) is E2eStatus.OK
+
+
+@BOTH
+@pytest.mark.parametrize("lost", [5, 6, 11, 14, 16, 17, 40])
+def test_after_a_long_silence_the_third_frame_is_usable_again(profile: Profile, lost: int) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 50)
+    receiver.check(sent[0])
+    for _ in range(lost):
+        receiver.miss()
+    assert [receiver.check(frame).is_valid for frame in sent[1 + lost : 5 + lost]] == [False, False, True, True]
+
+
+@BOTH
+def test_a_silence_of_a_whole_turn_of_the_counter_costs_one_frame_more(profile: Profile) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, profile.modulus + 4)
+    receiver.check(sent[0])
+    for _ in range(profile.modulus - 1):
+        receiver.miss()
+    assert [receiver.check(frame) for frame in sent[profile.modulus :]] == [
+        E2eStatus.REPEATED,
+        E2eStatus.SYNC,
+        E2eStatus.SYNC,
+        E2eStatus.OK,
+    ]
+
+
+@BOTH
+def test_after_a_wrong_sequence_one_frame_is_sync(profile: Profile) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 12)
+    receiver.check(sent[0])
+    assert [receiver.check(frame) for frame in sent[7:11]] == [
+        E2eStatus.WRONG_SEQUENCE,
+        E2eStatus.SYNC,
+        E2eStatus.OK,
+        E2eStatus.OK,
+    ]
+
+
+@BOTH
+@pytest.mark.parametrize("age", range(1, 9))
+def test_a_stray_old_frame_is_not_used_and_costs_three_frames(profile: Profile, age: int) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 20)
+    for frame in sent[:12]:
+        receiver.check(frame)
+    stray = [receiver.check(frame).is_valid for frame in (sent[11 - age], *sent[12:17])]
+    assert stray[0] is False
+    assert stray[3:] == [True, True, True]
+
+
+@BOTH
+@pytest.mark.parametrize("missed", range(5))
+def test_a_frame_from_the_past_is_not_used_after_a_burst(profile: Profile, missed: int) -> None:
+    sent = frames(profile, 12)
+    for age in range(1, 9):
+        receiver = profile.receiver()
+        for frame in sent:
+            receiver.check(frame)
+        for _ in range(missed):
+            receiver.miss()
+        assert receiver.check(sent[11 - age]) is E2eStatus.WRONG_SEQUENCE
+
+
+@BOTH
+def test_a_repeated_frame_is_not_valid(profile: Profile) -> None:
+    receiver = profile.receiver()
+    frame = frames(profile, 1)[0]
+    receiver.check(frame)
+    assert {receiver.check(frame) for _ in range(30)} == {E2eStatus.REPEATED}
+
+
+@BOTH
+def test_a_frame_with_a_wrong_crc_leaves_the_sequence_alone(profile: Profile) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 9)
+    receiver.check(sent[0])
+    broken = bytearray(sent[8])
+    broken[-1] ^= 1
+    assert receiver.check(bytes(broken)) is E2eStatus.WRONG_CRC
+    assert receiver.check(sent[1]) is E2eStatus.OK
+
+
+@pytest.mark.parametrize(
+    "profile", [profile_2(6), *map(profile_5, (8, 12, 16, 24, 64))], ids=lambda p: f"{p.modulus}-{p.length}"
+)
+@given(payload=st.binary(min_size=64, max_size=64), index=st.integers(0, 20))
+def test_every_flipped_bit_is_found(profile: Profile, payload: bytes, index: int) -> None:
+    sender = profile.sender()
+    frame = b""
+    for _ in range(index + 1):
+        frame = sender.protect(bytearray(payload[: profile.length]))
+    receiver = profile.receiver()
+    found = set()
+    for bit in range(8 * profile.length):
+        flipped = bytearray(frame)
+        flipped[bit // 8] ^= 1 << bit % 8
+        found.add(receiver.check(bytes(flipped)))
+    assert found == {E2eStatus.WRONG_CRC}
+    assert receiver.check(frame) is E2eStatus.OK
+
+
+@BOTH
+def test_a_frame_of_another_length_is_not_taken(profile: Profile) -> None:
+    receiver = profile.receiver()
+    wrong = [length for length in range(65) if length != profile.length]
+    for length in wrong:
+        header = bytearray(profile.sender().protect(bytearray(max(length, 4)))[:length])
+        assert receiver.check(bytes(header)) is E2eStatus.WRONG_CRC
+    assert receiver.counts[E2eStatus.WRONG_CRC] == len(wrong)
+
+
+@BOTH
+def test_a_frame_of_another_message_is_not_taken(profile: Profile) -> None:
+    other = profile.stranger()
+    assert {other.check(frame) for frame in frames(profile, 40)} == {E2eStatus.WRONG_CRC}
+
+
+@BOTH
+def test_every_check_is_counted(profile: Profile) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 12)
+    for frame in (sent[0], sent[1], sent[2], sent[4], sent[4], sent[11], bytes(profile.length), sent[0]):
+        receiver.check(frame)
+    receiver.miss()
+    receiver.miss()
+    assert receiver.counts == [3, 1, 1, 2, 1, 2, 0]
+    assert receiver.tally() == list(zip(E2eStatus, receiver.counts, strict=True))
+    assert receiver.rejected == 4
+
+
+@BOTH
+def test_a_restart_forgets_the_sequence_and_keeps_the_counts(profile: Profile) -> None:
+    receiver = profile.receiver()
+    sent = frames(profile, 12)
+    receiver.check(sent[0])
+    receiver.check(sent[9])
+    for _ in range(20):
+        receiver.miss()
+    counts = list(receiver.counts)
+    receiver.restart()
+    assert receiver.counts == counts
+    assert [receiver.check(sent[3]), receiver.check(sent[4])] == [E2eStatus.OK, E2eStatus.OK]
+
+
+@BOTH
+def test_after_a_restart_the_tolerance_is_that_of_the_start(profile: Profile) -> None:
+    receiver = profile.receiver()
+    for _ in range(20):
+        receiver.miss()
+    receiver.restart()
+    sent = frames(profile, 12)
+    receiver.check(sent[0])
+    assert receiver.check(sent[7]) is E2eStatus.WRONG_SEQUENCE
+
+
+def test_without_protection_every_frame_is_ok_and_passes_as_it_is() -> None:
+    receiver = E2eReceiver()
+    assert E2eSender().protect(bytearray(b"\x01\x02\x03")) == b"\x01\x02\x03"
+    assert [receiver.check(frame) for frame in (b"\x01", b"\x01", b"")] == [E2eStatus.OK] * 3
+    assert receiver.miss() is E2eStatus.NO_NEW_DATA
+    receiver.restart()
+    assert receiver.counts == [3, 0, 0, 0, 0, 1, 0]
+    assert receiver.rejected == 0
+
+
+@pytest.mark.parametrize(
+    ("status", "number", "is_valid"),
+    [
+        (E2eStatus.OK, 0, True),
+        (E2eStatus.OK_SOME_LOST, 1, True),
+        (E2eStatus.REPEATED, 2, False),
+        (E2eStatus.WRONG_SEQUENCE, 3, False),
+        (E2eStatus.WRONG_CRC, 4, False),
+        (E2eStatus.NO_NEW_DATA, 5, False),
+        (E2eStatus.SYNC, 6, False),
+    ],
+)
+def test_only_ok_frames_may_be_used(status: E2eStatus, number: int, is_valid: bool) -> None:
+    assert int(status) == number
     assert status.is_valid is is_valid
+
+
+def test_the_header_takes_what_the_profile_says() -> None:
+    assert [protection.header_bytes for protection in Protection] == [0, 2, 4]

@@ -1,0 +1,247 @@
+"""The CAN FD contracts: frames written by hand, their protection, and what a contract may not say."""
+
+from pathlib import Path
+
+import pytest
+from cantools.autosar.end_to_end import compute_profile2_crc, compute_profile5_crc
+
+from adacd_hil.wire.codec import FD_LENGTHS, Codec, CodecError, contract_folder, load_codec
+from adacd_hil.wire.e2e import E2eReceiver, E2eSender, Protection
+
+FD = load_codec(contract_folder() / "arm_fd.dbc")
+HALF_MS = load_codec(contract_folder() / "arm_fd_500us.dbc")
+CLASSIC = load_codec()
+PROTECTED = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque", "Drive1Command", "Drive2Command")
+
+# contract, message, bytes on the wire, values after the end-to-end header; every field a different value
+FRAMES = [
+    (
+        FD,
+        "Drive1Feedback",
+        "ca1c07a5" + "40420f00" + "18fcffff" + "3712" + "0a" + "21" + "9cff" + "1f86" + "7d00" + "39a0",
+        (1_000_000 * 5.9921124526782858e-06, -0.5, 4663.0, 10.0, 33.0, -100.0, 34335.0, 125.0, 41017.0),
+    ),
+    (FD, "Drive2Command", "ca1c07a5" + "0f00" + "85ff" + "0c00" + "e803", (15.0, -123.0, 12.0, 1000.0)),
+    (
+        FD,
+        "Sensor1Torque",
+        "ca1c07a5" + "60e31600" + "c0bdf0ff" + "05" + "81" + "9308",
+        (1.5, -1.0, 5.0, 129.0, 21.95),
+    ),
+    (
+        HALF_MS,
+        "Drive2Feedback",
+        "ca1c07a5" + "40420f00" + "18fcffff" + "3712" + "1f86",
+        (1_000_000 * 5.9921124526782858e-06, -0.5, 4663.0, 34335.0),
+    ),
+    (HALF_MS, "Drive1Command", "ca1c07a5" + "0f00" + "85ff" + "0c00" + "e803", (15.0, -123.0, 12.0, 1000.0)),
+    (HALF_MS, "Sensor2Torque", "ca1c07a5" + "60e31600" + "05" + "81" + "9308", (1.5, 5.0, 129.0, 21.95)),
+]
+
+
+@pytest.mark.parametrize(("codec", "name", "wire", "values"), FRAMES)
+def test_an_fd_frame_written_by_hand_decodes_to_its_values(
+    codec: Codec, name: str, wire: str, values: tuple[float, ...]
+) -> None:
+    assert codec.message(name).decode_values(bytes.fromhex(wire)) == pytest.approx(values, rel=1e-12)
+
+
+@pytest.mark.parametrize(("codec", "name", "wire", "values"), FRAMES)
+def test_values_encode_to_the_fd_frame_written_by_hand(
+    codec: Codec, name: str, wire: str, values: tuple[float, ...]
+) -> None:
+    assert bytes(codec.message(name).encode(*values))[4:] == bytes.fromhex(wire)[4:]
+
+
+def test_an_fd_header_written_by_hand_decodes_to_its_signals() -> None:
+    assert FD.message("Drive1Command").decode(bytes.fromhex("ca1c07a5" + "00" * 8))[:3] == (0x1CCA, 7.0, 165.0)
+
+
+def test_there_is_one_frame_per_device_and_direction() -> None:
+    lengths = {name: (FD.message(name).length, HALF_MS.message(name).length) for name in PROTECTED}
+    assert lengths == {
+        "Drive1Feedback": (24, 16),
+        "Drive2Feedback": (24, 16),
+        "Sensor1Torque": (16, 12),
+        "Sensor2Torque": (16, 12),
+        "Drive1Command": (12, 12),
+        "Drive2Command": (12, 12),
+    }
+
+
+@pytest.mark.parametrize("codec", [FD, HALF_MS], ids=["arm_fd", "arm_fd_500us"])
+def test_an_fd_contract_is_the_classic_one_without_status_frames(codec: Codec) -> None:
+    statuses = {"Drive1Status", "Drive2Status", "Sensor1Status", "Sensor2Status"}
+    assert set(codec.messages) == set(CLASSIC.messages) - statuses
+    for name, message in codec.messages.items():
+        assert message.can_id == CLASSIC.message(name).can_id
+        if name not in PROTECTED:
+            assert message.signals == CLASSIC.message(name).signals
+
+
+@pytest.mark.parametrize("name", ["Drive1Feedback", "Drive1Status", "Sensor1Torque", "Sensor1Status", "Drive1Command"])
+def test_every_classic_signal_is_found_under_its_name_and_scale_in_the_fd_contract(name: str) -> None:
+    frame = {"Drive1Status": "Drive1Feedback", "Sensor1Status": "Sensor1Torque"}.get(name, name)
+    there = {signal.name: signal for signal in FD.message(frame).values}
+    for signal in CLASSIC.message(name).values:
+        fd = there[signal.name]
+        assert (fd.unit, fd.scale, fd.offset, fd.raw_low) == (signal.unit, signal.scale, signal.offset, signal.raw_low)
+
+
+@pytest.mark.parametrize(
+    ("codec", "protection", "header_bytes", "is_fd"),
+    [(CLASSIC, Protection.PROFILE_2, 2, False), (FD, Protection.PROFILE_5, 4, True)],
+    ids=["arm", "arm_fd"],
+)
+def test_a_message_says_how_it_is_protected(
+    codec: Codec, protection: Protection, header_bytes: int, is_fd: bool
+) -> None:
+    command, sync = codec.message("Drive1Command"), codec.message("Sync")
+    assert (command.protection, command.header_bytes, command.is_fd) == (protection, header_bytes, is_fd)
+    assert (sync.protection, sync.header_bytes, sync.is_fd) == (Protection.NONE, 0, False)
+    assert codec.is_fd is is_fd
+    assert type(sync.sender()) is E2eSender
+    assert type(sync.receiver()) is E2eReceiver
+
+
+@pytest.mark.parametrize("codec", [FD, HALF_MS], ids=["arm_fd", "arm_fd_500us"])
+def test_cantools_finds_the_profile_5_crc_of_a_sent_frame_right(codec: Codec) -> None:
+    for name in PROTECTED:
+        message = codec.message(name)
+        frame = message.sender().protect(message.encode_raw(*range(1, 1 + len(message.values))))
+        crc = compute_profile5_crc(frame, int.from_bytes(message.data_ids, "little"))
+        assert frame[0] | frame[1] << 8 == crc
+
+
+def test_cantools_finds_the_profile_2_crc_of_a_sent_frame_right() -> None:
+    message = CLASSIC.message("Drive1Command")
+    frame = message.sender().protect(message.encode_raw(15, -123))
+    assert frame[0] == compute_profile2_crc(frame, message.data_ids[0])
+
+
+@pytest.mark.parametrize("codec", [CLASSIC, FD, HALF_MS], ids=["arm", "arm_fd", "arm_fd_500us"])
+def test_no_receiver_takes_the_frame_of_another_message(codec: Codec) -> None:
+    protected = [message for message in codec.messages.values() if message.is_protected]
+    for mine in protected:
+        for other in protected:
+            frame = other.sender().protect(bytearray(other.length))
+            assert mine.receiver().check(frame).is_valid is (mine is other)
+
+
+def test_the_data_ids_of_all_fd_contracts_differ() -> None:
+    ids = [codec.message(name).data_ids for codec in (FD, HALF_MS) for name in PROTECTED]
+    assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.parametrize("codec", [CLASSIC, FD, HALF_MS], ids=["arm", "arm_fd", "arm_fd_500us"])
+def test_every_flipped_bit_of_every_protected_frame_is_found(codec: Codec) -> None:
+    for message in codec.messages.values():
+        if not message.is_protected:
+            continue
+        frame = message.sender().protect(bytearray(range(message.length)))
+        for bit in range(8 * message.length):
+            flipped = bytearray(frame)
+            flipped[bit // 8] ^= 1 << bit % 8
+            assert not message.receiver().check(bytes(flipped)).is_valid, f"{message.name} bit {bit}"
+
+
+def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
+    text = (contract_folder() / "arm_fd.dbc").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "edited.dbc"
+    path.write_text(text)
+    return path
+
+
+def test_the_layout_digest_of_the_classic_contract_is_that_of_wire_version_1() -> None:
+    assert (CLASSIC.wire_version, CLASSIC.layout_digest) == (1, 0xF80FDAE0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('BA_ "Trigger" BO_ 385 0;', 'BA_ "Trigger" BO_ 385 2;'),
+        ('BA_ "GenMsgCycleTime" BO_ 1793 100;', 'BA_ "GenMsgCycleTime" BO_ 1793 50;'),
+        ('BA_ "GenMsgDelayTime" BO_ 129 10;', 'BA_ "GenMsgDelayTime" BO_ 129 20;'),
+        ('BA_ "Baudrate" 1000000;', 'BA_ "Baudrate" 500000;'),
+        ('BA_ "BaudrateCANFD" 5000000;', 'BA_ "BaudrateCANFD" 8000000;'),
+        ('BA_ "BusPeriod_us" 1000;', 'BA_ "BusPeriod_us" 500;'),
+        ("CiA 301 SYNC", "The SYNC"),
+    ],
+)
+def test_the_layout_digest_ignores_what_is_not_on_the_wire(tmp_path: Path, old: str, new: str) -> None:
+    assert load_codec(edited(tmp_path, (old, new))).layout_digest == FD.layout_digest
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ([('BA_ "E2EDataId" BO_ 513 52174;', 'BA_ "E2EDataId" BO_ 513 52175;')], "data id"),
+        ([('BA_ "E2EProfile" BO_ 513 "P05";\n', ""), ('BA_ "E2EDataId" BO_ 513 52174;\n', "")], "profile"),
+        ([("SG_ torque_offset : 64|16@1-", "SG_ torque_offset : 64|16@1+")], "sign"),
+        ([("SG_ temperature : 112|16@1- (0.01,0)", "SG_ temperature : 112|16@1- (0.1,0)")], "scale"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_the_fd_layout_digest_changes_with(tmp_path: Path, changes: list[tuple[str, str]], what: str) -> None:
+    assert load_codec(edited(tmp_path, *changes)).layout_digest != FD.layout_digest, what
+
+
+@pytest.mark.parametrize("length", range(65))
+def test_only_lengths_with_a_data_length_code_are_taken(tmp_path: Path, length: int) -> None:
+    signals = "".join(f' SG_ b{index} : {8 * index}|8@1+ (1,0) [0|255] "" HOST\n' for index in range(length))
+    fd = 'BA_DEF_ BO_ "VFrameFormat" ENUM ' + ",".join(f'"f{index}"' for index in range(14)) + ',"StandardCAN_FD";\n'
+    path = tmp_path / "lengths.dbc"
+    path.write_text(
+        f'VERSION ""\n\nBU_: HOST\n\nBO_ 5 Probe: {length} HOST\n{signals}\nBA_DEF_ "WireVersion" INT 1 9;\n{fd}'
+        f'BA_ "WireVersion" 1;\n' + ('BA_ "VFrameFormat" BO_ 5 14;\n' if length > 8 else "")
+    )
+    if length <= 8 or length in (12, 16, 20, 24, 32, 48, 64):
+        assert load_codec(path).message("Probe").is_fd is (length > 8)
+    else:
+        with pytest.raises(CodecError, match=rf"Probe: no CAN frame has {length} bytes; beyond 8 there are 12, 16, 20"):
+            load_codec(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (('BA_ "VFrameFormat" BO_ 385 14;\n', ""), r"Drive1Feedback: 24 bytes need VFrameFormat StandardCAN_FD"),
+        (
+            ('BA_ "VFrameFormat" BO_ 385 14;', 'BA_ "VFrameFormat" BO_ 385 14;\nBA_ "VFrameFormat" BO_ 128 14;'),
+            r"Sync: 1 bytes go in a classic frame; VFrameFormat says CAN FD",
+        ),
+        (
+            ('BA_ "E2EProfile" BO_ 385 "P05";', 'BA_ "E2EProfile" BO_ 385 "P04";'),
+            r"Drive1Feedback: E2EProfile = 'P04' is none of '', 'P02', 'P05'",
+        ),
+        (
+            ('BA_ "E2EProfile" BO_ 385 "P05";', 'BA_ "E2EProfile" BO_ 385 "P02";'),
+            r"Drive1Feedback: E2EDataIdList has 0 bytes, 16 expected",
+        ),
+        (('BA_ "E2EDataId" BO_ 385 36486;\n', ""), r"Drive1Feedback: E2EProfile P05 without E2EDataId"),
+        (('BA_ "E2EProfile" BO_ 385 "P05";\n', ""), r"Drive1Feedback: E2EDataId without E2EProfile"),
+        (
+            ('BA_ "E2EDataId" BO_ 385 36486;', 'BA_ "E2EDataId" BO_ 385 65536;'),
+            r"Drive1Feedback: E2EDataId = 65536 is no integer of 0..65535",
+        ),
+        (
+            (
+                "BO_ 385 Drive1Feedback: 24 DRIVE1\n SG_ e2e_crc : 0|16@1+",
+                "BO_ 385 Drive1Feedback: 24 DRIVE1\n SG_ crc : 0|16@1+",
+            ),
+            r"protected by P05 begins with unsigned e2e_crc \(16 bits\), e2e_counter \(8 bits\), e2e_status \(8 bits\)",
+        ),
+    ],
+    ids=["FD not said", "FD of 1 byte", "P04", "P02 without list", "no data id", "no profile", "65536", "no header"],
+)
+def test_an_fd_contract_that_cant_work_is_refused_by_name(tmp_path: Path, change: tuple[str, str], reason: str) -> None:
+    with pytest.raises(CodecError, match=reason) as caught:
+        load_codec(edited(tmp_path, change))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_lengths_beyond_8_are_those_of_iso_11898() -> None:
+    assert FD_LENGTHS == (12, 16, 20, 24, 32, 48, 64)
