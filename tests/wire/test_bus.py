@@ -5,7 +5,8 @@ import socket
 import pytest
 
 from adacd_hil.clock import MonotonicClock, VirtualClock
-from adacd_hil.wire.bus import BusError, BusMissingError, EmbeddedBus, Frame, SocketCanBus, open_bus
+from adacd_hil.wire.bus import BusError, BusMissingError, EmbeddedBus, Frame, open_bus
+from adacd_hil.wire.socketcan import SocketCanBus
 from adacd_hil.wire.tap import Tap
 
 
