@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock
 
+_INTERFACES = Path("/sys/class/net")
 _ARPHRD_CAN = "280"
 
 
@@ -23,8 +24,33 @@ class BusMissingError(BusError):
     """The bus can't be opened; one line with what there is."""
 
 
+class TransmitQueueError(BusError):
+    """The transmit queue stays full: nobody acknowledges, or it is too short. What waits in it is old by then."""
+
+
+class InterfaceDownError(BusError):
+    """The interface was taken down or has vanished. The bus end stays dead until `recover`."""
+
+
+class BusOffError(BusError):
+    """The controller has left the bus after too many errors. `frame` is the error frame that said so."""
+
+    def __init__(self, message: str, frame: "Frame") -> None:
+        super().__init__(message)
+        self.frame = frame
+
+
+MAX_CLASSIC_BYTES = 8
+"""A frame with more data is CAN FD with bit rate switch; one with less is classic, on an FD bus too."""
+FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
+"""Counts of data bytes that an FD frame can have beyond those of a classic one. Source: ISO 11898-1, table of DLC."""
+
+
 class Frame(NamedTuple):
-    """One CAN frame. t_ns: host time of its reception or transmission."""
+    """One CAN frame. t_ns: host time of its reception or transmission.
+
+    An error frame has the error class for its identifier; `adacd_hil.wire.error_frames` reads it.
+    """
 
     can_id: int
     data: bytes
@@ -38,10 +64,19 @@ class Bus(Protocol):
     channel: str
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Hand a frame to the bus. Raises BusError."""
+        """Hand a frame to the bus. Raises BusError, of it TransmitQueueError and InterfaceDownError."""
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None when none came within `timeout_s`. Raises BusError."""
+        """Return the next frame, or None when none came within `timeout_s`.
+
+        Raises BusError, of it BusOffError and InterfaceDownError.
+        """
+
+    def recover(self) -> None:
+        """Drop everything queued both ways, here and in the interface, so that no old frame gets out or in.
+
+        Raises BusError when that isn't possible yet; may be called again.
+        """
 
     def close(self) -> None:
         """Release the bus; twice is once."""
@@ -77,32 +112,42 @@ class EmbeddedBus:
         """Return the next frame, or None."""
         return self._received.popleft() if self._received else None
 
+    def recover(self) -> None:
+        """Drop what the host has not read."""
+        self._received.clear()
+
     def close(self) -> None:
         """Disconnect the device."""
         self._device = None
 
 
 def open_bus(
-    interface: str, channel: str, clock: Clock, can_ids: Iterable[int] | None = None, bitrate: int | None = None
+    interface: str,
+    channel: str,
+    clock: Clock,
+    can_ids: Iterable[int] | None = None,
+    bitrate: int | None = None,
+    is_fd: bool = False,
 ) -> Bus:
     """Open one end of a real or virtual bus. Raises BusMissingError.
 
     `can_ids` are filtered in the kernel on SocketCAN; elsewhere everything is received. `bitrate` in bit/s is for the
-    interfaces that python-can configures; a SocketCAN interface has its own from `ip link`.
+    interfaces that python-can configures; a SocketCAN interface has its own from `ip link`. Frames of more than 8 bytes
+    need `is_fd`. Remote frames, and 29-bit identifiers that would read as 11-bit ones, are never received.
     """
     # Both build on this module; and who only knows frames, such as the log's writer, does without python-can (0.1 s).
     from adacd_hil.wire.python_can import PythonCanBus
     from adacd_hil.wire.socketcan import SocketCanBus
 
     if interface == "socketcan":
-        return SocketCanBus(channel, clock, can_ids)
-    return PythonCanBus(interface, channel, clock, bitrate)
+        return SocketCanBus(channel, clock, can_ids, is_fd)
+    return PythonCanBus(interface, channel, clock, bitrate, is_fd)
 
 
 def can_interfaces() -> list[str]:
     """Name the CAN interfaces of this machine, up or down."""
     names = []
-    for folder in sorted(Path("/sys/class/net").glob("*")):
+    for folder in sorted(_INTERFACES.glob("*")):
         with contextlib.suppress(OSError):
             if (folder / "type").read_text().strip() == _ARPHRD_CAN:
                 names.append(folder.name)
@@ -112,5 +157,5 @@ def can_interfaces() -> list[str]:
 def is_hardware(interface: str, channel: str) -> bool:
     """Tell whether a channel may have a real bus behind it: everything but vcan and python-can's own virtual bus."""
     if interface == "socketcan":
-        return (Path("/sys/class/net") / channel / "device").exists()
+        return (_INTERFACES / channel / "device").exists()
     return interface != "virtual"
