@@ -5,7 +5,8 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 
 | topic | type | when |
 |---|---|---|
-| /to_can_bus, /from_can_bus | can_msgs/msg/Frame | every frame |
+| /to_can_bus, /from_can_bus | can_msgs/msg/Frame | every frame of up to 8 bytes, error frames too |
+| /to_can_bus_fd, /from_can_bus_fd | ros2_socketcan_msgs/msg/FdFrame | every longer frame |
 | /decoded/<DBC message> | adacd_hil_msgs/msg/<DBC message> | every frame that the DBC knows |
 | /joint_states | sensor_msgs/msg/JointState | every cycle; measured q, dq, tau_J |
 | /scheme | adacd_hil_msgs/msg/Scheme | every cycle; records.scheme_layout |
@@ -22,7 +23,7 @@ from typing import Protocol
 
 from adacd_hil.log.cdr import Member, MessageType, body_struct, number_type, ros_message_name
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.ros_types import CAN_FRAME, JOINT_STATE, LOG
+from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, JOINT_STATE, LOG
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     TRUTH_LAYOUT,
@@ -53,6 +54,8 @@ class ChannelId(IntEnum):
     CYCLE = 7
     EVENTS = 8
     TRUTH = 9
+    TO_CAN_BUS_FD = 10
+    FROM_CAN_BUS_FD = 11
     DECODED_FIRST = 16  # and up: the messages of the DBC, in its order
 
 
@@ -159,6 +162,8 @@ def run_channels(parameter_count: int, messages: "tuple[MessageLike, ...]" = ())
     own = (
         Channel(ChannelId.TO_CAN_BUS, "/to_can_bus", CAN_FRAME),
         Channel(ChannelId.FROM_CAN_BUS, "/from_can_bus", CAN_FRAME),
+        Channel(ChannelId.TO_CAN_BUS_FD, "/to_can_bus_fd", FD_FRAME),
+        Channel(ChannelId.FROM_CAN_BUS_FD, "/from_can_bus_fd", FD_FRAME),
         Channel(ChannelId.JOINT_STATES, "/joint_states", JOINT_STATE),
         Channel(ChannelId.SCHEME, "/scheme", number_type(f"{PACKAGE}/Scheme", scheme)),
         Channel(ChannelId.CONTACT, "/contact", number_type(f"{PACKAGE}/Contact", _CONTACT)),

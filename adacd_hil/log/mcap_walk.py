@@ -12,7 +12,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import zstandard
@@ -29,12 +29,25 @@ MAGIC = b"\x89MCAP0\r\n"
 MESSAGE_HEAD = 31
 """Bytes of a message record before its payload: opcode, length, channel, sequence, log time, publish time."""
 _RECORD_HEAD = struct.Struct("<BQ")
+RECORD_HEAD_BYTES = _RECORD_HEAD.size
+"""Bytes of a record that its length doesn't count."""
 _MESSAGE_START = struct.Struct("<BQH")
 _MAX_CHUNK = 1 << 30
 _DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, MemoryError, OverflowError)
 
-PayloadLayout = Callable[[Channel, Schema], "np.dtype[Any] | None"]
-"""Describes the payloads of a channel; None where their size varies."""
+
+class Payload(NamedTuple):
+    """The layout of a topic's payloads. `has_tail`: they end in bytes, counted by the field `count`, that fill `data`.
+
+    Records of such payloads are padded with zeros to those with the longest tail.
+    """
+
+    dtype: "np.dtype[Any]"
+    has_tail: bool = False
+
+
+PayloadLayout = Callable[[Channel, Schema], Payload | None]
+"""Describes the payloads of a channel; None where their size varies otherwise."""
 
 
 def record_dtype(payload: "np.dtype[Any]") -> "np.dtype[Any]":
@@ -54,9 +67,10 @@ def record_dtype(payload: "np.dtype[Any]") -> "np.dtype[Any]":
 class Topic:
     """The messages of one topic, in the order of the file."""
 
-    def __init__(self, type_name: str, payload: "np.dtype[Any] | None") -> None:
+    def __init__(self, type_name: str, payload: Payload | None) -> None:
         self.type_name = type_name
-        self.dtype = None if payload is None else record_dtype(payload)
+        self.dtype = None if payload is None else record_dtype(payload.dtype)
+        self.has_tail = payload is not None and payload.has_tail
         self.pieces: list[NDArray[np.uint8]] = []  # (n, size of a record): numpy would not copy what no field covers
         self.places: list[NDArray[np.int64]] = []  # where each record began, increasing over the whole file
         self.payloads: list[bytes] = []  # where the size varies
@@ -198,13 +212,35 @@ class Walk:
                 _, length, _ = _MESSAGE_START.unpack_from(data, place)
                 topic.payloads.append(data[place + MESSAGE_HEAD : place + _RECORD_HEAD.size + length])
             return
-        size = topic.dtype.itemsize
-        fitting = places[places + size <= len(data)]
-        if len(fitting):
-            windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), size)
-            rows = windows[fitting]
-            is_right = rows.view(topic.dtype)[:, 0]["record_length"] == size - _RECORD_HEAD.size
-            topic.pieces.append(rows[is_right])
-            topic.places.append(fitting[is_right] + self._bytes_before)
-        if not len(fitting) or len(places) != len(topic.pieces[-1]):
+        rows, is_right = (
+            _rows_with_tail(topic.dtype, data, places) if topic.has_tail else _rows(topic.dtype, data, places)
+        )
+        topic.pieces.append(rows[is_right])
+        topic.places.append(places[: len(rows)][is_right] + self._bytes_before)
+        if len(places) != len(topic.pieces[-1]):
             self._note("a message is not as long as its schema says")
+
+
+def _rows(
+    dtype: "np.dtype[Any]", data: bytes, places: NDArray[np.int64]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Gather the records at increasing `places` that lie within `data` (n, size), and which of them are that long."""
+    fitting = places[places + dtype.itemsize <= len(data)]
+    if not len(fitting):
+        return np.empty((0, dtype.itemsize), np.uint8), np.empty(0, np.bool_)
+    rows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), dtype.itemsize)[fitting]
+    return rows, rows.view(dtype)[:, 0]["record_length"] == dtype.itemsize - _RECORD_HEAD.size
+
+
+def _rows_with_tail(
+    dtype: "np.dtype[Any]", data: bytes, places: NDArray[np.int64]
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Gather as `_rows` does, with what lies beyond the tail zeroed."""
+    assert dtype.fields is not None
+    tail = int(dtype.fields["data"][1])
+    rows, _ = _rows(dtype, data + bytes(dtype.itemsize - tail), places)
+    records = rows.view(dtype)[:, 0]
+    counts = records["count"]
+    records["data"][np.arange(dtype.itemsize - tail) >= counts[:, np.newaxis]] = 0
+    is_right = (records["record_length"] == tail - _RECORD_HEAD.size + counts) & (counts <= dtype.itemsize - tail)
+    return rows, is_right

@@ -1,7 +1,8 @@
 """Packets between the control process and the writer: one per cycle, one per event, one to end.
 
 A cycle's packet: kind, count of messages, count of frames, packets dropped so far, t_ns; then per frame identifier,
-count of data bytes, flags, data, t_ns; then per message channel and size; then the bodies.
+count of data bytes, flags, the first 8 of them, t_ns; then per message channel and size; then the bodies; then what FD
+frames have beyond 8 bytes. So a cycle of classic frames pays nothing for the others.
 """
 
 import functools
@@ -10,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from adacd_hil.records import Event
-from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, Frame
 
 CYCLE = 1
 EVENT = 2
@@ -30,13 +31,13 @@ _MAX_TEXT = 4096
 
 
 class LoggedFrame(NamedTuple):
-    """A frame on its way to the log; `length` over 8 marks data that didn't fit."""
+    """A frame on its way to the log."""
 
     can_id: int
     length: int
     is_tx: bool
     is_error: bool
-    data: bytes  # 8 bytes, of which `length` count
+    data: bytes  # 8 bytes, of which `length` count; all of them when there are more
     t_ns: int
 
 
@@ -68,14 +69,18 @@ def pack_cycle(
 ) -> bytes:
     """Pack a cycle."""
     values: list[int | bytes] = [CYCLE, len(messages), len(frames), dropped, t_ns]
+    rests = []
     for is_tx, (can_id, data, frame_t_ns, is_error) in frames:
-        values += (can_id, len(data), is_tx | is_error << 1, data, frame_t_ns)
+        length = len(data)
+        values += (can_id, length, is_tx | is_error << 1, data, frame_t_ns)
+        if length > MAX_CLASSIC_BYTES:
+            rests.append(data[MAX_CLASSIC_BYTES:])
     parts = [b""]
     for channel, body in messages:
         values += (channel, len(body))
         parts.append(body)
     parts[0] = _table(len(frames), len(messages)).pack(*values)
-    return b"".join(parts)
+    return b"".join((*parts, *rests)) if rests else b"".join(parts)
 
 
 def pack_event(t_ns: int, dropped: int, event: Event) -> bytes:
@@ -112,4 +117,16 @@ def unpack(packet: bytes) -> CyclePacket | EventPacket | None:
     for channel, size in _MESSAGE.iter_unpack(packet[tables:position]):
         messages.append((channel, packet[position : position + size]))
         position += size
+    if position < len(packet):
+        _join_rests(frames, packet[position:])
     return CyclePacket(t_ns, dropped, frames, messages)
+
+
+def _join_rests(frames: list[LoggedFrame], rests: bytes) -> None:
+    """Give the FD frames what they have beyond 8 bytes."""
+    position = 0
+    for index, frame in enumerate(frames):
+        if frame.length > MAX_CLASSIC_BYTES:
+            end = position + frame.length - MAX_CLASSIC_BYTES
+            frames[index] = frame._replace(data=frame.data + rests[position:end])
+            position = end

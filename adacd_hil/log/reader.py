@@ -16,26 +16,53 @@ from adacd_hil.log.cdr import MessageType
 from adacd_hil.log.channels import DECODED, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import FIELDS_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.mcap_walk import MESSAGE_HEAD, Topic, Walk
-from adacd_hil.log.ros_types import CAN_FRAME, CAN_FRAME_DTYPE, JOINT_STATE, JOINT_STATE_DTYPE, LOG, unpack_log
+from adacd_hil.log.mcap_walk import MESSAGE_HEAD, RECORD_HEAD_BYTES, Payload, Topic, Walk
+from adacd_hil.log.ros_types import (
+    CAN_FRAME,
+    CAN_FRAME_DTYPE,
+    FD_FRAME,
+    FD_FRAME_DTYPE,
+    JOINT_STATE,
+    JOINT_STATE_DTYPE,
+    LOG,
+    unpack_log,
+)
 from adacd_hil.records import PARAMETER_NAMES, ContactReport, Event, Vector
 
 EPOCH_KEY = "epoch_ns"
-_FIXED = {CAN_FRAME.name: CAN_FRAME_DTYPE, JOINT_STATE.name: JOINT_STATE_DTYPE}
-_FRAME_TOPICS = {"/to_can_bus": True, "/from_can_bus": False}
+_KNOWN = {
+    CAN_FRAME.name: Payload(CAN_FRAME_DTYPE),
+    FD_FRAME.name: Payload(FD_FRAME_DTYPE, has_tail=True),
+    JOINT_STATE.name: Payload(JOINT_STATE_DTYPE),
+}
+_FRAME_TOPICS = {
+    "/to_can_bus": (True, "dlc"),
+    "/from_can_bus": (False, "dlc"),
+    "/to_can_bus_fd": (True, "len"),
+    "/from_can_bus_fd": (False, "len"),
+}
+"""Topics of frames: whether they were sent, and the field that counts their data bytes."""
 _NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
 
-FRAME_DTYPE = np.dtype(
-    [
-        ("t_ns", np.int64),  # when it passed
-        ("cycle_t_ns", np.int64),  # t_ns of the cycle that it was logged with
-        ("can_id", np.uint32),
-        ("is_tx", np.bool_),
-        ("is_error", np.bool_),
-        ("length", np.uint8),
-        ("data", np.uint8, (8,)),
-    ]
-)
+
+def _frame_dtype(data_bytes: int) -> "np.dtype[Any]":
+    return np.dtype(
+        [
+            ("t_ns", np.int64),  # when it passed
+            ("cycle_t_ns", np.int64),  # t_ns of the cycle that it was logged with
+            ("can_id", np.uint32),
+            ("is_tx", np.bool_),
+            ("is_error", np.bool_),
+            ("length", np.uint8),  # so many bytes of the data count, the rest is zero
+            ("data", np.uint8, (data_bytes,)),
+        ]
+    )
+
+
+FRAME_DTYPE = _frame_dtype(8)
+"""A frame of a log without FD frames."""
+LONG_FRAME_DTYPE = _frame_dtype(64)
+"""A frame of a log with FD frames, classic ones too: `data` (64,). All else is as in the other."""
 
 
 class LoggedEvent(NamedTuple):
@@ -90,7 +117,11 @@ class Series:
 
     def payloads(self) -> bytes:
         """Return the payloads of all messages, one after the other."""
-        return self._rows()[:, MESSAGE_HEAD:].tobytes()
+        rows = self._rows()
+        ends = self.records["record_length"] + RECORD_HEAD_BYTES
+        if (ends == self.records.dtype.itemsize).all():
+            return rows[:, MESSAGE_HEAD:].tobytes()
+        return b"".join(row[MESSAGE_HEAD:end].tobytes() for row, end in zip(rows, ends.tolist(), strict=True))
 
     def _rows(self) -> NDArray[np.uint8]:
         return np.ascontiguousarray(self.records).view(np.uint8).reshape(len(self), self.records.dtype.itemsize)
@@ -107,7 +138,7 @@ class RunLog:
     attachments: dict[str, bytes]
     topics: Mapping[str, Series]
     decoded: Mapping[str, Series]  # by DBC message
-    frames: NDArray[Any]  # (n,) of FRAME_DTYPE, both ways, in the order of the bus
+    frames: NDArray[Any]  # (n,) of FRAME_DTYPE or LONG_FRAME_DTYPE, both ways, in the order of the bus
     events: list[LoggedEvent]
     contacts: list[LoggedContact]
 
@@ -176,7 +207,7 @@ def topic_bytes(path: Path, topic: str) -> bytes:
     return b"".join(found.payloads) if found.dtype is None else Series(found.records(), 0).payloads()
 
 
-def _payload_layout(channel: Channel, schema: Schema) -> "np.dtype[Any] | None":
+def _payload_layout(channel: Channel, schema: Schema) -> Payload | None:
     try:
         text = schema.data.decode("utf-8")
     except UnicodeDecodeError:
@@ -184,12 +215,12 @@ def _payload_layout(channel: Channel, schema: Schema) -> "np.dtype[Any] | None":
     return _own_layout(MessageType(schema.name, text, tuple(channel.metadata.get(FIELDS_KEY, "").split())))
 
 
-def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
+def _own_layout(message_type: MessageType) -> Payload | None:
     """Describe payloads as we write them; None where their size varies."""
-    if message_type.name in _FIXED:
-        return _FIXED[message_type.name]
+    if message_type.name in _KNOWN:
+        return _KNOWN[message_type.name]
     try:
-        return message_type.dtype
+        return Payload(message_type.dtype)
     except LogError:
         return None
 
@@ -219,17 +250,21 @@ def _all_series(topics: Mapping[str, Topic], metadata: Mapping[str, str], epoch_
 
 def _frames(topics: Mapping[str, Topic], series: Mapping[str, Series], epoch_ns: int) -> NDArray[Any]:
     parts, places = [], []
-    for name, is_tx in _FRAME_TOPICS.items():
+    has_long = any(len(series[name]) for name, (_, length) in _FRAME_TOPICS.items() if length == "len")
+    dtype = LONG_FRAME_DTYPE if has_long else FRAME_DTYPE
+    for name, (is_tx, length) in _FRAME_TOPICS.items():
         source = series[name]
         if not len(source):
             continue
-        part = np.zeros(len(source), FRAME_DTYPE)
+        part = np.zeros(len(source), dtype)
         part["t_ns"] = source.t_ns
         part["cycle_t_ns"] = source.records["publish_time"].astype(np.int64) - epoch_ns
         part["is_tx"] = is_tx
-        part["length"] = source.records["dlc"]
-        for field in ("can_id", "is_error", "data"):
-            part[field] = source.records[field]
+        part["length"] = source.records[length]
+        part["can_id"] = source.records["can_id"]
+        part["is_error"] = source.records["is_error"]
+        data = source.records["data"]
+        part["data"][:, : data.shape[1]] = data
         parts.append(part)
         places.append(topics[name].place())
     if not parts:

@@ -1,7 +1,8 @@
-"""Message types that others defined and every viewer knows: can_msgs/Frame, sensor_msgs/JointState, foxglove_msgs/Log.
+"""Message types of others: can_msgs/Frame, ros2_socketcan_msgs/FdFrame, sensor_msgs/JointState, foxglove_msgs/Log.
 
 Each is packed here to its whole payload. Strings and counts that could vary are constant (no frame_id, two joints),
-so that the sizes of frames and joint states are constant too.
+so that the sizes of classic frames and joint states are constant too. An FD frame is as long as its data, as
+ros2_socketcan publishes it.
 """
 
 import struct
@@ -26,6 +27,16 @@ bool is_extended
 bool is_error
 uint8 dlc
 uint8[8] data
+{_HEADER_TEXT}""",
+)
+FD_FRAME = MessageType(
+    "ros2_socketcan_msgs/msg/FdFrame",
+    f"""std_msgs/Header header
+uint32 id
+bool is_extended
+bool is_error
+uint8 len
+uint8[<=64] data
 {_HEADER_TEXT}""",
 )
 JOINT_STATE = MessageType(
@@ -65,7 +76,17 @@ CAN_FRAME_DTYPE = np.dtype(
         "itemsize": 36,
     }
 )
-MAX_DATA = 8
+MAX_DATA = 64
+_FD_FRAME_BODY = struct.Struct("<I??BxI")
+FD_FRAME_DTYPE = np.dtype(
+    {
+        "names": ["sec", "nanosec", "can_id", "is_extended", "is_error", "len", "count", "data"],
+        "formats": ["<u4", "<u4", "<u4", "?", "?", "u1", "<u4", ("u1", (MAX_DATA,))],
+        "offsets": [4, 8, 20, 24, 25, 26, 28, 32],
+        "itemsize": 32 + MAX_DATA,
+    }
+)
+"""The longest payload; others end after `count` bytes of data."""
 
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
 _LEVEL_NAMES = {number: name for name, number in _LEVELS.items()} | {0: "info", 1: "info", 5: "error"}
@@ -74,6 +95,14 @@ _LEVEL_NAMES = {number: name for name, number in _LEVELS.items()} | {0: "info", 
 def pack_can_frame(stamp: bytes, can_id: int, data: bytes, dlc: int, is_error: bool) -> bytes:
     """Pack a frame; `stamp` is a packed builtin_interfaces/Time, `data` up to 8 bytes of which `dlc` count."""
     return ENCAPSULATION + stamp + _FRAME_ID + _CAN_FRAME_BODY.pack(can_id, False, can_id > 0x7FF, is_error, dlc, data)
+
+
+def pack_fd_frame(stamp: bytes, can_id: int, data: bytes, is_error: bool) -> bytes:
+    """Pack an FD frame; `stamp` is a packed builtin_interfaces/Time, `data` up to 64 bytes."""
+    length = len(data)
+    return (
+        ENCAPSULATION + stamp + _FRAME_ID + _FD_FRAME_BODY.pack(can_id, can_id > 0x7FF, is_error, length, length) + data
+    )
 
 
 def _joint_state_parts() -> tuple[bytes, bytes]:

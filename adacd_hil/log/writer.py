@@ -21,10 +21,11 @@ from adacd_hil.log.channels import SCHEME_BLOCK, ChannelId, MessageLike, run_cha
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import McapFile
 from adacd_hil.log.packet import CyclePacket, EventPacket, LoggedFrame, unpack
-from adacd_hil.log.ros_types import MAX_DATA, pack_can_frame, pack_joint_state, pack_log
+from adacd_hil.log.ros_types import MAX_DATA, pack_can_frame, pack_fd_frame, pack_joint_state, pack_log
 from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
 from adacd_hil.records import Event, scheme_layout
+from adacd_hil.wire.bus import MAX_CLASSIC_BYTES
 
 FLUSH_PERIOD_NS = 250_000_000
 POLL_PERIOD_NS = 10_000_000
@@ -79,8 +80,12 @@ class PacketWriter:
             raise ValueError(f"a frame of {frame.length} bytes; {MAX_DATA} are the most")
         time_ns = frame.t_ns + self._epoch_ns
         stamp = _stamp(time_ns)
-        channel_id = ChannelId.TO_CAN_BUS if frame.is_tx else ChannelId.FROM_CAN_BUS
-        payload = pack_can_frame(stamp, frame.can_id, frame.data, frame.length, frame.is_error)
+        if frame.length > MAX_CLASSIC_BYTES:
+            channel_id = ChannelId.TO_CAN_BUS_FD if frame.is_tx else ChannelId.FROM_CAN_BUS_FD
+            payload = pack_fd_frame(stamp, frame.can_id, frame.data, frame.is_error)
+        else:
+            channel_id = ChannelId.TO_CAN_BUS if frame.is_tx else ChannelId.FROM_CAN_BUS
+            payload = pack_can_frame(stamp, frame.can_id, frame.data, frame.length, frame.is_error)
         self._file.add(channel_id, time_ns, cycle_time_ns, payload)
         self.frames += 1
         decoder = self._decoders.get(frame.can_id)

@@ -1,33 +1,19 @@
 """Where frames enter and leave: one seam over SocketCAN, the embedded bus, and every other python-can interface.
 
-SocketCAN is opened by python-can (filters, error mask, options) and then used through its socket, because building a
-`can.Message` costs more than everything else in a cycle together. The embedded bus joins host and emulator in one
-process, without threads: what the host sends is handled before `send` returns.
+The embedded bus joins host and emulator in one process, without threads: what the host sends is handled before `send`
+returns.
 """
 
 import contextlib
-import difflib
-import errno
-import select
-import socket
-import struct
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
-import can
+from adacd_hil.clock import Clock
 
-from adacd_hil.clock import Clock, MonotonicClock
-
-CAN_ERR_FLAG = 0x20000000
-CAN_ID_MASK = 0x1FFFFFFF
-_FRAME = struct.Struct("=IB3x8s")
+_INTERFACES = Path("/sys/class/net")
 _ARPHRD_CAN = "280"
-_IFF_UP = 1
-_ECHOING_INTERFACES = ("udp_multicast",)
-_SEND_PATIENCE_S = 0.05
-"""Longest wait for room in the transmit queue: over 300 frames at 1 Mbit/s, so a live bus has drained by then."""
 
 
 class BusError(OSError):
@@ -38,8 +24,33 @@ class BusMissingError(BusError):
     """The bus can't be opened; one line with what there is."""
 
 
+class TransmitQueueError(BusError):
+    """The transmit queue stays full: nobody acknowledges, or it is too short. What waits in it is old by then."""
+
+
+class InterfaceDownError(BusError):
+    """The interface was taken down or has vanished. The bus end stays dead until `recover`."""
+
+
+class BusOffError(BusError):
+    """The controller has left the bus after too many errors. `frame` is the error frame that said so."""
+
+    def __init__(self, message: str, frame: "Frame") -> None:
+        super().__init__(message)
+        self.frame = frame
+
+
+MAX_CLASSIC_BYTES = 8
+"""A frame with more data is CAN FD with bit rate switch; one with less is classic, on an FD bus too."""
+FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
+"""Counts of data bytes that an FD frame can have beyond those of a classic one. Source: ISO 11898-1, table of DLC."""
+
+
 class Frame(NamedTuple):
-    """One CAN frame. t_ns: host time of its reception or transmission."""
+    """One CAN frame. t_ns: host time of its reception or transmission.
+
+    An error frame has the error class for its identifier; `adacd_hil.wire.error_frames` reads it.
+    """
 
     can_id: int
     data: bytes
@@ -53,13 +64,19 @@ class Bus(Protocol):
     channel: str
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Hand a frame to the bus. Raises BusError."""
+        """Hand a frame to the bus. Raises BusError, of it TransmitQueueError and InterfaceDownError."""
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None when none came within `timeout_s`. Raises BusError."""
+        """Return the next frame, or None when none came within `timeout_s`.
+
+        Raises BusError, of it BusOffError and InterfaceDownError.
+        """
 
     def recover(self) -> None:
-        """Drop everything that is queued both ways. Raises BusError."""
+        """Drop everything queued both ways, here and in the interface, so that no old frame gets out or in.
+
+        Raises BusError when that isn't possible yet; may be called again.
+        """
 
     def close(self) -> None:
         """Release the bus; twice is once."""
@@ -96,7 +113,7 @@ class EmbeddedBus:
         return self._received.popleft() if self._received else None
 
     def recover(self) -> None:
-        """Drop what the device sent."""
+        """Drop what the host has not read."""
         self._received.clear()
 
     def close(self) -> None:
@@ -104,157 +121,33 @@ class EmbeddedBus:
         self._device = None
 
 
-class SocketCanBus:
-    """A SocketCAN interface, classic frames.
-
-    Frames that are found waiting carry one stamp, that of the first of them: a reading of the clock costs as much as a
-    frame where it is a system call.
-    """
-
-    def __init__(self, channel: str, clock: Clock, can_ids: Iterable[int] | None = None) -> None:
-        """Open `channel`, receiving only `can_ids` when given. Raises BusMissingError."""
-        filters = None if can_ids is None else [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in can_ids]
-        self.channel = channel
-        self._clock = clock
-        _check_channel(channel)
-        try:
-            self._bus = can.Bus(channel, interface="socketcan", can_filters=filters, receive_own_messages=False)
-        except (OSError, can.CanError) as error:
-            raise BusMissingError(f"CAN interface {channel}: {error}") from None
-        self._socket: socket.socket = self._bus.socket  # type: ignore[attr-defined]
-        self._socket.setblocking(False)
-        self._patience = MonotonicClock()
-        self._is_drained = True  # the last look found nothing, so waiting comes before looking
-        self._stamp_ns: int | None = None
-        self._is_closed = False
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Queue a frame for transmission. Raises BusError when the queue stays full or the interface is down."""
-        packed = _FRAME.pack(can_id, len(data), data)
-        if self._try_to_send(packed):
-            return
-        patience = self._patience
-        deadline_ns = patience.now_ns() + int(_SEND_PATIENCE_S * 1e9)
-        while patience.now_ns() < deadline_ns:
-            patience.sleep_until_ns(patience.now_ns() + 100_000)  # one frame's time at 1 Mbit/s
-            if self._try_to_send(packed):
-                return
-        raise BusError(
-            f"transmit queue of {self.channel} stayed full for {_SEND_PATIENCE_S * 1000:.0f} ms: nobody acknowledges, "
-            f"or txqueuelen is too small"
-        )
-
-    def _try_to_send(self, packed: bytes) -> bool:
-        try:
-            self._socket.send(packed)
-        except OSError as error:
-            if error.errno in (errno.ENOBUFS, errno.EAGAIN):
-                return False
-            raise BusError(f"sending on {self.channel}: {error.strerror}") from None
-        return True
-
-    def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None after `timeout_s`. Raises BusError when the interface is down."""
-        packed = None if self._is_drained and timeout_s > 0.0 else self._look()
-        if packed is None:
-            if timeout_s <= 0.0 or not select.select([self._socket], [], [], timeout_s)[0]:
-                return None
-            packed = self._look()
-            if packed is None:
-                return None
-        if self._stamp_ns is None:
-            self._stamp_ns = self._clock.now_ns()
-        can_id, length, data = _FRAME.unpack(packed)
-        return Frame(can_id & CAN_ID_MASK, data[:length], self._stamp_ns, bool(can_id & CAN_ERR_FLAG))
-
-    def _look(self) -> bytes | None:
-        """Take a frame that waits, None when there is none."""
-        try:
-            packed = self._socket.recv(_FRAME.size)
-        except BlockingIOError:
-            self._is_drained = True
-            self._stamp_ns = None
-            return None
-        except OSError as error:
-            raise BusError(f"receiving on {self.channel}: {error.strerror}") from None
-        if self._is_drained:
-            self._is_drained = False
-            self._stamp_ns = None
-        return packed
-
-    def recover(self) -> None:
-        """Drop everything that is queued both ways. Raises BusError."""
-        raise BusError("x")
-
-    def close(self) -> None:
-        """Close the socket."""
-        if not self._is_closed:
-            self._is_closed = True
-            self._bus.shutdown()
-
-
-class PythonCanBus:
-    """Any other python-can interface."""
-
-    def __init__(self, interface: str, channel: str, clock: Clock, bitrate: int | None = None) -> None:
-        """Open it, at `bitrate` bit/s where the interface sets one. Raises BusMissingError."""
-        if interface in _ECHOING_INTERFACES:
-            raise BusMissingError(f"interface {interface} echoes own frames and can't carry a cycle; use socketcan")
-        if interface not in can.VALID_INTERFACES:
-            nearest = difflib.get_close_matches(interface, can.VALID_INTERFACES, n=1)
-            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-            raise BusMissingError(f"unknown interface {interface!r}{hint}")
-        self.channel = channel
-        self._clock = clock
-        try:
-            options: dict[str, Any] = {} if bitrate is None else {"bitrate": bitrate}
-            self._bus = can.Bus(channel, interface=interface, receive_own_messages=False, **options)
-        except (OSError, can.CanError, ValueError) as error:
-            raise BusMissingError(f"interface {interface}, channel {channel}: {error}") from None
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send a frame. Raises BusError."""
-        try:
-            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        except (OSError, can.CanError) as error:
-            raise BusError(f"sending on {self.channel}: {error}") from None
-
-    def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None after `timeout_s`. Raises BusError."""
-        try:
-            message = self._bus.recv(timeout_s)
-        except (OSError, can.CanError) as error:
-            raise BusError(f"receiving on {self.channel}: {error}") from None
-        if message is None:
-            return None
-        return Frame(message.arbitration_id, bytes(message.data), self._clock.now_ns(), message.is_error_frame)
-
-    def recover(self) -> None:
-        """Drop everything that is queued both ways. Raises BusError."""
-        raise BusError("x")
-
-    def close(self) -> None:
-        """Shut the interface down."""
-        self._bus.shutdown()
-
-
 def open_bus(
-    interface: str, channel: str, clock: Clock, can_ids: Iterable[int] | None = None, bitrate: int | None = None
+    interface: str,
+    channel: str,
+    clock: Clock,
+    can_ids: Iterable[int] | None = None,
+    bitrate: int | None = None,
+    is_fd: bool = False,
 ) -> Bus:
     """Open one end of a real or virtual bus. Raises BusMissingError.
 
     `can_ids` are filtered in the kernel on SocketCAN; elsewhere everything is received. `bitrate` in bit/s is for the
-    interfaces that python-can configures; a SocketCAN interface has its own from `ip link`.
+    interfaces that python-can configures; a SocketCAN interface has its own from `ip link`. Frames of more than 8 bytes
+    need `is_fd`. Remote frames, and 29-bit identifiers that would read as 11-bit ones, are never received.
     """
+    # Both build on this module; and who only knows frames, such as the log's writer, does without python-can (0.1 s).
+    from adacd_hil.wire.python_can import PythonCanBus
+    from adacd_hil.wire.socketcan import SocketCanBus
+
     if interface == "socketcan":
-        return SocketCanBus(channel, clock, can_ids)
-    return PythonCanBus(interface, channel, clock, bitrate)
+        return SocketCanBus(channel, clock, can_ids, is_fd)
+    return PythonCanBus(interface, channel, clock, bitrate, is_fd)
 
 
 def can_interfaces() -> list[str]:
     """Name the CAN interfaces of this machine, up or down."""
     names = []
-    for folder in sorted(Path("/sys/class/net").glob("*")):
+    for folder in sorted(_INTERFACES.glob("*")):
         with contextlib.suppress(OSError):
             if (folder / "type").read_text().strip() == _ARPHRD_CAN:
                 names.append(folder.name)
@@ -264,28 +157,5 @@ def can_interfaces() -> list[str]:
 def is_hardware(interface: str, channel: str) -> bool:
     """Tell whether a channel may have a real bus behind it: everything but vcan and python-can's own virtual bus."""
     if interface == "socketcan":
-        return (Path("/sys/class/net") / channel / "device").exists()
+        return (_INTERFACES / channel / "device").exists()
     return interface != "virtual"
-
-
-def _check_channel(channel: str) -> None:
-    """Raise BusMissingError, with what there is, unless `channel` is a CAN interface that can be opened.
-
-    Done before python-can opens its socket, which it would leave open on failure.
-    """
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except OSError as error:
-        if error.errno != errno.EAFNOSUPPORT:
-            raise BusMissingError(f"CAN interface {channel}: {error.strerror}") from None
-        raise BusMissingError(
-            f"this kernel has no SocketCAN, so {channel} can't be opened; tools/with-vcan runs a command with vcan"
-        ) from None
-    present = can_interfaces()
-    if channel not in present:
-        known = f"present: {', '.join(present)}" if present else "no CAN interface is present"
-        nearest = difflib.get_close_matches(channel, present, n=1)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        raise BusMissingError(f"CAN interface {channel} does not exist; {known}{hint}")
-    if not int((Path("/sys/class/net") / channel / "flags").read_text(), 16) & _IFF_UP:
-        raise BusMissingError(f"CAN interface {channel} is down; bring it up: ip link set {channel} up")

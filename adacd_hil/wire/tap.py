@@ -1,7 +1,7 @@
 """A bus end that remembers what passed, so that the log holds every frame both ways."""
 
 from adacd_hil.clock import Clock
-from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.bus import Bus, BusOffError, Frame
 
 
 class Tap:
@@ -26,7 +26,11 @@ class Tap:
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Receive and remember a frame. Raises BusError."""
-        frame = self._bus.receive(timeout_s)
+        try:
+            frame = self._bus.receive(timeout_s)
+        except BusOffError as error:
+            self._passed.append((False, error.frame))
+            raise
         if frame is not None:
             self._passed.append((False, frame))
         return frame
@@ -37,7 +41,7 @@ class Tap:
         return passed
 
     def recover(self) -> None:
-        """Drop everything that is queued both ways. Raises BusError."""
+        """Drop everything queued in the bus behind it; what has passed stays. Raises BusError."""
         self._bus.recover()
 
     def close(self) -> None:

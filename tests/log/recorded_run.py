@@ -22,7 +22,7 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
-from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.bus import FD_LENGTHS, Frame
 from adacd_hil.wire.codec import load_codec
 
 PERIOD_NS = 1_000_000
@@ -37,6 +37,7 @@ CYCLIC = (
     "Sensor2Torque",
 )
 UNKNOWN_ID = 0x7A5
+LONG_ID = 0x3A5
 
 
 @dataclass
@@ -78,7 +79,7 @@ class Run:
         return [(is_tx, frame) for cycle in self.cycles for is_tx, frame in cycle.frames]
 
 
-def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123):
+def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123, has_fd=False):
     generator = np.random.default_rng(seed)
     layout = scheme_layout(parameter_count)
     cycles = []
@@ -108,6 +109,8 @@ def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123):
             record=CycleRecord(number, -number, 3 * number, 2**40 + number, 7, number % 5),
             frames=_frames(generator, t_ns, number),
         )
+        if has_fd:
+            cycle.frames[3:3] = _long_frames(generator, t_ns, number)
         if number % 50 == 20:
             cycle.contact = ContactReport(number, 2, (-1, 1), (1.5, -2.5), (0.25, number), number % 100 == 20)
         if number % 40 == 10:
@@ -131,6 +134,26 @@ def _frames(generator, t_ns, number):
     if number % 10 == 7:
         frames.append((False, Frame(0x18DAF110, bytearray(b"extended"), t_ns - 5_000_000)))  # stamped late
     return frames
+
+
+def _long_frames(generator, t_ns, number):
+    """Make an FD frame each way, of every length in turn, of which the first is in the DBC of `fd_contract`."""
+    length = FD_LENGTHS[number % len(FD_LENGTHS)]
+    return [
+        (number % 2 == 0, Frame(LONG_ID, generator.bytes(length), t_ns + 25)),
+        (number % 2 == 1, Frame(0x18DAF111, generator.bytes(length), t_ns + 26)),
+    ]
+
+
+def fd_contract(folder: Path) -> Path:
+    """Write a DBC with one more message, `Long`, of 24 bytes."""
+    signals = "".join(f' SG_ part{n} : {32 * n}|32@1- (0.5,0) [0|0] "Nm" HOST\n' for n in range(6))
+    message = f"BO_ {LONG_ID} Long: 24 Drive1\n{signals}\n"
+    text = CODEC.text.decode()
+    place = text.index("BO_ ")
+    path = folder / "fd.dbc"
+    path.write_text(text[:place] + message + text[place:])
+    return path
 
 
 def start(path: Path, run: Run, **options) -> Recorder:

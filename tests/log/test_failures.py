@@ -226,7 +226,7 @@ def test_a_packet_that_makes_no_sense_is_dropped_alone(tmp_path):
     run = make_run(10)
     recorder = start(tmp_path / "run.mcap", run)
     feed(recorder, run.cycles[:5])
-    recorder.cycle(1, [], [(True, Frame(1, bytes(12), 0))])
+    recorder.cycle(1, [], [(True, Frame(1, bytes(65), 0))])
     recorder.cycle(1, [(9999, b"no such channel")])
     recorder._send(b"\x01")
     feed(recorder, run.cycles[5:])

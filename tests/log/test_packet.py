@@ -10,7 +10,7 @@ from adacd_hil.wire.bus import Frame
 TIMES = st.integers(0, 2**62)
 COUNTS = st.integers(0, 2**32 - 1)
 FRAMES = st.tuples(
-    st.booleans(), st.builds(Frame, st.integers(0, 2**29 - 1), st.binary(max_size=8), TIMES, st.booleans())
+    st.booleans(), st.builds(Frame, st.integers(0, 2**29 - 1), st.binary(max_size=64), TIMES, st.booleans())
 )
 MESSAGES = st.tuples(st.integers(0, 2**16 - 1), st.binary(max_size=500))
 
@@ -39,7 +39,15 @@ def test_the_end_is_the_end():
     assert unpack(pack_end(3)) is None
 
 
-def test_data_that_does_not_fit_shows_by_its_length():
-    packet = unpack(pack_cycle(0, 0, [], [(True, Frame(1, bytes(12), 0))]))
+def test_data_that_no_frame_can_hold_shows_by_its_length():
+    packet = unpack(pack_cycle(0, 0, [], [(True, Frame(1, bytes(65), 0))]))
     assert isinstance(packet, CyclePacket)
-    assert packet.frames[0].length == 12
+    assert packet.frames[0].length == 65
+
+
+def test_classic_frames_are_packed_without_room_for_more():
+    frames = [(False, Frame(1, bytes(8), 0))] * 7
+    longer = [*frames, (False, Frame(1, bytes(24), 0))]
+    empty, classic, mixed = (len(pack_cycle(0, 0, [], each)) for each in ([], frames, longer))
+    assert classic - empty == 7 * 24
+    assert mixed - classic == 24 + 16

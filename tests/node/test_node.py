@@ -50,7 +50,7 @@ def checker():
 @pytest.fixture(scope="module")
 def log_path(tmp_path_factory):
     path = tmp_path_factory.mktemp("node") / "run.mcap"
-    record(path, make_run(400))
+    record(path, make_run(400, has_fd=True))
     return path
 
 
@@ -69,7 +69,7 @@ def test_every_message_is_there_with_every_crc_right(report, log_path):
     assert {topic: counts[topic] for topic in ("/scheme", "/control", "/cycle", "/joint_states")} == dict.fromkeys(
         ("/scheme", "/control", "/cycle", "/joint_states"), 400
     )
-    assert counts["/to_can_bus"] + counts["/from_can_bus"] == len(log.frames)
+    assert sum(counts[f"/{way}_can_bus{kind}"] for way in ("to", "from") for kind in ("", "_fd")) == len(log.frames)
     for name, series in log.decoded.items():
         assert counts[f"/decoded/{name}"] == len(series)
 
@@ -92,10 +92,12 @@ def test_texts_and_frames_decode_to_the_same_values(report, log_path):
     event = log.events[-1].event
     assert report["topics"]["/events"]["last"]["message"] == event.message
     assert report["topics"]["/events"]["last"]["name"] == event.name
-    frame = log.frames[~log.frames["is_tx"]][-1]
-    last = report["topics"]["/from_can_bus"]["last"]
-    assert [int(value) for value in last["data"]] == frame["data"].tolist()
-    assert (int(last["id"]), int(last["dlc"])) == (int(frame["can_id"]), int(frame["length"]))
+    for topic, length_field, is_long in (("/from_can_bus", "dlc", False), ("/from_can_bus_fd", "len", True)):
+        frames = log.frames[~log.frames["is_tx"] & ((log.frames["length"] > 8) == is_long)]
+        frame, last = frames[-1], report["topics"][topic]["last"]
+        sent = frame["data"].tolist()[: frame["length"] if is_long else 8]
+        assert [int(value) for value in last["data"]] == sent
+        assert (int(last["id"]), int(last[length_field])) == (int(frame["can_id"]), int(frame["length"]))
     joints = report["topics"]["/joint_states"]["last"]
     assert joints["name"] == ["joint1", "joint2"]
     assert [float(value) for value in joints["effort"]] == log.scheme["tau_J"][-1].tolist()

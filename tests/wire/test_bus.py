@@ -1,11 +1,10 @@
-"""The seam: the embedded bus, interfaces that don't exist, and real SocketCAN where there is one."""
+"""The seam: the embedded bus, the tap, and interfaces that don't exist. SocketCAN is in test_bus_on_vcan.py."""
 
-import socket
-
+import can
 import pytest
 
 from adacd_hil.clock import MonotonicClock, VirtualClock
-from adacd_hil.wire.bus import BusError, BusMissingError, EmbeddedBus, Frame, SocketCanBus, open_bus
+from adacd_hil.wire.bus import BusError, BusMissingError, BusOffError, EmbeddedBus, Frame, open_bus
 from adacd_hil.wire.tap import Tap
 
 
@@ -69,56 +68,75 @@ def test_any_other_python_can_interface_carries_frames() -> None:
     assert (frame.can_id, frame.data) == (0x123, b"\x01\x02")
 
 
-@pytest.mark.vcan
-def test_a_frame_crosses_vcan_and_does_not_echo() -> None:
-    left, right = SocketCanBus("vcan0", MonotonicClock()), SocketCanBus("vcan0", MonotonicClock())
-    left.send(0x201, b"\x01\x02\x03\x04\x05\x06")
-    frame, echo = right.receive(1.0), left.receive(0.01)
+def test_a_recovered_embedded_bus_has_nothing_old_to_read() -> None:
+    bus = EmbeddedBus(VirtualClock())
+    bus.deliver(0x181, b"old")
+    bus.recover()
+    bus.deliver(0x181, b"new")
+    assert bus.receive(0.0) == Frame(0x181, b"new", 0)
+
+
+def test_a_tap_recovers_the_bus_behind_it_and_keeps_what_has_passed() -> None:
+    bus = EmbeddedBus(VirtualClock())
+    tap = Tap(bus, VirtualClock())
+    tap.send(0x10, b"x")
+    bus.deliver(0x181, b"old")
+    tap.recover()
+    assert tap.receive(0.0) is None
+    assert tap.take() == [(True, Frame(0x10, b"x", 0))]
+
+
+def test_a_tap_remembers_the_error_frame_of_a_bus_off() -> None:
+    class OffBus(EmbeddedBus):
+        def receive(self, timeout_s: float) -> Frame | None:
+            raise BusOffError("off", Frame(0x40, bytes(8), 5, is_error=True))
+
+    tap = Tap(OffBus(VirtualClock()), VirtualClock())
+    with pytest.raises(BusOffError):
+        tap.receive(0.0)
+    assert tap.take() == [(False, Frame(0x40, bytes(8), 5, is_error=True))]
+
+
+def test_any_other_python_can_interface_carries_fd_frames_and_marks_them_so() -> None:
+    left = open_bus("virtual", "fd seam", MonotonicClock(), is_fd=True)
+    with can.Bus("fd seam", interface="virtual") as right:
+        left.send(0x123, bytes(range(24)))
+        left.send(0x124, bytes(range(8)))
+        long, short = right.recv(1.0), right.recv(1.0)
     left.close()
-    right.close()
-    assert frame is not None
-    assert (frame.can_id, frame.data, echo) == (0x201, b"\x01\x02\x03\x04\x05\x06", None)
+    assert (long.is_fd, long.bitrate_switch, bytes(long.data)) == (True, True, bytes(range(24)))
+    assert (short.is_fd, short.bitrate_switch, bytes(short.data)) == (False, False, bytes(range(8)))
 
 
-@pytest.mark.vcan
-def test_the_kernel_filters_other_identifiers() -> None:
-    left, right = SocketCanBus("vcan0", MonotonicClock()), SocketCanBus("vcan0", MonotonicClock(), [0x181])
-    left.send(0x182, b"\x01")
-    left.send(0x181, b"\x02")
-    frame = right.receive(1.0)
-    left.close()
-    right.close()
-    assert frame is not None
-    assert frame.can_id == 0x181
+def test_a_long_frame_on_a_classic_bus_is_refused_in_one_line() -> None:
+    bus = open_bus("virtual", "classic seam", MonotonicClock())
+    with pytest.raises(BusError, match="sending on classic seam: 12 data bytes need CAN FD"):
+        bus.send(0x123, bytes(12))
+    bus.close()
 
 
-@pytest.mark.vcan
-def test_a_missing_channel_names_those_that_are_present() -> None:
-    with pytest.raises(BusMissingError, match=r"CAN interface vcan9 does not exist; present: .*vcan0"):
-        open_bus("socketcan", "vcan9", MonotonicClock())
+def test_remote_frames_and_ambiguous_identifiers_are_not_received() -> None:
+    bus = open_bus("virtual", "odd seam", MonotonicClock())
+    with can.Bus("odd seam", interface="virtual") as peer:
+        peer.send(can.Message(arbitration_id=0x181, is_remote_frame=True, is_extended_id=False))
+        peer.send(can.Message(arbitration_id=0x182, data=b"x"))  # 29 bits
+        peer.send(can.Message(arbitration_id=0x1800, data=b"y"))
+        peer.send(can.Message(arbitration_id=0x183, data=b"z", is_extended_id=False))
+        received = [bus.receive(0.0) for _ in range(3)]
+    bus.close()
+    assert [(frame.can_id, frame.data) for frame in received if frame] == [(0x1800, b"y"), (0x183, b"z")]
 
 
-@pytest.mark.vcan
-def test_an_error_frame_is_seen_and_marked() -> None:
-    bus = SocketCanBus("vcan0", MonotonicClock())
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as peer:
-        peer.bind(("vcan0",))
-        peer.send(bytes.fromhex("40000020080000000000000000000000"))  # CAN_ERR_BUSOFF
+def test_a_recovered_python_can_interface_has_nothing_old_to_read_and_still_works() -> None:
+    bus = open_bus("virtual", "recovered seam", MonotonicClock(), is_fd=True)
+    with can.Bus("recovered seam", interface="virtual") as peer:
+        peer.send(can.Message(arbitration_id=0x181, data=b"old", is_extended_id=False))
+        bus.recover()
+        peer.send(can.Message(arbitration_id=0x181, data=b"new", is_extended_id=False))
         frame = bus.receive(1.0)
+        bus.send(0x201, bytes(12))
+        sent = peer.recv(1.0)
     bus.close()
     assert frame is not None
-    assert frame.is_error
-
-
-@pytest.mark.vcan
-def test_an_interface_that_goes_down_is_one_line() -> None:
-    import subprocess
-
-    bus = SocketCanBus("vcan1", MonotonicClock())
-    subprocess.run(["ip", "link", "set", "vcan1", "down"], check=True)
-    try:
-        with pytest.raises(BusError, match="vcan1: Network is down"):
-            bus.send(0x80, b"\x01")
-    finally:
-        subprocess.run(["ip", "link", "set", "vcan1", "up"], check=True)
-        bus.close()
+    assert frame.data == b"new"
+    assert sent.is_fd

@@ -1,0 +1,153 @@
+"""One CAN network interface of this machine: its state, what waits in its transmit queue, taking it down and up.
+
+Sources: Linux netdevice(7) for the flags, rtnetlink(7) for the queueing discipline, linux/can/raw.h.
+"""
+
+import difflib
+import errno
+import fcntl
+import socket
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+from adacd_hil.wire.bus import BusError, InterfaceDownError, can_interfaces, is_hardware
+
+CAN_MTU = 16
+"""Size of a classic frame in SocketCAN, bytes."""
+CANFD_MTU = 72
+"""Size of an FD frame in SocketCAN, bytes."""
+
+_IFF_UP = 0x1
+_SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8913, 0x8914
+_FLAGS_REQUEST = struct.Struct("16sH22x")
+
+_RTM_NEWQDISC, _RTM_GETQDISC = 36, 38
+_NLM_F_REQUEST_DUMP = 0x301
+_NLMSG_ERROR, _NLMSG_DONE = 2, 3
+_NETLINK_HEAD = struct.Struct("=IHHII")  # length, type, flags, sequence, port
+_TRAFFIC_HEAD = struct.Struct("=B3xiIII")  # family, interface, handle, parent, info
+_ATTRIBUTE = struct.Struct("=HH")  # length, type
+_TC_H_ROOT = 0xFFFFFFFF
+_TCA_STATS2, _TCA_STATS_QUEUE = 7, 3
+
+
+class CanInterface:
+    """An interface by its name, present or not."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._folder = Path("/sys/class/net") / name
+
+    @property
+    def is_up(self) -> bool:
+        """Whether it is present and up."""
+        return bool(self._number("flags", 16) & _IFF_UP)
+
+    @property
+    def is_hardware(self) -> bool:
+        """Whether a controller is behind it, which may hold frames of its own."""
+        return is_hardware("socketcan", self.name)
+
+    def _number(self, file: str, base: int) -> int:
+        try:
+            return int((self._folder / file).read_text(), base)
+        except OSError:
+            return 0
+
+    def problem(self, is_fd: bool) -> str:
+        """Say in one line why it can't be used, with the remedy; "" when it can."""
+        present = can_interfaces()
+        if self.name not in present:
+            known = f"present: {', '.join(present)}" if present else "no CAN interface is present"
+            nearest = difflib.get_close_matches(self.name, present, n=1)
+            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+            return f"CAN interface {self.name} does not exist; {known}{hint}"
+        if not self.is_up:
+            return f"CAN interface {self.name} is down; bring it up: ip link set {self.name} up"
+        mtu = self._number("mtu", 10)
+        if is_fd and mtu < CANFD_MTU:
+            bit_rates = "type can bitrate 1000000 dbitrate 5000000 fd on" if self.is_hardware else f"mtu {CANFD_MTU}"
+            return (
+                f"CAN interface {self.name} carries classic frames only (MTU {mtu}, CAN FD needs {CANFD_MTU}): "
+                f"ip link set {self.name} down && ip link set {self.name} {bit_rates} && ip link set {self.name} up"
+            )
+        return ""
+
+    def restart(self) -> None:
+        """Take it down and up, which drops every frame in its queue and in its controller.
+
+        Raises InterfaceDownError when it doesn't come up again, BusError with the command when it isn't permitted.
+        """
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as control:
+            try:
+                flags = self._flags(control)
+                self._set_flags(control, flags & ~_IFF_UP)
+            except PermissionError:
+                raise BusError(
+                    f"old frames may wait in the transmit queue of {self.name}, and dropping them needs CAP_NET_ADMIN; "
+                    f"run: sudo ip link set {self.name} down && sudo ip link set {self.name} up"
+                ) from None
+            except OSError as error:
+                raise InterfaceDownError(f"CAN interface {self.name} can't be taken down: {error.strerror}") from None
+            try:
+                self._set_flags(control, flags | _IFF_UP)
+            except OSError as error:
+                raise InterfaceDownError(f"CAN interface {self.name} can't be brought up: {error.strerror}") from None
+
+    def _flags(self, control: socket.socket) -> int:
+        answer = fcntl.ioctl(control, _SIOCGIFFLAGS, _FLAGS_REQUEST.pack(self.name.encode(), 0))
+        flags: int = _FLAGS_REQUEST.unpack(answer)[1]
+        return flags
+
+    def _set_flags(self, control: socket.socket, flags: int) -> None:
+        fcntl.ioctl(control, _SIOCSIFFLAGS, _FLAGS_REQUEST.pack(self.name.encode(), flags))
+
+    def waiting_frames(self) -> int:
+        """Count the frames of all processes that wait in the queueing discipline; needs no permission.
+
+        What the controller has already taken is not in it. Raises InterfaceDownError when the interface is absent.
+        """
+        try:
+            index = socket.if_nametoindex(self.name)
+        except OSError:
+            raise InterfaceDownError(self.problem(is_fd=False)) from None
+        return sum(length for interface, parent, length in _queues() if (interface, parent) == (index, _TC_H_ROOT))
+
+
+def _queues() -> Iterator[tuple[int, int, int]]:
+    """List (interface, parent, frames waiting) of all queueing disciplines; the root's count includes the others'."""
+    size = _NETLINK_HEAD.size + _TRAFFIC_HEAD.size
+    request = _NETLINK_HEAD.pack(size, _RTM_GETQDISC, _NLM_F_REQUEST_DUMP, 1, 0) + _TRAFFIC_HEAD.pack(0, 0, 0, 0, 0)
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:
+        netlink.send(request)
+        while True:
+            for kind, body in _messages(netlink.recv(65536)):
+                if kind == _NLMSG_DONE:
+                    return
+                if kind == _NLMSG_ERROR:
+                    code = -int.from_bytes(body[:4], "little", signed=True)
+                    raise BusError(f"reading the transmit queues: {errno.errorcode.get(code, code)}")
+                if kind == _RTM_NEWQDISC:
+                    _, interface, _, parent, _ = _TRAFFIC_HEAD.unpack_from(body)
+                    statistics = _attributes(body[_TRAFFIC_HEAD.size :]).get(_TCA_STATS2, b"")
+                    queue = _attributes(statistics).get(_TCA_STATS_QUEUE, bytes(4))
+                    yield interface, parent, struct.unpack_from("=I", queue)[0]
+
+
+def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:
+    position = 0
+    while position < len(data):
+        length, kind, _, _, _ = _NETLINK_HEAD.unpack_from(data, position)
+        yield kind, data[position + _NETLINK_HEAD.size : position + length]
+        position += length + -length % 4
+
+
+def _attributes(data: bytes) -> dict[int, bytes]:
+    found = {}
+    position = 0
+    while position < len(data):
+        length, kind = _ATTRIBUTE.unpack_from(data, position)
+        found[kind] = data[position + _ATTRIBUTE.size : position + length]
+        position += length + -length % 4
+    return found

@@ -1,0 +1,84 @@
+"""Any interface that python-can offers, if it does not echo own frames."""
+
+import contextlib
+import difflib
+from typing import Any
+
+import can
+
+from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, BusError, BusMissingError, Frame
+
+_ECHOING_INTERFACES = ("udp_multicast",)
+_MAX_STANDARD_ID = 0x7FF
+
+
+class PythonCanBus:
+    """Any other python-can interface. How CAN FD's second bit rate is set, python-can leaves to its own settings."""
+
+    def __init__(
+        self, interface: str, channel: str, clock: Clock, bitrate: int | None = None, is_fd: bool = False
+    ) -> None:
+        """Open it, at `bitrate` bit/s where the interface sets one. Raises BusMissingError."""
+        if interface in _ECHOING_INTERFACES:
+            raise BusMissingError(f"interface {interface} echoes own frames and can't carry a cycle; use socketcan")
+        if interface not in can.VALID_INTERFACES:
+            nearest = difflib.get_close_matches(interface, can.VALID_INTERFACES, n=1)
+            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+            raise BusMissingError(f"unknown interface {interface!r}{hint}")
+        self.channel = channel
+        self._interface = interface
+        self._clock = clock
+        self._waiting = MonotonicClock()
+        self._options: dict[str, Any] = {} if bitrate is None else {"bitrate": bitrate}
+        if is_fd:
+            self._options["fd"] = True
+        self._is_fd = is_fd
+        self._bus = self._open()
+
+    def _open(self) -> can.BusABC:
+        try:
+            return can.Bus(self.channel, interface=self._interface, receive_own_messages=False, **self._options)
+        except (OSError, can.CanError, ValueError) as error:
+            raise BusMissingError(f"interface {self._interface}, channel {self.channel}: {error}") from None
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send a frame. Raises BusError."""
+        is_long = len(data) > MAX_CLASSIC_BYTES
+        if is_long and not self._is_fd:
+            raise BusError(f"sending on {self.channel}: {len(data)} data bytes need CAN FD")
+        try:
+            self._bus.send(
+                can.Message(
+                    arbitration_id=can_id, data=data, is_extended_id=False, is_fd=is_long, bitrate_switch=is_long
+                )
+            )
+        except (OSError, can.CanError, ValueError) as error:
+            raise BusError(f"sending on {self.channel}: {error}") from None
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, or None after `timeout_s`. Raises BusError."""
+        deadline_ns = self._waiting.now_ns() + int(timeout_s * 1e9)
+        while True:
+            try:
+                message = self._bus.recv(timeout_s)
+            except (OSError, can.CanError) as error:
+                raise BusError(f"receiving on {self.channel}: {error}") from None
+            if message is None:
+                return None
+            can_id = message.arbitration_id
+            is_ambiguous = message.is_extended_id and can_id <= _MAX_STANDARD_ID and not message.is_error_frame
+            if not message.is_remote_frame and not is_ambiguous:
+                return Frame(can_id, bytes(message.data), self._clock.now_ns(), message.is_error_frame)
+            timeout_s = max(deadline_ns - self._waiting.now_ns(), 0) * 1e-9
+
+    def recover(self) -> None:
+        """Empty the transmit buffer where the interface can, and open it anew. Raises BusError."""
+        with contextlib.suppress(NotImplementedError, OSError, can.CanError):
+            self._bus.flush_tx_buffer()
+        self._bus.shutdown()
+        self._bus = self._open()
+
+    def close(self) -> None:
+        """Shut the interface down."""
+        self._bus.shutdown()

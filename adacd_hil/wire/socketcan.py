@@ -1,0 +1,259 @@
+"""SocketCAN through its raw socket, classic and FD: a `can.Message` costs more than everything else in a cycle.
+
+Sources: Linux Documentation/networking/can.rst; linux/can.h, linux/can/raw.h. Remote frames, and 29-bit identifiers
+that would read as 11-bit ones, are left to the kernel's filter.
+
+The three ways in which a live bus fails are told apart: the transmit queue stays full (nobody acknowledges), the
+interface goes down or vanishes, the controller goes bus-off. After the second this end stays dead until `recover`, so
+that nothing is sent on an interface that others have set up anew.
+"""
+
+import errno
+import select
+import socket
+import struct
+from collections.abc import Iterable
+from typing import NoReturn
+
+from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.wire.bus import (
+    FD_LENGTHS,
+    MAX_CLASSIC_BYTES,
+    BusError,
+    BusMissingError,
+    BusOffError,
+    Frame,
+    InterfaceDownError,
+    TransmitQueueError,
+)
+from adacd_hil.wire.can_interface import CAN_MTU, CANFD_MTU, CanInterface
+from adacd_hil.wire.error_frames import ERROR_CLASS_MASK, is_bus_off
+
+CAN_ERR_FLAG = 0x20000000
+CAN_RTR_FLAG = 0x40000000
+CAN_EFF_FLAG = 0x80000000
+CAN_ID_MASK = 0x1FFFFFFF
+CANFD_BRS = 0x01
+_MAX_STANDARD_ID = 0x7FF
+_FRAME = struct.Struct("=IB3x8s")
+_FD_FRAME = struct.Struct("=IBB2x64s")
+_FILTER = struct.Struct("=II")
+_CAN_RAW_ERR_FILTER = 2
+_SO_MEMINFO = 55
+_MEMINFO = struct.Struct("=9I")
+_MEMINFO_DROPS = 8
+_DOWN = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
+_SEND_PATIENCE_S = 0.05
+"""Longest wait for room in the transmit queue: over 300 frames at 1 Mbit/s, so a live bus has drained by then."""
+
+
+class SocketCanBus:
+    """A SocketCAN interface.
+
+    Frames that are found waiting carry one stamp, that of the first of them: a reading of the clock costs as much as a
+    frame where it is a system call.
+    """
+
+    def __init__(self, channel: str, clock: Clock, can_ids: Iterable[int] | None = None, is_fd: bool = False) -> None:
+        """Open `channel`, receiving only `can_ids` when given. Raises BusMissingError."""
+        self.channel = channel
+        self._clock = clock
+        self._filters = _pack_filters(can_ids)
+        self._is_fd = is_fd
+        self._mtu = CANFD_MTU if is_fd else CAN_MTU
+        self._interface = CanInterface(channel)
+        self._patience = MonotonicClock()
+        self._dropped_before = 0  # by the sockets before this one
+        self._is_down = False
+        self._is_closed = False
+        _require_socketcan(channel)
+        problem = self._interface.problem(is_fd)
+        if problem:
+            raise BusMissingError(problem)
+        self._open()
+
+    def _open(self) -> None:
+        opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        try:
+            opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
+            opened.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, ERROR_CLASS_MASK)
+            opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, int(self._is_fd))
+            opened.setblocking(False)
+            opened.bind((self.channel,))
+        except OSError as error:
+            opened.close()
+            raise BusMissingError(f"CAN interface {self.channel}: {error.strerror}") from None
+        self._socket = opened
+        self._is_down = False
+        self._is_drained = True  # the last look found nothing, so waiting comes before looking
+        self._stamp_ns: int | None = None
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Queue a frame for transmission.
+
+        Raises TransmitQueueError, InterfaceDownError, and BusError for data that the bus can't carry.
+        """
+        length = len(data)
+        packed = _FRAME.pack(can_id, length, data) if length <= MAX_CLASSIC_BYTES else self._pack_fd(can_id, data)
+        try:
+            self._socket.send(packed)
+        except OSError as error:
+            if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
+                self._fail("sending", error)
+            self._send_patiently(packed)
+
+    def _pack_fd(self, can_id: int, data: bytes) -> bytes:
+        if not self._is_fd:
+            raise BusError(f"sending on {self.channel}: {len(data)} data bytes need CAN FD, and it was opened without")
+        if len(data) not in FD_LENGTHS:
+            allowed = ", ".join(map(str, FD_LENGTHS))
+            raise BusError(f"sending on {self.channel}: an FD frame can't have {len(data)} data bytes, only {allowed}")
+        return _FD_FRAME.pack(can_id, len(data), CANFD_BRS, data)
+
+    def _send_patiently(self, packed: bytes) -> None:
+        patience = self._patience
+        deadline_ns = patience.now_ns() + int(_SEND_PATIENCE_S * 1e9)
+        while patience.now_ns() < deadline_ns:
+            patience.sleep_until_ns(patience.now_ns() + 100_000)  # one frame's time at 1 Mbit/s
+            try:
+                self._socket.send(packed)
+            except OSError as error:
+                if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
+                    self._fail("sending", error)
+            else:
+                return
+        raise TransmitQueueError(
+            f"transmit queue of {self.channel} stayed full for {_SEND_PATIENCE_S * 1000:.0f} ms: nobody acknowledges "
+            f"(power, wiring, termination, bit rate), or it is too short: ip link set {self.channel} txqueuelen 64"
+        )
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, or None after `timeout_s`. Raises BusOffError, InterfaceDownError, BusError."""
+        packed = None if self._is_drained and timeout_s > 0.0 else self._look()
+        if packed is None:
+            if timeout_s <= 0.0 or not self._wait(timeout_s):
+                return None
+            packed = self._look()
+            if packed is None:
+                return None
+        if self._stamp_ns is None:
+            self._stamp_ns = self._clock.now_ns()
+        can_id, length, data = _FRAME.unpack(packed) if len(packed) == CAN_MTU else _unpack_fd(packed)
+        if can_id > _MAX_STANDARD_ID:
+            return self._take_unusual(can_id, data[:length], self._stamp_ns)
+        return Frame(can_id, data[:length], self._stamp_ns)
+
+    def _wait(self, timeout_s: float) -> bool:
+        """Wait until there is something to read; False after `timeout_s`."""
+        if self._socket.fileno() < 0:
+            self._fail("receiving", OSError(errno.EBADF, "closed"))
+        return bool(select.select([self._socket], [], [], timeout_s)[0])
+
+    def _take_unusual(self, can_id: int, data: bytes, t_ns: int) -> Frame:
+        """Take an error frame or a 29-bit identifier."""
+        frame = Frame(can_id & CAN_ID_MASK, data, t_ns, bool(can_id & CAN_ERR_FLAG))
+        if frame.is_error and is_bus_off(frame):
+            raise BusOffError(
+                f"{self.channel} is bus-off: its controller has left the bus after too many errors (wiring, "
+                f"termination, bit rate); to have it return by itself: ip link set {self.channel} type can "
+                f"restart-ms 100",
+                frame,
+            )
+        return frame
+
+    def _look(self) -> bytes | None:
+        """Take a frame that waits, None when there is none."""
+        try:
+            packed = self._socket.recv(self._mtu)
+        except BlockingIOError:
+            self._is_drained = True
+            self._stamp_ns = None
+            return None
+        except OSError as error:
+            self._fail("receiving", error)
+        if self._is_drained:
+            self._is_drained = False
+            self._stamp_ns = None
+        return packed
+
+    def _fail(self, doing: str, error: OSError) -> NoReturn:
+        if error.errno in _DOWN:
+            self._is_down = True
+            self._retire_socket()
+        if self._is_down:
+            reason = self._interface.problem(self._is_fd) or f"CAN interface {self.channel} was down and is up again"
+            raise InterfaceDownError(f"{doing} on {self.channel}: {reason}") from None
+        raise BusError(f"{doing} on {self.channel}: {'closed' if self._is_closed else error.strerror}") from None
+
+    @property
+    def dropped_frames(self) -> int:
+        """Count of received frames that the kernel dropped because this end didn't read them in time.
+
+        Asked of the socket here (SO_MEMINFO), so that receiving pays nothing for it, as it would for SO_RXQ_OVFL.
+        """
+        return self._dropped_before + (0 if self._socket.fileno() < 0 else _socket_drops(self._socket))
+
+    def recover(self) -> None:
+        """Open the socket anew, and empty the interface's transmit queue by taking it down and up where need be.
+
+        Need is: frames wait in the queue, or a controller is there, which may hold some. None is where the interface
+        has been down since this end last sent. Other sockets of the interface see it go down.
+
+        Raises InterfaceDownError while the interface is down, BusError with the command where it isn't permitted.
+        """
+        if self._is_closed:
+            raise BusError(f"recovering {self.channel}: closed")
+        problem = self._interface.problem(self._is_fd)
+        if problem:
+            raise InterfaceDownError(problem)
+        if not self._is_down and self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) in _DOWN:
+            self._is_down = True  # unheard of, so nothing was sent since
+        if self._interface.waiting_frames() > 0 or (self._interface.is_hardware and not self._is_down):
+            self._interface.restart()
+        self._retire_socket()
+        self._is_down = True  # should it not open
+        self._open()
+
+    def _retire_socket(self) -> None:
+        """Close the socket, keeping its count of drops."""
+        self._dropped_before = self.dropped_frames
+        self._socket.close()
+
+    def close(self) -> None:
+        """Close the socket; twice is once."""
+        self._is_closed = True
+        self._retire_socket()
+
+
+def _pack_filters(can_ids: Iterable[int] | None) -> bytes:
+    """Pack the kernel's receive filters; without `can_ids` everything but remote and ambiguous frames.
+
+    A filter that asks for all three of identifier, 11 bits and no remote frame is looked up by table in the kernel.
+    """
+    flags = CAN_EFF_FLAG | CAN_RTR_FLAG
+    if can_ids is not None:
+        return b"".join(_FILTER.pack(can_id, _MAX_STANDARD_ID | flags) for can_id in can_ids)
+    extended = (_FILTER.pack(CAN_EFF_FLAG | 1 << bit, flags | 1 << bit) for bit in range(11, 29))
+    return b"".join((_FILTER.pack(0, flags), *extended))
+
+
+def _unpack_fd(packed: bytes) -> tuple[int, int, bytes]:
+    can_id, length, _, data = _FD_FRAME.unpack(packed)
+    return can_id, length, data
+
+
+def _socket_drops(opened: socket.socket) -> int:
+    drops: int = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))[_MEMINFO_DROPS]
+    return drops
+
+
+def _require_socketcan(channel: str) -> None:
+    """Raise BusMissingError unless the kernel has SocketCAN."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError as error:
+        if error.errno != errno.EAFNOSUPPORT:
+            raise BusMissingError(f"CAN interface {channel}: {error.strerror}") from None
+        raise BusMissingError(
+            f"this kernel has no SocketCAN, so {channel} can't be opened; tools/with-vcan runs a command with vcan"
+        ) from None

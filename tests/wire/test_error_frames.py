@@ -1,0 +1,102 @@
+"""Error frames: written by hand after linux/can/error.h, each meaning what the header says."""
+
+import pytest
+
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.error_frames import BusTrouble, TroubleKind, decode_error, is_bus_off
+
+# error class, data, kind, text, counters
+REPORTS = [
+    (0x001, "0000000000000000", "TRANSMIT_TIMEOUT", "transmit timeout", None),
+    (0x002, "0000000000000000", "ARBITRATION_LOST", "arbitration lost", None),
+    (0x002, "0b00000000000000", "ARBITRATION_LOST", "arbitration lost in bit 11", None),
+    (0x004, "0000000000000000", "OTHER", "unspecified controller error", None),
+    (0x004, "0001000000000000", "RECEIVE_OVERFLOW", "receive buffer overflow", None),
+    (0x004, "0002000000000000", "TRANSMIT_OVERFLOW", "transmit buffer overflow", None),
+    (0x204, "0004000000000060", "ERROR_WARNING", "error warning (receiving)", (0, 96)),
+    (0x204, "0008000000006105", "ERROR_WARNING", "error warning (sending)", (97, 5)),
+    (0x204, "0010000000000880", "ERROR_PASSIVE", "error passive (receiving)", (8, 128)),
+    (0x204, "0030000000008081", "ERROR_PASSIVE", "error passive (receiving), error passive (sending)", (128, 129)),
+    (0x204, "0040000000000000", "ERROR_ACTIVE", "error active again", (0, 0)),
+    (0x008, "0000000000000000", "PROTOCOL", "protocol error (unspecified)", None),
+    (0x088, "0000040a00000000", "PROTOCOL", "protocol error (bit stuffing at data)", None),
+    (0x008, "0000880600000000", "PROTOCOL", "protocol error (unable to send dominant bit, while sending at "
+     "identifier bits 2-0)", None),
+    (0x008, "0000001800000000", "PROTOCOL", "protocol error (CRC delimiter)", None),
+    (0x010, "0000000007000000", "OTHER", "transceiver: CAN-H short to ground", None),
+    (0x010, "0000000044000000", "OTHER", "transceiver: CAN-H no wire, CAN-L no wire", None),
+    (0x010, "0000000080000000", "OTHER", "transceiver: CAN-L short to CAN-H", None),
+    (0x020, "0000000000000000", "NO_ACKNOWLEDGE", "no acknowledgement", None),
+    (0x088, "0000001900000000", "NO_ACKNOWLEDGE", "no acknowledgement, protocol error (acknowledge slot)", None),
+    (0x0A8, "0000801900008800", "NO_ACKNOWLEDGE", "no acknowledgement, protocol error (while sending at "
+     "acknowledge slot)", (136, 0)),
+    (0x040, "0000000000000000", "BUS_OFF", "bus-off", None),
+    (0x064, "0020000000000000", "BUS_OFF", "bus-off, error passive (sending), no acknowledgement", None),
+    (0x080, "0000000000000000", "PROTOCOL", "bus error", None),
+    (0x100, "0000000000000000", "RESTARTED", "controller restarted", None),
+    (0x200, "0000000000000300", "OTHER", "unspecified error", (3, 0)),
+    (0x000, "0000000000000000", "OTHER", "unspecified error", None),
+    (0x040, "", "BUS_OFF", "bus-off", None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("error_class", "data", "kind", "text", "counters"), REPORTS)
+def test_a_report_is_read_as_the_header_says(
+    error_class: int, data: str, kind: str, text: str, counters: tuple[int, int] | None
+) -> None:
+    if counters is not None:
+        text += f"; error counters: sending {counters[0]}, receiving {counters[1]}"
+    expected = BusTrouble(TroubleKind[kind], text, *(counters or (None, None)))
+    assert decode_error(Frame(error_class, bytes.fromhex(data), 0, is_error=True)) == expected
+
+
+@pytest.mark.parametrize(
+    ("place", "text"),
+    [
+        (0x02, "identifier bits 10-3"),
+        (0x03, "start of frame"),
+        (0x04, "remote request bit"),
+        (0x05, "identifier extension bit"),
+        (0x06, "identifier bits 2-0"),
+        (0x07, "identifier bits 17-13"),
+        (0x08, "CRC sequence"),
+        (0x09, "reserved bit 0"),
+        (0x0A, "data"),
+        (0x0B, "data length code"),
+        (0x0C, "remote request bit"),
+        (0x0D, "reserved bit 1"),
+        (0x0E, "identifier bits 4-0"),
+        (0x0F, "identifier bits 12-5"),
+        (0x12, "intermission"),
+        (0x18, "CRC delimiter"),
+        (0x19, "acknowledge slot"),
+        (0x1A, "end of frame"),
+        (0x1B, "acknowledge delimiter"),
+        (0x55, "unspecified"),
+    ],
+)
+def test_the_place_of_a_protocol_error_is_named(place: int, text: str) -> None:
+    trouble = decode_error(Frame(0x008, bytes((0, 0, 0, place, 0, 0, 0, 0)), 0, is_error=True))
+    assert f"protocol error ({text})" in trouble.text
+
+
+def test_every_kind_is_reported_by_some_frame() -> None:
+    assert {kind for _, _, kind, _, _ in REPORTS} == {kind.name for kind in TroubleKind}
+
+
+def test_no_frame_of_any_class_is_without_a_line() -> None:
+    for error_class in range(0x400):
+        text = decode_error(Frame(error_class, b"\xff" * 8, 0, is_error=True)).text
+        assert text
+        assert "\n" not in text
+
+
+def test_only_the_bus_off_class_is_bus_off() -> None:
+    assert [error_class for error_class in range(0x400) if is_bus_off(Frame(error_class, bytes(8), 0, True))] == [
+        error_class for error_class in range(0x400) if error_class >> 6 & 1
+    ]
+
+
+def test_a_frame_that_is_no_error_frame_is_refused() -> None:
+    with pytest.raises(ValueError, match="frame 0x40 is not an error frame"):
+        decode_error(Frame(0x40, bytes(8), 0))
