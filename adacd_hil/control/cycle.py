@@ -183,7 +183,7 @@ class Cycle:
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
-        for event in self._master.take_events():
+        for event in (*self._master.take_events(), *self._exchange.troubles.take_events()):
             recorder.event(t_ns, event)
         if output.state is not self._state:
             event = self._transition(output)

@@ -3,6 +3,7 @@
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.realtime import Tick
+from adacd_hil.control.trouble_report import TroubleReport
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmState
@@ -28,6 +29,7 @@ class Exchange:
     ) -> None:
         self.sync_ns = 0
         self.feedback_ns = 0
+        self.troubles = TroubleReport()
         self._bus, self._arm, self._master = bus, arm, master
         self._stopwatch = stopwatch
         self._is_lockstep = is_lockstep
@@ -68,5 +70,7 @@ class Exchange:
             self._accept(late)
 
     def _accept(self, frame: Frame) -> None:
-        if not self._arm.accept(frame):
+        if frame.is_error:
+            self.troubles.accept(frame)
+        elif not self._arm.accept(frame):
             self._master.accept(frame)

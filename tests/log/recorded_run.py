@@ -152,7 +152,9 @@ def fd_contract(folder: Path) -> Path:
     text = CODEC.text.decode()
     place = text.index("BO_ ")
     path = folder / "fd.dbc"
-    path.write_text(text[:place] + message + text[place:])
+    kinds = ",".join(['"StandardCAN"', *['"other"'] * 13, '"StandardCAN_FD"'])
+    is_fd = f'BA_DEF_ BO_ "VFrameFormat" ENUM {kinds};\nBA_ "VFrameFormat" BO_ {LONG_ID} 14;\n'
+    path.write_text(text[:place] + message + text[place:] + is_fd)
     return path
 
 
