@@ -206,6 +206,17 @@ def test_after_a_long_silence_the_third_frame_is_usable_again(profile: Profile, 
 
 
 @BOTH
+@pytest.mark.parametrize(("silent", "status"), [(4, E2eStatus.OK), (5, E2eStatus.SYNC)])
+def test_a_sender_that_paused_is_not_trusted_at_once(profile: Profile, silent: int, status: E2eStatus) -> None:
+    receiver = profile.receiver()
+    first, second = frames(profile, 2)
+    receiver.check(first)
+    for _ in range(silent):
+        receiver.miss()
+    assert receiver.check(second) is status
+
+
+@BOTH
 def test_a_silence_of_a_whole_turn_of_the_counter_costs_one_frame_more(profile: Profile) -> None:
     receiver = profile.receiver()
     sent = frames(profile, profile.modulus + 4)
