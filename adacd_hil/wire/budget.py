@@ -237,7 +237,7 @@ class Budget:
     def _describe_traffic(self, traffic: Traffic) -> str:
         if not self.cyclic:
             return "no cyclic frames"
-        last = max(self.cyclic, key=lambda entry: (entry.late_ns(traffic), entry.responses[traffic].time_ns))
+        last = max(self.cyclic, key=lambda entry: entry.responses[traffic].time_ns)
         if last.late_ns(traffic):
             return _describe_late(last, traffic)
         return f"in time, {last.frame.name} within {us(last.responses[traffic].time_ns)} µs"

@@ -1,12 +1,14 @@
 """The bit budget of contracts: which fit, why not, and what the DBC has to say for it."""
 
+import dataclasses
 from pathlib import Path
 
 import cantools
 import pytest
 
-from adacd_hil.wire.budget import Budget, Traffic, Trigger, check_budget, find_budget, read_contract, us
+from adacd_hil.wire.budget import Budget, ContractFrame, Traffic, Trigger, check_budget, find_budget, read_contract, us
 from adacd_hil.wire.codec import CodecError, contract_folder, load_codec
+from adacd_hil.wire.response_time import Response
 
 CONTRACTS = Path(__file__).parent / "contracts"
 ARM = load_codec()
@@ -56,6 +58,7 @@ def test_the_arm_does_not_fit_half_a_millisecond() -> None:
     budget = check_budget(ARM, 500)
     assert not budget.is_fit
     assert "arm.dbc at 500 µs doesn't fit: the cyclic frames need 795 µs, 295 µs too many" in budget.line
+    assert "Drive2Command misses its deadline of 500 µs by at least 420 µs, 12 more miss theirs" in budget.line
 
 
 def test_a_contract_can_miss_deadlines_though_its_cyclic_frames_have_room() -> None:
@@ -89,11 +92,29 @@ def test_one_sdo_frame_per_cycle_blocks_the_last_command_for_135_us() -> None:
 
 
 def test_requests_of_several_nodes_are_one_per_cycle() -> None:
-    # Eight SDO messages of 135 µs lie above the heartbeats. Were all of them sent in every cycle, nothing would be left.
-    entry = check_budget(ARM).frames[-1]
-    assert entry.frame.name == "HostHeartbeat"
-    assert entry.responses[Traffic.REQUESTS].is_bounded
-    assert entry.late_ns(Traffic.REQUESTS) == 0
+    budget = check_budget(ARM)
+    heartbeat = budget.frames[-1]
+    assert heartbeat.frame.name == "HostHeartbeat"
+    # Eight SDO messages of 135 µs lie above it. Were all of them sent in every cycle, nothing would be left.
+    assert heartbeat.responses[Traffic.REQUESTS].is_bounded
+    assert heartbeat.late_ns(Traffic.REQUESTS) == 0
+    assert heartbeat.responses[Traffic.REQUESTS] > heartbeat.responses[Traffic.OPERATION]
+    requests = [entry for entry in budget.frames if "Sdo" in entry.frame.name]
+    assert len(requests) == 8
+    assert {entry.responses[Traffic.REQUESTS] for entry in requests} == {requests[0].responses[Traffic.REQUESTS]}
+
+
+def test_a_single_request_gets_through_where_one_per_cycle_would_not() -> None:
+    (request,) = [entry for entry in budget_of("fd_500us").frames if entry.frame.name == "Drive1SdoRequest"]
+    # a heartbeat, the cyclic frames, itself
+    assert request.responses[Traffic.OPERATION] == Response(65_000 + 388_500 + 135_000)
+    assert not request.responses[Traffic.REQUESTS].is_bounded
+
+
+def test_a_frame_without_bound_is_late_whatever_was_found() -> None:
+    entry = check_budget(ARM).frames[1]
+    endless = dataclasses.replace(entry, responses={Traffic.OPERATION: Response(10_000, is_bounded=False)})
+    assert (entry.late_ns(), endless.late_ns()) == (0, 1)
 
 
 def test_an_emcy_of_every_device_makes_commands_late_and_is_said() -> None:
@@ -110,7 +131,9 @@ def test_an_inhibit_time_counts_as_the_interval() -> None:
     intervals = {entry.frame.name: entry.interval_ns for entry in budget.frames}
     assert (intervals["Drive1Emcy"], intervals["Sync"]) == (20_000_000, 1_000_000)
     assert not [note for note in budget.notes if "inhibit" in note]
-    assert [note for note in check_budget(ARM).notes if "inhibit" in note]
+    # four EMCY, four status; a heartbeat keeps its time
+    (note,) = [note for note in check_budget(ARM).notes if "inhibit" in note]
+    assert "event frames without inhibit time (GenMsgDelayTime): 8." in note
 
 
 def test_event_frames_that_come_too_often_miss_their_deadlines() -> None:
@@ -199,4 +222,6 @@ def test_arbitration_is_by_the_bits_on_the_wire() -> None:
     text = text.replace(b"VAL_ 1919 ", f"VAL_ {0x80000000 | 0x081 << 18} ".encode())
     names = [frame.name for frame in read_contract(text, "x").frames]
     # An extended frame loses to the base frame with the same first 11 bits and wins over the next one.
+    assert ContractFrame("a", 0x81, False, 8, Trigger.EVENT, 0, 0).priority == (0x81, 0)
+    assert ContractFrame("a", 0x81 << 18, True, 8, Trigger.EVENT, 0, 0).priority > (0x81, 0)
     assert names[:5] == ["Nmt", "Sync", "Drive1Emcy", "HostHeartbeat", "Drive2Emcy"]
