@@ -138,6 +138,33 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
     return code
 
 
+@cli.command(epilog="Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC.")
+@click.option(
+    "--dbc", default="arm", show_default=True, metavar="NAME|FILE", help="The contract: the package's, or a file."
+)
+@_config
+@click.option(
+    "--period-us",
+    type=click.IntRange(min=100, max=1_000_000),
+    help="SYNC period; default: BusPeriod_us of the DBC, else bus.period_us of the configuration.",
+)
+@click.option("-b", "--bitrate", type=click.IntRange(min=10_000, max=1_000_000), help="bit/s; default: the DBC's.")
+@click.option(
+    "--data-bitrate", type=click.IntRange(min=10_000, max=8_000_000), help="bit/s of CAN FD; default: the DBC's."
+)
+@_json
+@_explained
+def budget(
+    dbc: str, config: str, period_us: int | None, bitrate: int | None, data_bitrate: int | None, as_json: bool
+) -> ExitCode:
+    """Say whether the frames of a contract get through in time: bits, response times, what is left for the host."""
+    from adacd_hil.cli import budget as budgets
+
+    found, notes, code = budgets.judge(dbc, config, period_us, bitrate, data_bitrate)
+    print(json.dumps(budgets.as_json(found, notes), indent=2) if as_json else budgets.as_text(found, notes))
+    return code
+
+
 def main() -> None:
     """Enter here from the console script."""
     cli.main(prog_name="adacd-hil")

@@ -1,0 +1,151 @@
+"""The bit budget of a contract, as text and as JSON."""
+
+import difflib
+import textwrap
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.cli.exit_codes import ExitCode
+from adacd_hil.config import load_settings
+from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, us
+from adacd_hil.wire.codec import CodecError, contract_folder, load_codec
+from adacd_hil.wire.response_time import Response
+
+_COLUMNS = ("id", "message", "bytes", "trigger", "every ms", "bits", "µs", "response µs", "disturbed µs", "deadline µs")
+_WIDTH = 120
+_LEFT_ALIGNED = ("message", "trigger")
+_LEGEND = (
+    "bits at worst-case stuffing, intermission included; CAN FD: nominal + data rate",
+    "response in operation; disturbed: with an SDO frame per cycle and every EMCY at once; > : no bound, at least this",
+)
+
+
+def find_contract(name_or_file: str) -> Path:
+    """Find the DBC that a name (`arm`) or a path stands for. Raises CodecError with the nearest name."""
+    path = Path(name_or_file)
+    if path.suffix or path.exists():
+        return path
+    names = sorted(entry.stem for entry in contract_folder().glob("*.dbc"))
+    if name_or_file in names:
+        return contract_folder() / f"{name_or_file}.dbc"
+    nearest = difflib.get_close_matches(name_or_file, names, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; there are: {', '.join(names)}"
+    raise CodecError(f"contract {name_or_file!r} is neither one of the package's nor a file{hint}")
+
+
+def judge(
+    dbc: str, config: str, period_us: int | None, bitrate: int | None, data_bitrate: int | None
+) -> tuple[Budget, list[str], ExitCode]:
+    """Find the budget of a contract, and what else there is to say of it. Raises CodecError, ConfigError.
+
+    The configuration's period counts where neither option nor DBC gives one.
+    """
+    settings = load_settings(config)
+    codec = load_codec(find_contract(dbc))
+    contract = read_contract(codec.text, codec.path.name)
+    budget = find_budget(contract, period_us or contract.period_us or settings.bus.period_us, bitrate, data_bitrate)
+    notes = list(budget.notes)
+    if period_us is None and settings.bus.period_us != budget.period_us:
+        notes.append(
+            f"configuration {settings.name} has bus.period_us = {settings.bus.period_us}, the DBC {budget.period_us}"
+        )
+    return budget, notes, ExitCode.OK if budget.is_fit else ExitCode.FAILURE
+
+
+def as_text(budget: Budget, notes: list[str]) -> str:
+    """Write a budget for people, at most 120 characters wide."""
+    rates = f"{budget.bitrate} bit/s" + (f", data {budget.data_bitrate} bit/s" if budget.data_bitrate else "")
+    findings = [
+        (
+            "per cycle",
+            f"{budget.unstuffed_bits} bits without stuffing, {budget.worst_bits} at worst, {us(budget.cyclic_ns)} µs",
+        ),
+        ("utilisation", f"{budget.cyclic_load:.1%} cyclic, {budget.load:.1%} with event frames"),
+        (
+            "phases",
+            f"feedback in after {us(budget.feedback_ns)} µs, commands need {us(budget.command_ns)} µs, "
+            f"left for the host {us(budget.host_ns)} µs",
+        ),
+        *(("note", note) for note in notes),
+        ("verdict", budget.line),
+    ]
+    lines = [f"{budget.contract.name}, {budget.period_us} µs, {rates}", "", *_table(budget), "", *_LEGEND, ""]
+    for title, finding in findings:
+        lines += textwrap.wrap(finding, _WIDTH, initial_indent=f"{title:14}", subsequent_indent=" " * 14)
+    return "\n".join(lines)
+
+
+def _table(budget: Budget) -> list[str]:
+    rows = [_COLUMNS, *(_row(entry) for entry in budget.frames)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS))]
+    return [
+        "  ".join(
+            cell.ljust(width) if heading in _LEFT_ALIGNED else cell.rjust(width)
+            for heading, cell, width in zip(_COLUMNS, row, widths, strict=True)
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _row(entry: FrameBudget) -> tuple[str, ...]:
+    frame = entry.frame
+    return (
+        f"0x{frame.can_id:08X}" if frame.is_extended else f"0x{frame.can_id:03X}",
+        frame.name,
+        str(frame.length),
+        frame.trigger.value,
+        f"{entry.interval_ns / 1e6:g}",
+        f"{entry.worst.nominal}+{entry.worst.data}" if entry.worst.data else str(entry.worst.nominal),
+        us(entry.duration_ns),
+        _response(entry.responses[Traffic.OPERATION]),
+        _response(entry.responses[Traffic.EMERGENCIES]),
+        "-" if entry.deadline_ns is None else us(entry.deadline_ns),
+    )
+
+
+def _response(response: Response) -> str:
+    return ("" if response.is_bounded else "> ") + us(response.time_ns)
+
+
+def as_json(budget: Budget, notes: list[str]) -> dict[str, Any]:
+    """Describe a budget for machines."""
+    return {
+        "contract": budget.contract.name,
+        "period_us": budget.period_us,
+        "bitrate": budget.bitrate,
+        "data_bitrate": budget.data_bitrate,
+        "is_fit": budget.is_fit,
+        "verdict": budget.line,
+        "notes": notes,
+        "unstuffed_bits": budget.unstuffed_bits,
+        "worst_bits": budget.worst_bits,
+        "cyclic_us": budget.cyclic_ns / 1000,
+        "cyclic_load": budget.cyclic_load,
+        "load": budget.load,
+        "feedback_us": budget.feedback_ns / 1000,
+        "command_us": budget.command_ns / 1000,
+        "host_us": budget.host_ns / 1000,
+        "messages": [_message(entry) for entry in budget.frames],
+    }
+
+
+def _message(entry: FrameBudget) -> dict[str, Any]:
+    frame = entry.frame
+    return {
+        "name": frame.name,
+        "id": frame.can_id,
+        "is_extended": frame.is_extended,
+        "bytes": frame.length,
+        "trigger": frame.trigger.value,
+        "interval_us": entry.interval_ns / 1000,
+        "unstuffed_bits": entry.unstuffed.total,
+        "worst_bits": entry.worst.total,
+        "worst_data_rate_bits": entry.worst.data,
+        "worst_us": entry.duration_ns / 1000,
+        "deadline_us": None if entry.deadline_ns is None else entry.deadline_ns / 1000,
+        "response_us": {
+            traffic.value: {"time": response.time_ns / 1000, "is_bounded": response.is_bounded}
+            for traffic, response in entry.responses.items()
+        },
+        "late_us": entry.late_ns() / 1000,
+    }

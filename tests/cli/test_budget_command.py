@@ -1,0 +1,123 @@
+"""The budget command: its verdict as exit status, its table, its JSON, its complaints."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from adacd_hil.cli.main import cli
+
+CONTRACTS = Path(__file__).parent.parent / "wire" / "contracts"
+FITS, DOES_NOT_FIT, USAGE = 0, 1, 2
+
+
+def budget(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["budget", *arguments])
+
+
+@pytest.mark.parametrize(
+    ("dbc", "bits", "status"),
+    [
+        ("naive_cia402", 1135, DOES_NOT_FIT),
+        ("arm", 795, FITS),
+        ("stock", 715, FITS),
+        ("shared_command", 700, FITS),
+        ("srdo", 1010, DOES_NOT_FIT),
+    ],
+)
+def test_the_exit_status_is_the_verdict(dbc: str, bits: int, status: int) -> None:
+    ran = budget("--dbc", dbc if dbc == "arm" else str(CONTRACTS / f"{dbc}.dbc"), "--json")
+    assert ran.exit_code == status
+    found = json.loads(ran.stdout)
+    assert (found["worst_bits"], found["is_fit"]) == (bits, status == FITS)
+
+
+def test_can_fd_contracts_are_judged_at_both_rates() -> None:
+    ran = budget("--dbc", str(CONTRACTS / "fd_1ms.dbc"), "--json")
+    assert json.loads(ran.stdout)["cyclic_us"] == 513.8
+    slower = budget("--dbc", str(CONTRACTS / "fd_1ms.dbc"), "--data-bitrate", "1000000")
+    assert slower.exit_code == DOES_NOT_FIT
+    assert budget("--dbc", str(CONTRACTS / "fd_500us.dbc")).exit_code == FITS
+
+
+def test_the_text_has_table_phases_and_verdict_within_120_columns() -> None:
+    lines = budget().stdout.splitlines()
+    assert max(len(line) for line in lines) <= 120
+    table = lines[2 : lines.index("", 2)]
+    assert len(table) == 1 + 29
+    assert table[0].split()[:4] == ["id", "message", "bytes", "trigger"]
+    # numbers end where their heading ends
+    (command,) = [line for line in table if "Drive2Command" in line]
+    assert command.split() == ["0x202", "Drive2Command", "6", "command", "1", "115", "115", "920", "2830", "1000"]
+    assert len(command) == len(table[0])
+    assert "phases        feedback in after 565 µs, commands need 230 µs, left for the host 205 µs" in lines
+    assert lines[-1] == "verdict       arm.dbc at 1000 µs fits: 795 µs of cyclic frames, 205 µs left for the host"
+
+
+def test_a_contract_that_does_not_fit_says_who_is_late_and_by_how_much() -> None:
+    ran = budget("--period-us", "900")
+    assert ran.exit_code == DOES_NOT_FIT
+    assert "Drive2Command misses its deadline of 900 µs by 20 µs" in " ".join(ran.stdout.split())
+
+
+def test_json_has_every_message_with_its_response_times() -> None:
+    messages = json.loads(budget("--json").stdout)["messages"]
+    (command,) = [message for message in messages if message["name"] == "Drive1Command"]
+    assert command == {
+        "name": "Drive1Command",
+        "id": 0x201,
+        "is_extended": False,
+        "bytes": 6,
+        "trigger": "command",
+        "interval_us": 1000.0,
+        "unstuffed_bits": 95,
+        "worst_bits": 115,
+        "worst_data_rate_bits": 0,
+        "worst_us": 115.0,
+        "deadline_us": 1000.0,
+        "response_us": {
+            "operation": {"time": 805.0, "is_bounded": True},
+            "requests": {"time": 815.0, "is_bounded": True},
+            "emergencies": {"time": 1920.0, "is_bounded": True},
+        },
+        "late_us": 0.0,
+    }
+
+
+def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_path: Path) -> None:
+    config = tmp_path / "slow.toml"
+    config.write_text("[bus]\nperiod_us = 2000\n")
+    without = tmp_path / "without.dbc"
+    arm = (CONTRACTS / "stock.dbc").read_text()
+    without.write_text(arm.replace('BA_ "BusPeriod_us" 1000;', ""))
+
+    def period(*arguments: str) -> int:
+        found: int = json.loads(budget("--json", "--config", str(config), *arguments).stdout)["period_us"]
+        return found
+
+    assert period("--dbc", str(without), "--period-us", "4000") == 4000
+    assert period("--dbc", str(CONTRACTS / "stock.dbc")) == 1000
+    assert period("--dbc", str(without)) == 2000
+    said = budget("--config", str(config)).stdout
+    assert "configuration slow has bus.period_us = 2000, the DBC 1000" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--dbc", "arn"), "contract 'arn' is neither one of the package's nor a file; did you mean 'arm'?"),
+        (("--dbc", "none.dbc"), "DBC none.dbc: No such file"),
+        (("--config", "papper"), "did you mean 'paper'?"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: tuple[str, ...], line: str) -> None:
+    ran = budget(*arguments)
+    assert (ran.exit_code, ran.stdout) == (USAGE, "")
+    (complaint,) = ran.stderr.splitlines()
+    assert line in complaint
+
+
+def test_the_help_says_what_the_exit_status_means() -> None:
+    said = " ".join(budget("--help").stdout.split())
+    assert "Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC." in said

@@ -1,0 +1,227 @@
+"""The bit budget of contracts: which fit, why not, and what the DBC has to say for it."""
+
+import dataclasses
+from pathlib import Path
+
+import cantools
+import pytest
+
+from adacd_hil.wire.budget import Budget, ContractFrame, Traffic, Trigger, check_budget, find_budget, read_contract, us
+from adacd_hil.wire.codec import CodecError, contract_folder, load_codec
+from adacd_hil.wire.response_time import Response
+
+CONTRACTS = Path(__file__).parent / "contracts"
+ARM = load_codec()
+
+
+def budget_of(name: str, period_us: int | None = None) -> Budget:
+    return check_budget(load_codec(CONTRACTS / f"{name}.dbc"), period_us)
+
+
+def edited(*edits: tuple[str, str]) -> bytes:
+    """Return arm.dbc's text with edits, each of which must change something."""
+    text = ARM.text.decode()
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    return text.encode()
+
+
+def response_us(budget: Budget, name: str, traffic: Traffic = Traffic.OPERATION) -> float:
+    (entry,) = [entry for entry in budget.frames if entry.frame.name == name]
+    return entry.responses[traffic].time_ns / 1000
+
+
+@pytest.mark.parametrize(
+    ("name", "unstuffed", "worst", "is_fit"),
+    [
+        ("naive_cia402", 935, 1135, False),
+        ("stock", 593, 715, True),
+        ("shared_command", 578, 700, True),
+        ("srdo", 832, 1010, False),
+    ],
+)
+def test_sets_of_frames_at_1_ms(name: str, unstuffed: int, worst: int, is_fit: bool) -> None:
+    budget = budget_of(name)
+    assert (budget.unstuffed_bits, budget.worst_bits, budget.is_fit) == (unstuffed, worst, is_fit)
+
+
+def test_the_arm_fits_1_ms_and_leaves_205_us_for_the_host() -> None:
+    budget = check_budget(ARM)
+    assert (budget.unstuffed_bits, budget.worst_bits) == (657, 795)
+    assert (budget.feedback_ns, budget.command_ns, budget.host_ns) == (565_000, 230_000, 205_000)
+    assert budget.is_fit
+    assert budget.line == "arm.dbc at 1000 µs fits: 795 µs of cyclic frames, 205 µs left for the host"
+
+
+def test_the_arm_does_not_fit_half_a_millisecond() -> None:
+    budget = check_budget(ARM, 500)
+    assert not budget.is_fit
+    assert "arm.dbc at 500 µs doesn't fit: the cyclic frames need 795 µs, 295 µs too many" in budget.line
+    assert "Drive2Command misses its deadline of 500 µs by at least 420 µs, 12 more miss theirs" in budget.line
+
+
+def test_a_contract_can_miss_deadlines_though_its_cyclic_frames_have_room() -> None:
+    budget = check_budget(ARM, 900)
+    assert budget.host_ns == 105_000
+    # 795 µs, and a drive status of 125 µs that has just begun
+    assert [entry.frame.name for entry in budget.late if entry.frame.is_cyclic] == ["Drive2Command"]
+    assert "Drive2Command misses its deadline of 900 µs by 20 µs" in budget.line
+
+
+def test_half_the_bit_rate_takes_twice_the_time() -> None:
+    assert check_budget(ARM, 2000, bitrate=500_000).cyclic_ns == 2 * 795_000
+    assert not check_budget(ARM, 1000, bitrate=500_000).is_fit
+
+
+def test_response_times_of_the_arm_by_hand() -> None:
+    budget = check_budget(ARM)
+    # SYNC waits for one 8-byte frame; the last command for a status and all six others
+    assert response_us(budget, "Sync") == 135 + 65
+    assert response_us(budget, "Drive1Feedback") == 135 + 65 + 135
+    assert response_us(budget, "Sensor1Torque") == 125 + 65 + 2 * 135 + 115
+    assert response_us(budget, "Drive2Command") == 125 + 795
+    # a status waits for its cycle's frames and, as it doesn't get through before it, not for the next cycle's
+    assert response_us(budget, "Drive1Status") == 125 + 795 + 125
+
+
+def test_one_sdo_frame_per_cycle_blocks_the_last_command_for_135_us() -> None:
+    budget = check_budget(ARM)
+    assert response_us(budget, "Drive2Command", Traffic.REQUESTS) == 135 + 795
+    assert "one SDO in every cycle: in time, Drive2Command within 930 µs" in budget.notes
+
+
+def test_requests_of_several_nodes_are_one_per_cycle() -> None:
+    budget = check_budget(ARM)
+    heartbeat = budget.frames[-1]
+    assert heartbeat.frame.name == "HostHeartbeat"
+    # Eight SDO messages of 135 µs lie above it. Were all of them sent in every cycle, nothing would be left.
+    assert heartbeat.responses[Traffic.REQUESTS].is_bounded
+    assert heartbeat.late_ns(Traffic.REQUESTS) == 0
+    assert heartbeat.responses[Traffic.REQUESTS] > heartbeat.responses[Traffic.OPERATION]
+    requests = [entry for entry in budget.frames if "Sdo" in entry.frame.name]
+    assert len(requests) == 8
+    assert {entry.responses[Traffic.REQUESTS] for entry in requests} == {requests[0].responses[Traffic.REQUESTS]}
+
+
+def test_a_single_request_gets_through_where_one_per_cycle_would_not() -> None:
+    (request,) = [entry for entry in budget_of("fd_500us").frames if entry.frame.name == "Drive1SdoRequest"]
+    # a heartbeat, the cyclic frames, itself
+    assert request.responses[Traffic.OPERATION] == Response(65_000 + 388_500 + 135_000)
+    assert not request.responses[Traffic.REQUESTS].is_bounded
+
+
+def test_a_frame_without_bound_is_late_whatever_was_found() -> None:
+    entry = check_budget(ARM).frames[1]
+    endless = dataclasses.replace(entry, responses={Traffic.OPERATION: Response(10_000, is_bounded=False)})
+    assert (entry.late_ns(), endless.late_ns()) == (0, 1)
+
+
+def test_an_emcy_of_every_device_makes_commands_late_and_is_said() -> None:
+    budget = check_budget(ARM)
+    # B 135, four EMCY 540: SYNC and feedback of the next two cycles overtake the second command as well
+    assert response_us(budget, "Drive2Command", Traffic.EMERGENCIES) == 135 + 540 + 3 * 680 + 115
+    assert "and every EMCY at once: Drive2Command misses its deadline of 1000 µs by 1830 µs" in budget.notes
+    assert budget.is_fit
+
+
+def test_an_inhibit_time_counts_as_the_interval() -> None:
+    contract = read_contract(edited(('BA_DEF_DEF_ "GenMsgDelayTime" 0;', 'BA_DEF_DEF_ "GenMsgDelayTime" 20;')), "x")
+    budget = find_budget(contract)
+    intervals = {entry.frame.name: entry.interval_ns for entry in budget.frames}
+    assert (intervals["Drive1Emcy"], intervals["Sync"]) == (20_000_000, 1_000_000)
+    assert not [note for note in budget.notes if "inhibit" in note]
+    # four EMCY, four status; a heartbeat keeps its time
+    (note,) = [note for note in check_budget(ARM).notes if "inhibit" in note]
+    assert "event frames without inhibit time (GenMsgDelayTime): 8." in note
+
+
+def test_event_frames_that_come_too_often_miss_their_deadlines() -> None:
+    contract = read_contract(edited(('BA_DEF_DEF_ "GenMsgDelayTime" 0;', 'BA_DEF_DEF_ "GenMsgDelayTime" 1;')), "x")
+    budget = find_budget(contract)
+    assert budget.load > 1.0
+    late = [entry.frame.name for entry in budget.late]
+    assert late[-1] == "HostHeartbeat"
+    assert not budget.is_fit
+
+
+def test_can_fd_at_1m_5m_takes_514_us() -> None:
+    budget = budget_of("fd_1ms")
+    assert us(budget.cyclic_ns) == "513.8"
+    assert budget.is_fit
+
+
+def test_a_smaller_can_fd_set_at_1m_8m_fits_half_a_millisecond() -> None:
+    budget = budget_of("fd_500us")
+    assert (budget.period_us, budget.is_fit) == (500, True)
+    # SYNC 65; nominal 6 x 33; data 2 x 194 + 4 x 154 at 8 Mbit/s
+    assert budget.cyclic_ns == (65 + 6 * 33) * 1000 + (2 * 194 + 4 * 154) * 125
+    assert "one SDO in every cycle: Drive2Command misses its deadline of 500 µs by 23.5 µs" in budget.notes
+
+
+def test_the_same_set_at_1m_5m_does_not() -> None:
+    assert not check_budget(load_codec(CONTRACTS / "fd_1ms.dbc"), 500).is_fit
+
+
+def test_a_can_fd_contract_needs_a_data_bit_rate() -> None:
+    text = (CONTRACTS / "fd_1ms.dbc").read_bytes().replace(b'BA_ "BaudrateCANFD" 5000000;', b"")
+    with pytest.raises(CodecError, match=r"DBC x has no BaudrateCANFD, and none is given"):
+        find_budget(read_contract(text, "x"))
+    assert find_budget(read_contract(text, "x"), data_bitrate=5_000_000).is_fit
+
+
+def test_a_length_between_those_of_can_fd_is_refused() -> None:
+    text = (CONTRACTS / "fd_1ms.dbc").read_bytes().replace(b"Drive1Command: 12", b"Drive1Command: 13")
+    with pytest.raises(
+        CodecError, match=r"DBC x: Drive1Command: a CAN FD frame can't have 13 bytes; next possible: 16"
+    ):
+        find_budget(read_contract(text, "x"))
+
+
+def test_a_dbc_that_does_not_say_when_is_refused() -> None:
+    text = "\n".join(line for line in ARM.text.decode().splitlines() if '"Trigger"' not in line)
+    with pytest.raises(CodecError, match="it has no Trigger attribute"):
+        read_contract(text.encode(), "x")
+
+
+def test_an_unknown_trigger_is_named() -> None:
+    with pytest.raises(CodecError, match=r"DBC x: Nmt: Trigger = 'never'; known: sync, command, event, request"):
+        read_contract(edited(('"event","request"', '"event","request","never"'), ("BO_ 0 3;", "BO_ 0 4;")), "x")
+
+
+def test_a_dbc_without_period_needs_one() -> None:
+    contract = read_contract(edited(('BA_ "BusPeriod_us" 1000;', 'BA_ "BusPeriod_us" 0;')), "x")
+    with pytest.raises(CodecError, match="DBC x has no BusPeriod_us, and none is given"):
+        find_budget(contract)
+
+
+def test_every_message_of_the_arm_says_when_it_is_sent() -> None:
+    triggers = {frame.name: frame.trigger for frame in read_contract(ARM.text, "arm").frames}
+    assert {name for name, trigger in triggers.items() if trigger is Trigger.COMMAND} == {
+        "Drive1Command",
+        "Drive2Command",
+    }
+    assert {name for name, trigger in triggers.items() if trigger is Trigger.REQUEST} == {
+        name for name in triggers if "Sdo" in name or name == "Nmt"
+    }
+    explicit = [message.name for message in cantools.database.load_file(contract_folder() / "arm.dbc").messages]
+    assert ARM.text.count(b'BA_ "Trigger" BO_') == len(explicit)
+
+
+def test_the_layout_digest_leaves_the_timing_out(tmp_path: Path) -> None:
+    path = tmp_path / "slow.dbc"
+    path.write_bytes(
+        edited(('BA_ "BusPeriod_us" 1000;', 'BA_ "BusPeriod_us" 4000;'), ('"Trigger" BO_ 641 2', '"Trigger" BO_ 641 0'))
+    )
+    assert load_codec(path).layout_digest == ARM.layout_digest
+
+
+def test_arbitration_is_by_the_bits_on_the_wire() -> None:
+    text = edited(("BO_ 1919 HostHeartbeat", f"BO_ {0x80000000 | 0x081 << 18} HostHeartbeat"))
+    text = text.replace(b" BO_ 1919 ", f" BO_ {0x80000000 | 0x081 << 18} ".encode())
+    text = text.replace(b"VAL_ 1919 ", f"VAL_ {0x80000000 | 0x081 << 18} ".encode())
+    names = [frame.name for frame in read_contract(text, "x").frames]
+    # An extended frame loses to the base frame with the same first 11 bits and wins over the next one.
+    assert ContractFrame("a", 0x81, False, 8, Trigger.EVENT, 0, 0).priority == (0x81, 0)
+    assert ContractFrame("a", 0x81 << 18, True, 8, Trigger.EVENT, 0, 0).priority > (0x81, 0)
+    assert names[:5] == ["Nmt", "Sync", "Drive1Emcy", "HostHeartbeat", "Drive2Emcy"]

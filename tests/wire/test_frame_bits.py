@@ -1,0 +1,179 @@
+"""Frame lengths: by hand, against an encoder of its own, and the worst case against exact frames."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from adacd_hil.wire.frame_bits import (
+    FD_LENGTHS,
+    FrameBits,
+    exact_bits,
+    exact_fd_bits,
+    unstuffed_bits,
+    unstuffed_fd_bits,
+    worst_case_bits,
+    worst_case_fd_bits,
+)
+
+BASE_ID = st.integers(0, 0x7FF)
+EXTENDED_ID = st.integers(0, 0x1FFFFFFF)
+FD_DATA = st.sampled_from(FD_LENGTHS).flatmap(lambda length: st.binary(min_size=length, max_size=length))
+
+
+def to_bits(value: int, count: int) -> list[int]:
+    return [value >> place & 1 for place in reversed(range(count))]
+
+
+def count_stuff_bits(bits: list[int]) -> int:
+    """Insert as a transmitter does, bit by bit: ISO 11898-1, frame coding."""
+    sent: list[int] = []
+    count = 0
+    for bit in bits:
+        sent.append(bit)
+        if len(sent) >= 5 and len(set(sent[-5:])) == 1:
+            sent.append(1 - bit)
+            count += 1
+    return count
+
+
+def crc15(bits: list[int]) -> list[int]:
+    """The shift register of the CAN specification 2.0, section 3.1.1."""
+    register = 0
+    for bit in bits:
+        is_next = bit ^ (register >> 14 & 1)
+        register = register << 1 & 0x7FFF
+        if is_next:
+            register ^= 0x4599
+    return to_bits(register, 15)
+
+
+def encode_classic(can_id: int, data: bytes, is_extended: bool) -> list[int]:
+    """Start of frame to CRC."""
+    if is_extended:
+        head = [0, *to_bits(can_id >> 18, 11), 1, 1, *to_bits(can_id, 18), 0, 0, 0]
+    else:
+        head = [0, *to_bits(can_id, 11), 0, 0, 0]
+    content = [*head, *to_bits(len(data), 4), *(bit for byte in data for bit in to_bits(byte, 8))]
+    return content + crc15(content)
+
+
+@pytest.mark.parametrize(
+    ("length", "base", "extended"),
+    [(0, 55, 80), (1, 65, 90), (4, 95, 120), (6, 115, 140), (7, 125, 150), (8, 135, 160)],
+)
+def test_the_worst_case_is_that_of_davis_2007(length: int, base: int, extended: int) -> None:
+    assert worst_case_bits(length) == base
+    assert worst_case_bits(length, is_extended=True) == extended
+
+
+def test_lengths_without_stuffing_are_47_and_67_bits_and_the_data() -> None:
+    assert [unstuffed_bits(length) for length in (0, 1, 8)] == [47, 55, 111]
+    assert [unstuffed_bits(length, is_extended=True) for length in (0, 1, 8)] == [67, 75, 131]
+
+
+def test_a_frame_of_zeros_is_stuffed_after_every_fifth_bit() -> None:
+    # Identifier 0, no data: 19 zeros, and the CRC of zeros is zero: 34 bits, 6 whole runs of 5.
+    assert exact_bits(0, b"") == 47 + 6
+
+
+def test_the_lengths_of_a_can_fd_frame_by_hand() -> None:
+    # SOF 1, id 11, RRS, IDE, FDF, res, BRS 5; ACK 2, EOF 7, intermission 3 | ESI 1, DLC 4, 96 data, stuff count 4,
+    # CRC 17 with 6 fixed stuff bits, CRC delimiter 1
+    assert unstuffed_fd_bits(12) == FrameBits(29, 129)
+    assert unstuffed_fd_bits(24) == FrameBits(29, 5 + 192 + 4 + 21 + 7 + 1)
+    # 17 bits take 4 stuff bits at most, 118 take 29
+    assert worst_case_fd_bits(12) == FrameBits(33, 129 + 25)
+
+
+def test_data_that_end_with_five_equal_bits_get_the_fixed_stuff_bit_only() -> None:
+    assert exact_fd_bits(0x555, bytes(11) + b"\x10").data == exact_fd_bits(0x555, bytes(11) + b"\x20").data
+
+
+@pytest.mark.parametrize("length", [9, 13, 65, -1])
+def test_a_length_that_no_can_fd_frame_has_is_refused(length: int) -> None:
+    with pytest.raises(ValueError, match=f"a CAN FD frame can't have {length} bytes"):
+        worst_case_fd_bits(length)
+
+
+def test_nine_bytes_are_too_many_for_a_classic_frame() -> None:
+    with pytest.raises(ValueError, match="a classic frame can't have 9 bytes, at most 8"):
+        exact_bits(1, bytes(9))
+
+
+def test_times_are_rounded_up_to_whole_nanoseconds() -> None:
+    assert FrameBits(1, 1).duration_ns(300_000, 3_000_000) == 3334 + 334
+    assert FrameBits(100, 40).duration_s(1_000_000, 8_000_000) == pytest.approx(105e-6)
+
+
+@pytest.mark.slow
+@given(can_id=BASE_ID, data=st.binary(max_size=8))
+def test_a_base_frame_is_as_long_as_its_bits_put_one_after_the_other(can_id: int, data: bytes) -> None:
+    bits = encode_classic(can_id, data, is_extended=False)
+    assert exact_bits(can_id, data) == len(bits) + count_stuff_bits(bits) + 13
+
+
+@given(can_id=EXTENDED_ID, data=st.binary(max_size=8))
+def test_an_extended_frame_is_as_long_as_its_bits_put_one_after_the_other(can_id: int, data: bytes) -> None:
+    bits = encode_classic(can_id, data, is_extended=True)
+    assert exact_bits(can_id, data, is_extended=True) == len(bits) + count_stuff_bits(bits) + 13
+
+
+@pytest.mark.slow
+@given(can_id=EXTENDED_ID, data=FD_DATA, is_extended=st.booleans())
+def test_a_can_fd_frame_is_as_long_as_its_bits_put_one_after_the_other(
+    can_id: int, data: bytes, is_extended: bool
+) -> None:
+    if is_extended:
+        head = [0, *to_bits(can_id >> 18, 11), 1, 1, *to_bits(can_id, 18), 0, 1, 0, 1]
+    else:
+        head = [0, *to_bits(can_id, 11), 0, 0, 1, 0, 1]
+    dlc = {12: 9, 16: 10, 20: 11, 24: 12, 32: 13, 48: 14, 64: 15}.get(len(data), len(data))
+    dynamic = [*head, 0, *to_bits(dlc, 4), *(bit for byte in data for bit in to_bits(byte, 8))]
+    # A stuff bit that would follow the last data bit is the fixed one that begins the CRC field: feed one bit less.
+    nominal = len(head) + count_stuff_bits(head)
+    stuffed = len(dynamic) + count_stuff_bits(dynamic[:-1])
+    crc_field = 4 + 17 + 6 if len(data) <= 16 else 4 + 21 + 7
+    found = exact_fd_bits(can_id if is_extended else can_id & 0x7FF, data, is_extended)
+    assert found == FrameBits(nominal + 2 + 7 + 3, stuffed - nominal + crc_field + 1)
+
+
+@pytest.mark.slow
+@given(can_id=BASE_ID, data=st.binary(max_size=8))
+def test_no_frame_is_longer_than_the_worst_case(can_id: int, data: bytes) -> None:
+    assert unstuffed_bits(len(data)) <= exact_bits(can_id, data) <= worst_case_bits(len(data))
+
+
+@pytest.mark.slow
+@given(can_id=EXTENDED_ID, data=FD_DATA, is_extended=st.booleans(), rate=st.sampled_from([1, 2, 5, 8]))
+def test_no_can_fd_frame_is_longer_than_the_worst_case(can_id: int, data: bytes, is_extended: bool, rate: int) -> None:
+    exact, worst = exact_fd_bits(can_id, data, is_extended), worst_case_fd_bits(len(data), is_extended)
+    assert exact.nominal <= worst.nominal
+    assert exact.total <= worst.total
+    assert exact.duration_ns(1_000_000, rate * 1_000_000) <= worst.duration_ns(1_000_000, rate * 1_000_000)
+
+
+def most_stuff_bits(length: int) -> int:
+    """Most stuff bits that any identifier, data and CRC could cause, given the fixed bits of the control field."""
+    fixed = [0, *[None] * 11, 0, 0, 0, *to_bits(length, 4), *[None] * (8 * length + 15)]
+    best: dict[tuple[int, int], int] = {(1, 0): 0}  # last bit on the wire, length of its run
+    for fixed_bit in fixed:
+        reached: dict[tuple[int, int], int] = {}
+        for (last, run), count in best.items():
+            for bit in (0, 1) if fixed_bit is None else (fixed_bit,):
+                longer = run + 1 if bit == last else 1
+                key, new = ((1 - bit, 1), count + 1) if longer == 5 else ((bit, longer), count)
+                reached[key] = max(reached.get(key, 0), new)
+        best = reached
+    return max(best.values())
+
+
+def test_a_frame_built_for_it_has_the_most_stuff_bits_that_the_format_allows() -> None:
+    # 0 0000 0111 11|.., then runs of four to the end of the data; identifier and data picked so that the CRC goes on.
+    found = exact_bits(0x01F, bytes.fromhex("8787c1e1e1e1e1")) - unstuffed_bits(7)
+    assert found == most_stuff_bits(7)
+    # The formula is one more: it doesn't know that the control field is fixed.
+    assert found == worst_case_bits(7) - unstuffed_bits(7) - 1
+
+
+def test_the_longest_known_frame_of_8_bytes_is_two_bits_short_of_the_formula() -> None:
+    assert exact_bits(0x07C, bytes.fromhex("01e1e1e1f0787878")) == worst_case_bits(8) - 2
