@@ -4,16 +4,18 @@ No threads: a request is sent, then the bus is read until its answer is in. What
 concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 """
 
+import configparser
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import canopen
 from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
+from adacd_hil.config import ConfigError
 from adacd_hil.wire.bus import Bus, Frame
 
 ANSWER_TIMEOUT_S = 0.5
@@ -28,6 +30,42 @@ logging.getLogger("canopen").propagate = False
 
 class DeviceError(RuntimeError):
     """A device is missing, not the expected one, or refuses its set-up; one line."""
+
+
+class Variable(NamedTuple):
+    """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size."""
+
+    name: str
+    bits: int
+    is_signed: bool
+    default: int | None
+
+
+def read_eds(path: Path, node_id: int) -> Any:
+    """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`. Raises ConfigError."""
+    try:
+        return canopen.import_od(str(path), node_id)
+    except (OSError, ValueError, KeyError, configparser.Error) as error:
+        raise ConfigError(f"EDS {path}: {' '.join(str(error).split())}") from None
+
+
+def find_variable(objects: Any, index: int, sub: int) -> Variable | None:
+    """Describe an object of an object dictionary, None when it isn't listed."""
+    entry = objects.get(index)
+    if entry is None:
+        return None
+    if not isinstance(entry, canopen.objectdictionary.ODVariable):
+        entry = entry.subindices.get(sub)
+    elif sub:
+        return None
+    if entry is None:
+        return None
+    parent = entry.parent
+    name = entry.name if entry.parent is objects or not sub else f"{parent.name}, {entry.name}"
+    default = entry.value if entry.value is not None else entry.default
+    is_number = entry.data_type in canopen.objectdictionary.NUMBER_TYPES
+    is_signed = entry.data_type in canopen.objectdictionary.SIGNED_TYPES
+    return Variable(name, len(entry) if is_number else 0, is_signed, default if isinstance(default, int) else None)
 
 
 class _Network(canopen.Network):

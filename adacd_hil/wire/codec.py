@@ -78,6 +78,11 @@ class MessageCodec:
         """Whether the frames carry an end-to-end header."""
         return bool(self.data_ids)
 
+    @property
+    def header_bytes(self) -> int:
+        """Count the bytes of the end-to-end header."""
+        return HEADER_BYTES if self.is_protected else 0
+
     def sender(self) -> E2eSender:
         """Make the end-to-end sender of this message."""
         return E2eSender(self.data_ids)
@@ -238,6 +243,11 @@ def load_codec(path: Path | None = None) -> Codec:
         text = path.read_bytes()
     except OSError as error:
         raise CodecError(f"DBC {path}: {error.strerror}") from None
+    return parse_codec(text, path)
+
+
+def parse_codec(text: bytes, path: Path) -> Codec:
+    """Generate the codec from the text of a DBC; `path` is where it is, or would be. Raises CodecError."""
     try:
         database = cantools.database.load_string(text.decode("utf-8"), "dbc")
     except (UnicodeDecodeError, DatabaseError) as error:
