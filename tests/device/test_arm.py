@@ -137,4 +137,4 @@ def test_a_sensor_that_says_its_value_is_not_valid_is_a_fault() -> None:
 def test_faults_are_described_with_the_device_and_its_code() -> None:
     devices = Devices()
     devices.send("Drive2Status", 0x0218, 10, 0, 0x8250)
-    assert devices.arm.describe_faults() == ["Drive2: FAULT, error code 0x8250"]
+    assert devices.arm.describe_faults() == ["Drive2: FAULT, error code 0x8250: RPDO timeout"]
