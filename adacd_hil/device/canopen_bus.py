@@ -19,7 +19,7 @@ from adacd_hil.config import ConfigError
 from adacd_hil.wire.bus import Bus, Frame
 
 ANSWER_TIMEOUT_S = 0.5
-"""Longest silence while waiting for an answer. CiA 301 gives none; drives answer within 100 ms."""
+"""Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
 _SDO_ABORT = 0x80
 
@@ -84,6 +84,8 @@ class CanopenBus:
 
     def __init__(self, bus: Bus) -> None:
         self.channel = bus.channel
+        self.bystander: Callable[[Frame], object] = lambda _: None
+        """Gets every frame that arrives while an answer is awaited, besides canopen."""
         self._bus = bus
         self._network = _Network(self._send)
 
@@ -107,14 +109,21 @@ class CanopenBus:
             self.pump(lambda frame: frame.can_id == can_id - 0x80, ANSWER_TIMEOUT_S)
 
     def pump(self, is_answer: Callable[[Frame], bool], timeout_s: float) -> bool:
-        """Read the bus until an answer is in; False after a silence of `timeout_s`."""
+        """Read the bus until an answer is in; False after a silence of `timeout_s`, or as much of other traffic."""
+        remaining_s = timeout_s
+        first_ns: int | None = None
         for _ in range(_MAX_UNRELATED_FRAMES):
-            frame = self._bus.receive(timeout_s)
+            frame = self._bus.receive(remaining_s)
             if frame is None:
                 return False
             self.accept(frame)
+            self.bystander(frame)
             if is_answer(frame):
                 return True
+            first_ns = frame.t_ns if first_ns is None else first_ns
+            remaining_s = timeout_s - (frame.t_ns - first_ns) * 1e-9
+            if remaining_s <= 0.0:
+                return False
         return False
 
     def accept(self, frame: Frame) -> None:
