@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.placement import Device, place_devices
-from adacd_hil.device.profile import HEADER_SIGNALS, PdoSettings
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings
 from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
 
 HOST_NODE = 127
 COMPOSED_NAME = "contract.dbc"
 WIRE_VERSION = 1
 _TRIGGERS = ("sync", "command", "event", "request")
+_FRAME_FORMATS = ("StandardCAN", "ExtendedCAN", "reserved", "J1939PG", *("reserved",) * 10, "StandardCAN_FD")
 _CLASSIC_BYTES = 8
 _FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 
@@ -152,7 +153,9 @@ def _messages(settings: Settings, devices: list[Device]) -> list[_Message]:
     for device in devices:
         node, sender, host = device.node_id, device.name.upper(), ("HOST",)
         messages += [
-            _Message(0x080 + node, f"{device.name}Emcy", sender, host, _EMCY, "event"),
+            _Message(
+                0x080 + node, f"{device.name}Emcy", sender, host, _EMCY, "event", delay_ms=EMCY_INHIBIT_100US // 10
+            ),
             *(_pdo_message(device, pdo) for pdo in device.settings.pdo),
             _Message(0x580 + node, f"{device.name}SdoResponse", sender, host, _SDO, "request"),
             _Message(0x600 + node, f"{device.name}SdoRequest", "HOST", (sender,), _SDO, "request"),
@@ -165,7 +168,9 @@ def _messages(settings: Settings, devices: list[Device]) -> list[_Message]:
 
 def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], period_ms: int) -> _Message:
     values = {"state": _NMT_STATES}
-    return _Message(0x700 + node, f"{name}Heartbeat", sender, receivers, _HEARTBEAT, "event", period_ms, values=values)
+    return _Message(
+        0x700 + node, f"{name}Heartbeat", sender, receivers, _HEARTBEAT, "event", period_ms, period_ms, values=values
+    )
 
 
 def _pdo_message(device: Device, pdo: PdoSettings) -> _Message:
@@ -225,6 +230,7 @@ _ATTRIBUTES = f"""BA_DEF_ "WireVersion" INT 1 65535;
 BA_DEF_ "Baudrate" INT 0 1000000;
 BA_DEF_ "BaudrateCANFD" INT 0 16000000;
 BA_DEF_ "BusPeriod_us" INT 0 1000000;
+BA_DEF_ BO_ "VFrameFormat" ENUM {",".join(f'"{name}"' for name in _FRAME_FORMATS)};
 BA_DEF_ BO_ "E2EProfile" STRING;
 BA_DEF_ BO_ "E2EDataIdList" STRING;
 BA_DEF_ BO_ "E2EDataId" INT 0 65535;
@@ -235,6 +241,7 @@ BA_DEF_DEF_ "WireVersion" 1;
 BA_DEF_DEF_ "Baudrate" 0;
 BA_DEF_DEF_ "BaudrateCANFD" 0;
 BA_DEF_DEF_ "BusPeriod_us" 0;
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
 BA_DEF_DEF_ "E2EProfile" "";
 BA_DEF_DEF_ "E2EDataIdList" "";
 BA_DEF_DEF_ "E2EDataId" 0;
@@ -284,6 +291,8 @@ def _number(value: float) -> str:
 
 
 def _attribute_lines(message: _Message) -> Iterable[str]:
+    if message.length > _CLASSIC_BYTES:
+        yield f'BA_ "VFrameFormat" BO_ {message.can_id} {_FRAME_FORMATS.index("StandardCAN_FD")};'
     if message.protection:
         yield f'BA_ "E2EProfile" BO_ {message.can_id} "{message.protection}";'
         if message.protection == "P02":

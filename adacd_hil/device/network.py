@@ -15,6 +15,7 @@ from adacd_hil.device.emergency import describe_emergency
 from adacd_hil.device.heartbeat import OPERATIONAL, PATIENCE_PERIODS, HeartbeatWatch
 from adacd_hil.device.pdo_mapping import set_up_pdos
 from adacd_hil.device.placement import place_devices
+from adacd_hil.device.profile import EMCY_INHIBIT_100US
 from adacd_hil.device.sensor_setup import set_up_sensor
 from adacd_hil.device.slave import Slave
 from adacd_hil.records import Event
@@ -152,6 +153,7 @@ class Master:
         for slave in self.slaves:
             self._set_up_sync(slave)
             self._set_up_heartbeats(slave)
+            self._set_up_emergencies(slave)
             set_up_pdos(slave, command_deadline_ms(self._settings))
             if slave.device.settings.kind == "drive":
                 set_up_drive(slave, self._settings, self._codec)
@@ -175,6 +177,11 @@ class Master:
         if slave.has(0x1006):
             slave.write(0x1006, 0, self._settings.bus.period_us)
             slave.expect(0x1006, 0, self._settings.bus.period_us, "SYNC period", "µs")
+
+    @staticmethod
+    def _set_up_emergencies(slave: Slave) -> None:
+        if slave.has(0x1015):
+            slave.write_checked(0x1015, 0, EMCY_INHIBIT_100US, "x 100 µs")
 
     def _set_up_heartbeats(self, slave: Slave) -> None:
         period_ms = self._settings.bus.heartbeat_ms

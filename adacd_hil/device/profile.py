@@ -21,6 +21,8 @@ FEATURES = ("heartbeat_consumer", "sync_counter", "option_codes", "torque_limits
 heartbeat_consumer 0x1016; sync_counter 0x1019; option_codes 0x605A, 0x605E; torque_limits 0x6072, 0x60E0, 0x60E1;
 autozero 0x6125; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the device's time in ms.
 """
+EMCY_INHIBIT_100US = 100
+"""0x1015 of every device that has it: one EMCY per device and 10 ms, so that a storm of errors can't take the bus."""
 HEADER_SIGNALS = {
     "P02": (("e2e_crc", 8), ("e2e_counter", 4), ("e2e_status", 4)),
     "P05": (("e2e_crc", 16), ("e2e_counter", 8), ("e2e_status", 8)),

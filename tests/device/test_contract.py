@@ -15,7 +15,7 @@ from adacd_hil.wire.codec import contract_folder, load_codec
 DRIVE_PROFILE = Path(adacd_hil.__file__).parent / "device_profiles" / "adacd-drive.toml"
 WRITTEN = [
     name
-    for name in ("paper", "fd", "stock")
+    for name in ("paper", "fd", "fd_500us", "stock")
     if (contract_folder() / f"{load_settings(name).devices.contract}.dbc").is_file()
 ]
 

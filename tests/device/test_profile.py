@@ -26,12 +26,14 @@ def profile_file(folder: Path, text: str) -> str:
     return str(path)
 
 
-def test_six_profiles_are_built_in() -> None:
+def test_profiles_for_each_contract_are_built_in() -> None:
     assert profile_names() == [
         "adacd-drive",
         "adacd-drive-fd",
+        "adacd-drive-fd-500us",
         "adacd-sensor",
         "adacd-sensor-fd",
+        "adacd-sensor-fd-500us",
         "int32-sensor",
         "stock-drive",
     ]
@@ -93,7 +95,9 @@ def test_a_sensor_is_no_drive() -> None:
         load_profile("int32-sensor", "drive")
 
 
-@pytest.mark.parametrize(("name", "contract"), [("paper", "arm"), ("fd", "arm_fd"), ("stock", "arm_stock")])
+@pytest.mark.parametrize(
+    ("name", "contract"), [("paper", "arm"), ("fd", "arm_fd"), ("stock", "arm_stock"), ("fd_500us", "arm_fd_500us")]
+)
 def test_built_in_configurations_name_their_contract(name: str, contract: str) -> None:
     settings = load_settings(name)
     assert (settings.name, settings.devices.contract) == (name, contract)
