@@ -89,9 +89,12 @@ class CanopenBus:
         self._bus = bus
         self._network = _Network(self._send)
 
-    def add_node(self, node_id: int, eds: Path | None, on_emergency: Callable[[EmcyError], None] | None = None) -> Any:
-        """Return canopen's node; without an EDS it has no objects, and SDO goes by index through `node.sdo.upload`."""
-        node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if eds is None else str(eds))  # type: ignore[no-untyped-call]
+    def add_node(self, node_id: int, objects: Any, on_emergency: Callable[[EmcyError], None] | None = None) -> Any:
+        """Return canopen's node with the objects of `read_eds`.
+
+        With None it has no objects, and SDO goes by index through `node.sdo.upload`.
+        """
+        node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if objects is None else objects)  # type: ignore[no-untyped-call]
         self._network.add_node(node)
         node.sdo.RESPONSE_TIMEOUT = 0.0005  # the answer is in the queue when `_send` returns, or never comes
         if on_emergency is not None:

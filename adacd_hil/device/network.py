@@ -55,7 +55,7 @@ class Master:
         self.slaves: list[Slave] = []
         self.nodes: dict[str, Any] = {}
         for device in place_devices(settings):
-            node = self._canopen.add_node(device.node_id, device.profile.eds, self._emergency_listener(device.name))
+            node = self._canopen.add_node(device.node_id, device.objects, self._emergency_listener(device.name))
             self.nodes[device.name] = node
             self.slaves.append(Slave(device, node))
         watched = [(slave.name, slave.node_id) for slave in self.slaves if slave.has(0x1017)]
