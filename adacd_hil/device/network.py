@@ -91,6 +91,8 @@ class Master:
 
     def reset(self) -> None:
         """Reset the communication of all nodes and wait until each has booted. Raises DeviceError, BusError."""
+        while self._bus.receive(0.0) is not None:  # from before the reset; a full queue has no room for what follows
+            pass
         timeout_s = self._settings.devices.boot_timeout_s
         waiting = {slave.node_id: slave.name for slave in self.slaves}
         self._heartbeats.stop()
