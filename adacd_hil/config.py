@@ -194,6 +194,38 @@ class BusSettings:
 
 
 @dataclass(frozen=True)
+class DevicesSettings:
+    """Which devices are on the bus, by joint, and the contract that describes their frames."""
+
+    drive: tuple[str, str] = setting(
+        ("adacd-drive", "adacd-drive"), meaning="device profile: a built-in name or a file"
+    )
+    sensor: tuple[str, str] = setting(
+        ("adacd-sensor", "adacd-sensor"), meaning="device profile: a built-in name or a file"
+    )
+    drive_node: tuple[int, int] = setting((1, 2), low=1, high=126, meaning="CANopen node ids; the host is 127")
+    sensor_node: tuple[int, int] = setting((3, 4), low=1, high=126, meaning="CANopen node ids; the host is 127")
+    contract: str = setting("arm", meaning="a DBC in dbc/ by name, or a file; empty: composed from the profiles")
+    boot_timeout_s: float = setting(
+        2.0, unit="s", low=0.1, high=60.0, meaning="longest wait for the nodes to boot after a reset of communication"
+    )
+    start: str = setting("sensors_first", choices=("sensors_first", "all"), meaning="order of the NMT start commands")
+    quick_stop_option: int | None = setting(None, low=0, high=8, meaning="0x605A of the drives; unset: the profile's")
+    fault_reaction_option: int | None = setting(
+        None, low=0, high=4, meaning="0x605E of the drives; unset: the profile's"
+    )
+    bitrate: int = setting(1_000_000, unit="bit/s", low=10_000, high=1_000_000, meaning="of a composed contract")
+    data_bitrate: int = setting(
+        5_000_000, unit="bit/s", low=0, high=8_000_000, meaning="CAN FD data phase of a composed contract; 0: classic"
+    )
+
+    def __post_init__(self) -> None:
+        nodes = (*self.drive_node, *self.sensor_node)
+        if len(set(nodes)) != len(nodes):
+            raise ValueError(f"node ids {', '.join(map(str, nodes))} of drives and sensors must differ")
+
+
+@dataclass(frozen=True)
 class FilterSettings:
     """Eq. (16): F(s) = b / (s + a)."""
 
@@ -335,6 +367,7 @@ class Settings:
     name: str = setting("", meaning="name of the configuration")
     arm: ArmSettings = setting(ArmSettings, meaning="the arm")
     bus: BusSettings = setting(BusSettings, meaning="timing on the bus")
+    devices: DevicesSettings = setting(DevicesSettings, meaning="drives and sensors")
     filter: FilterSettings = setting(FilterSettings, meaning="torque filter")
     estimator: EstimatorSettings = setting(EstimatorSettings, meaning="adaptation law")
     termination: TerminationSettings = setting(TerminationSettings, meaning="end of adaptation")
@@ -424,7 +457,7 @@ def _load_table(name_or_file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]
     path = find_toml("configuration", name_or_file, _builtin_folder())
     table = read_toml(path)
     table.setdefault("name", path.stem)
-    if name_or_file in builtin_names():
+    if "extends" not in table and name_or_file in builtin_names():
         return table
     base = _load_table(str(table.pop("extends", "paper")), (*seen, name_or_file))
     return merge(base, table)

@@ -3,16 +3,22 @@
 The only place of sign, zero offset and torque ratio. Every value carries its age in cycles.
 """
 
+import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from adacd_hil.config import Settings
-from adacd_hil.device.drive import Cia402State, Drive
+from adacd_hil.device.drive import Cia402State, Drive, option_codes, torque_limit_permille
+from adacd_hil.device.emergency import name_error
+from adacd_hil.device.heartbeat import PATIENCE_PERIODS
+from adacd_hil.device.placement import Device, place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.e2e import E2eStatus
 
 SYNC_OVERFLOW = 240
 """0x1019: the SYNC counter runs 1…240."""
@@ -20,13 +26,33 @@ SYNC_OVERFLOW = 240
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
 
 
+class SignalAge(NamedTuple):
+    """How old the value of some signals of one device is, in cycles; `limit`: the oldest that is usable."""
+
+    device: str
+    signals: str
+    age: int
+    limit: int
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it is too old."""
+        return self.age > self.limit
+
+
 class Arm:
     """Both joints on one bus. Per cycle: `synchronise`, `accept` each frame, `state`, `write`."""
 
     def __init__(self, settings: Settings, codec: Codec, bus: Bus) -> None:
+        """Place the devices.
+
+        Raises ConfigError when a device profile can't be used, CodecError when the contract lacks a signal.
+        """
         period_s = settings.bus.period_s
-        self.drives = tuple(Drive(codec, joint, period_s) for joint in range(1, JOINTS + 1))
-        self.sensors = tuple(TorqueSensor(codec, joint) for joint in range(1, JOINTS + 1))
+        devices = place_devices(settings)
+        self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
+        self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
+        self._devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
         self._bus = bus
         self._sync_id = codec.message("Sync").can_id
         self._sign = settings.arm.sign
@@ -34,6 +60,8 @@ class Arm:
         self._permille_per_Nm = tuple(
             sign * 1000.0 / rated for sign, rated in zip(settings.arm.sign, settings.arm.rated_torque_Nm, strict=True)
         )
+        self._max_age = settings.bus.max_age_cycles
+        self._max_status_age = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
         self._handlers = self._build_handlers()
         self._cycle = -1
         self._t_ns = 0
@@ -47,8 +75,10 @@ class Arm:
         for joint, (drive, sensor) in enumerate(zip(self.drives, self.sensors, strict=True)):
             handlers[drive.feedback_message.can_id] = (_at_cycle(self, drive.accept_feedback), 1 << joint)
             handlers[sensor.torque_message.can_id] = (_at_cycle(self, sensor.accept_torque), 4 << joint)
-            handlers[drive.status_message.can_id] = (_without_cycle(drive.accept_status), 0)
-            handlers[sensor.status_message.can_id] = (_without_cycle(sensor.accept_status), 0)
+            if drive.status_message is not None:
+                handlers[drive.status_message.can_id] = (_drive_status(self, drive), 0)
+            if sensor.status_message is not None:
+                handlers[sensor.status_message.can_id] = (_without_cycle(sensor.accept_status), 0)
         return handlers
 
     @property
@@ -58,12 +88,20 @@ class Arm:
 
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
         """Begin a cycle: every device samples on this SYNC, every drive takes its last command. Raises BusError."""
+        if self._cycle >= 0 and self._seen != _COMPLETE:
+            self._miss()
         self._cycle = cycle
         self._t_ns = t_ns
         self._periods = periods
         self._received = 0
         self._seen = 0
         self._bus.send(self._sync_id, bytes((1 + cycle % SYNC_OVERFLOW,)))
+
+    def _miss(self) -> None:
+        """Let every device note that its frame of the cycle that ends now did not come."""
+        for bit, device in enumerate(self._devices):
+            if not self._seen & (1 << bit):
+                device.miss()
 
     def accept(self, frame: Frame) -> bool:
         """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing."""
@@ -124,7 +162,24 @@ class Arm:
             return FaultReason.DRIVE
         if any(sensor.status & SensorStatus.NOT_VALID for sensor in self.sensors):
             return FaultReason.SENSOR
+        if is_enabled and any(
+            self._cycle - drive.status_cycle > limit
+            for drive, limit in zip(self.drives, self._max_status_age, strict=True)
+        ):
+            return FaultReason.DATA_AGE
         return FaultReason.NONE
+
+    def ages(self) -> list[SignalAge]:
+        """Return the age of every signal that the arm is run by, against its limit."""
+        cycle = self._cycle
+        ages = []
+        for drive, status_limit in zip(self.drives, self._max_status_age, strict=True):
+            ages.append(SignalAge(drive.name, "position, velocity", cycle - drive.sample_cycle, self._max_age))
+            if drive.has_status_frame and not math.isinf(status_limit):
+                ages.append(SignalAge(drive.name, "statusword", cycle - drive.status_cycle, int(status_limit)))
+        for sensor in self.sensors:
+            ages.append(SignalAge(sensor.name, "torque", cycle - sensor.sample_cycle, self._max_age))
+        return ages
 
     def write(self, command: ArmCommand) -> None:
         """Send the commands of this cycle; they act at the next SYNC. Raises BusError."""
@@ -134,25 +189,87 @@ class Arm:
 
     def describe_checks(self) -> list[str]:
         """Say how many cyclic frames of each device passed and failed their checks, one line each."""
-        drives = [f"{drive.name}: unprotected, {drive.implausible_frames} implausible" for drive in self.drives]
-        sensors = [
-            f"{sensor.name}: " + ", ".join(f"{count} {status.name}" for status, count in sensor.end_to_end.tally())
-            for sensor in self.sensors
-        ]
-        return drives + sensors
+        return [_describe_checks(device) for device in self._devices]
 
     def describe_faults(self) -> list[str]:
-        """Say what is wrong with each device, one line each; empty when nothing is."""
+        """Say what is wrong with each device, one line each; empty when nothing is.
+
+        A drive's fault with the name of its error, a sensor's status, and signals that are older than their limit.
+        """
         lines = []
         for drive in self.drives:
             if drive.state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE) or drive.error_code:
-                lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}")
-        lines.extend(f"{sensor.name}: status 0x{int(sensor.status):02X}" for sensor in self.sensors if sensor.status)
+                name = f": {name_error(drive.error_code)}" if drive.error_code else ""
+                lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}{name}")
+            elif self._was_enabled and not drive.is_enabled:
+                lines.append(
+                    f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"
+                )
+        for sensor in self.sensors:
+            if sensor.status:
+                lines.append(f"{sensor.name}: status 0x{int(sensor.status):02X}: {_describe_status(sensor.status)}")
+        lines.extend(
+            f"{age.device}: {age.signals} {age.age} cycles old, {age.limit} allowed"
+            for age in self.ages()
+            if age.is_over
+        )
         return lines
+
+
+def _make_drive(settings: Settings, codec: Codec, device: Device) -> Drive:
+    quick_stop_option, _ = option_codes(settings, device.settings)
+    return Drive(
+        codec,
+        device.joint + 1,
+        settings.bus.period_s,
+        quick_stop_option,
+        torque_limit_permille(settings, device.joint),
+        device.settings.plausibility.position_jump_rad,
+    )
+
+
+def _make_sensor(codec: Codec, device: Device, period_s: float) -> TorqueSensor:
+    bounds = device.settings.plausibility
+    return TorqueSensor(codec, device.joint + 1, period_s, bounds.torque_rate_Nm_s, bounds.torque_range_Nm)
+
+
+def _status_age_limit(device: Device, period_s: float) -> float:
+    """Return how many cycles old a drive's status may be: 2.5 of its periods; infinite where it has no period."""
+    status = device.pdo("Status")
+    if status is None or not status.event_timer_ms:
+        return math.inf
+    return math.ceil(PATIENCE_PERIODS * status.event_timer_ms * 1e-3 / period_s)
+
+
+def _describe_checks(device: Drive | TorqueSensor) -> str:
+    tally = device.end_to_end.tally()
+    if device.is_protected:
+        return f"{device.name}: " + ", ".join(f"{count} {status.name}" for status, count in tally)
+    missing = dict(tally)[E2eStatus.NO_NEW_DATA]
+    return (
+        f"{device.name}: unprotected, {device.implausible_frames} implausible, {missing} {E2eStatus.NO_NEW_DATA.name}"
+    )
+
+
+def _describe_status(status: SensorStatus) -> str:
+    words = (
+        (SensorStatus.POSITIVE_OVERLOAD, "positive overload"),
+        (SensorStatus.NEGATIVE_OVERLOAD, "negative overload"),
+        (SensorStatus.NOT_VALID, "not valid"),
+    )
+    return ", ".join(text for bit, text in words if status & bit)
 
 
 def _at_cycle(arm: Arm, accept: Callable[[bytes, int], bool]) -> Callable[[bytes], bool]:
     return lambda data: accept(data, arm.cycle)
+
+
+def _drive_status(arm: Arm, drive: Drive) -> Callable[[bytes], bool]:
+    def take(data: bytes) -> bool:
+        drive.accept_status(data, arm.cycle)
+        return False
+
+    return take
 
 
 def _without_cycle(accept: Callable[[bytes], None]) -> Callable[[bytes], bool]:

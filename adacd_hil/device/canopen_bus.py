@@ -4,20 +4,22 @@ No threads: a request is sent, then the bus is read until its answer is in. What
 concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 """
 
+import configparser
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import canopen
 from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
+from adacd_hil.config import ConfigError
 from adacd_hil.wire.bus import Bus, Frame
 
 ANSWER_TIMEOUT_S = 0.5
-"""Longest silence while waiting for an answer. CiA 301 gives none; drives answer within 100 ms."""
+"""Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
 _SDO_ABORT = 0x80
 
@@ -28,6 +30,42 @@ logging.getLogger("canopen").propagate = False
 
 class DeviceError(RuntimeError):
     """A device is missing, not the expected one, or refuses its set-up; one line."""
+
+
+class Variable(NamedTuple):
+    """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size."""
+
+    name: str
+    bits: int
+    is_signed: bool
+    default: int | None
+
+
+def read_eds(path: Path, node_id: int) -> Any:
+    """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`. Raises ConfigError."""
+    try:
+        return canopen.import_od(str(path), node_id)
+    except (OSError, ValueError, KeyError, configparser.Error) as error:
+        raise ConfigError(f"EDS {path}: {' '.join(str(error).split())}") from None
+
+
+def find_variable(objects: Any, index: int, sub: int) -> Variable | None:
+    """Describe an object of an object dictionary, None when it isn't listed."""
+    entry = objects.get(index)
+    if entry is None:
+        return None
+    if not isinstance(entry, canopen.objectdictionary.ODVariable):
+        entry = entry.subindices.get(sub)
+    elif sub:
+        return None
+    if entry is None:
+        return None
+    parent = entry.parent
+    name = entry.name if entry.parent is objects or not sub else f"{parent.name}, {entry.name}"
+    default = entry.value if entry.value is not None else entry.default
+    is_number = entry.data_type in canopen.objectdictionary.NUMBER_TYPES
+    is_signed = entry.data_type in canopen.objectdictionary.SIGNED_TYPES
+    return Variable(name, len(entry) if is_number else 0, is_signed, default if isinstance(default, int) else None)
 
 
 class _Network(canopen.Network):
@@ -46,12 +84,17 @@ class CanopenBus:
 
     def __init__(self, bus: Bus) -> None:
         self.channel = bus.channel
+        self.bystander: Callable[[Frame], object] = lambda _: None
+        """Gets every frame that arrives while an answer is awaited, besides canopen."""
         self._bus = bus
         self._network = _Network(self._send)
 
-    def add_node(self, node_id: int, eds: Path | None, on_emergency: Callable[[EmcyError], None] | None = None) -> Any:
-        """Return canopen's node; without an EDS it has no objects, and SDO goes by index through `node.sdo.upload`."""
-        node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if eds is None else str(eds))  # type: ignore[no-untyped-call]
+    def add_node(self, node_id: int, objects: Any, on_emergency: Callable[[EmcyError], None] | None = None) -> Any:
+        """Return canopen's node with the objects of `read_eds`.
+
+        With None it has no objects, and SDO goes by index through `node.sdo.upload`.
+        """
+        node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if objects is None else objects)  # type: ignore[no-untyped-call]
         self._network.add_node(node)
         node.sdo.RESPONSE_TIMEOUT = 0.0005  # the answer is in the queue when `_send` returns, or never comes
         if on_emergency is not None:
@@ -69,14 +112,21 @@ class CanopenBus:
             self.pump(lambda frame: frame.can_id == can_id - 0x80, ANSWER_TIMEOUT_S)
 
     def pump(self, is_answer: Callable[[Frame], bool], timeout_s: float) -> bool:
-        """Read the bus until an answer is in; False after a silence of `timeout_s`."""
+        """Read the bus until an answer is in; False after a silence of `timeout_s`, or as much of other traffic."""
+        remaining_s = timeout_s
+        first_ns: int | None = None
         for _ in range(_MAX_UNRELATED_FRAMES):
-            frame = self._bus.receive(timeout_s)
+            frame = self._bus.receive(remaining_s)
             if frame is None:
                 return False
             self.accept(frame)
+            self.bystander(frame)
             if is_answer(frame):
                 return True
+            first_ns = frame.t_ns if first_ns is None else first_ns
+            remaining_s = timeout_s - (frame.t_ns - first_ns) * 1e-9
+            if remaining_s <= 0.0:
+                return False
         return False
 
     def accept(self, frame: Frame) -> None:

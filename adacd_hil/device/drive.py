@@ -4,11 +4,12 @@ Positions, velocities and torques are the device's own: sign and ratio belong to
 Source: CiA 402-2 / IEC 61800-7-201, clause 10.3 (state machine), clause 16 (cyclic synchronous torque).
 """
 
-from enum import IntEnum
+from enum import Enum, IntEnum
 from typing import NamedTuple
 
-from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.e2e import E2eSender
+from adacd_hil.config import Settings
+from adacd_hil.device.profile import ProfileSettings
+from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 
 MODE_CYCLIC_SYNCHRONOUS_TORQUE = 10
 
@@ -25,7 +26,7 @@ class Cia402State(IntEnum):
     READY_TO_SWITCH_ON = 2  # switch on
     SWITCHED_ON = 3  # enable operation
     OPERATION_ENABLED = 4  # disable operation, shutdown, disable voltage, quick stop
-    QUICK_STOP_ACTIVE = 5  # by itself at standstill, or disable voltage
+    QUICK_STOP_ACTIVE = 5  # by itself at standstill, or with 0x605A from 5 on, disable voltage
     FAULT_REACTION_ACTIVE = 6  # by itself, when the reaction is done
     FAULT = 7  # fault reset, rising edge, cause gone
 
@@ -37,8 +38,19 @@ class Controlword(IntEnum):
     QUICK_STOP = 0x0002
     SHUTDOWN = 0x0006
     SWITCH_ON = 0x0007
+    DISABLE_OPERATION = 0x0007  # the same bits; the state tells which is meant
     ENABLE_OPERATION = 0x000F
-    FAULT_RESET = 0x0080
+    FAULT_RESET = 0x0080  # the rising edge of bit 7
+
+
+class Goal(Enum):
+    """Where the host wants a drive to be."""
+
+    OPERATION_ENABLED = "operation enabled"
+    SWITCHED_ON = "switched on"
+    READY_TO_SWITCH_ON = "ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    QUICK_STOP_ACTIVE = "quick stop active"
 
 
 _STATUSWORD = (  # mask, value: IEC 61800-7-201 table 30
@@ -61,15 +73,97 @@ class Transition(NamedTuple):
     target: Cia402State
 
 
+_S, _C = Cia402State, Controlword
+TRANSITIONS: dict[tuple[Cia402State, Controlword], Transition] = {
+    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): Transition(2, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): Transition(3, _C.SWITCH_ON, _S.SWITCHED_ON),
+    # With all bits of transition 4 set the drive does 3, then 4 by itself.
+    (_S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION): Transition(3, _C.ENABLE_OPERATION, _S.SWITCHED_ON),
+    (_S.SWITCHED_ON, _C.ENABLE_OPERATION): Transition(4, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+    (_S.OPERATION_ENABLED, _C.DISABLE_OPERATION): Transition(5, _C.DISABLE_OPERATION, _S.SWITCHED_ON),
+    (_S.SWITCHED_ON, _C.SHUTDOWN): Transition(6, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): Transition(7, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): Transition(7, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.OPERATION_ENABLED, _C.SHUTDOWN): Transition(8, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): Transition(9, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.SWITCHED_ON, _C.QUICK_STOP): Transition(10, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): Transition(10, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.OPERATION_ENABLED, _C.QUICK_STOP): Transition(11, _C.QUICK_STOP, _S.QUICK_STOP_ACTIVE),
+    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): Transition(12, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.FAULT, _C.FAULT_RESET): Transition(15, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
+    # With 0x605A from 5 on; never sent by us: torque would be back at once.
+    (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): Transition(16, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+}
+"""What each command does in each state, where it does anything; by the drive itself: 0, 1, 12, 13, 14.
+
+IEC 61800-7-201, figure of the power drive system finite state automaton and its table of transitions.
+"""
+
 TOWARD_ENABLED: dict[Cia402State, Transition] = {
-    Cia402State.SWITCH_ON_DISABLED: Transition(2, Controlword.SHUTDOWN, Cia402State.READY_TO_SWITCH_ON),
-    Cia402State.READY_TO_SWITCH_ON: Transition(3, Controlword.SWITCH_ON, Cia402State.SWITCHED_ON),
-    Cia402State.SWITCHED_ON: Transition(4, Controlword.ENABLE_OPERATION, Cia402State.OPERATION_ENABLED),
-    Cia402State.FAULT: Transition(15, Controlword.FAULT_RESET, Cia402State.SWITCH_ON_DISABLED),
+    state: TRANSITIONS[state, command]
+    for state, command in (
+        (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN),
+        (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON),
+        (_S.SWITCHED_ON, _C.ENABLE_OPERATION),
+        (_S.FAULT, _C.FAULT_RESET),
+    )
 }
 """The way up. States that are not listed are left by the drive itself."""
 
-_HOLD = {Cia402State.OPERATION_ENABLED: Controlword.ENABLE_OPERATION}
+_WAYS: dict[Goal, dict[Cia402State, Controlword]] = {
+    Goal.OPERATION_ENABLED: {
+        _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
+        _S.READY_TO_SWITCH_ON: _C.SWITCH_ON,
+        _S.SWITCHED_ON: _C.ENABLE_OPERATION,
+        _S.OPERATION_ENABLED: _C.ENABLE_OPERATION,
+    },
+    Goal.SWITCHED_ON: {
+        _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
+        _S.READY_TO_SWITCH_ON: _C.SWITCH_ON,
+        _S.SWITCHED_ON: _C.SWITCH_ON,
+        _S.OPERATION_ENABLED: _C.DISABLE_OPERATION,
+    },
+    Goal.READY_TO_SWITCH_ON: {
+        _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
+        _S.READY_TO_SWITCH_ON: _C.SHUTDOWN,
+        _S.SWITCHED_ON: _C.SHUTDOWN,
+        _S.OPERATION_ENABLED: _C.SHUTDOWN,
+    },
+}
+"""The next command by goal and state. States that are not listed get disable voltage; FAULT and QUICK_STOP_ACTIVE have
+rules of their own."""
+
+_FIRST_STAYING_OPTION = 5
+"""0x605A: from 5 on the drive stays in QUICK_STOP_ACTIVE; below it goes on to SWITCH_ON_DISABLED at standstill."""
+_TARGET_REACHED = 1 << 10  # of the statusword; in QUICK_STOP_ACTIVE with such an option: the drive stands still
+_STANDSTILL_RAD_S = 0.02
+"""Speed of the joint that counts as standing still, for drives that leave bit 10 alone."""
+
+_STATUS_SIGNALS = (
+    "statusword",
+    "mode_display",
+    "torque_actual",
+    "error_code",
+    "error_register",
+    "torque_demand",
+    "acted_commands",
+)
+
+
+def option_codes(settings: Settings, profile: ProfileSettings) -> tuple[int | None, int | None]:
+    """Return 0x605A and 0x605E: the configuration's, else the profile's, None where neither says."""
+    chosen = settings.devices
+    quick_stop, fault_reaction = chosen.quick_stop_option, chosen.fault_reaction_option
+    return (
+        profile.quick_stop_option if quick_stop is None else quick_stop,
+        profile.fault_reaction_option if fault_reaction is None else fault_reaction,
+    )
+
+
+def torque_limit_permille(settings: Settings, joint: int) -> int:
+    """Return the largest commanded torque of joint 0 or 1 as per mille of rated torque, for 0x6072."""
+    arm = settings.arm
+    return min(0xFFFF, round(1000 * arm.torque_limit_Nm[joint] / arm.rated_torque_Nm[joint]))
 
 
 def decode_statusword(statusword: int) -> Cia402State:
@@ -81,57 +175,125 @@ def decode_statusword(statusword: int) -> Cia402State:
 
 
 class Drive:
-    """One drive of the arm, joint 1 or 2."""
+    """One drive of the arm, joint 1 or 2. Its status may be in a frame of its own or in the feedback."""
 
-    def __init__(self, codec: Codec, joint: int, period_s: float) -> None:
+    def __init__(
+        self,
+        codec: Codec,
+        joint: int,
+        period_s: float,
+        quick_stop_option: int | None = None,
+        max_torque_permille: int = 1000,
+        position_jump_rad: float = IMPLAUSIBLE_JUMP_RAD,
+    ) -> None:
+        """`quick_stop_option`: 0x605A, None when unknown. `max_torque_permille`: for commands that carry 0x6072.
+
+        Raises CodecError when the contract lacks a message or signal.
+        """
         name = f"Drive{joint}"
         self.name = name
         self.node_id = codec.node_id(f"{name}Feedback")
         self.feedback_message = codec.message(f"{name}Feedback")
-        self.status_message = codec.message(f"{name}Status")
-        self._command_message = codec.message(f"{name}Command")
-        self.command_id = self._command_message.can_id
-        self._sender: E2eSender = self._command_message.sender()
+        self.status_message = codec.messages.get(f"{name}Status")
+        self.command_message = codec.message(f"{name}Command")
+        self.command_id = self.command_message.can_id
+        self.end_to_end = self.feedback_message.receiver()
+        self._sender = self.command_message.sender()
         self._period_s = period_s
+        self._quick_stop_option = quick_stop_option
+        self._position_jump_rad = position_jump_rad
+        self._position_at = find_signal(self.feedback_message, "position")
+        self._velocity_at = find_signal(self.feedback_message, "velocity")
+        self._feedback_status = _status_places(self.feedback_message)
+        self._status_places = [] if self.status_message is None else _status_places(self.status_message)
+        self._status_receiver = None if self.status_message is None else self.status_message.receiver()
+        self.is_protected = self.feedback_message.header_bytes > 0
+        """Whether the feedback carries an end-to-end header; else it is checked by plausibility."""
+        self._command, self._controlword_at, self._torque_at = _command_template(
+            self.command_message, max_torque_permille
+        )
+        carried = {name for name, _ in (*self._feedback_status, *self._status_places)}
+        if "statusword" not in carried:
+            raise CodecError(f"{name}: no message carries signal statusword")
         self._received_position_rad: float | None = None
         self._received_cycle = 0
-        self._fault_reset = False
+        self._last_controlword = int(Controlword.DISABLE_VOLTAGE)
         self.position_rad = 0.0
         self.velocity_rad_s = 0.0
         self.sample_cycle = -1
         """Cycle of the position and velocity in use; -1 before the first."""
+        self.status_cycle = -1
+        """Cycle in which the status in use came; -1 before the first."""
         self.implausible_frames = 0
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
-        self.mode = 0
+        self.statusword = 0
+        # Where no frame shows the mode, the master has compared 0x6061 before the start.
+        self.mode = 0 if "mode_display" in carried else MODE_CYCLIC_SYNCHRONOUS_TORQUE
         self.torque_actual_permille = 0
+        self.torque_demand_permille = 0
         self.error_code = 0
+        self.error_register = 0
+        self.acted_commands = 0
+
+    @property
+    def has_status_frame(self) -> bool:
+        """Whether the status comes in a frame of its own."""
+        return not self._feedback_status
 
     def accept_feedback(self, data: bytes, cycle: int) -> bool:
-        """Take one feedback frame of `cycle`; False when it is implausible and changes nothing."""
+        """Take one feedback frame of `cycle`; False when a check fails and it changes nothing."""
         if len(data) != self.feedback_message.length:
             self.implausible_frames += 1
             return False
-        position, velocity = self.feedback_message.decode_values(data)
+        if self.is_protected:
+            if not self.end_to_end.check(data).is_valid:
+                return False
+            values = self.feedback_message.decode_values(data)
+            position = values[self._position_at]
+        else:
+            values = self.feedback_message.decode_values(data)
+            position = values[self._position_at]
+            if not self._is_plausible(position, values[self._velocity_at], cycle):
+                return False
+        self.position_rad = position
+        self.velocity_rad_s = values[self._velocity_at]
+        self.sample_cycle = cycle
+        if self._feedback_status:
+            self._take_status(values, self._feedback_status, cycle)
+        return True
+
+    def _is_plausible(self, position: float, velocity: float, cycle: int) -> bool:
         last, self._received_position_rad = self._received_position_rad, position
         elapsed_s = (cycle - self._received_cycle) * self._period_s
         self._received_cycle = cycle
-        if last is not None and not abs(position - last - velocity * elapsed_s) <= IMPLAUSIBLE_JUMP_RAD:
+        if last is not None and not abs(position - last - velocity * elapsed_s) <= self._position_jump_rad:
             self.implausible_frames += 1
             return False
-        self.position_rad = position
-        self.velocity_rad_s = velocity
-        self.sample_cycle = cycle
         return True
 
-    def accept_status(self, data: bytes) -> None:
-        """Take one status frame; a frame of the wrong length changes nothing."""
-        if len(data) != self.status_message.length:
+    def miss(self) -> None:
+        """Note a cycle in which no feedback came."""
+        self.end_to_end.miss()
+
+    def accept_status(self, data: bytes, cycle: int = -1) -> None:
+        """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
+        message, receiver = self.status_message, self._status_receiver
+        if message is None or receiver is None or len(data) != message.length:
             return
-        statusword, mode, torque, error_code = self.status_message.decode_values(data)
-        self.state = decode_statusword(int(statusword))
-        self.mode = int(mode)
-        self.torque_actual_permille = int(torque)
-        self.error_code = int(error_code)
+        if receiver.check(data).is_valid:
+            self._take_status(message.decode_values(data), self._status_places, cycle)
+
+    def _take_status(self, values: tuple[float, ...], places: list[tuple[str, int]], cycle: int) -> None:
+        found = {name: int(values[at]) for name, at in places}
+        self.status_cycle = cycle
+        self.statusword = found.get("statusword", self.statusword)
+        self.state = decode_statusword(self.statusword)
+        self.mode = found.get("mode_display", self.mode)
+        self.torque_actual_permille = found.get("torque_actual", self.torque_actual_permille)
+        self.torque_demand_permille = found.get("torque_demand", self.torque_demand_permille)
+        self.error_code = found.get("error_code", self.error_code)
+        self.error_register = found.get("error_register", self.error_register)
+        self.acted_commands = found.get("acted_commands", self.acted_commands)
 
     @property
     def is_enabled(self) -> bool:
@@ -140,19 +302,65 @@ class Drive:
 
     def command(self, torque_permille: int, enable: bool, quick_stop: bool) -> bytes:
         """Encode one command frame; torque is zero unless the drive is wanted and enabled."""
-        controlword = self._next_controlword(enable, quick_stop)
-        if not (enable and self.is_enabled):
-            torque_permille = 0
-        return self._sender.protect(self._command_message.encode_raw(controlword, torque_permille))
-
-    def _next_controlword(self, enable: bool, quick_stop: bool) -> int:
         if quick_stop:
+            return self.lead(Goal.QUICK_STOP_ACTIVE)
+        return self.lead(Goal.OPERATION_ENABLED if enable else Goal.SWITCH_ON_DISABLED, torque_permille)
+
+    def lead(self, goal: Goal, torque_permille: int = 0) -> bytes:
+        """Encode the command frame that brings the drive one state nearer to `goal`, or holds it there.
+
+        Torque is zero unless the goal is OPERATION_ENABLED and the drive is there, in cyclic synchronous torque.
+        """
+        controlword = self._next_controlword(goal)
+        self._last_controlword = controlword
+        raw = self._command
+        raw[self._controlword_at] = controlword
+        raw[self._torque_at] = torque_permille if goal is Goal.OPERATION_ENABLED and self.is_enabled else 0
+        return self._sender.protect(self.command_message.encode_raw(*raw))
+
+    def _next_controlword(self, goal: Goal) -> int:
+        if goal is Goal.QUICK_STOP_ACTIVE:
             return Controlword.QUICK_STOP
-        if not enable:
+        if goal is Goal.SWITCH_ON_DISABLED:
             return Controlword.DISABLE_VOLTAGE
         if self.state is Cia402State.FAULT:  # the edge counts, so low and high alternate
-            self._fault_reset = not self._fault_reset
-            return Controlword.FAULT_RESET if self._fault_reset else Controlword.DISABLE_VOLTAGE
-        if self.state in TOWARD_ENABLED:
-            return TOWARD_ENABLED[self.state].command
-        return _HOLD.get(self.state, Controlword.DISABLE_VOLTAGE)
+            is_high = self._last_controlword & Controlword.FAULT_RESET
+            return Controlword.DISABLE_VOLTAGE if is_high else Controlword.FAULT_RESET
+        if self.state is Cia402State.QUICK_STOP_ACTIVE:
+            return Controlword.QUICK_STOP if self._is_quick_stopping else Controlword.DISABLE_VOLTAGE
+        return _WAYS[goal].get(self.state, Controlword.DISABLE_VOLTAGE)
+
+    @property
+    def _is_quick_stopping(self) -> bool:
+        """Whether the drive, in QUICK_STOP_ACTIVE, must be left to brake: disable voltage would let it coast."""
+        option = self._quick_stop_option
+        if option is None:
+            return False
+        if option < _FIRST_STAYING_OPTION:
+            return True  # it leaves by itself
+        is_halted = bool(self.statusword & _TARGET_REACHED) or abs(self.velocity_rad_s) <= _STANDSTILL_RAD_S
+        return not is_halted
+
+
+def find_signal(message: MessageCodec, name: str) -> int:
+    """Return the place of a signal among a message's values. Raises CodecError when it isn't there."""
+    for place, signal in enumerate(message.values):
+        if signal.name == name:
+            return place
+    raise CodecError(f"{message.name} has no signal {name}")
+
+
+def _status_places(message: MessageCodec) -> list[tuple[str, int]]:
+    places = {signal.name: place for place, signal in enumerate(message.values)}
+    return [(name, places[name]) for name in _STATUS_SIGNALS if name in places]
+
+
+def _command_template(message: MessageCodec, max_torque_permille: int) -> tuple[list[int], int, int]:
+    """Return the raw values of a command with the constant ones filled in, and where controlword and torque are."""
+    constants = {"controlword": 0, "target_torque": 0, "torque_offset": 0, "max_torque": max_torque_permille}
+    template = []
+    for signal in message.values:
+        if signal.name not in constants:
+            raise CodecError(f"{message.name}: signal {signal.name} is none that the host can fill")
+        template.append(constants[signal.name])
+    return template, find_signal(message, "controlword"), find_signal(message, "target_torque")

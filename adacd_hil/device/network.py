@@ -1,26 +1,36 @@
-"""The host as CANopen master of one arm: NMT, identity and set-up over SDO, heartbeat, EMCY.
+"""The host as CANopen master of one arm: boot, identity and set-up over SDO, NMT, heartbeats both ways, EMCY.
 
-Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects).
+Boot: reset of communication, wait for every boot-up, identity, SYNC, heartbeats, PDOs, application, start.
+Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects); CiA 302-2 (boot-up of slaves).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from adacd_hil.config import Settings
 from adacd_hil.device.arm import SYNC_OVERFLOW
-from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
-from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE
-from adacd_hil.records import JOINTS, Event
+from adacd_hil.device.canopen_bus import CanopenBus, DeviceError
+from adacd_hil.device.drive_setup import command_deadline_ms, set_up_drive
+from adacd_hil.device.emergency import describe_emergency
+from adacd_hil.device.heartbeat import OPERATIONAL, PATIENCE_PERIODS, HeartbeatWatch
+from adacd_hil.device.pdo_mapping import set_up_pdos
+from adacd_hil.device.placement import place_devices
+from adacd_hil.device.profile import EMCY_INHIBIT_100US
+from adacd_hil.device.sensor_setup import set_up_sensor
+from adacd_hil.device.slave import Slave
+from adacd_hil.records import Event
 from adacd_hil.wire.bus import Bus, Frame
-from adacd_hil.wire.codec import Codec, contract_folder
+from adacd_hil.wire.codec import Codec
 
-BOOT_TIMEOUT_S = 2.0
-"""Longest silence while waiting for the nodes to boot after a reset of communication."""
 _START, _ENTER_PRE_OPERATIONAL, _RESET_COMMUNICATION = 0x01, 0x80, 0x82
-_STATE_OPERATIONAL = 5
+_SYNC_ID = 0x080
+_IDENTIFIER_MASK = 0x7FF
+_PROFILE_NUMBER_MASK = 0xFFFF  # of 0x1000
+_AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
 
 
 class Identity(NamedTuple):
-    """Object 0x1018 of one node, with its name in the DBC."""
+    """Object 0x1018 of one node, with its name in the DBC; 0 for what the EDS doesn't list."""
 
     name: str
     node_id: int
@@ -34,40 +44,59 @@ class Master:
     """The CANopen master of one arm."""
 
     def __init__(self, settings: Settings, codec: Codec, bus: Bus) -> None:
+        """Load the profiles. Raises ConfigError when one can't be used."""
         self._settings = settings
         self._codec = codec
         self._bus = bus
         self._canopen = CanopenBus(bus)
         self._events: list[Event] = []
+        self._emergencies: dict[str, str] = {}
         self._heartbeat_id = codec.message("HostHeartbeat").can_id
+        self.slaves: list[Slave] = []
         self.nodes: dict[str, Any] = {}
-        for kind, eds in (("Drive", "drive.eds"), ("Sensor", "torque_sensor.eds")):
-            for joint in range(1, JOINTS + 1):
-                name = f"{kind}{joint}"
-                self.nodes[name] = self._add_node(name, codec.node_id(f"{name}Heartbeat"), eds)
+        for device in place_devices(settings):
+            node = self._canopen.add_node(device.node_id, device.objects, self._emergency_listener(device.name))
+            self.nodes[device.name] = node
+            self.slaves.append(Slave(device, node))
+        watched = [(slave.name, slave.node_id) for slave in self.slaves if slave.has(0x1017)]
+        self._heartbeats = HeartbeatWatch(watched, settings.bus.heartbeat_ms, self._events.append)
+        self._canopen.bystander = self._heartbeats.accept
 
-    def _add_node(self, name: str, node_id: int, eds: str) -> Any:
-        return self._canopen.add_node(node_id, contract_folder() / eds, lambda error: self._on_emergency(name, error))
+    def _emergency_listener(self, name: str) -> Callable[[Any], None]:
+        return lambda error: self._on_emergency(name, error)
 
     def _on_emergency(self, name: str, error: Any) -> None:
-        if error.code:
-            description = error.get_desc() or "unknown"
-            self._events.append(Event("warning", name, f"EMCY 0x{error.code:04X}: {description}"))
+        slave = next(slave for slave in self.slaves if slave.name == name)
+        text = describe_emergency(error.code, bytes(error.data), slave.device.can("watchdog_in_emcy"))
+        if error.code >> 8:
+            self._emergencies[name] = text
         else:
-            self._events.append(Event("info", name, "EMCY 0x0000: error reset"))
+            self._emergencies.pop(name, None)
+        self._events.append(Event("warning" if error.code >> 8 else "info", name, text))
 
     def accept(self, frame: Frame) -> None:
         """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY."""
+        self._heartbeats.accept(frame)
         self._canopen.accept(frame)
 
     def take_events(self) -> list[Event]:
         """Return what the devices reported since the last call."""
-        events, self._events = self._events, []
+        events = self._events.copy()
+        self._events.clear()
         return events
 
+    def describe_emergencies(self) -> list[str]:
+        """Return the last error that each device reported and has not reset since, one line each."""
+        return [f"{name}: {text}" for name, text in self._emergencies.items()]
+
     def reset(self) -> None:
-        """Reset the communication of all nodes and wait until each has booted. Raises DeviceError."""
-        waiting = {node.id: name for name, node in self.nodes.items()}
+        """Reset the communication of all nodes and wait until each has booted. Raises DeviceError, BusError."""
+        while self._bus.receive(0.0) is not None:  # from before the reset; a full queue has no room for what follows
+            pass
+        timeout_s = self._settings.devices.boot_timeout_s
+        waiting = {slave.node_id: slave.name for slave in self.slaves}
+        self._heartbeats.stop()
+        self._emergencies.clear()
         self._canopen.command(_RESET_COMMUNICATION)
 
         def is_last_boot(frame: Frame) -> bool:
@@ -75,76 +104,143 @@ class Master:
                 waiting.pop(frame.can_id & 0x7F, None)
             return not waiting
 
-        if not self._canopen.pump(is_last_boot, BOOT_TIMEOUT_S):
+        if not self._canopen.pump(is_last_boot, timeout_s):
             missing = ", ".join(f"{name} (node {node_id})" for node_id, name in waiting.items())
-            raise DeviceError(f"no boot-up from {missing} on {self._bus.channel} within {BOOT_TIMEOUT_S:g} s")
+            raise DeviceError(f"no boot-up from {missing} on {self._bus.channel} within {timeout_s:g} s")
 
     def identify(self) -> list[Identity]:
-        """Read who is there and compare it with EDS and DBC. Raises DeviceError."""
-        identities = []
-        for name, node in self.nodes.items():
-            with explained(name, node.id, "identity"):
-                read = {index: node.sdo[0x1018][index].raw for index in (1, 2, 3, 4)}
-                expected = {index: node.object_dictionary[0x1018][index].default for index in (1, 2)}
-                version = node.sdo[0x2000][1].raw
-                digest = node.sdo[0x2000][2].raw
-            for index, what in ((1, "vendor"), (2, "product code")):
-                if read[index] != expected[index]:
-                    raise DeviceError(
-                        f"{name} (node {node.id}): {what} 0x{read[index]:X} is not the EDS's 0x{expected[index]:X}"
-                    )
-            if version != self._codec.wire_version:
-                raise DeviceError(
-                    f"{name} (node {node.id}): wire version {version} is not the DBC's {self._codec.wire_version}"
-                )
-            if digest != self._codec.layout_digest:
-                raise DeviceError(
-                    f"{name} (node {node.id}): layout digest 0x{digest:08X} is not the DBC's "
-                    f"0x{self._codec.layout_digest:08X}; host and device use different DBC files"
-                )
-            identities.append(Identity(name, node.id, *read.values()))
-        return identities
+        """Read who is there and compare it with EDS, profile and DBC. Raises DeviceError, BusError."""
+        return [self._identify(slave) for slave in self.slaves]
 
-    def configure(self) -> None:
-        """Write communication and application parameters, and read back what matters. Raises DeviceError."""
-        settings = self._settings
-        for name, node in self.nodes.items():
-            with explained(name, node.id, "set-up"):
-                node.sdo[0x1006].raw = settings.bus.period_us
-                node.sdo[0x1019].raw = SYNC_OVERFLOW
-                node.sdo[0x1017].raw = settings.bus.heartbeat_ms
-                self._compare(name, node, 0x1006, settings.bus.period_us, "SYNC period", "µs")
-        for joint in range(JOINTS):
-            self._configure_drive(f"Drive{joint + 1}", joint)
-
-    def _configure_drive(self, name: str, joint: int) -> None:
-        node = self.nodes[name]
-        arm = self._settings.arm
-        with explained(name, node.id, "set-up"):
-            node.sdo[0x6060].raw = MODE_CYCLIC_SYNCHRONOUS_TORQUE
-            self._compare(name, node, 0x6061, MODE_CYCLIC_SYNCHRONOUS_TORQUE, "mode of operation", "")
-            self._compare(name, node, 0x6076, round(arm.rated_torque_Nm[joint] * 1000), "rated torque", "mNm")
-            node.sdo[0x2200].raw = self._settings.bus.command_patience_cycles
-            node.sdo[0x6072].raw = min(0xFFFF, round(1000 * arm.torque_limit_Nm[joint] / arm.rated_torque_Nm[joint]))
+    def _identify(self, slave: Slave) -> Identity:
+        profile = slave.device.settings
+        by_contract = self._codec.node_id(f"{slave.name}Heartbeat")
+        if slave.node_id != by_contract:
+            slave.fail(f"node id {by_contract} by the DBC, {slave.node_id} by the configuration")
+        device_type = slave.read(0x1000)
+        read = {sub: slave.read(0x1018, sub) if slave.has(0x1018, sub) else 0 for sub in (1, 2, 3, 4)}
+        if profile.identity == "eds":
+            self._check_identity(slave, device_type, read)
+        if profile.serial and read[4] != profile.serial[slave.device.joint]:
+            slave.fail(f"serial number 0x1018:4 = {read[4]}, {profile.serial[slave.device.joint]} expected")
+        if profile.contract_object:
+            self._check_contract(slave)
+        return Identity(slave.name, slave.node_id, *read.values())
 
     @staticmethod
-    def _compare(name: str, node: Any, index: int, expected: int, quantity: str, unit: str) -> None:
-        found = node.sdo[index].raw
-        if found != expected:
-            raise DeviceError(
-                f"{name} (node {node.id}): {quantity} 0x{index:04X} = {found} {unit}".rstrip()
-                + f", {expected} {unit}".rstrip()
-                + " expected"
+    def _check_identity(slave: Slave, device_type: int, read: dict[int, int]) -> None:
+        expected_type = slave.default(0x1000)
+        if device_type & _PROFILE_NUMBER_MASK != expected_type & _PROFILE_NUMBER_MASK:
+            slave.fail(f"device type 0x1000 = 0x{device_type:08X}, 0x{expected_type:08X} expected")
+        for sub, what in ((1, "vendor"), (2, "product code")):
+            if read[sub] != slave.default(0x1018, sub):
+                slave.fail(f"{what} 0x{read[sub]:X} is not the EDS's 0x{slave.default(0x1018, sub):X}")
+        # CiA 301, 7.5.2.19: the high word stands for a behaviour on the bus, the low word for versions of it.
+        major, minor = divmod(slave.default(0x1018, 3), 1 << 16)
+        if (major or minor) and (read[3] >> 16 != major or read[3] & 0xFFFF < minor):
+            slave.fail(f"revision 0x{read[3]:X} is not of the EDS's 0x{slave.default(0x1018, 3):X}")
+
+    def _check_contract(self, slave: Slave) -> None:
+        version, digest = slave.read(0x2000, 1), slave.read(0x2000, 2)
+        if version != self._codec.wire_version:
+            slave.fail(f"wire version {version} is not the DBC's {self._codec.wire_version}")
+        if digest != self._codec.layout_digest:
+            slave.fail(
+                f"layout digest 0x{digest:08X} is not the DBC's 0x{self._codec.layout_digest:08X}; "
+                "host and device use different DBC files"
             )
 
+    def configure(self) -> None:
+        """Write communication and application parameters, and read back what matters. Raises DeviceError, BusError."""
+        for slave in self.slaves:
+            self._set_up_sync(slave)
+            self._set_up_heartbeats(slave)
+            self._set_up_emergencies(slave)
+            set_up_pdos(slave, command_deadline_ms(self._settings))
+            if slave.device.settings.kind == "drive":
+                set_up_drive(slave, self._settings, self._codec)
+            else:
+                status = set_up_sensor(slave, self._codec)
+                if status:
+                    self._events.append(Event("info", slave.name, status))
+            for extra in slave.device.settings.setup:
+                slave.write_checked(extra.name.index, extra.name.sub, extra.value)
+
+    def _set_up_sync(self, slave: Slave) -> None:
+        if slave.has(0x1005):
+            identifier = slave.read(0x1005) & _IDENTIFIER_MASK
+            if identifier != _SYNC_ID:
+                slave.fail(f"SYNC identifier 0x1005 = 0x{identifier:X}, 0x{_SYNC_ID:X} expected")
+        counts = slave.has(0x1019) and slave.device.can("sync_counter")
+        if counts and slave.read(0x1019) != SYNC_OVERFLOW:
+            if slave.has(0x1006):
+                slave.write(0x1006, 0, 0)  # CiA 301, 7.5.2.22: the overflow value can be changed at period 0 only
+            slave.write_checked(0x1019, 0, SYNC_OVERFLOW)
+        if slave.has(0x1006):
+            slave.write(0x1006, 0, self._settings.bus.period_us)
+            slave.expect(0x1006, 0, self._settings.bus.period_us, "SYNC period", "µs")
+
+    @staticmethod
+    def _set_up_emergencies(slave: Slave) -> None:
+        if slave.has(0x1015):
+            slave.write_checked(0x1015, 0, EMCY_INHIBIT_100US, "x 100 µs")
+
+    def _set_up_heartbeats(self, slave: Slave) -> None:
+        period_ms = self._settings.bus.heartbeat_ms
+        if slave.has(0x1017):
+            slave.write_checked(0x1017, 0, period_ms, "ms")
+        else:
+            self._events.append(Event("warning", slave.name, "sends no heartbeat (0x1017 is not in its EDS)"))
+        if slave.has(0x1016, 1) and slave.device.can("heartbeat_consumer"):
+            host = self._heartbeat_id & 0x7F
+            slave.write_checked(0x1016, 1, host << 16 | round(PATIENCE_PERIODS * period_ms))
+
     def start(self) -> None:
-        """Let all nodes exchange cyclic frames. Raises BusError."""
-        self._canopen.command(_START)
+        """Let all nodes exchange cyclic frames, the sensors first by default. Raises BusError."""
+        self._heartbeats.start()
+        if self._settings.devices.start == "all":
+            self._canopen.command(_START)
+            return
+        # False sorts first: a drive that starts finds its sensor sending.
+        for slave in sorted(self.slaves, key=lambda slave: slave.device.settings.kind == "drive"):
+            self._canopen.command(_START, slave.node_id)
 
     def stop(self) -> None:
         """Put all nodes back to pre-operational; drives drop out if they are still enabled. Raises BusError."""
+        self._heartbeats.stop()
         self._canopen.command(_ENTER_PRE_OPERATIONAL)
+
+    def watch(self, t_ns: int) -> list[str]:
+        """Name what is wrong with the nodes' heartbeats now, one line per node; empty when nothing is.
+
+        Between `start` and `stop` only: a node that is silent for 2.5 heartbeat periods, or that isn't OPERATIONAL.
+        """
+        return self._heartbeats.watch(t_ns)
 
     def send_heartbeat(self) -> None:
         """Say that the host lives, 0x700 + 127. Raises BusError."""
-        self._bus.send(self._heartbeat_id, bytes((_STATE_OPERATIONAL,)))
+        self._bus.send(self._heartbeat_id, bytes((OPERATIONAL,)))
+
+    def begin_autozero(self, joint: int, on_frame: Callable[[Frame], object] = lambda _: None) -> int:
+        """Tell the sensor of joint 0 or 1 to take its present torque for zero; return how many samples that takes.
+
+        `on_frame` gets the frames that arrive meanwhile, so that a running cycle misses none. Completion is seen by
+        `TorqueSensor.begin_zero`. Raises DeviceError when the sensor can't or refuses.
+        """
+        slave = next(s for s in self.slaves if s.device.settings.kind == "sensor" and s.device.joint == joint)
+        torque = slave.device.pdo("Torque")
+        signals = () if torque is None else torque.signals
+        channel = next((signal.name.sub for signal in signals if signal.signal == "torque"), 1)
+        if not slave.has(0x6125, channel) or not slave.device.can("autozero"):
+            slave.fail("has no auto-zero, 0x6125")
+
+        def on_both(frame: Frame) -> None:
+            self._heartbeats.accept(frame)
+            on_frame(frame)
+
+        self._canopen.bystander = on_both
+        try:
+            slave.write(0x6125, channel, _AUTOZERO_SIGNATURE)
+        finally:
+            self._canopen.bystander = self._heartbeats.accept
+        return slave.device.settings.autozero_samples

@@ -1,7 +1,13 @@
-"""One joint torque sensor as the host sees it: protected process value, status. Source: CiA 404, clause 7."""
+"""One joint torque sensor as the host sees it: process value, status, checks. Source: CiA 404, clause 7.
 
+A saturated sensor repeats its value and goes on counting: its torque is fresh and its status says overload. A silent
+one ages. Torque is the device's own, with its own zero: sign and tare belong to `adacd_hil.device.arm`.
+"""
+
+import math
 from enum import IntFlag
 
+from adacd_hil.device.drive import find_signal
 from adacd_hil.wire.codec import Codec
 
 
@@ -13,30 +19,130 @@ class SensorStatus(IntFlag):
     NEGATIVE_OVERLOAD = 4
 
 
+_STATUS_BITS = 0x07
+_OVERLOAD = SensorStatus.POSITIVE_OVERLOAD | SensorStatus.NEGATIVE_OVERLOAD
+_STATUS_IN_HEADER = {0: None, 2: (1, 4), 4: (3, 0)}
+"""Byte and shift of the sender's status, by the length of the end-to-end header: none, Profile 2, Profile 5."""
+
+
 class TorqueSensor:
     """The torque sensor of joint 1 or 2."""
 
-    def __init__(self, codec: Codec, joint: int) -> None:
+    def __init__(
+        self,
+        codec: Codec,
+        joint: int,
+        period_s: float = 0.001,
+        torque_rate_Nm_s: float = math.inf,
+        torque_range_Nm: float = 0.0,
+    ) -> None:
+        """`torque_rate_Nm_s` bounds the torque of unprotected frames; at `torque_range_Nm`, if not 0, is overload.
+
+        Raises CodecError when the contract lacks a message or signal.
+        """
         name = f"Sensor{joint}"
         self.name = name
         self.node_id = codec.node_id(f"{name}Torque")
         self.torque_message = codec.message(f"{name}Torque")
-        self.status_message = codec.message(f"{name}Status")
+        self.status_message = codec.messages.get(f"{name}Status")
         self.end_to_end = self.torque_message.receiver()
+        self._period_s = period_s
+        self._torque_rate_Nm_s = torque_rate_Nm_s
+        self._torque_range_Nm = torque_range_Nm
+        names = [signal.name for signal in self.torque_message.values]
+        self._torque_at = find_signal(self.torque_message, "torque")
+        self._gross_at = names.index("gross_torque") if "gross_torque" in names else None
+        self._status_at = names.index("status") if "status" in names else None
+        self._status_in_header = _STATUS_IN_HEADER[self.torque_message.header_bytes]
+        self._slow_status_at = None if self.status_message is None else find_signal(self.status_message, "status")
+        self._status_receiver = None if self.status_message is None else self.status_message.receiver()
+        self.is_protected = self.torque_message.header_bytes > 0
+        """Whether the torque carries an end-to-end header; else it is checked by plausibility."""
+        self._received_torque_Nm: float | None = None
+        self._received_cycle = 0
+        self._zero_left = 0
         self.torque_Nm = 0.0
+        """As the device gives it: its sign, its own auto-zero, not tared."""
+        self.gross_torque_Nm: float | None = None
+        """Before the device's auto-zero; None where the contract doesn't carry it."""
         self.sample_cycle = -1
         """Cycle of the torque in use; -1 before the first."""
+        self.implausible_frames = 0
         self.status = SensorStatus(0)
 
     def accept_torque(self, data: bytes, cycle: int) -> bool:
         """Take one torque frame of `cycle`; False when a check fails and it changes nothing."""
-        if len(data) != self.torque_message.length or not self.end_to_end.check(data).is_valid:
+        if len(data) != self.torque_message.length:
+            self.implausible_frames += 1
             return False
-        (self.torque_Nm,) = self.torque_message.decode_values(data)
+        if self.is_protected:
+            if not self.end_to_end.check(data).is_valid:
+                return False
+            values = self.torque_message.decode_values(data)
+            torque = values[self._torque_at]
+        else:
+            values = self.torque_message.decode_values(data)
+            torque = values[self._torque_at]
+            if not self._is_plausible(torque, cycle):
+                return False
+        self.torque_Nm = torque
         self.sample_cycle = cycle
+        if self._gross_at is not None:
+            self.gross_torque_Nm = values[self._gross_at]
+        self._take_status(data, values, torque)
+        if self._zero_left:
+            self._zero_left -= 1
         return True
 
+    def _is_plausible(self, torque: float, cycle: int) -> bool:
+        last, self._received_torque_Nm = self._received_torque_Nm, torque
+        # Two frames of one cycle, late and present, may lie a period apart.
+        elapsed_s = max(1, cycle - self._received_cycle) * self._period_s
+        self._received_cycle = cycle
+        if last is not None and not abs(torque - last) <= self._torque_rate_Nm_s * elapsed_s:
+            self.implausible_frames += 1
+            return False
+        return True
+
+    def _take_status(self, data: bytes, values: tuple[float, ...], torque: float) -> None:
+        if self._status_at is not None:
+            self.status = SensorStatus(int(values[self._status_at]) & _STATUS_BITS)
+        elif self._status_in_header is not None:
+            byte, shift = self._status_in_header
+            self.status = SensorStatus(data[byte] >> shift & _STATUS_BITS)
+        elif self._torque_range_Nm:
+            self.status = _judge_range(torque, self._torque_range_Nm)
+
+    def miss(self) -> None:
+        """Note a cycle in which no torque came."""
+        self.end_to_end.miss()
+
     def accept_status(self, data: bytes) -> None:
-        """Take one status frame; a frame of the wrong length changes nothing."""
-        if len(data) == self.status_message.length:
-            self.status = SensorStatus(int(self.status_message.decode_values(data)[0]) & 0x07)
+        """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
+        message, receiver, at = self.status_message, self._status_receiver, self._slow_status_at
+        if message is None or receiver is None or at is None or len(data) != message.length:
+            return
+        if receiver.check(data).is_valid:
+            self.status = SensorStatus(int(message.decode_values(data)[at]) & _STATUS_BITS)
+
+    @property
+    def is_overloaded(self) -> bool:
+        """Whether the torque is beyond the sensor's range: fresh, but not the torque that acts."""
+        return bool(self.status & _OVERLOAD)
+
+    def begin_zero(self, samples: int) -> None:
+        """Begin to count the samples of an auto-zero that the device has been told to take, 0x6125."""
+        self._zero_left = samples + 1  # the value after the last sample is the first with the new zero
+
+    @property
+    def is_zeroing(self) -> bool:
+        """Whether an auto-zero is still under way: silence doesn't end it, valid frames do."""
+        return self._zero_left > 0
+
+
+def _judge_range(torque: float, range_Nm: float) -> SensorStatus:
+    if torque >= range_Nm:
+        return SensorStatus.NOT_VALID | SensorStatus.POSITIVE_OVERLOAD
+    if torque <= -range_Nm:
+        return SensorStatus.NOT_VALID | SensorStatus.NEGATIVE_OVERLOAD
+    return SensorStatus(0)

@@ -322,6 +322,11 @@ def load_codec(path: Path | None = None) -> Codec:
         text = path.read_bytes()
     except OSError as error:
         raise CodecError(f"DBC {path}: {error.strerror}") from None
+    return parse_codec(text, path)
+
+
+def parse_codec(text: bytes, path: Path) -> Codec:
+    """Generate the codec from the text of a DBC; `path` is where it is, or would be. Raises CodecError."""
     try:
         database = cantools.database.load_string(text.decode("utf-8"), "dbc")
     except (UnicodeDecodeError, DatabaseError) as error:

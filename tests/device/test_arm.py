@@ -137,4 +137,97 @@ def test_a_sensor_that_says_its_value_is_not_valid_is_a_fault() -> None:
 def test_faults_are_described_with_the_device_and_its_code() -> None:
     devices = Devices()
     devices.send("Drive2Status", 0x0218, 10, 0, 0x8250)
-    assert devices.arm.describe_faults() == ["Drive2: FAULT, error code 0x8250"]
+    assert devices.arm.describe_faults() == ["Drive2: FAULT, error code 0x8250: RPDO timeout"]
+
+
+def test_a_drive_that_never_moved_up_is_no_fault_but_one_that_dropped_is_described() -> None:
+    devices = Devices()
+    assert devices.arm.describe_faults() == []
+    devices.enable()
+    devices.arm.state()
+    devices.send("Drive1Status", 0x0250, 10, 0, 0)
+    expected = "Drive1: SWITCH_ON_DISABLED, mode 10, OPERATION_ENABLED in mode 10 expected"
+    assert devices.arm.describe_faults() == [expected]
+
+
+def test_signals_that_are_too_old_are_described_with_age_and_limit() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    devices.arm.synchronise(4, 0, 4)
+    devices.answer(without=("Drive2Feedback", "Sensor1Torque"))
+    assert devices.arm.describe_faults() == [
+        "Drive2: position, velocity 4 cycles old, 3 allowed",
+        "Sensor1: torque 4 cycles old, 3 allowed",
+    ]
+
+
+@pytest.mark.parametrize(("cycle", "fault"), [(250, FaultReason.NONE), (251, FaultReason.DATA_AGE)])
+def test_a_status_that_stays_away_from_an_enabled_drive_is_a_fault(cycle: int, fault: FaultReason) -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.enable()
+    devices.arm.synchronise(cycle, 0, 1)
+    devices.answer()
+    assert devices.arm.state().fault is fault
+
+
+def test_a_status_that_stays_away_is_described() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.enable()
+    devices.arm.synchronise(300, 0, 1)
+    devices.answer()
+    assert devices.arm.describe_faults() == [
+        "Drive1: statusword 300 cycles old, 250 allowed",
+        "Drive2: statusword 300 cycles old, 250 allowed",
+    ]
+
+
+def test_a_sensors_status_is_described_in_words() -> None:
+    devices = Devices()
+    devices.send("Sensor1Status", 3, 0)
+    assert devices.arm.describe_faults() == ["Sensor1: status 0x03: positive overload, not valid"]
+
+
+def test_the_age_of_every_signal_can_be_asked() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer(without=("Sensor2Torque",))
+    assert [(age.device, age.signals, age.age, age.limit) for age in devices.arm.ages()] == [
+        ("Drive1", "position, velocity", 0, 3),
+        ("Drive1", "statusword", 1, 250),
+        ("Drive2", "position, velocity", 0, 3),
+        ("Drive2", "statusword", 1, 250),
+        ("Sensor1", "torque", 0, 3),
+        ("Sensor2", "torque", 1, 3),
+    ]
+
+
+def test_a_cycle_without_a_frame_is_counted_once_as_no_new_data() -> None:
+    devices = Devices()
+    for cycle in range(3):
+        devices.arm.synchronise(cycle, 0, 1)
+        devices.answer(without=("Sensor1Torque", "Drive1Feedback") if cycle == 1 else ())
+    checks = devices.arm.describe_checks()
+    assert checks[0] == "Drive1: unprotected, 0 implausible, 1 NO_NEW_DATA"
+    assert checks[1] == "Drive2: unprotected, 0 implausible, 0 NO_NEW_DATA"
+    assert "1 NO_NEW_DATA" in checks[2]
+    assert "0 NO_NEW_DATA" in checks[3]
+
+
+def test_a_late_frame_is_no_miss() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer(without=("Sensor1Torque",))
+    devices.send("Sensor1Torque", 1.5)
+    devices.arm.synchronise(1, 0, 1)
+    assert "0 NO_NEW_DATA" in devices.arm.describe_checks()[2]
+
+
+def test_the_raw_torque_stays_beside_the_tared_one() -> None:
+    devices = Devices({"sign": [1, -1], "torque_offset_Nm": [0.5, 0.25]})
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    devices.arm.state()
+    assert [sensor.torque_Nm for sensor in devices.arm.sensors] == [1.5, -2.5]

@@ -1,0 +1,312 @@
+"""The contract of one arm: the DBC that describes its frames, loaded, or composed from the devices' profiles.
+
+What is composed has the layout of a DBC written by hand for the same devices, bit for bit, and its layout digest.
+Source: Vector DBC file format; CiA 301 clause 7.3.3 (predefined connection set).
+"""
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from adacd_hil.config import ConfigError, Settings
+from adacd_hil.device.placement import Device, place_devices
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings
+from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
+
+HOST_NODE = 127
+COMPOSED_NAME = "contract.dbc"
+WIRE_VERSION = 1
+_TRIGGERS = ("sync", "command", "event", "request")
+_FRAME_FORMATS = ("StandardCAN", "ExtendedCAN", "reserved", "J1939PG", *("reserved",) * 10, "StandardCAN_FD")
+_CLASSIC_BYTES = 8
+_FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
+
+
+class _Signal(NamedTuple):
+    name: str
+    bits: int
+    is_signed: bool = False
+    scale: float = 1.0
+    unit: str = ""
+
+
+@dataclass
+class _Message:
+    can_id: int
+    name: str
+    sender: str
+    receivers: tuple[str, ...]
+    signals: tuple[_Signal, ...]
+    trigger: str
+    period_ms: int = 0
+    delay_ms: int = 0
+    protection: str = ""
+    data_ids: str = ""
+    values: dict[str, dict[int, str]] = field(default_factory=dict)
+
+    @property
+    def length(self) -> int:
+        return sum(signal.bits for signal in self.signals) // 8
+
+
+_NMT_COMMANDS = {1: "start", 2: "stop", 128: "pre_operational", 129: "reset_node", 130: "reset_communication"}
+_NMT_STATES = {0: "boot_up", 4: "stopped", 5: "operational", 127: "pre_operational"}
+_MODES = {0: "none", 10: "cyclic_synchronous_torque"}
+_EMCY = (
+    _Signal("error_code", 16),
+    _Signal("error_register", 8),
+    _Signal("manufacturer_code", 8),
+    _Signal("manufacturer_data", 32),
+)
+_SDO = (_Signal("command", 8), _Signal("index", 16), _Signal("subindex", 8), _Signal("data", 32))
+_HEARTBEAT = (_Signal("state", 8),)
+
+
+def load_contract(settings: Settings) -> Codec:
+    """Return the codec of the configured devices: from the DBC that `devices.contract` names, or composed.
+
+    Raises ConfigError when a profile can't be used or says otherwise than the DBC, CodecError for a DBC that can't
+    serve.
+    """
+    devices = place_devices(settings)
+    composed = compose(settings, devices)
+    name = settings.devices.contract
+    if not name:
+        return composed
+    codec = load_codec(_find_contract(name))
+    _compare(codec, composed, name)
+    return codec
+
+
+def write_contract(codec: Codec, folder: Path) -> Codec:
+    """Return the codec with a file behind it: a composed one is written to `folder`, which must exist.
+
+    Raises OSError, CodecError.
+    """
+    if codec.path.is_file():
+        return codec
+    path = folder / codec.path.name
+    path.write_bytes(codec.text)
+    return load_codec(path)
+
+
+def compose(settings: Settings, devices: list[Device]) -> Codec:
+    """Compose the contract of these devices. Raises ConfigError, CodecError."""
+    text = _write_dbc(settings, _messages(settings, devices))
+    return parse_codec(text.encode(), Path(COMPOSED_NAME))
+
+
+def _find_contract(name: str) -> Path:
+    folder = contract_folder()
+    if (folder / f"{name}.dbc").is_file():
+        return folder / f"{name}.dbc"
+    path = Path(name)
+    if path.suffix or path.exists():
+        return path
+    known = sorted(path.stem for path in folder.glob("*.dbc"))
+    nearest = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}"
+    raise ConfigError(f"`devices.contract` = {name!r} is neither in dbc/ nor a file; {hint}")
+
+
+def _compare(codec: Codec, composed: Codec, name: str) -> None:
+    """Raise ConfigError with the first message in which the DBC and the profiles differ."""
+    if codec.layout_digest == composed.layout_digest:
+        return
+    for message in composed.messages.values():
+        theirs = codec.messages.get(message.name)
+        if theirs is None:
+            raise ConfigError(f"message {message.name} of the device profiles is missing in contract {name}")
+        for what, ours, other in (
+            ("identifier", f"0x{message.can_id:03X}", f"0x{theirs.can_id:03X}"),
+            ("length", f"{message.length} bytes", f"{theirs.length} bytes"),
+            ("signals", _signal_names(message), _signal_names(theirs)),
+            ("scales", _scales(message), _scales(theirs)),
+        ):
+            if ours != other:
+                raise ConfigError(f"{message.name}: {what} {ours} by the device profile, {other} by contract {name}")
+    extra = [message for message in codec.messages if message not in composed.messages]
+    if extra:
+        raise ConfigError(f"message {extra[0]} of contract {name} is in no device profile")
+    raise ConfigError(f"data ids or places of signals differ between the device profiles and contract {name}")
+
+
+def _signal_names(message: MessageCodec) -> str:
+    return ", ".join(signal.name for signal in message.signals)
+
+
+def _scales(message: MessageCodec) -> str:
+    return ", ".join(f"{signal.name} {signal.scale:.17g}" for signal in message.signals if signal.scale != 1.0)
+
+
+def _messages(settings: Settings, devices: list[Device]) -> list[_Message]:
+    names = tuple(device.name.upper() for device in devices)
+    heartbeat_ms = settings.bus.heartbeat_ms
+    nmt = (_Signal("command", 8), _Signal("node", 8))
+    messages = [
+        _Message(0x000, "Nmt", "HOST", names, nmt, "request", values={"command": _NMT_COMMANDS}),
+        _Message(0x080, "Sync", "HOST", names, (_Signal("counter", 8),), "sync"),
+        _heartbeat("Host", HOST_NODE, "HOST", names, heartbeat_ms),
+    ]
+    for device in devices:
+        node, sender, host = device.node_id, device.name.upper(), ("HOST",)
+        messages += [
+            _Message(
+                0x080 + node, f"{device.name}Emcy", sender, host, _EMCY, "event", delay_ms=EMCY_INHIBIT_100US // 10
+            ),
+            *(_pdo_message(device, pdo) for pdo in device.settings.pdo),
+            _Message(0x580 + node, f"{device.name}SdoResponse", sender, host, _SDO, "request"),
+            _Message(0x600 + node, f"{device.name}SdoRequest", "HOST", (sender,), _SDO, "request"),
+            _heartbeat(device.name, node, sender, host, heartbeat_ms),
+        ]
+    messages.sort(key=lambda message: message.can_id)
+    _check_identifiers(messages)
+    return messages
+
+
+def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], period_ms: int) -> _Message:
+    values = {"state": _NMT_STATES}
+    return _Message(
+        0x700 + node, f"{name}Heartbeat", sender, receivers, _HEARTBEAT, "event", period_ms, period_ms, values=values
+    )
+
+
+def _pdo_message(device: Device, pdo: PdoSettings) -> _Message:
+    profile, name = device.settings, device.name.upper()
+    signals: list[_Signal] = []
+    if pdo.data_ids:
+        signals = [_Signal(signal, bits) for signal, bits in HEADER_SIGNALS[profile.protection]]
+        mapped = sum(device.variable(signal.name).bits for signal in device.header(pdo))
+        if mapped != sum(signal.bits for signal in signals):
+            raise ConfigError(f"device profile {device.profile.name}: header objects have {mapped} bits in all")
+    for signal in pdo.signals:
+        variable = device.variable(signal.name)
+        scale, unit = profile.unit_of(signal)
+        signals.append(_Signal(signal.signal, variable.bits, variable.is_signed, scale, unit))
+    sender, receiver = ("HOST", name) if pdo.is_received else (name, "HOST")
+    message = _Message(
+        device.can_id(pdo),
+        f"{device.name}{pdo.message}",
+        sender,
+        (receiver,),
+        tuple(signals),
+        "command" if pdo.is_received else "sync" if pdo.is_synchronous else "event",
+        0 if pdo.is_received or pdo.is_synchronous else pdo.event_timer_ms,
+        -(-pdo.inhibit_100us // 10),
+        profile.protection if pdo.data_ids else "",
+        pdo.data_ids[device.joint] if pdo.data_ids else "",
+        {"mode_display": _MODES} if any(signal.name == "mode_display" for signal in signals) else {},
+    )
+    if message.length > _CLASSIC_BYTES and message.length not in _FD_LENGTHS:
+        raise ConfigError(
+            f"device profile {device.profile.name}: {pdo.message} has {message.length} bytes; "
+            f"a frame has 0 to 8, {', '.join(map(str, _FD_LENGTHS))}"
+        )
+    return message
+
+
+def _check_identifiers(messages: list[_Message]) -> None:
+    owner: dict[int, str] = {}
+    for message in messages:
+        if message.can_id in owner:
+            raise ConfigError(f"{owner[message.can_id]} and {message.name} both have identifier 0x{message.can_id:03X}")
+        owner[message.can_id] = message.name
+
+
+_HEAD = """VERSION "1"
+
+NS_ :
+\tCM_
+\tBA_DEF_
+\tBA_
+\tVAL_
+\tBA_DEF_DEF_
+
+BS_:
+"""
+_ATTRIBUTES = f"""BA_DEF_ "WireVersion" INT 1 65535;
+BA_DEF_ "Baudrate" INT 0 1000000;
+BA_DEF_ "BaudrateCANFD" INT 0 16000000;
+BA_DEF_ "BusPeriod_us" INT 0 1000000;
+BA_DEF_ BO_ "VFrameFormat" ENUM {",".join(f'"{name}"' for name in _FRAME_FORMATS)};
+BA_DEF_ BO_ "E2EProfile" STRING;
+BA_DEF_ BO_ "E2EDataIdList" STRING;
+BA_DEF_ BO_ "E2EDataId" INT 0 65535;
+BA_DEF_ BO_ "Trigger" ENUM {",".join(f'"{name}"' for name in _TRIGGERS)};
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "GenMsgDelayTime" INT 0 65535;
+BA_DEF_DEF_ "WireVersion" 1;
+BA_DEF_DEF_ "Baudrate" 0;
+BA_DEF_DEF_ "BaudrateCANFD" 0;
+BA_DEF_DEF_ "BusPeriod_us" 0;
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_DEF_DEF_ "E2EProfile" "";
+BA_DEF_DEF_ "E2EDataIdList" "";
+BA_DEF_DEF_ "E2EDataId" 0;
+BA_DEF_DEF_ "Trigger" "request";
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "GenMsgDelayTime" 0;
+"""
+
+
+def _write_dbc(settings: Settings, messages: list[_Message]) -> str:
+    senders = sorted({message.sender for message in messages} - {"HOST"})
+    is_fd = any(message.length > _CLASSIC_BYTES for message in messages)
+    if is_fd and not settings.devices.data_bitrate:
+        raise ConfigError("`devices.data_bitrate` = 0 bit/s, but the device profiles have frames of CAN FD")
+    data_bitrate = settings.devices.data_bitrate if is_fd else 0
+    lines = [_HEAD, f"BU_: HOST {' '.join(senders)}", ""]
+    for message in messages:
+        lines.append(f"BO_ {message.can_id} {message.name}: {message.length} {message.sender}")
+        lines.extend(_signal_lines(message))
+        lines.append("")
+    lines.append(_ATTRIBUTES.rstrip("\n"))
+    lines.append(f'BA_ "WireVersion" {WIRE_VERSION};')
+    lines.append(f'BA_ "Baudrate" {settings.devices.bitrate};')
+    lines.append(f'BA_ "BaudrateCANFD" {data_bitrate};')
+    lines.append(f'BA_ "BusPeriod_us" {settings.bus.period_us};')
+    lines.extend(line for message in messages for line in _attribute_lines(message))
+    lines.extend(line for message in messages for line in _value_lines(message))
+    return "\n".join(lines) + "\n"
+
+
+def _signal_lines(message: _Message) -> Iterable[str]:
+    start = 0
+    receivers = ",".join(message.receivers)
+    for signal in message.signals:
+        low, high = (
+            (-(1 << signal.bits - 1), (1 << signal.bits - 1) - 1) if signal.is_signed else (0, (1 << signal.bits) - 1)
+        )
+        sign = "-" if signal.is_signed else "+"
+        bounds = f"[{_number(low * signal.scale)}|{_number(high * signal.scale)}]"
+        place = f"{start}|{signal.bits}@1{sign} ({_number(signal.scale)},0)"
+        yield f' SG_ {signal.name} : {place} {bounds} "{signal.unit}" {receivers}'
+        start += signal.bits
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value == int(value) else repr(float(value))
+
+
+def _attribute_lines(message: _Message) -> Iterable[str]:
+    if message.length > _CLASSIC_BYTES:
+        yield f'BA_ "VFrameFormat" BO_ {message.can_id} {_FRAME_FORMATS.index("StandardCAN_FD")};'
+    if message.protection:
+        yield f'BA_ "E2EProfile" BO_ {message.can_id} "{message.protection}";'
+        if message.protection == "P02":
+            yield f'BA_ "E2EDataIdList" BO_ {message.can_id} "{message.data_ids}";'
+        else:
+            yield f'BA_ "E2EDataId" BO_ {message.can_id} {int(message.data_ids, 16)};'
+    yield f'BA_ "Trigger" BO_ {message.can_id} {_TRIGGERS.index(message.trigger)};'
+    if message.period_ms:
+        yield f'BA_ "GenMsgCycleTime" BO_ {message.can_id} {message.period_ms};'
+    if message.delay_ms:
+        yield f'BA_ "GenMsgDelayTime" BO_ {message.can_id} {message.delay_ms};'
+
+
+def _value_lines(message: _Message) -> Iterable[str]:
+    for signal, table in message.values.items():
+        values = " ".join(f'{value} "{text}"' for value, text in table.items())
+        yield f"VAL_ {message.can_id} {signal} {values} ;"

@@ -1,0 +1,97 @@
+"""The host's heartbeat consumer: which nodes are silent, or not in the state that they should be in.
+
+Source: CiA 301 (4.2), clause 7.2.8.2.2 (heartbeat protocol); t_ns is the host's time, the frames' stamps included.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from adacd_hil.records import Event
+from adacd_hil.wire.bus import Frame
+
+PATIENCE_PERIODS = 2.5
+"""Periods without a heartbeat until a node counts as silent, on the host and in 0x1016 of the devices: one heartbeat
+may be lost and the next one be late by half a period, and yet nobody waits for a third."""
+OPERATIONAL = 5
+_STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
+
+
+@dataclass
+class _Node:
+    name: str
+    node_id: int
+    state: int | None = None
+    heard_ns: int | None = None
+    has_run: bool = False
+    complaint: str = ""
+
+
+class HeartbeatWatch:
+    """Follows the heartbeats of some nodes, while they should be operational."""
+
+    def __init__(self, nodes: Iterable[tuple[str, int]], period_ms: int, report: Callable[[Event], None]) -> None:
+        """`nodes`: name and node id. `report` gets an event when a node falls out and when it is back."""
+        self._nodes = {0x700 + node_id: _Node(name, node_id) for name, node_id in nodes}
+        self._patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
+        self._report = report
+        self._is_watching = False
+        self._since_ns: int | None = None
+
+    def start(self) -> None:
+        """Expect OPERATIONAL from now on; what was heard before says nothing."""
+        self._is_watching = True
+        self._since_ns = None
+        for node in self._nodes.values():
+            node.state = node.heard_ns = None
+            node.has_run = False
+            node.complaint = ""
+
+    def stop(self) -> None:
+        """Expect nothing more."""
+        self._is_watching = False
+
+    def accept(self, frame: Frame) -> None:
+        """Take a heartbeat; other frames change nothing."""
+        node = self._nodes.get(frame.can_id)
+        if node is None or frame.is_error or len(frame.data) != 1:
+            return
+        node.state = frame.data[0] & 0x7F
+        node.heard_ns = frame.t_ns
+        node.has_run |= node.state == OPERATIONAL
+
+    def watch(self, t_ns: int) -> list[str]:
+        """Name what is wrong now, one line per node; empty when nothing is or nothing is expected."""
+        if not self._is_watching:
+            return []
+        if self._since_ns is None:
+            self._since_ns = t_ns
+        lines = []
+        for node in self._nodes.values():
+            line = self._judge(node, t_ns, self._since_ns)
+            if line:
+                lines.append(line)
+        return lines
+
+    def _judge(self, node: _Node, t_ns: int, since_ns: int) -> str:
+        heard_ns = since_ns if node.heard_ns is None else max(node.heard_ns, since_ns)
+        silent_ns = t_ns - heard_ns
+        if silent_ns > self._patience_ns:
+            complaint = "silent"
+            text = f"no heartbeat for {silent_ns // 1_000_000} ms, {self._patience_ns // 1_000_000} ms allowed"
+        elif (
+            node.state is not None
+            and node.state != OPERATIONAL
+            # A heartbeat from before the start command took effect may still be on its way.
+            and (node.has_run or t_ns - since_ns > self._patience_ns)
+        ):
+            complaint = f"state {node.state}"
+            text = f"is {_STATES.get(node.state, f'in NMT state {node.state}')}, OPERATIONAL expected"
+        else:
+            if node.complaint:
+                self._report(Event("info", node.name, "heartbeat: OPERATIONAL again"))
+                node.complaint = ""
+            return ""
+        if complaint != node.complaint:
+            node.complaint = complaint
+            self._report(Event("error", node.name, f"heartbeat: {text}"))
+        return f"{node.name} (node {node.node_id}): {text}"

@@ -1,0 +1,274 @@
+"""Device profiles: a short TOML that, with an EDS, describes a drive or a sensor well enough to be run.
+
+The EDS says which objects a device has and of what type. The profile says the rest: which of them travel in which
+frame under which signal name, what one count is worth, how frames are protected, what the device can do.
+Source: CiA 306 (EDS), CiA 301 clause 7.5.2 (PDO parameters), CiA 402-2, CiA 404.
+"""
+
+import math
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import NamedTuple
+
+from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, toml_names
+from adacd_hil.wire.codec import contract_folder
+
+FEATURES = ("heartbeat_consumer", "sync_counter", "option_codes", "torque_limits", "autozero", "watchdog_in_emcy")
+"""What a profile may name: the host uses an object of these kinds only where the EDS lists it too.
+
+heartbeat_consumer 0x1016; sync_counter 0x1019; option_codes 0x605A, 0x605E; torque_limits 0x6072, 0x60E0, 0x60E1;
+autozero 0x6125; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the device's time in ms.
+"""
+EMCY_INHIBIT_100US = 100
+"""0x1015 of every device that has it: one EMCY per device and 10 ms, so that a storm of errors can't take the bus."""
+HEADER_SIGNALS = {
+    "P02": (("e2e_crc", 8), ("e2e_counter", 4), ("e2e_status", 4)),
+    "P05": (("e2e_crc", 16), ("e2e_counter", 8), ("e2e_status", 8)),
+}
+"""Signals of the end-to-end header with their bits, per AUTOSAR profile."""
+_DATA_ID_DIGITS = {"P02": 32, "P05": 4}
+
+
+@dataclass(frozen=True)
+class ObjectName:
+    """An object with its sub-index, `0x6064` or `0x9130:1` in text."""
+
+    index: int
+    sub: int = 0
+
+    def __str__(self) -> str:
+        return f"0x{self.index:04X}" + (f":{self.sub}" if self.sub else "")
+
+
+def parse_object(text: str) -> ObjectName:
+    """Read `0x9130:1` or `0x6064`. Raises ValueError."""
+    index, _, sub = text.partition(":")
+    try:
+        name = ObjectName(int(index, 16), int(sub or "0"))
+    except ValueError:
+        raise ValueError(f"object {text!r} must be like 0x6064 or 0x9130:1") from None
+    if not (0 < name.index <= 0xFFFF and 0 <= name.sub <= 0xFF):
+        raise ValueError(f"object {text!r} must be within 0x0001 to 0xFFFF:255")
+    return name
+
+
+@dataclass(frozen=True)
+class SignalSettings:
+    """One mapped object and the signal that it is in the contract."""
+
+    object: str = setting(meaning="index and sub-index")
+    signal: str = setting(meaning="name in the contract")
+    unit: str = setting("", meaning="unit of the signal's value")
+    scale: float = setting(1.0, low=1e-12, high=1e12, meaning="value of one count, where [scale] doesn't say it")
+
+    def __post_init__(self) -> None:
+        parse_object(self.object)
+        if not self.signal.isidentifier():
+            raise ValueError(f"signal {self.signal!r} must be a name of letters, digits and _")
+
+    @property
+    def name(self) -> ObjectName:
+        """The object."""
+        return parse_object(self.object)
+
+
+@dataclass(frozen=True)
+class PdoSettings:
+    """One PDO: which frame of the contract it is, and its communication and mapping parameters."""
+
+    message: str = setting(choices=("Feedback", "Status", "Command", "Torque"), meaning="name in the contract")
+    number: int = setting(low=1, high=512, meaning="1 is 0x1400 or 0x1800")
+    cob_id: int = setting(low=0x180, high=0x57F, meaning="identifier without the node id")
+    signals: tuple[SignalSettings, ...] = setting(meaning="mapped objects in order, the header apart")
+    transmission: int = setting(1, low=0, high=255, meaning="1 on every SYNC, 254 and 255 on events")
+    inhibit_100us: int = setting(0, unit="100 µs", low=0, high=0xFFFF, meaning="smallest distance of two frames")
+    event_timer_ms: int = setting(0, unit="ms", low=0, high=0xFFFF, meaning="period of an event-driven frame")
+    data_ids: tuple[str, ...] = setting((), meaning="hexadecimal data ids of joint 1 and 2; none: unprotected")
+
+    @property
+    def is_received(self) -> bool:
+        """Whether the device receives it."""
+        return self.message == "Command"
+
+    @property
+    def is_synchronous(self) -> bool:
+        """Whether it is exchanged on SYNC."""
+        return self.transmission <= 240
+
+    @property
+    def communication_index(self) -> int:
+        """Index of the communication parameters, 0x14xx or 0x18xx."""
+        return (0x1400 if self.is_received else 0x1800) + self.number - 1
+
+    @property
+    def mapping_index(self) -> int:
+        """Index of the mapping parameters, 0x16xx or 0x1Axx."""
+        return self.communication_index + 0x200
+
+
+@dataclass(frozen=True)
+class ScaleSettings:
+    """What one count of the device is worth."""
+
+    increments_per_joint_rev: int = setting(
+        0, low=0, high=2**40, meaning="position increments per revolution of the joint; checked with 0x608F, 0x6091"
+    )
+    velocity_rad_s: float = setting(0.0, unit="rad/s", low=0.0, high=100.0, meaning="one count of velocity")
+    torque_Nm: float = setting(0.0, unit="Nm", low=0.0, high=100.0, meaning="one count of the sensor's torque")
+
+
+@dataclass(frozen=True)
+class PlausibilitySettings:
+    """Bounds on values of frames that no end-to-end header protects."""
+
+    position_jump_rad: float = setting(
+        0.02, unit="rad", low=1e-4, high=10.0, meaning="largest step of position beyond velocity x time"
+    )
+    torque_rate_Nm_s: float = setting(20_000.0, unit="Nm/s", low=1.0, high=1e7, meaning="largest change of torque")
+    torque_range_Nm: float = setting(
+        0.0, unit="Nm", low=0.0, high=1e6, meaning="end of the sensor's range, there it is overloaded; 0: unknown"
+    )
+
+
+@dataclass(frozen=True)
+class WriteSettings:
+    """One extra SDO write at set-up."""
+
+    object: str = setting(meaning="index and sub-index")
+    value: int = setting(low=-(2**31), high=2**32 - 1, meaning="value")
+
+    def __post_init__(self) -> None:
+        parse_object(self.object)
+
+    @property
+    def name(self) -> ObjectName:
+        """The object."""
+        return parse_object(self.object)
+
+
+@dataclass(frozen=True)
+class ProfileSettings:
+    """One device profile."""
+
+    kind: str = setting(choices=("drive", "sensor"), meaning="what it is")
+    eds: str = setting(meaning="EDS file, beside the profile or in dbc/")
+    pdo: tuple[PdoSettings, ...] = setting(meaning="the frames")
+    identity: str = setting(
+        "eds", choices=("eds", "any"), meaning="device type, vendor, product, revision as in the EDS, or unchecked"
+    )
+    serial: tuple[int, ...] = setting((), low=0, high=2**32 - 1, meaning="serial number of joint 1 and 2; none: any")
+    contract_object: bool = setting(False, meaning="the device carries wire version and layout digest in 0x2000")
+    protection: str = setting("none", choices=("none", "P02", "P05"), meaning="AUTOSAR end-to-end profile")
+    header: tuple[str, ...] = setting((), meaning="objects of the end-to-end header, in order")
+    mapping: str = setting("writable", choices=("writable", "fixed"), meaning="whether PDO parameters are written")
+    command_watchdog: str = setting(
+        "none", choices=("none", "0x2200", "0x1400:5"), meaning="where the deadline of commands is set: SYNCs, or ms"
+    )
+    features: tuple[str, ...] = setting((), choices=FEATURES, meaning="what the device can do besides")
+    quick_stop_option: int | None = setting(None, low=0, high=8, meaning="0x605A that is written, or fixed")
+    fault_reaction_option: int | None = setting(None, low=0, high=4, meaning="0x605E that is written, or fixed")
+    autozero_samples: int = setting(64, low=1, high=100_000, meaning="samples that the device takes for its zero")
+    scale: ScaleSettings = setting(ScaleSettings, meaning="worth of a count")
+    plausibility: PlausibilitySettings = setting(PlausibilitySettings, meaning="bounds for unprotected frames")
+    setup: tuple[WriteSettings, ...] = setting((), meaning="extra SDO writes, last")
+
+    def __post_init__(self) -> None:
+        for text in self.header:
+            parse_object(text)
+        self._check_frames()
+        self._check_protection()
+        self._check_scale()
+
+    def _check_frames(self) -> None:
+        wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
+        found = [pdo.message for pdo in self.pdo]
+        if missing := [name for name in wanted if name not in found]:
+            raise ValueError(f"pdo: a {self.kind} needs {' and '.join(missing)}")
+        if len(set(found)) != len(found) or not set(found) <= {*wanted, "Status"}:
+            raise ValueError(f"pdo: a {self.kind} has {', '.join(wanted)} and perhaps Status, once each")
+        for pdo in self.pdo:
+            names = [signal.signal for signal in pdo.signals]
+            if not names or len(set(names)) != len(names):
+                raise ValueError(f"pdo {pdo.message}: signals must be there and differ")
+        needed = {
+            "drive": ("position", "velocity", "statusword", "controlword", "target_torque"),
+            "sensor": ("torque",),
+        }
+        carried = {signal.signal for pdo in self.pdo for signal in pdo.signals}
+        if missing := [name for name in needed[self.kind] if name not in carried]:
+            raise ValueError(f"pdo: no frame carries {', '.join(missing)}")
+
+    def _check_protection(self) -> None:
+        headers = {"none": 0, "P02": 2, "P05": 3}
+        if len(self.header) != headers[self.protection]:
+            raise ValueError(
+                f"header has {len(self.header)} objects, {self.protection} takes {headers[self.protection]}"
+            )
+        for pdo in self.pdo:
+            if not pdo.data_ids:
+                continue
+            digits = _DATA_ID_DIGITS.get(self.protection)
+            if digits is None:
+                raise ValueError(f"pdo {pdo.message}: data_ids need protection P02 or P05")
+            if len(pdo.data_ids) != 2 or any(not _is_hex(text, digits) for text in pdo.data_ids):
+                raise ValueError(f"pdo {pdo.message}: data_ids must be two of {digits} hexadecimal digits")
+
+    def _check_scale(self) -> None:
+        if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
+            raise ValueError("scale: a drive needs increments_per_joint_rev and velocity_rad_s")
+        if self.kind == "sensor" and not self.scale.torque_Nm:
+            raise ValueError("scale: a sensor needs torque_Nm")
+        if self.serial and len(self.serial) != 2:
+            raise ValueError(f"serial has {len(self.serial)} numbers, 2 expected")
+
+    def unit_of(self, signal: SignalSettings) -> tuple[float, str]:
+        """Return the worth of one count and the unit of a signal."""
+        if self.kind == "drive" and signal.signal == "position":
+            return 2.0 * math.pi / self.scale.increments_per_joint_rev, "rad"
+        if self.kind == "drive" and signal.signal == "velocity":
+            return self.scale.velocity_rad_s, "rad/s"
+        if self.kind == "sensor" and signal.signal in ("torque", "gross_torque"):
+            return self.scale.torque_Nm, "Nm"
+        return signal.scale, signal.unit
+
+
+def _is_hex(text: str, digits: int) -> bool:
+    return len(text) == digits and all(c in "0123456789abcdefABCDEF" for c in text)
+
+
+class Profile(NamedTuple):
+    """A device profile with its name and the place of its EDS."""
+
+    name: str
+    eds: Path
+    settings: ProfileSettings
+
+
+def _builtin_folder() -> Traversable:
+    return resources.files("adacd_hil") / "device_profiles"
+
+
+def profile_names() -> list[str]:
+    """Name the device profiles that come with the package."""
+    return toml_names(_builtin_folder())
+
+
+def load_profile(name_or_file: str, kind: str) -> Profile:
+    """Load a device profile by built-in name or file; `kind` is what it must be, drive or sensor.
+
+    Raises ConfigError for an unknown name or key, a value outside its bounds, an EDS that isn't there, another kind.
+    """
+    path = find_toml("device profile", name_or_file, _builtin_folder())
+    try:
+        settings = parse(ProfileSettings, read_toml(path))
+    except ConfigError as error:
+        raise ConfigError(f"device profile {name_or_file}: {error}") from None
+    if settings.kind != kind:
+        raise ConfigError(f"device profile {name_or_file} is a {settings.kind}, a {kind} is needed")
+    beside = path.parent / settings.eds
+    eds = beside if beside.is_file() else contract_folder() / settings.eds
+    if not eds.is_file():
+        raise ConfigError(f"device profile {name_or_file}: eds = {settings.eds!r} is neither beside it nor in dbc/")
+    return Profile(path.stem, eds, settings)

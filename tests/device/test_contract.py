@@ -1,0 +1,135 @@
+"""Contracts composed from device profiles, against the DBC files written by hand."""
+
+import warnings
+from pathlib import Path
+
+import cantools
+import pytest
+
+import adacd_hil
+from adacd_hil.config import ConfigError, Settings, load_settings, parse
+from adacd_hil.device.contract import compose, load_contract, write_contract
+from adacd_hil.device.placement import place_devices
+from adacd_hil.wire.codec import contract_folder, load_codec
+
+DRIVE_PROFILE = Path(adacd_hil.__file__).parent / "device_profiles" / "adacd-drive.toml"
+WRITTEN = [
+    name
+    for name in ("paper", "fd", "fd_500us", "stock")
+    if (contract_folder() / f"{load_settings(name).devices.contract}.dbc").is_file()
+]
+
+
+def layout(path_or_text: str) -> dict[str, object]:
+    """What cantools reads of a DBC: where each signal lies and what it is worth."""
+    database = cantools.database.load_string(path_or_text, "dbc")
+    return {
+        message.name: (
+            message.frame_id,
+            message.length,
+            message.senders,
+            [
+                (s.name, s.start, s.length, s.is_signed, s.byte_order, float(s.scale), float(s.offset), s.unit or "")
+                for s in sorted(message.signals, key=lambda s: s.start)
+            ],
+        )
+        for message in database.messages
+    }
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_profiles_compose_to_the_dbc_bit_for_bit(name: str) -> None:
+    settings = load_settings(name)
+    by_hand = load_codec(contract_folder() / f"{settings.devices.contract}.dbc")
+    composed = compose(settings, place_devices(settings))
+    assert layout(composed.text.decode()) == layout(by_hand.text.decode())
+    assert composed.layout_digest == by_hand.layout_digest
+
+
+def test_cantools_reads_a_composed_contract_without_a_warning() -> None:
+    settings = load_settings("paper")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        text = compose(settings, place_devices(settings)).text.decode()
+        database = cantools.database.load_string(text, "dbc", strict=True)
+    assert database.dbc.attributes["BusPeriod_us"].value == 1000
+    choices = database.dbc.attribute_definitions["Trigger"].choices
+    triggers = {m.name: choices[m.dbc.attributes["Trigger"].value] for m in database.messages}
+    assert {triggers[n] for n in ("Sync", "Drive1Feedback", "Sensor2Torque")} == {"sync"}
+    assert triggers["Drive2Command"] == "command"
+    assert {triggers[n] for n in ("Drive1Status", "Drive1Emcy", "HostHeartbeat")} == {"event"}
+    assert {triggers[n] for n in ("Nmt", "Sensor1SdoRequest")} == {"request"}
+
+
+def test_node_ids_move_every_identifier_of_a_device() -> None:
+    settings = parse(Settings, {"devices": {"drive_node": [11, 12], "contract": ""}})
+    codec = load_contract(settings)
+    ids = {name: message.can_id for name, message in codec.messages.items() if name.startswith("Drive2")}
+    assert ids == {
+        "Drive2Emcy": 0x08C,
+        "Drive2Feedback": 0x18C,
+        "Drive2Command": 0x20C,
+        "Drive2Status": 0x28C,
+        "Drive2SdoResponse": 0x58C,
+        "Drive2SdoRequest": 0x60C,
+        "Drive2Heartbeat": 0x70C,
+    }
+
+
+def test_a_composed_contract_gets_a_file_for_the_log(tmp_path: Path) -> None:
+    settings = parse(Settings, {"devices": {"contract": ""}})
+    codec = write_contract(load_contract(settings), tmp_path)
+    assert codec.path == tmp_path / "contract.dbc"
+    assert load_codec(codec.path).layout_digest == load_codec().layout_digest
+
+
+def test_a_contract_with_a_file_is_not_written_again(tmp_path: Path) -> None:
+    codec = load_codec()
+    assert write_contract(codec, tmp_path) is codec
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_misspelt_contract_is_told_the_nearest() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'arm'"):
+        load_contract(parse(Settings, {"devices": {"contract": "amr"}}))
+
+
+@pytest.mark.parametrize(
+    ("devices", "change", "line"),
+    [
+        (
+            {},
+            ("(1e-06,0)", "(1e-05,0)"),
+            "Sensor1Torque: scales torque .* by the device profile, torque .* by contract",
+        ),
+        ({"drive_node": [1, 7]}, ("", ""), "Drive2.*: identifier 0x.* by the device profile"),
+        ({}, ("SG_ torque_actual", "SG_ torque"), "Drive1Status: signals statusword, mode_display, torque_actual"),
+        ({}, ("f5ddf3da", "f5ddf3db"), "data ids or places of signals differ"),
+    ],
+)
+def test_a_contract_that_says_otherwise_than_the_profiles_is_named(
+    tmp_path: Path, devices: dict[str, object], change: tuple[str, str], line: str
+) -> None:
+    text = load_codec().text.decode()
+    path = tmp_path / "other.dbc"
+    path.write_text(text.replace(*change) if change[0] else text)
+    with pytest.raises(ConfigError, match=line):
+        load_contract(parse(Settings, {"devices": {"contract": str(path), **devices}}))
+
+
+def test_two_messages_of_one_identifier_are_refused(tmp_path: Path) -> None:
+    text = DRIVE_PROFILE.read_text()
+    path = tmp_path / "clash.toml"
+    path.write_text(text.replace("cob_id = 0x280", "cob_id = 0x180"))
+    settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
+    with pytest.raises(ConfigError, match="both have identifier 0x181"):
+        load_contract(settings)
+
+
+def test_an_object_that_the_eds_lacks_cant_be_mapped(tmp_path: Path) -> None:
+    text = DRIVE_PROFILE.read_text()
+    path = tmp_path / "wide.toml"
+    path.write_text(text.replace("0x603F", "0x603E"))
+    settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
+    with pytest.raises(ConfigError, match=r"object 0x603E is not in drive\.eds"):
+        load_contract(settings)

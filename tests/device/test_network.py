@@ -1,0 +1,165 @@
+"""The master against the emulated devices."""
+
+import numpy as np
+import pytest
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.config import Settings, load_settings, merge, parse
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.network import Master
+from adacd_hil.records import ArmCommand
+from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.codec import load_codec
+from firmware_sim.bench import Bench
+from firmware_sim.scenario import load_scenario
+
+pytestmark = pytest.mark.slow
+
+CODEC = load_codec()
+PERIOD_NS = 1_000_000
+
+
+class Rig:
+    """Host and emulator in one process; `passed` is every frame on the bus."""
+
+    def __init__(self, table: dict[str, object] | None = None) -> None:
+        self.clock = VirtualClock()
+        self.passed: list[tuple[int, bytes]] = []
+        bus = EmbeddedBus(self.clock)
+        self._bench = Bench(load_scenario("idle", "P"), CODEC, self._deliver)
+        self.bus = bus
+        bus.attach(self._on_frame)
+        self._bench.boot()
+        settings = parse(Settings, merge({"name": "test"}, table or {}))
+        self.arm = Arm(settings, CODEC, bus)
+        self.master = Master(settings, CODEC, bus)
+        self.cycle = 0
+
+    def _deliver(self, can_id: int, data: bytes) -> None:
+        self.passed.append((can_id, bytes(data)))
+        self.bus.deliver(can_id, data)
+
+    def _on_frame(self, frame: Frame) -> None:
+        self.passed.append((frame.can_id, frame.data))
+        self._bench.on_frame(frame)
+
+    def start(self) -> None:
+        self.master.reset()
+        self.master.identify()
+        self.master.configure()
+        self.master.start()
+
+    def accept(self, frame: Frame) -> None:
+        if not self.arm.accept(frame):
+            self.master.accept(frame)
+
+    def step(self, enable: bool = False) -> None:
+        self.clock.sleep_until_ns(self.cycle * PERIOD_NS)
+        self.arm.synchronise(self.cycle, self.cycle * PERIOD_NS, 1)
+        while (frame := self.bus.receive(0.0)) is not None:
+            self.accept(frame)
+        self.arm.write(ArmCommand(np.zeros(2), enable, False))
+        if self.cycle % 100 == 0:
+            self.master.send_heartbeat()
+        self.cycle += 1
+
+
+def read(rig: Rig, name: str, index: int, sub: int = 0) -> int:
+    return int(next(slave for slave in rig.master.slaves if slave.name == name).read(index, sub))
+
+
+def test_the_emulated_arm_boots_runs_and_is_watched() -> None:
+    rig = Rig()
+    rig.start()
+    for _ in range(300):
+        rig.step(enable=True)
+    assert rig.arm.state().is_enabled
+    assert rig.master.watch(rig.cycle * PERIOD_NS) == []
+
+
+def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:
+    rig = Rig({"bus": {"heartbeat_ms": 40}})
+    rig.start()
+    watched = [read(rig, name, 0x1016, 1) for name in ("Drive1", "Drive2", "Sensor1", "Sensor2")]
+    assert watched == [127 << 16 | 100] * 4
+
+
+def test_the_same_boot_twice_is_the_same_frames() -> None:
+    rigs = [Rig(), Rig()]
+    for rig in rigs:
+        rig.start()
+        for _ in range(50):
+            rig.step(enable=True)
+    assert rigs[0].passed == rigs[1].passed
+    assert len(rigs[0].passed) > 700
+
+
+def test_a_second_boot_of_running_nodes_leaves_them_configured() -> None:
+    rig = Rig()
+    rig.start()
+    for _ in range(20):
+        rig.step(enable=True)
+    rig.start()
+    assert read(rig, "Drive1", 0x6061) == 10
+    assert read(rig, "Drive1", 0x1017) == 100
+
+
+def test_an_option_code_of_the_configuration_reaches_the_drives() -> None:
+    rig = Rig({"devices": {"quick_stop_option": 6}})
+    rig.start()
+    assert [read(rig, name, 0x605A) for name in ("Drive1", "Drive2")] == [6, 6]
+
+
+def test_a_node_id_that_the_dbc_does_not_have_is_refused() -> None:
+    with pytest.raises(DeviceError, match=r"no boot-up from Drive2 \(node 9\)"):
+        Rig({"devices": {"drive_node": [1, 9]}}).start()
+
+
+def test_an_emergency_is_an_event_with_name_watchdog_and_time_and_stays_until_reset() -> None:
+    rig = Rig()
+    rig.start()
+    rig.master.take_events()
+    rig.accept(Frame(0x081, bytes.fromhex("5082 11 02 d2040000"), 0))
+    text = "EMCY 0x8250: RPDO timeout, watchdog 2 (command) at device time 1234 ms"
+    assert [(event.level, event.name, event.message) for event in rig.master.take_events()] == [
+        ("warning", "Drive1", text)
+    ]
+    assert rig.master.describe_emergencies() == [f"Drive1: {text}"]
+    rig.accept(Frame(0x081, bytes(8), 0))
+    assert [event.message for event in rig.master.take_events()] == ["EMCY 0x0000: error reset"]
+    assert rig.master.describe_emergencies() == []
+
+
+def test_an_auto_zero_takes_the_offset_away_and_says_when_it_is_done() -> None:
+    rig = Rig()
+    rig.start()
+    for _ in range(50):
+        rig.step()
+    sensor = rig.arm.sensors[0]
+    sensor.begin_zero(rig.master.begin_autozero(0, rig.accept))
+    steps = 0
+    while sensor.is_zeroing:
+        rig.step()
+        steps += 1
+    after = []
+    for _ in range(200):
+        rig.step()
+        after.append(sensor.torque_Nm)
+    assert steps == 65
+    assert abs(np.mean(after)) < 0.02
+
+
+def test_no_cyclic_frame_is_lost_to_an_sdo_in_between() -> None:
+    rig = Rig()
+    rig.start()
+    rig.arm.synchronise(0, 0, 1)  # its answers wait in the queue while the SDO is spoken
+    rig.master.begin_autozero(1, rig.accept)
+    assert rig.arm.is_complete
+
+
+def test_a_sensor_without_auto_zero_says_so() -> None:
+    settings = load_settings("stock")
+    bus = EmbeddedBus(VirtualClock())
+    with pytest.raises(DeviceError, match=r"Sensor2 \(node 4\): has no auto-zero, 0x6125"):
+        Master(settings, CODEC, bus).begin_autozero(1)

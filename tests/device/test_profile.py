@@ -1,0 +1,114 @@
+"""Device profiles: what is wrong with one is one line that names it."""
+
+from pathlib import Path
+
+import pytest
+
+from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.device.profile import ObjectName, load_profile, parse_object, profile_names
+
+SENSOR = """
+kind = "sensor"
+eds = "torque_sensor.eds"
+[scale]
+torque_Nm = 1e-6
+[[pdo]]
+message = "Torque"
+number = 1
+cob_id = 0x180
+signals = [{ object = "0x9130:1", signal = "torque" }]
+"""
+
+
+def profile_file(folder: Path, text: str) -> str:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_profiles_for_each_contract_are_built_in() -> None:
+    assert profile_names() == [
+        "adacd-drive",
+        "adacd-drive-fd",
+        "adacd-drive-fd-500us",
+        "adacd-sensor",
+        "adacd-sensor-fd",
+        "adacd-sensor-fd-500us",
+        "int32-sensor",
+        "stock-drive",
+    ]
+
+
+def test_a_users_file_is_a_profile(tmp_path: Path) -> None:
+    profile = load_profile(profile_file(tmp_path, SENSOR), "sensor")
+    assert (profile.name, profile.eds.name, profile.settings.pdo[0].mapping_index) == (
+        "mine",
+        "torque_sensor.eds",
+        0x1A00,
+    )
+
+
+def test_an_eds_beside_the_profile_comes_first(tmp_path: Path) -> None:
+    (tmp_path / "torque_sensor.eds").write_text("")
+    assert load_profile(profile_file(tmp_path, SENSOR), "sensor").eds == tmp_path / "torque_sensor.eds"
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [("0x6064", (0x6064, 0)), ("0x9130:1", (0x9130, 1)), ("1A00:8", (0x1A00, 8))]
+)
+def test_an_object_is_index_and_sub_index(text: str, name: tuple[int, int]) -> None:
+    assert parse_object(text) == ObjectName(*name)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (("kind", "kin"), "unknown key `kin`; did you mean `kind`?"),
+        (('"sensor"', '"senor"'), "`kind` = 'senor' must be one of drive, sensor; did you mean 'sensor'?"),
+        (("torque_sensor.eds", "none.eds"), "eds = 'none.eds' is neither beside it nor in dbc/"),
+        (("0x9130:1", "9130h"), "object '9130h' must be like 0x6064 or 0x9130:1"),
+        (("0x9130:1", "0x19130:1"), "must be within 0x0001 to 0xFFFF:255"),
+        (('"torque"', '"load"'), "no frame carries torque"),
+        (('"Torque"', '"Feedback"'), "a sensor needs Torque"),
+        (("cob_id = 0x180", "cob_id = 0x80"), "is below 384"),
+        (("torque_Nm = 1e-6", ""), "a sensor needs torque_Nm"),
+        (("[scale]", 'protection = "P02"\n[scale]'), "header has 0 objects, P02 takes 2"),
+        (("cob_id", 'data_ids = ["00", "11"]\ncob_id'), "data_ids need protection P02 or P05"),
+        (("[scale]", "features = ['autozerro']\n[scale]"), "did you mean 'autozero'?"),
+        (("[scale]", "serial = [1]\n[scale]"), "serial has 1 numbers, 2 expected"),
+    ],
+)
+def test_a_profile_that_cant_be_used_is_one_line(tmp_path: Path, change: tuple[str, str], line: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        load_profile(profile_file(tmp_path, SENSOR.replace(*change)), "sensor")
+    assert line in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_misspelt_name_is_told_the_nearest() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'stock-drive'"):
+        load_profile("stock-drvie", "drive")
+
+
+def test_a_sensor_is_no_drive() -> None:
+    with pytest.raises(ConfigError, match="int32-sensor is a sensor, a drive is needed"):
+        load_profile("int32-sensor", "drive")
+
+
+@pytest.mark.parametrize(
+    ("name", "contract"), [("paper", "arm"), ("fd", "arm_fd"), ("stock", "arm_stock"), ("fd_500us", "arm_fd_500us")]
+)
+def test_built_in_configurations_name_their_contract(name: str, contract: str) -> None:
+    settings = load_settings(name)
+    assert (settings.name, settings.devices.contract) == (name, contract)
+
+
+def test_the_other_configurations_are_the_papers_experiment() -> None:
+    assert load_settings("stock").operator == load_settings("paper").operator
+
+
+def test_two_devices_cant_share_a_node_id(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("[devices]\ndrive_node = [1, 3]\n")
+    with pytest.raises(ConfigError, match="node ids 1, 3, 3, 4 of drives and sensors must differ"):
+        load_settings(str(path))

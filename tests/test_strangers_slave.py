@@ -1,0 +1,638 @@
+"""Our master and arm run slaves that we did not write: canopen's LocalNode, untouched, from stock EDS files.
+
+Only the application is here: the CiA 402 state machine, a mass, a torque, and PDOs through canopen's own classes. All
+in one process, in virtual time.
+"""
+
+import dataclasses
+import functools
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import can
+import canopen
+import numpy as np
+import pytest
+
+from adacd_hil.config import DevicesSettings, Settings, load_settings
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.contract import load_contract
+from adacd_hil.device.network import Master
+from adacd_hil.records import ArmCommand, ArmState, FaultReason
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec import contract_folder
+
+PERIOD_NS = 1_000_000
+INCREMENTS_PER_RAD = 1048576 / (2 * np.pi)
+STATUSWORDS = {
+    "switch on disabled": 0x0250,
+    "ready to switch on": 0x0231,
+    "switched on": 0x0233,
+    "operation enabled": 0x0237,
+    "quick stop active": 0x0217,
+    "fault": 0x0218,
+}
+
+
+@functools.cache
+def read_once(eds: Path, node_id: int) -> canopen.ObjectDictionary:
+    """What LocalNode does with a path, but not again for each test; a node keeps its values elsewhere."""
+    return canopen.import_od(str(eds), node_id)
+
+
+compose_once = functools.cache(load_contract)
+
+
+class Periodic:
+    """What canopen gets for `send_periodic`: fires in virtual time."""
+
+    def __init__(self, wire: "Wire", message: can.Message, period_s: float) -> None:
+        self.wire, self.message, self.period_ns = wire, message, round(period_s * 1e9)
+        self.due_ns = wire.now_ns + self.period_ns
+        wire.timers.append(self)
+
+    def fire(self) -> None:
+        self.wire.to_host(self.message)
+        self.due_ns += self.period_ns
+
+    def stop(self) -> None:
+        self.wire.timers.remove(self)
+
+
+class Later:
+    """Something that happens once."""
+
+    def __init__(self, wire: "Wire", due_ns: int, action: Callable[[], None]) -> None:
+        self.wire, self.due_ns, self.action = wire, due_ns, action
+        wire.timers.append(self)
+
+    def fire(self) -> None:
+        self.wire.timers.remove(self)
+        self.action()
+
+
+class Wire:
+    """The host's bus, and to canopen's networks a python-can bus, in one process."""
+
+    channel = "in-process"
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+        self.timers: list[Periodic | Later] = []
+        self.networks: list[canopen.Network] = []
+        self.sent: list[Frame] = []
+        self._received: deque[Frame] = deque()
+
+    # the host's end
+    def send(self, can_id: int, data: bytes) -> None:
+        self.sent.append(Frame(can_id, data, self.now_ns))
+        for network in self.networks:
+            network.notify(can_id, bytearray(data), self.now_ns * 1e-9)
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        end_ns = self.now_ns + round(timeout_s * 1e9)
+        while not self._received:
+            due_ns = min((timer.due_ns for timer in self.timers), default=end_ns + 1)
+            if due_ns > end_ns:
+                self.now_ns = end_ns
+                return None
+            self.advance_to(due_ns)
+        return self._received.popleft()
+
+    def recover(self) -> None:
+        self._received.clear()
+
+    def close(self) -> None:
+        pass
+
+    def advance_to(self, t_ns: int) -> None:
+        while (timer := min(self.timers, key=lambda t: t.due_ns, default=None)) and timer.due_ns <= t_ns:
+            self.now_ns = timer.due_ns
+            timer.fire()
+        self.now_ns = t_ns
+
+    # canopen's end
+    def to_host(self, message: can.Message) -> None:
+        self._received.append(Frame(message.arbitration_id, bytes(message.data), self.now_ns))
+
+    def connect(self, node: canopen.LocalNode) -> canopen.Network:
+        network = canopen.Network()
+        network.bus = PythonCanEnd(self)
+        network.add_node(node)
+        self.networks.append(network)
+        return network
+
+
+class PythonCanEnd:
+    """As much of a python-can bus as canopen asks for."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+
+    def send(self, message: can.Message) -> None:
+        self._wire.to_host(message)
+
+    def send_periodic(self, message: can.Message, period_s: float) -> Periodic:
+        return Periodic(self._wire, message, period_s)
+
+
+class Stranger:
+    """A LocalNode with what every application does: boot, take over the PDO set-up, act on SYNC."""
+
+    def __init__(self, wire: Wire, node_id: int, eds: Path) -> None:
+        self.wire = wire
+        self.node = canopen.LocalNode(node_id, read_once(eds, node_id))
+        self.network = wire.connect(self.node)
+        self.lies: dict[tuple[int, int], int] = {}
+        self.refusals: dict[tuple[int, int], int] = {}
+        self.node.add_read_callback(lambda index, subindex, od: self.lies.get((index, subindex)))
+        self.node.add_write_callback(self._on_write)
+        self.network.subscribe(0x000, self._on_nmt)
+        self.network.subscribe(0x080, self._on_sync)
+        self.is_mapped = False
+
+    def _on_write(self, index: int, subindex: int, od: object, data: bytes) -> None:
+        if (index, subindex) in self.refusals:
+            raise canopen.SdoAbortedError(self.refusals[index, subindex])
+        self.on_write(index, data)
+
+    def _on_nmt(self, can_id: int, data: bytes, timestamp: float) -> None:
+        command, node_id = data
+        if node_id not in (0, self.node.id):
+            return
+        if command == 130:
+            for index in [index for index in self.node.data_store if index < 0x2000]:
+                del self.node.data_store[index]
+            self.boot()
+        if command == 1 and not self.is_mapped:
+            self.is_mapped = True
+            self.node.tpdo.read()
+            self.node.rpdo.read()
+            self.on_mapped()
+
+    def _on_sync(self, can_id: int, data: bytes, timestamp: float) -> None:
+        if self.node.nmt.state == "OPERATIONAL":
+            self.on_sync()
+
+    def boot(self) -> None:
+        self.node.nmt.state = "INITIALISING"
+        self.node.nmt.state = "PRE-OPERATIONAL"
+
+    def unplug(self) -> None:
+        self.wire.networks.remove(self.network)
+
+    def on_write(self, index: int, data: bytes) -> None:
+        pass
+
+    def on_mapped(self) -> None:
+        pass
+
+    def on_sync(self) -> None:
+        pass
+
+
+class StrangeDrive(Stranger):
+    """A CiA 402 drive with a mass of 1 kg m² behind it; rated torque in mNm."""
+
+    def __init__(self, wire: Wire, node_id: int, rated_mNm: int) -> None:
+        super().__init__(wire, node_id, contract_folder() / "stock_drive.eds")
+        self.node.sdo[0x6076].raw = rated_mNm
+        self.rated_Nm = rated_mNm * 1e-3
+        self.state = "switch on disabled"
+        self.error_code = 0
+        self.controlword = 0
+        self.resets = 0
+        self.torque_Nm = self.velocity = self.position = 0.0
+        self._command = (0, 0)
+        self._told: tuple[str, int] | None = None
+
+    def on_write(self, index: int, data: bytes) -> None:
+        if index == 0x6060:
+            self.node.sdo[0x6061].raw = data[0]
+
+    def on_mapped(self) -> None:
+        self.node.rpdo[1].add_callback(self._on_command)
+
+    def _on_command(self, pdo: canopen.pdo.PdoMap) -> None:
+        self._command = (pdo[0x6040].raw, pdo[0x6071].raw)
+
+    def on_sync(self) -> None:
+        controlword, permille = self._command
+        self._obey(controlword)
+        is_on = self.state == "operation enabled" and self.node.sdo[0x6061].raw == 10
+        self.torque_Nm = permille * 1e-3 * self.rated_Nm if is_on else 0.0
+        self.velocity += self.torque_Nm * 1e-3
+        self.position += self.velocity * 1e-3
+        feedback, status = self.node.tpdo[1], self.node.tpdo[2]
+        feedback[0x6064].raw = round(self.position * INCREMENTS_PER_RAD)
+        feedback[0x606C].raw = round(self.velocity * INCREMENTS_PER_RAD)
+        feedback.transmit()
+        if self._told != (self.state, self.error_code):
+            self._told = (self.state, self.error_code)
+            status[0x6041].raw = STATUSWORDS[self.state]
+            status[0x6061].raw = self.node.sdo[0x6061].raw
+            status[0x6077].raw = 0
+            status[0x603F].raw = self.error_code
+            status.transmit()
+
+    def _obey(self, controlword: int) -> None:
+        is_edge = controlword & 0x80 and not self.controlword & 0x80
+        self.controlword = controlword
+        if self.state == "fault":
+            if is_edge:
+                self.resets += 1
+                self.state, self.error_code = "switch on disabled", 0
+            return
+        command = controlword & 0x0F
+        if not command & 0x02:
+            self.state = "switch on disabled"
+        elif not command & 0x04:
+            is_stopping = self.state in ("operation enabled", "quick stop active")
+            self.state = "quick stop active" if is_stopping else "switch on disabled"
+        elif command == 0x06:
+            self.state = "ready to switch on"
+        elif command == 0x07 and self.state != "switch on disabled":
+            self.state = "switched on"
+        elif command == 0x0F and self.state in ("switched on", "operation enabled"):
+            self.state = "operation enabled"
+
+    def fail(self, code: int) -> None:
+        self.state, self.error_code = "fault", code
+        self.node.emcy.send(code, 0x81, b"")
+
+
+class StrangeSensor(Stranger):
+    """A torque transducer: int32, 1e-5 Nm, on SYNC."""
+
+    torque_Nm = 0.0
+
+    def on_sync(self) -> None:
+        torque = self.node.tpdo[1]
+        torque[0x9130].raw = round(self.torque_Nm * 1e5)
+        torque.transmit()
+
+
+class Rig:
+    """The host's master and arm with four strangers."""
+
+    def __init__(self, settings: Settings | None = None, sensor_eds: str = "int32_sensor.eds") -> None:
+        devices = dataclasses.replace((settings or load_settings("stock")).devices, contract="")
+        self.settings = dataclasses.replace(settings or load_settings("stock"), devices=devices)
+        self.wire = Wire()
+        self.drives = [StrangeDrive(self.wire, 1, 12_000), StrangeDrive(self.wire, 2, 6_000)]
+        self.sensors = [StrangeSensor(self.wire, node, contract_folder() / sensor_eds) for node in (3, 4)]
+        codec = compose_once(self.settings)
+        self.arm = Arm(self.settings, codec, self.wire)
+        self.master = Master(self.settings, codec, self.wire)
+        self.cycle = 0
+
+    def boot(self) -> None:
+        self.master.reset()
+        self.master.identify()
+        self.master.configure()
+
+    def start(self) -> None:
+        self.boot()
+        self.master.start()
+
+    def step(self, *tau: float, enable: bool = True, quick_stop: bool = False) -> ArmState:
+        self.wire.advance_to(self.wire.now_ns + PERIOD_NS)
+        self.arm.synchronise(self.cycle, self.wire.now_ns, 1)
+        while (frame := self.wire.receive(0.0)) is not None:
+            if not self.arm.accept(frame):
+                self.master.accept(frame)
+        state = self.arm.state()
+        self.arm.write(ArmCommand(np.array(tau or (0.0, 0.0)), enable, quick_stop))
+        self.cycle += 1
+        return state
+
+    def enable(self) -> None:
+        self.start()
+        for _ in range(10):
+            state = self.step()
+        assert state.is_enabled
+
+
+def test_the_master_maps_what_the_drive_did_not_map_by_itself() -> None:
+    rig = Rig()
+    rig.boot()
+    drive = rig.drives[0].node
+    mapping = [drive.sdo[0x1A00][sub].raw for sub in range(drive.sdo[0x1A00][0].raw + 1)]
+    assert mapping == [2, 0x60640020, 0x606C0020]
+    assert [drive.sdo[0x1800][sub].raw for sub in (1, 2)] == [0x181, 1]
+    assert [drive.sdo[0x1801][sub].raw for sub in (1, 2, 5)] == [0x281, 255, 100]
+    assert [drive.sdo[0x1400][sub].raw for sub in (1, 2, 5)] == [0x201, 1, 10]
+
+
+def test_a_pdo_is_changed_only_while_it_is_invalid_and_its_mapping_empty() -> None:
+    rig = Rig()
+    rig.boot()
+    writes = [
+        (int.from_bytes(f.data[1:3], "little"), f.data[3], int.from_bytes(f.data[4:8], "little"))
+        for f in rig.wire.sent
+        if f.can_id == 0x601 and f.data[0] & 0xE0 == 0x20
+    ]
+    first = writes.index((0x1A00, 0, 0))
+    assert writes[first - 1 : first + 8] == [
+        (0x1800, 1, 0x80000181),
+        (0x1A00, 0, 0),
+        (0x1A00, 1, 0x60640020),
+        (0x1A00, 2, 0x606C0020),
+        (0x1A00, 0, 2),
+        (0x1800, 2, 1),
+        (0x1800, 3, 0),
+        (0x1800, 5, 0),
+        (0x1800, 1, 0x00000181),
+    ]
+
+
+def test_pdos_that_the_contract_does_not_know_are_switched_off() -> None:
+    rig = Rig()
+    rig.drives[0].lies[0x1802, 1] = 0x381
+    rig.boot()
+    assert rig.drives[0].node.data_store[0x1802][1] == (0x80000381).to_bytes(4, "little")
+
+
+def test_a_fixed_mapping_is_not_written() -> None:
+    rig = Rig()
+    rig.boot()
+    indexes = {int.from_bytes(f.data[1:3], "little") for f in rig.wire.sent if f.can_id == 0x603 and f.data[0] < 0x40}
+    assert indexes == {0x1006, 0x1015, 0x1016, 0x1017}
+
+
+def test_communication_and_application_are_set_up() -> None:
+    rig = Rig()
+    rig.boot()
+    drive = rig.drives[1].node.sdo
+    values = [drive[i].raw for i in (0x1006, 0x1017, 0x1015, 0x1019, 0x6060, 0x6061, 0x6072, 0x60E0, 0x60E1, 0x605A)]
+    assert values == [1000, 100, 100, 240, 10, 10, 1000, 1000, 1000, 2]
+    assert drive[0x1016][1].raw == 127 << 16 | 250
+
+
+def test_a_node_that_comes_late_is_waited_for() -> None:
+    rig = Rig()
+    late = rig.sensors[1]
+    late.unplug()
+
+    def plug_in() -> None:
+        rig.wire.networks.append(late.network)
+        late.boot()
+
+    Later(rig.wire, 1_500_000_000, plug_in)
+    rig.boot()
+    assert rig.wire.now_ns >= 1_500_000_000
+
+
+def test_other_traffic_does_not_prolong_the_wait_for_a_node() -> None:
+    rig = Rig()
+    rig.sensors[1].unplug()
+    Periodic(rig.wire, can.Message(arbitration_id=0x7F0, data=[5], is_extended_id=False), 0.01)
+    with pytest.raises(DeviceError, match=r"no boot-up from Sensor2 \(node 4\) on in-process within 2 s"):
+        rig.master.reset()
+    assert rig.wire.now_ns <= 2_100_000_000
+
+
+def test_sensors_are_started_before_drives() -> None:
+    rig = Rig()
+    rig.start()
+    started = [frame.data[1] for frame in rig.wire.sent if frame.can_id == 0 and frame.data[0] == 1]
+    assert started == [3, 4, 1, 2]
+
+
+def test_all_nodes_can_be_started_at_once() -> None:
+    settings = load_settings("stock")
+    rig = Rig(dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, start="all")))
+    rig.start()
+    assert [frame.data for frame in rig.wire.sent if frame.can_id == 0][-1] == b"\x01\x00"
+
+
+def test_strangers_reach_operation_enabled_and_give_feedback() -> None:
+    rig = Rig()
+    rig.sensors[0].torque_Nm, rig.sensors[1].torque_Nm = 1.5, -0.25
+    rig.drives[0].position = 0.5
+    rig.enable()
+    state = rig.step()
+    assert (state.is_complete, state.age_q, state.age_tau_J, state.fault) == (True, (0, 0), (0, 0), FaultReason.NONE)
+    np.testing.assert_allclose([*state.q, *state.tau_J], [0.5, 0.0, 1.5, -0.25], atol=1e-5)
+
+
+def test_torque_reaches_strangers_in_newton_metres_and_moves_them() -> None:
+    rig = Rig()
+    rig.enable()
+    for _ in range(100):
+        state = rig.step(6.0, -1.5)
+    assert [drive.torque_Nm for drive in rig.drives] == [6.0, -1.5]
+    np.testing.assert_allclose(state.dq, [0.6, -0.15], rtol=0.05)
+    assert all(drive.implausible_frames == 0 for drive in rig.arm.drives)
+
+
+def test_a_strangers_fault_takes_the_torque_away_is_named_and_recovered_from_by_one_edge() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.step(6.0, 3.0)
+    rig.drives[1].fail(0x8611)
+    states = [rig.step(6.0, 3.0) for _ in range(3)]
+    assert states[-1].fault is FaultReason.DRIVE
+    assert "Drive2: FAULT, error code 0x8611: following error" in rig.arm.describe_faults() or rig.drives[1].resets
+    assert any(e.name == "Drive2" and "EMCY 0x8611: following error" in e.message for e in rig.master.take_events())
+    assert rig.drives[1].torque_Nm == 0.0
+    for _ in range(10):
+        state = rig.step(6.0, 3.0)
+    assert (rig.drives[1].resets, state.is_enabled, rig.drives[1].torque_Nm) == (1, True, 3.0)
+
+
+def test_an_unwanted_drive_in_fault_is_not_reset() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.drives[0].fail(0x2310)
+    for _ in range(5):
+        rig.step(enable=False)
+    assert (rig.drives[0].resets, rig.drives[0].state) == (0, "fault")
+    assert rig.arm.describe_faults()[0] == "Drive1: FAULT, error code 0x2310: continuous over-current, output"
+
+
+def test_a_quick_stop_stops_strangers() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.step(6.0, 3.0)
+    for _ in range(3):
+        rig.step(6.0, 3.0, quick_stop=True)
+    assert [(drive.state, drive.torque_Nm) for drive in rig.drives] == [("quick stop active", 0.0)] * 2
+
+
+def test_the_sensors_heartbeat_is_watched() -> None:
+    rig = Rig()
+    rig.enable()
+    for _ in range(300):
+        rig.step()
+    assert rig.master.watch(rig.wire.now_ns) == []
+    rig.sensors[0].node.nmt.stop_heartbeat()
+    for _ in range(300):
+        rig.step()
+    (line,) = rig.master.watch(rig.wire.now_ns)
+    assert line.startswith("Sensor1 (node 3): no heartbeat for")
+    rig.sensors[0].node.nmt.start_heartbeat(100)
+    for _ in range(150):
+        rig.step()
+    assert rig.master.watch(rig.wire.now_ns) == []
+
+
+def test_a_node_that_fell_to_pre_operational_is_named() -> None:
+    rig = Rig()
+    rig.enable()
+    for _ in range(150):
+        rig.step()
+    rig.drives[0].node.nmt.state = "PRE-OPERATIONAL"
+    for _ in range(150):
+        rig.step()
+    assert rig.master.watch(rig.wire.now_ns) == ["Drive1 (node 1): is PRE-OPERATIONAL, OPERATIONAL expected"]
+
+
+def silence(stranger: Stranger) -> None:
+    stranger.network.unsubscribe(stranger.node.sdo.rx_cobid)
+
+
+BAD_DEVICES: dict[str, tuple[Callable[[Rig], None], str]] = {
+    "wrong vendor": (
+        lambda rig: rig.drives[0].lies.update({(0x1018, 1): 0xBAD}),
+        "Drive1 (node 1): vendor 0xBAD is not the EDS's 0xB0B",
+    ),
+    "wrong product": (
+        lambda rig: rig.sensors[0].lies.update({(0x1018, 2): 0x41}),
+        "Sensor1 (node 3): product code 0x41 is not the EDS's 0x40",
+    ),
+    "another major revision": (
+        lambda rig: rig.drives[0].lies.update({(0x1018, 3): 0x20002}),
+        "Drive1 (node 1): revision 0x20002 is not of the EDS's 0x10002",
+    ),
+    "wrong device type": (
+        lambda rig: rig.drives[1].lies.update({(0x1000, 0): 0x00020191}),
+        "Drive2 (node 2): device type 0x1000 = 0x00020191, 0x00020192 expected",
+    ),
+    "mapping refused": (
+        lambda rig: rig.drives[1].refusals.update({(0x1A00, 2): 0x06040041}),
+        "Drive2 (node 2): writing 0x1A00:2 TPDO mapping parameter 1, Mapped object 2 = 0x606C0020 refused: "
+        "Code 0x06040041, Object cannot be mapped to the PDO",
+    ),
+    "mapping read back different": (
+        lambda rig: rig.drives[0].lies.update({(0x1A00, 2): 0x60690020}),
+        "Drive1 (node 1): mapped object 0x1A00:2 = 0x60690020, 0x606C0020 expected",
+    ),
+    "identifier read back different": (
+        lambda rig: rig.drives[0].lies.update({(0x1400, 1): 0x301}),
+        "Drive1 (node 1): identifier 0x1400:1 = 0x301, 0x201 expected",
+    ),
+    "another fixed mapping": (
+        lambda rig: rig.sensors[1].lies.update({(0x1A00, 1): 0x71300110}),
+        "Sensor2 (node 4): mapped object 0x1A00:1 = 0x71300110, 0x91300120 expected",
+    ),
+    "another transmission type": (
+        lambda rig: rig.sensors[1].lies.update({(0x1800, 2): 254}),
+        "Sensor2 (node 4): transmission type 0x1800:2 = 254, 1 expected",
+    ),
+    "wrong rated torque": (
+        lambda rig: rig.drives[1].lies.update({(0x6076, 0): 12_000}),
+        "Drive2 (node 2): rated torque 0x6076 = 12000 mNm, 6000 mNm expected",
+    ),
+    "no cyclic synchronous torque": (
+        lambda rig: rig.drives[0].lies.update({(0x6502, 0): 0x1A5}),
+        "Drive1 (node 1): supported modes 0x6502 = 0x000001A5, bit 9 (cyclic synchronous torque) expected",
+    ),
+    "mode not taken": (
+        lambda rig: rig.drives[0].lies.update({(0x6061, 0): 8}),
+        "Drive1 (node 1): mode of operation 0x6061 = 8, 10 expected",
+    ),
+    "wrong encoder": (
+        lambda rig: rig.drives[0].lies.update({(0x608F, 1): 4096}),
+        "Drive1 (node 1): increments per joint revolution 0x608F x 0x6091 = 4096/1 x 16/1, 1048576 expected",
+    ),
+    "torque limit not taken": (
+        lambda rig: rig.drives[0].lies.update({(0x60E1, 0): 900}),
+        "Drive1 (node 1): 0x60E1 Negative torque limit value reads back 900 per mille, 1000 per mille written",
+    ),
+    "wrong SYNC identifier": (
+        lambda rig: rig.sensors[0].lies.update({(0x1005, 0): 0x40000081}),
+        "Sensor1 (node 3): SYNC identifier 0x1005 = 0x81, 0x80 expected",
+    ),
+    "SYNC period not taken": (
+        lambda rig: rig.drives[0].lies.update({(0x1006, 0): 2000}),
+        "Drive1 (node 1): SYNC period 0x1006 = 2000 µs, 1000 µs expected",
+    ),
+    "no boot-up": (
+        lambda rig: rig.drives[1].unplug(),
+        "no boot-up from Drive2 (node 2) on in-process within 2 s",
+    ),
+    "SDO time-out": (
+        lambda rig: silence(rig.sensors[0]),
+        "Sensor1 (node 3): no SDO answer within 0.5 s (reading 0x1000 Device type)",
+    ),
+    "abort": (
+        lambda rig: rig.drives[0].refusals.update({(0x6060, 0): 0x08000022}),
+        "Drive1 (node 1): writing 0x6060 Modes of operation = 10 refused: Code 0x08000022, Data can not be transferred "
+        "or stored to the application because of the present device state",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_DEVICES)
+def test_a_bad_device_is_one_line_that_names_device_object_value_and_expectation(name: str) -> None:
+    spoil, line = BAD_DEVICES[name]
+    rig = Rig()
+    spoil(rig)
+    with pytest.raises(DeviceError) as raised:
+        rig.boot()
+    assert str(raised.value) == line
+
+
+DIGITS_PROFILE = """
+kind = "sensor"
+eds = "torque_sensor.eds"
+features = ["heartbeat_consumer", "sync_counter"]
+[scale]
+torque_Nm = 1e-6
+[[pdo]]
+message = "Torque"
+number = 1
+cob_id = 0x180
+signals = [{ object = "0x9130:1", signal = "torque" }]
+"""
+
+
+def rig_with_units(folder: Path) -> Rig:
+    path = folder / "digits.toml"
+    path.write_text(DIGITS_PROFILE)
+    settings = load_settings("stock")
+    devices: DevicesSettings = dataclasses.replace(settings.devices, sensor=(str(path), str(path)))
+    return Rig(dataclasses.replace(settings, devices=devices), "torque_sensor.eds")
+
+
+def test_a_users_own_profile_runs_a_sensor(tmp_path: Path) -> None:
+    rig = rig_with_units(tmp_path)
+    rig.start()
+    rig.sensors[0].torque_Nm = 0.5  # the stranger counts in 1e-5 Nm
+    rig.step()
+    np.testing.assert_allclose(rig.step().tau_J, [0.05, 0.0])
+
+
+def test_a_prefix_in_the_unit_counts_with_the_digits(tmp_path: Path) -> None:
+    rig = rig_with_units(tmp_path)
+    for sensor in rig.sensors:
+        sensor.lies.update({(0x6131, 1): 0xFD560100, (0x6132, 1): 3})  # mNm, three digits
+    rig.boot()
+
+
+@pytest.mark.parametrize(
+    ("lies", "line"),
+    [
+        ({(0x6132, 1): 3}, "Sensor1 (node 3): decimal digits 0x6132:1 = 3, 6 expected"),
+        ({(0x6131, 1): 0x00210000}, "Sensor1 (node 3): unit 0x6131:1 = 0x00210000, 0x00560100 (Nm) expected"),
+    ],
+)
+def test_wrong_units_of_a_sensor_are_one_line(tmp_path: Path, lies: dict[tuple[int, int], int], line: str) -> None:
+    rig = rig_with_units(tmp_path)
+    rig.sensors[0].lies.update(lies)
+    with pytest.raises(DeviceError) as raised:
+        rig.boot()
+    assert str(raised.value) == line
