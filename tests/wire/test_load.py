@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.wire.bus import CAN_ERR_FLAG, Frame, open_bus
+from adacd_hil.wire.bus import Frame, open_bus
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.load import LoadMeter
 
@@ -75,7 +75,7 @@ def test_a_rate_of_zero_is_refused() -> None:
 
 def test_error_frames_and_extended_identifiers() -> None:
     meter = LoadMeter(BITRATE, start_ns=0)
-    meter.add(Frame(CAN_ERR_FLAG, bytes(8), 0, is_error=True))
+    meter.add(Frame(0x004, bytes(8), 0, is_error=True))
     meter.add(frame(0x1AAAAAAA, b""))
     load = meter.take(SECOND_NS)
     assert load.frames == 1
