@@ -67,6 +67,8 @@ class Master:
 
     def reset(self) -> None:
         """Reset the communication of all nodes and wait until each has booted. Raises DeviceError."""
+        while self._bus.receive(0.0) is not None:  # from before the reset; a full queue has no room for what follows
+            pass
         waiting = {node.id: name for name, node in self.nodes.items()}
         self._canopen.command(_RESET_COMMUNICATION)
 

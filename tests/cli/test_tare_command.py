@@ -225,7 +225,9 @@ def test_on_vcan_a_tare_takes_a_sensors_offset_out_of_the_next_run(tmp_path: Pat
     config = tmp_path / "short.toml"
     config.write_text(SHORT_RUN)
     with emulator(tmp_path, "--scenario", str(scenario)):
-        tared = adacd_hil(tmp_path, "tare", "-i", "socketcan", "-c", "vcan0", "--clock", "lockstep", "--json")
+        tared = adacd_hil(
+            tmp_path, "tare", "-i", "socketcan", "-c", "vcan0", "--clock", "lockstep", "--json", "--seconds", "0.5"
+        )
         assert tared.status == 0, tared.stderr
         played = run_on_vcan(tmp_path, "--clock", "lockstep", "--config", str(config), "--tare", "tare.toml")
     assert played.status == 0, played.stderr

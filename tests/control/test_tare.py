@@ -325,6 +325,15 @@ def test_a_device_that_never_answers_is_named() -> None:
     assert "data are missing from Sensor2: no 200 complete cycles in a row within" in refusal_of(rig)
 
 
+def test_boot_ups_from_before_the_reset_are_not_taken_for_answers() -> None:
+    rig = TareRig()
+    for node_id in (1, 2, 3, 4):
+        rig.bus.deliver(0x700 + node_id, b"\x00")
+    rig.bus.attach(lambda frame: None)
+    with pytest.raises(DeviceError, match=r"no boot-up from Drive1 \(node 1\), Drive2"):
+        rig.session.run()
+
+
 def test_a_device_that_falls_silent_while_it_is_measured_is_named() -> None:
     rig = TareRig()
     rig.tamper = lambda cycle, can_id, data: None if can_id == 0x181 and cycle > SETTLED_CYCLE + 20 else data
