@@ -1,4 +1,4 @@
-"""`adacd-hil tare`, and `adacd-hil run --tare`: the commands on the embedded bus, and a process on vcan."""
+"""`adacd-hil tare`, and `adacd-hil run --tare`: the commands on the embedded bus."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from experiment_runs import adacd_hil, emulator
+from experiment_runs import adacd_hil
 
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import Clock
@@ -216,16 +216,3 @@ def test_a_bus_without_devices_says_who_is_missing_and_writes_nothing(tmp_path: 
     (complaint,) = played.error_lines
     assert "no boot-up from Drive1 (node 1)" in complaint
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.vcan
-def test_on_vcan_two_tares_in_a_row_find_the_same_offset(tmp_path: Path) -> None:
-    scenario = tmp_path / "biased.toml"
-    scenario.write_text(f"start_deg = [-30.0, -60.0]\ntorque_offset_Nm = {list(OFFSET)}\n")
-    on_vcan = ("tare", "-i", "socketcan", "-c", "vcan0", "--clock", "lockstep", "--json", "--seconds", "0.5")
-    with emulator(tmp_path, "--scenario", str(scenario)):
-        for _ in range(2):
-            played = adacd_hil(tmp_path, *on_vcan)
-            assert played.status == 0, played.stderr
-            np.testing.assert_allclose(played.json["offset_Nm"], OFFSET, atol=4 * 0.02 / 500**0.5)
-    assert (played.json["file"], played.json["backup"]) == ("tare.toml", "tare.toml.1")
