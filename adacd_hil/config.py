@@ -361,6 +361,53 @@ class SafetySettings:
 
 
 @dataclass(frozen=True)
+class TareSettings:
+    """Tare of the joint torque sensors: how long, how still, how far apart, and how old.
+
+    The bounds on spread and drift are a small part of the detection threshold (0.15 Nm); an offset that is off by the
+    threshold is a contact that nobody made.
+    """
+
+    poses: int = setting(1, low=1, high=50, meaning="poses to measure in")
+    window_s: float = setting(2.0, unit="s", low=0.1, high=600.0, meaning="measured time in each pose")
+    settle_s: float = setting(0.5, unit="s", low=0.0, high=60.0, meaning="rest before the measurement of a pose")
+    move_deg: float = setting(
+        10.0, unit="deg", low=1.0, high=360.0, meaning="a new pose: some joint is further than this from the last one"
+    )
+    move_timeout_s: float = setting(
+        120.0, unit="s", low=1.0, high=3600.0, meaning="longest wait for the user to move the arm to a new pose"
+    )
+    creep_limit_deg: float = setting(0.1, unit="deg", low=1e-4, high=10.0, meaning="largest travel while measuring")
+    std_limit_Nm: float = setting(
+        0.06, unit="Nm", low=1e-6, high=100.0, meaning="largest standard deviation; sensors have about 0.02"
+    )
+    peak_to_peak_limit_Nm: float = setting(
+        0.5, unit="Nm", low=1e-6, high=100.0, meaning="largest distance of two samples; catches a short knock"
+    )
+    drift_limit_Nm: float = setting(
+        0.02, unit="Nm", low=1e-6, high=100.0, meaning="largest difference of the means of the window's halves"
+    )
+    offset_limit_Nm: tuple[float, float] = setting(
+        (2.0, 2.0), unit="Nm", low=1e-3, high=50.0, meaning="largest plausible offset; beyond it something pushes"
+    )
+    pose_limit_Nm: float = setting(
+        0.1, unit="Nm", low=1e-6, high=100.0, meaning="vertical axes: largest spread of poses; else largest residual"
+    )
+    missing_limit: float = setting(0.01, low=0.0, high=0.5, meaning="largest share of cycles without complete data")
+    gravity_model: str = setting(
+        "estimated", choices=("estimated", "cad"), meaning="with estimator.gravity: a4, a5 from the poses, or the CAD's"
+    )
+    condition_limit: float = setting(
+        30.0, low=1.0, high=1e6, meaning="largest condition number of the poses' equations for a4, a5 and offsets"
+    )
+    auto_zero_limit_Nm: float = setting(
+        0.02, unit="Nm", low=1e-6, high=10.0, meaning="largest torque left after the sensor's own zero, 0x6125"
+    )
+    warn_age_h: float = setting(24.0, unit="h", low=0.0, high=1e5, meaning="a run warns of a tare older than this")
+    max_age_h: float = setting(0.0, unit="h", low=0.0, high=1e5, meaning="a run refuses one older than this; 0: never")
+
+
+@dataclass(frozen=True)
 class Settings:
     """Everything a run depends on, resolved. Attached to every log."""
 
@@ -377,6 +424,7 @@ class Settings:
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
     operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
+    tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
 
     @property
     def cad_theta(self) -> Vector:

@@ -5,16 +5,17 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
-from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
+from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.control.tare_file import use_tare
 from adacd_hil.wire.bus import is_hardware, open_bus
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.codec import Codec, load_codec
 
 
 def make_clock(name: str) -> Clock:
@@ -22,8 +23,29 @@ def make_clock(name: str) -> Clock:
     return VirtualClock() if name == "lockstep" else MonotonicClock()
 
 
+def check_clock(name: str, interface: str, channel: str) -> None:
+    """Raise CommandError for lockstep on hardware, which has no time for it."""
+    if name == "lockstep" and is_hardware(interface, channel):
+        raise CommandError(
+            f"--clock lockstep is for emulated arms; {interface} {channel} is hardware and needs --clock realtime",
+            ExitCode.USAGE,
+        )
+
+
+def received_ids(codec: Codec) -> list[int]:
+    """List the identifiers that the host receives."""
+    return [message.can_id for message in codec.messages.values() if "HOST" not in message.senders]
+
+
+class Interruptible(Protocol):
+    """What a signal can end in good order."""
+
+    def interrupt(self) -> None:
+        """Ask for the end; safe in a signal handler."""
+
+
 @contextmanager
-def interruptible(session: Session) -> Iterator[None]:
+def interruptible(session: Interruptible) -> Iterator[None]:
     """Let SIGINT and SIGTERM end the session instead of the process."""
     previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number in previous:
@@ -44,23 +66,28 @@ def run_on_bus(
     dbc: Path | None,
     clock_name: str,
     out: Path,
+    tare_path: Path | None = None,
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Run the scheme on a bus. Raises ConfigError, CodecError, BusMissingError, LogError, CommandError."""
-    if clock_name == "lockstep" and is_hardware(interface, channel):
-        raise CommandError(
-            f"--clock lockstep is for emulated arms; {interface} {channel} is hardware and needs --clock realtime",
-            ExitCode.USAGE,
-        )
+    """Run the scheme on a bus, with the offsets of a tare when one is given.
+
+    Raises ConfigError, CodecError, BusMissingError, LogError, CommandError.
+    """
+    check_clock(clock_name, interface, channel)
     settings = load_settings(config, profile)
+    tare = None
+    if tare_path is not None:
+        tare = use_tare(tare_path, settings, wall_ns())
+        settings = tare.apply(settings)
     codec = load_codec(dbc)
     clock = make_clock(clock_name)
-    received = [message.can_id for message in codec.messages.values() if "HOST" not in message.senders]
-    bus = open_bus(interface, channel, clock, received, bitrate)
+    bus = open_bus(interface, channel, clock, received_ids(codec), bitrate)
     operator: Operator = ScriptedOperator(settings.operator)
     if sys.stdin is not None and sys.stdin.isatty():
         operator = ConsoleOperator(ScriptedOperator(settings.operator))
     progress = Progress()
-    session = Session(settings, codec, bus, clock, operator, out, interface, progress=progress)
+    session = Session(settings, codec, bus, clock, operator, out, interface, progress=progress, tare=tare)
+    for line in () if tare is None else tare.warnings:
+        progress(f"warning: {line}")
     try:
         with interruptible(session):
             summary = session.run()

@@ -77,3 +77,8 @@ class GridPacer:
         """Let the next cycle begin on the next grid point that is ahead."""
         if self._start_ns is not None:
             self._cycle = max(self._cycle, (self._clock.now_ns() - self._start_ns) // self._period_ns)
+
+
+def make_pacer(clock: Clock, period_ns: int) -> Pacer:
+    """Make the pacer that goes with a clock: lockstep with a VirtualClock, else the grid."""
+    return LockstepPacer(clock, period_ns) if isinstance(clock, VirtualClock) else GridPacer(clock, period_ns)

@@ -13,8 +13,9 @@ from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.exchange import SilenceError
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import GridPacer, LockstepPacer, Pacer
+from adacd_hil.control.realtime import Pacer, make_pacer
 from adacd_hil.control.recovery import Recovery
+from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
@@ -80,6 +81,7 @@ class Session:
     interface: str
     metadata: dict[str, str] = field(default_factory=dict)
     progress: Callable[[str], None] = lambda _: None
+    tare: UsedTare | None = None
     _cycle: Cycle | None = None
     _is_interrupted: bool = False
     _has_started: bool = False
@@ -101,7 +103,7 @@ class Session:
         Raises LogError when the log can't be created.
         """
         tap = Tap(self.bus, self.clock)
-        pacer = self._pacer()
+        pacer = make_pacer(self.clock, self.settings.bus.period_ns)
         self.progress("compiling")
         attempt = self._prepare(tap, pacer)
         # After compiling: a second of work at real-time priority would be paid back by 50 ms of throttling later.
@@ -160,8 +162,12 @@ class Session:
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
         """Bring the devices from whatever they were in to pre-operational and configured. Raises DeviceError."""
         master.reset()
-        for identity in master.identify():
+        identities = master.identify()
+        for identity in identities:
             recorder.event(self.clock.now_ns(), Event("info", identity.name, _describe(identity)))
+        if self.tare is not None:
+            for event in self.tare.check_sensors(identities):
+                recorder.event(self.clock.now_ns(), event)
         master.configure()
         recorder.cycle(self.clock.now_ns(), [], tap.take())
 
@@ -183,17 +189,14 @@ class Session:
             recorder.event(self.clock.now_ns(), Event("error", "run", f"devices were not stopped: {error}"))
         recorder.cycle(self.clock.now_ns(), [], tap.take())
 
-    def _pacer(self) -> Pacer:
-        if isinstance(self.clock, VirtualClock):
-            return LockstepPacer(self.clock, self.settings.bus.period_ns)
-        return GridPacer(self.clock, self.settings.bus.period_ns)
-
     def _open_log(self, grant: RealtimeGrant) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
         attachments = {path.name: path.read_bytes() for path in sorted(contract_folder().glob("*.eds"))}
         attachments["arm.dbc"] = self.codec.text
         attachments["config.toml"] = to_toml(self.settings).encode()
+        if self.tare is not None:
+            attachments[TARE_NAME] = self.tare.text
         return Recorder(
             self.out / LOG_NAME,
             codec_path=self.codec.path,
@@ -208,7 +211,7 @@ class Session:
         settings = self.settings
         return {
             "version": __version__,
-            "git": _git_commit(),
+            "git": git_commit(),
             "config": settings.name,
             "profile": settings.arm.profile,
             "wire_version": str(self.codec.wire_version),
@@ -220,6 +223,7 @@ class Session:
             "period_us": str(settings.bus.period_us),
             "python": platform.python_version(),
             "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
+            **(self.tare.metadata() if self.tare is not None else {}),
             **self.metadata,
         }
 
@@ -231,7 +235,7 @@ def _describe(identity: Identity) -> str:
     )
 
 
-def _git_commit() -> str:
+def git_commit() -> str:
     """Name the commit of the source tree, empty when installed without one."""
     try:
         done = subprocess.run(

@@ -26,6 +26,7 @@ _START, _ENTER_PRE_OPERATIONAL, _RESET_COMMUNICATION = 0x01, 0x80, 0x82
 _SYNC_ID = 0x080
 _IDENTIFIER_MASK = 0x7FF
 _PROFILE_NUMBER_MASK = 0xFFFF  # of 0x1000
+_MOST_OLD_FRAMES = 10_000  # more than any queue holds; a bus that somebody floods is never empty
 _AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
 
 
@@ -91,8 +92,9 @@ class Master:
 
     def reset(self) -> None:
         """Reset the communication of all nodes and wait until each has booted. Raises DeviceError, BusError."""
-        while self._bus.receive(0.0) is not None:  # from before the reset; a full queue has no room for what follows
-            pass
+        for _ in range(_MOST_OLD_FRAMES):  # from before the reset; a full queue has no room for what follows
+            if self._bus.receive(0.0) is None:
+                break
         timeout_s = self._settings.devices.boot_timeout_s
         waiting = {slave.node_id: slave.name for slave in self.slaves}
         self._heartbeats.stop()

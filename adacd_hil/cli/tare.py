@@ -1,0 +1,106 @@
+"""A tare on a bus: opens it, lets a tare session measure, stores what it found."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.progress import Progress
+from adacd_hil.cli.run import check_clock, interruptible, make_clock, received_ids
+from adacd_hil.config import Settings, load_settings
+from adacd_hil.control.exchange import SilenceError
+from adacd_hil.control.tare import TareRefusedError
+from adacd_hil.control.tare_file import Tare, read_tare, write_tare
+from adacd_hil.control.tare_session import TareInterruptedError, TareSession
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.wire.bus import open_bus
+from adacd_hil.wire.codec import load_codec
+
+
+@dataclass(frozen=True)
+class StoredTare:
+    """A tare and where it lies. `backup`: where the file lies that was there."""
+
+    tare: Tare
+    path: Path
+    backup: Path | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Describe it for machines."""
+        backup = None if self.backup is None else str(self.backup)
+        return {"file": str(self.path), "backup": backup, **dataclasses.asdict(self.tare)}
+
+    def as_text(self) -> str:
+        """Describe it for people."""
+        tare = self.tare
+        lines = [
+            f"joint{joint}: offset {offset:+.4f} ± {error:.4f} Nm (was {old:+.4f}), spread of poses {spread:.4f} Nm, "
+            f"sensor {sensor.serial}"
+            for joint, (offset, error, old, spread, sensor) in enumerate(
+                zip(
+                    tare.offset_Nm,
+                    tare.standard_error_Nm,
+                    tare.old_offset_Nm,
+                    tare.spread_Nm,
+                    tare.sensors,
+                    strict=True,
+                ),
+                start=1,
+            )
+        ]
+        if tare.gravity_model != "none":
+            lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))
+        kept = "" if self.backup is None else f"; the one before is {self.backup}"
+        lines.append(f"{self.path}{kept}")
+        return "\n".join(lines)
+
+
+def tare_on_bus(
+    interface: str,
+    channel: str,
+    bitrate: int | None,
+    config: str,
+    profile: str | None,
+    dbc: Path | None,
+    clock_name: str,
+    out: Path,
+    poses: int | None,
+    seconds: float | None,
+    is_auto_zeroing: bool,
+) -> StoredTare:
+    """Tare the sensors of an arm on a bus. Raises ConfigError, CodecError, BusError, CommandError, OSError."""
+    check_clock(clock_name, interface, channel)
+    settings = _with_options(load_settings(config, profile), poses, seconds)
+    # A file that is no tare isn't overwritten.
+    old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
+    codec = load_codec(dbc)
+    clock = make_clock(clock_name)
+    bus = open_bus(interface, channel, clock, received_ids(codec), bitrate)
+    progress = Progress()
+    try:
+        session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
+        with interruptible(session):
+            tare = session.run()
+    except TareRefusedError as reason:
+        raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None
+    except TareInterruptedError as reason:
+        raise CommandError(str(reason), ExitCode.INTERRUPTED) from None
+    except DeviceError as reason:
+        raise CommandError(str(reason), ExitCode.BUS_MISSING) from None
+    except SilenceError as reason:
+        raise CommandError(str(reason), ExitCode.SAFETY_STOP) from None
+    finally:
+        bus.close()
+        progress.close()
+    return StoredTare(tare, out, write_tare(tare, out))
+
+
+def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
+    """Let the command's options outweigh the configuration."""
+    tare = settings.tare
+    if poses is not None:
+        tare = dataclasses.replace(tare, poses=poses)
+    if seconds is not None:
+        tare = dataclasses.replace(tare, window_s=seconds)
+    return dataclasses.replace(settings, tare=tare)

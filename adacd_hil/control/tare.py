@@ -1,0 +1,227 @@
+"""The tare of the joint torque sensors: a window at rest judged, and the offsets solved from one or several poses.
+
+At rest, drives off, pose k, joint i, the sensor reads gravity and its zero offset:
+
+    tau_J[k, i] = Y_g(q[k])[i] (a4, a5)' + offset[i]
+
+With vertical joint axes Y_g is zero and the offset is the mean over the poses. Otherwise a4 and a5 are estimated with
+the offsets by least squares, or taken from the CAD model. Y_g are the gravity columns of the scheme's regressor.
+
+Shapes: histories q, dq, tau_J (n, 2); per joint (2,); per pose (N, 2). Units: rad, rad/s, Nm. tau_J is in joint
+direction with nothing subtracted.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.config import ConfigError, Settings
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINT_NAMES, JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.scheme.regressor import A4, A5, regressor
+
+GRAVITY_POSES = 3
+"""Fewest poses that estimate a4, a5 and two offsets and leave residuals to judge them by: 6 equations, 4 unknowns."""
+_BLOCKS = 10
+"""Parts of a window whose means show noise slower than the sample rate."""
+_GRAVITY = (A4, A5)
+
+
+class TareRefusedError(RuntimeError):
+    """The sensors can't be tared now; one line with quantity, value, bound and unit."""
+
+
+class ArmMovedError(TareRefusedError):
+    """The arm did not rest while it was measured."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One pose that was measured at rest."""
+
+    q: Vector
+    mean_Nm: Vector
+    standard_error_Nm: Vector
+    std_Nm: Vector
+    peak_to_peak_Nm: Vector
+    drift_Nm: Vector
+    samples: int
+
+
+@dataclass(frozen=True)
+class TareSolution:
+    """What the poses say. `gravity_Nm`: a4 and a5, zeros with vertical axes. `condition`: of the poses' equations."""
+
+    offset_Nm: Vector
+    standard_error_Nm: Vector
+    gravity_Nm: Vector
+    residual_Nm: Vector
+    condition: float
+
+    @property
+    def spread_Nm(self) -> Vector:
+        """Distance of the highest and the lowest residual of each joint, Nm (2,)."""
+        spread: Vector = np.ptp(self.residual_Nm, axis=0)
+        return spread
+
+
+def check_plan(settings: Settings) -> None:
+    """Raise ConfigError when these settings can't lead to a tare, whatever is measured."""
+    tare = settings.tare
+    if not settings.estimator.gravity:
+        return
+    if tare.gravity_model == "cad" and not settings.arm.cad_theta:
+        raise ConfigError("`tare.gravity_model` = 'cad' needs `arm.cad_theta` with a4 and a5")
+    if tare.gravity_model == "estimated" and tare.poses < GRAVITY_POSES:
+        raise ConfigError(
+            f"`tare.poses` = {tare.poses} is below {GRAVITY_POSES}, which estimating gravity needs; "
+            f"or set `tare.gravity_model` to 'cad'"
+        )
+
+
+def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
+    """Raise ArmMovedError when the arm moves or creeps. q, dq: (2,), or (n, 2) with n at least 1."""
+    q, dq = np.atleast_2d(q), np.atleast_2d(dq)
+    speed = np.abs(dq).max(axis=0)
+    bound_rad_s = settings.safety.rest_velocity_rad_s
+    travel_deg = np.degrees(np.ptp(q, axis=0))
+    bound_deg = settings.tare.creep_limit_deg
+    for joint, name in enumerate(JOINT_NAMES):
+        if not speed[joint] <= bound_rad_s:
+            raise ArmMovedError(
+                f"the arm moves: |dq[{name}]| = {speed[joint]:.3g} rad/s exceeds safety.rest_velocity_rad_s = "
+                f"{bound_rad_s:g} rad/s"
+            )
+        if not travel_deg[joint] <= bound_deg:
+            raise ArmMovedError(
+                f"the arm creeps: q[{name}] went through {travel_deg[joint]:.3g} deg while it was measured, which "
+                f"exceeds tare.creep_limit_deg = {bound_deg:g} deg"
+            )
+
+
+def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Pose:
+    """Judge one window of samples at rest (n, 2 each) and reduce it to a pose. Raises TareRefusedError."""
+    tare = settings.tare
+    if len(tau_J) < 2 * _BLOCKS:
+        raise TareRefusedError(f"{len(tau_J)} complete samples in a pose are below {2 * _BLOCKS}")
+    check_motion(q, dq, settings)
+    middle = len(tau_J) // 2
+    pose = Pose(
+        q=q.mean(axis=0),
+        mean_Nm=tau_J.mean(axis=0),
+        standard_error_Nm=_standard_error(tau_J),
+        std_Nm=tau_J.std(axis=0, ddof=1),
+        peak_to_peak_Nm=np.ptp(tau_J, axis=0),
+        drift_Nm=tau_J[middle:].mean(axis=0) - tau_J[:middle].mean(axis=0),
+        samples=len(tau_J),
+    )
+    _bound("standard deviation of tau_J", pose.std_Nm, tare.std_limit_Nm, "tare.std_limit_Nm")
+    _bound(
+        "peak-to-peak value of tau_J", pose.peak_to_peak_Nm, tare.peak_to_peak_limit_Nm, "tare.peak_to_peak_limit_Nm"
+    )
+    _bound("drift of tau_J from first to second half", pose.drift_Nm, tare.drift_limit_Nm, "tare.drift_limit_Nm")
+    return pose
+
+
+def _standard_error(tau_J: Vector) -> Vector:
+    """Estimate the standard error of the mean (2,), by samples and by blocks: the larger one, as noise has memory."""
+    by_sample = tau_J.std(axis=0, ddof=1) / math.sqrt(len(tau_J))
+    means = np.array([block.mean(axis=0) for block in np.array_split(tau_J, _BLOCKS)])
+    larger: Vector = np.maximum(by_sample, means.std(axis=0, ddof=1) / math.sqrt(_BLOCKS))
+    return larger
+
+
+def _bound(quantity: str, values: Vector, bound: float | Sequence[float], setting: str, remedy: str = "") -> None:
+    """Raise TareRefusedError when the size of a joint's value exceeds its bound; NaN does."""
+    bounds = np.broadcast_to(bound, JOINTS)
+    for joint, name in enumerate(JOINT_NAMES):
+        if not abs(values[joint]) <= bounds[joint]:
+            raise TareRefusedError(
+                f"{quantity}[{name}] = {values[joint]:.4g} Nm exceeds {setting} = {bounds[joint]:g} Nm{remedy}"
+            )
+
+
+def gravity_columns(q: Vector) -> Vector:
+    """Return Y_g (2, 2): the torques at rest of a unit a4 and a unit a5, by the scheme's own regressor."""
+    rest = np.zeros(JOINTS)
+    columns: Vector = regressor(q, rest, rest, len(PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES))[:, list(_GRAVITY)]
+    return columns
+
+
+def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
+    """Solve the poses for the offsets and check the result against its bounds. Raises TareRefusedError."""
+    solution = _solve(poses, settings)
+    tare = settings.tare
+    if settings.estimator.gravity:
+        for number, residual in enumerate(solution.residual_Nm, start=1):
+            remedy = "; something pushes on the arm there, or the gravity model is wrong"
+            _bound(f"residual of pose {number}", residual, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
+    else:
+        remedy = "; friction, a cable or somebody pushes on the arm in one of them"
+        _bound("spread between poses of tau_J", solution.spread_Nm, tare.pose_limit_Nm, "tare.pose_limit_Nm", remedy)
+    remedy = "; something pushes on the arm, or the sensor is damaged"
+    _bound("offset", solution.offset_Nm, tare.offset_limit_Nm, "tare.offset_limit_Nm", remedy)
+    return solution
+
+
+def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
+    """Solve by least squares, without a word on the result's plausibility."""
+    is_estimated = settings.estimator.gravity and settings.tare.gravity_model == "estimated"
+    gravity = np.zeros(len(_GRAVITY))
+    if settings.estimator.gravity and not is_estimated:
+        gravity = settings.cad_theta[list(_GRAVITY)]
+    torque = np.array([pose.mean_Nm for pose in poses])
+    columns = np.array([gravity_columns(pose.q) for pose in poses]) if settings.estimator.gravity else None
+    if columns is not None and not is_estimated:
+        torque = torque - columns @ gravity
+    offsets = np.tile(np.eye(JOINTS), (len(poses), 1))
+    if columns is not None and is_estimated:
+        matrix = np.hstack((columns.reshape(-1, len(_GRAVITY)), offsets))
+    else:
+        matrix = offsets
+    condition = _check_condition(matrix, poses, settings) if is_estimated else 1.0
+    unknowns, *_ = np.linalg.lstsq(matrix, torque.ravel(), rcond=None)
+    residual = torque - (matrix @ unknowns).reshape(-1, JOINTS)
+    if is_estimated:
+        gravity = unknowns[: len(_GRAVITY)]
+    errors = _errors_of_unknowns(matrix, poses, residual)
+    return TareSolution(unknowns[-JOINTS:], errors[-JOINTS:], gravity, residual, condition)
+
+
+def _errors_of_unknowns(matrix: NDArray[np.float64], poses: Sequence[Pose], residual: Vector) -> Vector:
+    """Give the standard errors of the unknowns.
+
+    An equation's error is the larger of two: the noise of its mean, and how far the poses disagree.
+    """
+    inverse = np.linalg.inv(matrix.T @ matrix)
+    variance = np.array([pose.standard_error_Nm for pose in poses]) ** 2
+    freedom = len(poses) - matrix.shape[1] / JOINTS
+    if freedom > 0.0:
+        variance = np.maximum(variance, (residual**2).sum(axis=0) / freedom)
+    covariance = inverse @ (matrix.T * variance.ravel()) @ matrix @ inverse
+    errors: Vector = np.sqrt(np.diag(covariance))
+    return errors
+
+
+def _check_condition(matrix: NDArray[np.float64], poses: Sequence[Pose], settings: Settings) -> float:
+    """Return the condition number of the equations for (a4, a5, offsets). Raises TareRefusedError naming the motion."""
+    _, values, directions = np.linalg.svd(matrix)
+    condition = float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
+    bound = settings.tare.condition_limit
+    if condition <= bound:
+        return condition
+    # What hardly shows is an a4 with the offset of joint 1, or an a5 with the offset of joint 2.
+    hidden = directions[-1] ** 2
+    q = np.array([pose.q for pose in poses])
+    if hidden[0] + hidden[2] >= hidden[1] + hidden[3]:
+        angles, what, motion = q[:, 0], "cos(q1)", "move joint 1 further between the poses"
+    else:
+        angles, what = q.sum(axis=1), "cos(q1 + q2)"
+        motion = "turn link 2 further between the poses, against the ground and not with link 1 only"
+    low, high = np.cos(angles).min(), np.cos(angles).max()
+    raise TareRefusedError(
+        f"condition number of {len(poses)} poses = {condition:.3g} exceeds tare.condition_limit = {bound:g}: "
+        f"{what} only goes from {low:.2f} to {high:.2f}; {motion}"
+    )

@@ -1,0 +1,212 @@
+"""A stored tare: the offsets with their provenance as TOML, and the checks before a run uses them.
+
+The offsets are in joint direction and are what `arm.torque_offset_Nm` subtracts after the sign. A tare belongs to the
+sensors that it was measured with, by their serial numbers of 0x1018:4.
+"""
+
+import dataclasses
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from adacd_hil.config import ConfigError, Settings, parse, read_toml, setting, to_toml
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.network import Identity
+from adacd_hil.records import JOINTS, Event
+
+TARE_NAME = "tare.toml"
+FORMAT = 1
+_DATE = "%Y-%m-%dT%H:%M:%SZ"
+_NS_PER_H = 3_600_000_000_000
+_CLOCK_TOLERANCE_H = 0.1
+
+
+@dataclass(frozen=True)
+class SensorRecord:
+    """The sensor of one joint: object 0x1018, and its temperature where it has object 0x2111."""
+
+    name: str = setting(meaning="name in the DBC")
+    node_id: int = setting(low=1, high=127, meaning="CANopen node id")
+    vendor: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:1")
+    product: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:2")
+    revision: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:3")
+    serial: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:4")
+    temperature_C: float | None = setting(None, unit="°C", low=-273.15, high=1000.0, meaning="when it was tared")
+
+
+@dataclass(frozen=True)
+class PoseRecord:
+    """One measured pose; pairs are (joint 1, joint 2)."""
+
+    q_rad: tuple[float, float] = setting(unit="rad", meaning="joint position")
+    mean_Nm: tuple[float, float] = setting(unit="Nm", meaning="mean torque, joint direction, nothing subtracted")
+    std_Nm: tuple[float, float] = setting(unit="Nm", low=0.0, meaning="standard deviation of the samples")
+    peak_to_peak_Nm: tuple[float, float] = setting(unit="Nm", low=0.0, meaning="highest less lowest sample")
+    drift_Nm: tuple[float, float] = setting(unit="Nm", meaning="mean of the second half less that of the first")
+    residual_Nm: tuple[float, float] = setting(unit="Nm", meaning="mean less gravity model and offset")
+    samples: int = setting(low=1, meaning="complete cycles")
+
+
+@dataclass(frozen=True)
+class Tare:
+    """Offsets of both joint torque sensors and where they come from."""
+
+    format: int = setting(low=FORMAT, high=FORMAT, meaning="version of this file's layout")
+    offset_Nm: tuple[float, float] = setting(unit="Nm", low=-50.0, high=50.0, meaning="subtracted after the sign")
+    standard_error_Nm: tuple[float, float] = setting(unit="Nm", low=0.0, meaning="of the offset")
+    spread_Nm: tuple[float, float] = setting(unit="Nm", low=0.0, meaning="highest less lowest residual of the poses")
+    old_offset_Nm: tuple[float, float] = setting(unit="Nm", meaning="offset that this one replaces")
+    sign: tuple[int, int] = setting(low=-1, high=1, meaning="arm.sign that it was measured with")
+    is_auto_zeroed: bool = setting(meaning="the sensors had just set their own zero, 0x6125")
+    gravity_model: str = setting(choices=("none", "estimated", "cad"), meaning="where a4 and a5 come from")
+    gravity_Nm: tuple[float, float] = setting(unit="Nm", meaning="a4 and a5, zeros with vertical joint axes")
+    condition: float = setting(low=1.0, meaning="condition number of the poses' equations")
+    samples: int = setting(low=1, meaning="of all poses together")
+    duration_s: float = setting(unit="s", low=0.0, meaning="of all samples together")
+    date_utc: str = setting(meaning="when it was measured, ISO 8601, UTC")
+    user: str = setting(meaning="who measured")
+    host: str = setting(meaning="on which machine")
+    interface: str = setting(meaning="python-can interface")
+    channel: str = setting(meaning="its channel")
+    config: str = setting(meaning="name of the configuration")
+    profile: str = setting(meaning="arm profile of the configuration")
+    wire_version: int = setting(low=0, meaning="of the DBC")
+    layout_digest: str = setting(meaning="of the DBC")
+    version: str = setting(meaning="of adacd-hil")
+    git: str = setting(meaning="commit of adacd-hil, empty when installed without one")
+    sensor1: SensorRecord = setting(meaning="sensor of joint 1")
+    sensor2: SensorRecord = setting(meaning="sensor of joint 2")
+    poses: tuple[PoseRecord, ...] = setting(meaning="what was measured")
+
+    def __post_init__(self) -> None:
+        if not self.poses:
+            raise ValueError("a tare without poses")
+        try:
+            self.measured_ns()
+        except ValueError:
+            raise ValueError(f"date_utc = {self.date_utc!r} is not like 2026-01-31T12:00:00Z") from None
+
+    @property
+    def sensors(self) -> tuple[SensorRecord, SensorRecord]:
+        """The sensors in joint order."""
+        return self.sensor1, self.sensor2
+
+    def measured_ns(self) -> int:
+        """Return when it was measured, ns since 1970."""
+        date = datetime.strptime(self.date_utc, _DATE).replace(tzinfo=UTC)
+        return int(date.timestamp()) * 1_000_000_000
+
+
+def format_date(t_ns: int) -> str:
+    """Write wall-clock time, ns since 1970, as ISO 8601 in UTC."""
+    return datetime.fromtimestamp(t_ns // 1_000_000_000, tz=UTC).strftime(_DATE)
+
+
+def read_tare(path: Path) -> Tare:
+    """Read a tare file. Raises ConfigError."""
+    if not path.exists():
+        raise ConfigError(f"tare {path} does not exist; `adacd-hil tare` makes one")
+    table = read_toml(path)
+    try:
+        return parse(Tare, table)
+    except ConfigError as error:
+        raise ConfigError(f"tare {path}: {error}") from None
+
+
+def write_tare(tare: Tare, path: Path) -> Path | None:
+    """Write a tare file in one step; what is there is kept with `.1` appended, whose path is returned. Raises OSError.
+
+    At no moment is there half a file, or none where there was one.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    backup = path.with_name(f"{path.name}.1") if path.exists() else None
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        new = Path(folder) / path.name
+        with new.open("w", encoding="utf-8") as file:
+            file.write(to_toml(tare))
+            file.flush()
+            os.fsync(file.fileno())
+        if backup is not None:
+            copy = Path(folder) / backup.name
+            shutil.copy2(path, copy)
+            copy.replace(backup)
+        new.replace(path)
+    return backup
+
+
+def sensor_identities(identities: Sequence[Identity]) -> tuple[Identity, ...]:
+    """Pick the torque sensors out of the devices found at boot, in joint order."""
+    found = {identity.name: identity for identity in identities}
+    return tuple(found[f"Sensor{joint}"] for joint in range(1, JOINTS + 1))
+
+
+@dataclass(frozen=True)
+class UsedTare:
+    """A tare file that a run uses. `text`: the file as it is. `warnings`: what there is to say of it."""
+
+    path: Path
+    text: bytes
+    tare: Tare
+    warnings: tuple[str, ...]
+
+    def apply(self, settings: Settings) -> Settings:
+        """Return settings whose `arm.torque_offset_Nm` is the tare's."""
+        arm = dataclasses.replace(settings.arm, torque_offset_Nm=self.tare.offset_Nm)
+        return dataclasses.replace(settings, arm=arm)
+
+    def check_sensors(self, identities: Sequence[Identity]) -> list[Event]:
+        """Return what goes to the log's events. Raises DeviceError unless the sensors are those that were tared."""
+        for sensor, identity in zip(self.tare.sensors, sensor_identities(identities), strict=True):
+            for what, of_tare, of_sensor in (
+                ("vendor", sensor.vendor, identity.vendor),
+                ("product code", sensor.product, identity.product),
+                ("serial number", sensor.serial, identity.serial),
+            ):
+                if of_tare != of_sensor:
+                    raise DeviceError(
+                        f"{identity.name} (node {identity.node_id}): {what} {of_sensor} is not the {of_tare} of tare "
+                        f"{self.path}; tare again"
+                    )
+        events = [Event("info", "tare", f"{self.path} of {self.tare.date_utc}: {self.describe_offset()} Nm subtracted")]
+        return events + [Event("warning", "tare", line) for line in self.warnings]
+
+    def metadata(self) -> dict[str, str]:
+        """Describe the tare for the log's metadata."""
+        return {
+            "tare": str(self.path),
+            "tare_date_utc": self.tare.date_utc,
+            "tare_offset_Nm": self.describe_offset(),
+            "tare_sensor_serials": ", ".join(str(sensor.serial) for sensor in self.tare.sensors),
+        }
+
+    def describe_offset(self) -> str:
+        """Write the offsets of both joints, Nm."""
+        return ", ".join(repr(offset) for offset in self.tare.offset_Nm)
+
+
+def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
+    """Read a tare for a run with these settings. now_ns: wall clock. Raises ConfigError when it can't be used."""
+    tare = read_tare(path)
+    if tare.sign != settings.arm.sign:
+        raise ConfigError(
+            f"tare {path} was measured with arm.sign = {list(tare.sign)}, but the configuration has "
+            f"{list(settings.arm.sign)}; tare again"
+        )
+    bounds = settings.tare
+    age_h = (now_ns - tare.measured_ns()) / _NS_PER_H
+    if 0.0 < bounds.max_age_h < age_h:
+        raise ConfigError(
+            f"tare {path} is {age_h:.1f} h old, more than tare.max_age_h = {bounds.max_age_h:g} h; tare again"
+        )
+    warnings = []
+    if age_h > bounds.warn_age_h:
+        warnings.append(f"{path} is {age_h:.1f} h old, more than tare.warn_age_h = {bounds.warn_age_h:g} h")
+    if age_h < -_CLOCK_TOLERANCE_H:
+        warnings.append(f"{path} is dated {-age_h:.1f} h in the future: a clock is wrong")
+    if tare.is_auto_zeroed:
+        warnings.append(f"{path} counts on the zero that the sensors set themselves; a sensor that was reset forgot it")
+    return UsedTare(path, path.read_bytes(), tare, tuple(warnings))

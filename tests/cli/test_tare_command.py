@@ -1,0 +1,218 @@
+"""`adacd-hil tare`, and `adacd-hil run --tare`: the commands on the embedded bus."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from experiment_runs import adacd_hil
+
+from adacd_hil.cli.main import cli
+from adacd_hil.clock import Clock
+from adacd_hil.config import parse
+from adacd_hil.control.tare_file import read_tare
+from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.wire.bus import Bus, EmbeddedBus
+from adacd_hil.wire.codec import load_codec
+from firmware_sim.bench import Bench
+from firmware_sim.scenario import Scenario
+
+pytestmark = pytest.mark.slow
+
+FAILURE, USAGE, BUS_MISSING = 1, 2, 5
+OFFSET = (0.3, -0.2)
+REST_CYCLES = 200  # before the drives are enabled
+ON_BUS = ("-i", "embedded", "-c", "embedded", "--clock", "lockstep")
+SHORT_RUN = '[operator]\nscript = [{at_s = 0.2, request = "finish"}]\n'
+
+
+class Lab:
+    """A folder, and an emulated arm that is there whenever a command opens the bus."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.scenario: dict[str, Any] = {"start_deg": [-30.0, -60.0], "torque_offset_Nm": list(OFFSET)}
+        self.serials: dict[int, int] = {}
+        self.tare_file = folder / "tare.toml"
+        self.settings_file = folder / "settings.toml"
+        self.settings_file.write_text(SHORT_RUN)
+        monkeypatch.setattr("adacd_hil.cli.tare.open_bus", self._open_bus)
+        monkeypatch.setattr("adacd_hil.cli.run.open_bus", self._open_bus)
+        monkeypatch.setattr("adacd_hil.cli.run.is_hardware", lambda interface, channel: False)
+
+    def _open_bus(self, interface: str, channel: str, clock: Clock, *_: object) -> Bus:
+        bus = EmbeddedBus(clock)
+        bench = Bench(parse(Scenario, self.scenario), load_codec(), bus.deliver)
+        for index, serial in self.serials.items():
+            bench.devices[index].serve(0x1018, 4, lambda serial=serial: serial)
+        bus.attach(bench.on_frame)
+        bench.boot()
+        return bus
+
+    def tare(self, *arguments: str) -> Result:
+        return CliRunner().invoke(cli, ["tare", *ON_BUS, "--seconds", "0.3", "--out", str(self.tare_file), *arguments])
+
+    def run(self, *arguments: str) -> Result:
+        config = ("--config", str(self.settings_file), "--out", str(self.folder))
+        return CliRunner().invoke(cli, ["run", *ON_BUS, "--json", *config, *arguments])
+
+    @property
+    def log(self) -> RunLog:
+        return read_log(self.folder / "run.mcap")
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
+    return Lab(tmp_path, monkeypatch)
+
+
+def complaints(result: Result) -> list[str]:
+    return [line for line in result.stderr.splitlines() if line.startswith("adacd-hil:")]
+
+
+def test_a_tare_is_measured_stored_and_printed(lab: Lab) -> None:
+    result = lab.tare("--json")
+    assert result.exit_code == 0, result.stderr
+    printed = json.loads(result.stdout)
+    stored = read_tare(lab.tare_file)
+    assert (printed["file"], printed["backup"]) == (str(lab.tare_file), None)
+    assert tuple(printed["offset_Nm"]) == stored.offset_Nm
+    np.testing.assert_allclose(stored.offset_Nm, OFFSET, atol=0.005)
+    assert stored.samples == 300
+
+
+def test_a_second_tare_keeps_the_first_and_says_what_it_replaces(lab: Lab) -> None:
+    lab.tare()
+    first = read_tare(lab.tare_file)
+    lab.scenario["torque_offset_Nm"] = [0.4, -0.2]
+    result = lab.tare()
+    assert read_tare(lab.tare_file).old_offset_Nm == first.offset_Nm
+    assert read_tare(lab.tare_file.with_name("tare.toml.1")) == first
+    assert f"(was {first.offset_Nm[0]:+.4f})" in result.stdout
+    assert result.stdout.splitlines()[-1] == f"{lab.tare_file}; the one before is {lab.tare_file}.1"
+
+
+def test_the_first_tare_replaces_the_configurations_offset(lab: Lab) -> None:
+    lab.settings_file.write_text("[arm]\ntorque_offset_Nm = [0.25, 0.0]\n")
+    lab.tare("--config", str(lab.settings_file))
+    assert read_tare(lab.tare_file).old_offset_Nm == (0.25, 0.0)
+
+
+def test_a_refused_tare_is_one_line_and_leaves_the_file_as_it_was(lab: Lab) -> None:
+    lab.tare()
+    before = lab.tare_file.read_bytes()
+    lab.scenario["torque_offset_Nm"] = [0.3, 3.0]
+    result = lab.tare()
+    assert result.exit_code == FAILURE
+    (line,) = complaints(result)
+    assert line.startswith("adacd-hil: tare refused: offset[joint2] = 3")
+    assert lab.tare_file.read_bytes() == before
+    assert [path.name for path in lab.folder.iterdir() if path.name.startswith("tare")] == ["tare.toml"]
+
+
+def test_a_file_that_is_no_tare_is_not_overwritten(lab: Lab) -> None:
+    lab.tare_file.write_text(SHORT_RUN)
+    result = lab.tare()
+    assert result.exit_code == USAGE
+    (line,) = complaints(result)
+    assert "unknown key `operator`" in line
+    assert lab.tare_file.read_text() == SHORT_RUN
+
+
+def test_the_options_outweigh_the_configuration(lab: Lab) -> None:
+    lab.settings_file.write_text("[tare]\nposes = 3\nmove_timeout_s = 1.0\nwindow_s = 5.0\n")
+    result = lab.tare("--config", str(lab.settings_file), "--poses", "1")
+    assert result.exit_code == 0, result.stderr
+    assert read_tare(lab.tare_file).samples == 300
+
+
+def test_several_poses_tell_the_user_what_to_do(lab: Lab) -> None:
+    lab.settings_file.write_text("[tare]\nmove_timeout_s = 1.0\n")
+    result = lab.tare("--config", str(lab.settings_file), "--poses", "2")
+    assert result.exit_code == FAILURE
+    assert "pose 2 of 2: move a joint by hand by more than 10 deg, then let go" in result.stderr
+    (line,) = complaints(result)
+    assert "the arm has not been moved by more than tare.move_deg = 10 deg" in line
+
+
+def test_with_the_tare_the_run_sees_no_torque_at_rest_and_the_log_holds_raw_and_tared(lab: Lab) -> None:
+    lab.tare()
+    result = lab.run("--tare", str(lab.tare_file))
+    assert result.exit_code == 0, result.stderr
+    log, offset = lab.log, read_tare(lab.tare_file).offset_Nm
+    tared = log.scheme["tau_J"]
+    raw = np.column_stack([log.decoded[f"Sensor{joint}Torque"]["torque"] for joint in (1, 2)])[: len(tared)]
+    np.testing.assert_allclose(tared[:REST_CYCLES].mean(axis=0), 0.0, atol=4 * 0.02 * (1 / 200 + 1 / 300) ** 0.5)
+    np.testing.assert_allclose(raw[:REST_CYCLES].mean(axis=0), OFFSET, atol=4 * 0.02 / 200**0.5)
+    np.testing.assert_allclose(tared, raw - offset, atol=1e-12)
+
+
+def test_the_log_holds_the_tare_itself_its_offset_and_the_settings_with_it(lab: Lab) -> None:
+    lab.tare()
+    lab.run("--tare", str(lab.tare_file))
+    log, tare = lab.log, read_tare(lab.tare_file)
+    assert log.attachments["tare.toml"] == lab.tare_file.read_bytes()
+    assert f"torque_offset_Nm = {list(tare.offset_Nm)}" in log.attachments["config.toml"].decode()
+    assert log.metadata["tare_offset_Nm"] == f"{tare.offset_Nm[0]!r}, {tare.offset_Nm[1]!r}"
+    assert log.metadata["tare"] == str(lab.tare_file)
+    assert any(entry.event.name == "tare" and entry.event.level == "info" for entry in log.events)
+
+
+def test_a_tare_of_other_sensors_is_refused_before_the_arm_is_started(lab: Lab) -> None:
+    lab.tare()
+    lab.serials[3] = 4711
+    result = lab.run("--tare", str(lab.tare_file))
+    assert result.exit_code == BUS_MISSING
+    (line,) = complaints(result)
+    assert line.startswith("adacd-hil: Sensor2 (node 4): serial number 4711 is not the ")
+    log = lab.log
+    assert log.is_complete
+    assert len(log.scheme["tau_J"]) == 0
+
+
+def test_an_old_tare_is_used_with_a_warning_on_the_terminal_and_in_the_log(lab: Lab) -> None:
+    lab.tare()
+    date = read_tare(lab.tare_file).date_utc
+    lab.tare_file.write_text(lab.tare_file.read_text().replace(date, "2020-01-01T00:00:00Z"))
+    result = lab.run("--tare", str(lab.tare_file))
+    assert result.exit_code == 0, result.stderr
+    assert "more than tare.warn_age_h = 24 h" in result.stderr
+    (event,) = [
+        entry.event for entry in lab.log.events if entry.event.name == "tare" and entry.event.level == "warning"
+    ]
+    assert "more than tare.warn_age_h = 24 h" in event.message
+
+
+@pytest.mark.parametrize(
+    ("settings", "change", "line"),
+    [
+        ("[arm]\nsign = [1, -1]\n", ("", ""), "was measured with arm.sign = [1, 1]"),
+        (
+            "[tare]\nmax_age_h = 1.0\n",
+            ("date_utc = ", "date_utc = '2020-01-01T00:00:00Z' # "),
+            "more than tare.max_age_h",
+        ),
+        ("", ("standard_error_Nm", "standard_eror_Nm"), "unknown key `standard_eror_Nm`; did you mean"),
+    ],
+)
+def test_a_tare_that_cant_be_used_is_one_line_and_wrong_usage(
+    lab: Lab, settings: str, change: tuple[str, str], line: str
+) -> None:
+    lab.tare()
+    if change[0]:
+        lab.tare_file.write_text(lab.tare_file.read_text().replace(*change))
+    lab.settings_file.write_text(settings)
+    result = lab.run("--tare", str(lab.tare_file))
+    assert result.exit_code == USAGE
+    (complaint,) = complaints(result)
+    assert line in complaint
+
+
+def test_a_bus_without_devices_says_who_is_missing_and_writes_nothing(tmp_path: Path) -> None:
+    played = adacd_hil(tmp_path, "tare", "-i", "virtual", "-c", "empty")
+    assert played.status == BUS_MISSING
+    (complaint,) = played.error_lines
+    assert "no boot-up from Drive1 (node 1)" in complaint
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,196 @@
+"""Stored tares: written whole or not at all, read with the rules of the configuration, used only where they belong."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.control.tare_file import (
+    PoseRecord,
+    SensorRecord,
+    Tare,
+    format_date,
+    read_tare,
+    use_tare,
+    write_tare,
+)
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.network import Identity
+
+DATE_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
+HOUR_NS = 3_600_000_000_000
+SETTINGS = load_settings("paper")
+
+SENSOR1 = SensorRecord("Sensor1", 3, 0x41444143, 0x404, 1, 3001, 23.5)
+SENSOR2 = SensorRecord("Sensor2", 4, 0x41444143, 0x404, 1, 3002)
+POSES = (
+    PoseRecord((0.5, -1.0), (0.31, -0.2), (0.02, 0.021), (0.12, 0.13), (0.001, -0.001), (0.005, 0.0), 2000),
+    PoseRecord((0.1, 1.0), (0.3, -0.2), (0.022, 0.023), (0.14, 0.15), (0.002, -0.002), (-0.005, 0.0), 1999),
+)
+TARE = Tare(
+    format=1,
+    offset_Nm=(0.305, -0.2),
+    standard_error_Nm=(0.005, 0.0004),
+    spread_Nm=(0.01, 0.0),
+    old_offset_Nm=(0.25, 0.0),
+    sign=(1, 1),
+    is_auto_zeroed=False,
+    gravity_model="none",
+    gravity_Nm=(0.0, 0.0),
+    condition=1.0,
+    samples=3999,
+    duration_s=3.999,
+    date_utc="2026-01-01T00:00:00Z",
+    user='o"neil\\lab',
+    host="bench",
+    interface="socketcan",
+    channel="can0",
+    config="paper",
+    profile="P",
+    wire_version=1,
+    layout_digest="0x12345678",
+    version="0.1.0",
+    git="abc1234",
+    sensor1=SENSOR1,
+    sensor2=SENSOR2,
+    poses=POSES,
+)
+
+
+def stored(folder: Path, **changes: object) -> Path:
+    path = folder / "tare.toml"
+    write_tare(dataclasses.replace(TARE, **changes), path)  # type: ignore[arg-type]
+    return path
+
+
+def identities(**changes: object) -> list[Identity]:
+    """Devices as found at boot; `changes` concern the second sensor."""
+    sensors = [Identity(s.name, s.node_id, s.vendor, s.product, s.revision, s.serial) for s in TARE.sensors]
+    drives = [Identity(f"Drive{n}", n, 0x41444143, 0x402, 1, 1000 + n) for n in (1, 2)]
+    return [*drives, sensors[0], sensors[1]._replace(**changes)]
+
+
+def test_a_tare_is_read_as_it_was_written(tmp_path: Path) -> None:
+    assert read_tare(stored(tmp_path)) == TARE
+
+
+def test_the_date_is_utc() -> None:
+    assert format_date(DATE_NS + 999_999_999) == "2026-01-01T00:00:00Z"
+    assert TARE.measured_ns() == DATE_NS
+
+
+def test_the_file_before_is_kept_and_nothing_else_is_left(tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    assert write_tare(TARE, folder / "tare.toml") is None
+    second = dataclasses.replace(TARE, offset_Nm=(0.1, 0.1))
+    assert write_tare(second, folder / "tare.toml") == folder / "tare.toml.1"
+    third = dataclasses.replace(TARE, offset_Nm=(0.2, 0.2))
+    write_tare(third, folder / "tare.toml")
+    assert read_tare(folder / "tare.toml") == third
+    assert read_tare(folder / "tare.toml.1") == second
+    assert sorted(path.name for path in folder.iterdir()) == ["tare.toml", "tare.toml.1"]
+
+
+def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    stored(tmp_path, offset_Nm=(0.1, 0.1))
+    path = stored(tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    broken = dataclasses.replace(TARE, user="\ud800")  # no UTF-8
+    with pytest.raises(UnicodeEncodeError):
+        write_tare(broken, path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert len(before) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("\noffset_Nm = [0.305", "\nofset_Nm = [0.305", "unknown key `ofset_Nm`; did you mean `offset_Nm`?"),
+        ("serial = 3001", "serail = 3001", "unknown key `sensor1.serail`; did you mean `sensor1.serial`?"),
+        ("\noffset_Nm = [0.305", "\noffset_Nm = [nan", "`offset_Nm[0]` = nan is not finite"),
+        ("\noffset_Nm = [0.305", "\noffset_Nm = [60.0", "`offset_Nm[0]` = 60.0 Nm is above 50 Nm"),
+        ("format = 1", "format = 2", "`format` = 2 is above 1"),
+        ("2026-01-01T00:00:00Z", "yesterday", "date_utc = 'yesterday' is not like 2026-01-31T12:00:00Z"),
+        ("format = 1", "format", "Expected '=' after a key"),
+    ],
+)
+def test_a_file_that_is_no_tare_is_one_line(tmp_path: Path, old: str, new: str, line: str) -> None:
+    path = stored(tmp_path)
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ConfigError) as error:
+        read_tare(path)
+    assert line in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_says_what_makes_one(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"tare .*none.toml does not exist; `adacd-hil tare` makes one"):
+        read_tare(tmp_path / "none.toml")
+
+
+def test_a_run_takes_over_the_offset_and_nothing_else(tmp_path: Path) -> None:
+    used = use_tare(stored(tmp_path), SETTINGS, DATE_NS)
+    arm = dataclasses.replace(SETTINGS.arm, torque_offset_Nm=(0.305, -0.2))
+    assert used.apply(SETTINGS) == dataclasses.replace(SETTINGS, arm=arm)
+    assert used.warnings == ()
+
+
+def test_another_sign_than_the_one_it_was_measured_with_is_refused(tmp_path: Path) -> None:
+    arm = dataclasses.replace(SETTINGS.arm, sign=(1, -1))
+    with pytest.raises(ConfigError, match=r"measured with arm.sign = \[1, 1\], but the configuration has \[1, -1\]"):
+        use_tare(stored(tmp_path), dataclasses.replace(SETTINGS, arm=arm), DATE_NS)
+
+
+@pytest.mark.parametrize(("age_h", "words"), [(24.0, None), (24.1, "is 24.1 h old"), (-0.2, "0.2 h in the future")])
+def test_an_old_tare_is_warned_of(tmp_path: Path, age_h: float, words: str | None) -> None:
+    warnings = use_tare(stored(tmp_path), SETTINGS, DATE_NS + int(age_h * HOUR_NS)).warnings
+    assert [words in line for line in warnings if words] == ([True] if words else [])
+    assert len(warnings) == (0 if words is None else 1)
+
+
+def test_a_tare_that_is_too_old_for_the_settings_is_refused(tmp_path: Path) -> None:
+    settings = dataclasses.replace(SETTINGS, tare=dataclasses.replace(SETTINGS.tare, max_age_h=12.0))
+    path = stored(tmp_path)
+    assert use_tare(path, settings, DATE_NS + 12 * HOUR_NS).warnings == ()
+    with pytest.raises(ConfigError, match=r"is 12.1 h old, more than tare.max_age_h = 12 h; tare again"):
+        use_tare(path, settings, DATE_NS + int(12.1 * HOUR_NS))
+
+
+def test_a_tare_of_sensors_that_zeroed_themselves_says_that_a_reset_forgets_it(tmp_path: Path) -> None:
+    (warning,) = use_tare(stored(tmp_path, is_auto_zeroed=True), SETTINGS, DATE_NS).warnings
+    assert "a sensor that was reset forgot it" in warning
+
+
+def test_the_sensors_that_were_tared_are_accepted_whatever_the_drives_are(tmp_path: Path) -> None:
+    used = use_tare(stored(tmp_path), SETTINGS, DATE_NS + 25 * HOUR_NS)
+    found = [identity._replace(serial=9) if identity.name == "Drive1" else identity for identity in identities()]
+    info, warning = used.check_sensors(found)
+    assert (info.level, info.name) == ("info", "tare")
+    assert "0.305, -0.2 Nm subtracted" in info.message
+    assert (warning.level, "25.0 h old" in warning.message) == ("warning", True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"serial": 7}, "Sensor2 (node 4): serial number 7 is not the 3002 of tare "),
+        ({"vendor": 1}, "Sensor2 (node 4): vendor 1 is not the 1094992195 of tare "),
+        ({"product": 1}, "Sensor2 (node 4): product code 1 is not the 1028 of tare "),
+    ],
+)
+def test_other_sensors_than_those_that_were_tared_are_refused(
+    tmp_path: Path, changes: dict[str, int], line: str
+) -> None:
+    with pytest.raises(DeviceError) as error:
+        use_tare(stored(tmp_path), SETTINGS, DATE_NS).check_sensors(identities(**changes))
+    assert str(error.value).startswith(line)
+
+
+def test_the_two_sensors_may_not_be_exchanged(tmp_path: Path) -> None:
+    drive1, drive2, sensor1, sensor2 = identities()
+    exchanged = [drive1, drive2, sensor1._replace(serial=3002), sensor2._replace(serial=3001)]
+    with pytest.raises(DeviceError, match="serial number 3002 is not the 3001"):
+        use_tare(stored(tmp_path), SETTINGS, DATE_NS).check_sensors(exchanged)
