@@ -162,12 +162,19 @@ class Arm:
             return FaultReason.DRIVE
         if any(sensor.status & SensorStatus.NOT_VALID for sensor in self.sensors):
             return FaultReason.SENSOR
-        if is_enabled and any(
-            self._cycle - drive.status_cycle > limit
-            for drive, limit in zip(self.drives, self._max_status_age, strict=True)
-        ):
+        (drive1, drive2), (limit1, limit2) = self.drives, self._max_status_age
+        if is_enabled and (self._cycle - drive1.status_cycle > limit1 or self._cycle - drive2.status_cycle > limit2):
             return FaultReason.DATA_AGE
         return FaultReason.NONE
+
+    def restart(self) -> None:
+        """Forget that the drives were enabled, and the sequence of every device's frames: for a recovery, or new run.
+
+        Values and ages stay: what is old is old until fresh frames are in.
+        """
+        self._was_enabled = False
+        for device in self._devices:
+            device.restart()
 
     def ages(self) -> list[SignalAge]:
         """Return the age of every signal that the arm is run by, against its limit."""

@@ -42,7 +42,6 @@ class HeartbeatWatch:
         self._is_watching = True
         self._since_ns = None
         for node in self._nodes.values():
-            node.state = node.heard_ns = None
             node.has_run = False
             node.complaint = ""
 

@@ -20,6 +20,7 @@ class SensorStatus(IntFlag):
 
 
 _STATUS_BITS = 0x07
+_STATUSES = tuple(SensorStatus(bits) for bits in range(_STATUS_BITS + 1))
 _OVERLOAD = SensorStatus.POSITIVE_OVERLOAD | SensorStatus.NEGATIVE_OVERLOAD
 _STATUS_IN_HEADER = {0: None, 2: (1, 4), 4: (3, 0)}
 """Byte and shift of the sender's status, by the length of the end-to-end header: none, Profile 2, Profile 5."""
@@ -106,10 +107,10 @@ class TorqueSensor:
 
     def _take_status(self, data: bytes, values: tuple[float, ...], torque: float) -> None:
         if self._status_at is not None:
-            self.status = SensorStatus(int(values[self._status_at]) & _STATUS_BITS)
+            self.status = _STATUSES[int(values[self._status_at]) & _STATUS_BITS]
         elif self._status_in_header is not None:
             byte, shift = self._status_in_header
-            self.status = SensorStatus(data[byte] >> shift & _STATUS_BITS)
+            self.status = _STATUSES[data[byte] >> shift & _STATUS_BITS]
         elif self._torque_range_Nm:
             self.status = _judge_range(torque, self._torque_range_Nm)
 
@@ -117,13 +118,19 @@ class TorqueSensor:
         """Note a cycle in which no torque came."""
         self.end_to_end.miss()
 
+    def restart(self) -> None:
+        """Forget the sequence of the torque frames: the next valid one is the first."""
+        self.end_to_end.restart()
+        self._received_torque_Nm = None
+        self._zero_left = 0
+
     def accept_status(self, data: bytes) -> None:
         """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
         message, receiver, at = self.status_message, self._status_receiver, self._slow_status_at
         if message is None or receiver is None or at is None or len(data) != message.length:
             return
         if receiver.check(data).is_valid:
-            self.status = SensorStatus(int(message.decode_values(data)[at]) & _STATUS_BITS)
+            self.status = _STATUSES[int(message.decode_values(data)[at]) & _STATUS_BITS]
 
     @property
     def is_overloaded(self) -> bool:

@@ -122,6 +122,20 @@ def test_a_drive_that_drops_out_is_a_fault() -> None:
     assert devices.arm.state().fault is FaultReason.DRIVE
 
 
+def test_after_a_restart_a_drive_has_not_dropped_out_and_any_position_is_taken() -> None:
+    devices = Devices()
+    devices.enable()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer()
+    devices.arm.state()
+    devices.arm.restart()
+    devices.send("Drive2Status", 0x0250, 10, 0, 0)
+    devices.arm.synchronise(1, 0, 1)
+    devices.send("Drive1Feedback", 1.0, 0.0)  # pushed by hand meanwhile
+    state = devices.arm.state()
+    assert (state.fault, round(float(state.q[0]), 4), state.age_q) == (FaultReason.NONE, 1.0, (0, 1))
+
+
 def test_a_drive_that_was_never_enabled_has_not_dropped_out() -> None:
     devices = Devices()
     devices.send("Drive2Status", 0x0218, 10, 0, 0x8250)
@@ -214,6 +228,15 @@ def test_a_cycle_without_a_frame_is_counted_once_as_no_new_data() -> None:
     assert checks[1] == "Drive2: unprotected, 0 implausible, 0 NO_NEW_DATA"
     assert "1 NO_NEW_DATA" in checks[2]
     assert "0 NO_NEW_DATA" in checks[3]
+
+
+def test_a_frame_that_fails_its_check_is_no_miss() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.answer(without=("Sensor2Torque",))
+    devices.arm.accept(Frame(CODEC.message("Sensor2Torque").can_id, bytes(6), 0))
+    devices.arm.synchronise(1, 0, 1)
+    assert "1 WRONG_CRC, 0 NO_NEW_DATA" in devices.arm.describe_checks()[3]
 
 
 def test_a_late_frame_is_no_miss() -> None:
