@@ -119,7 +119,7 @@ def test_the_kernel_filters_other_identifiers(raw: socket.socket) -> None:
 
 def test_without_a_filter_remote_and_ambiguous_frames_stay_out(raw: socket.socket) -> None:
     bus = open_end()
-    extended = [0x80000000 | 1 << bit for bit in range(11, 29)]
+    extended = [0x80000040 | 1 << bit for bit in range(11, 29)]  # with the bit that means bus-off in an error frame
     for can_id in (0x40000181, 0x80000181, 0x800007FF, 0xC0001800, *extended, 0x7FF):
         raw.send(CLASSIC.pack(can_id, 0, b""))
     frames = received(bus, 19)
@@ -285,6 +285,8 @@ def test_a_queue_that_drains_in_time_is_no_error(ends: tuple[SocketCanBus, Socke
                 break
         assert release.wait(10) == 0
         frames = received(far, 11)
+        rest = far.receive(0.05)
+    assert rest is None
     assert frames == [(0x201, OLD_DATA)] * 10 + [(0x202, NEW_DATA)]
 
 
@@ -385,6 +387,8 @@ def test_waiting_frames_are_counted_as_tc_counts_them(ends: tuple[SocketCanBus, 
         )
         assert CanInterface(CHANNEL).waiting_frames() == json.loads(shown.stdout)[0]["qlen"] == 7
     assert CanInterface(CHANNEL).waiting_frames() == 0
+    with pytest.raises(InterfaceDownError, match="CAN interface vcan9 does not exist"):
+        CanInterface("vcan9").waiting_frames()
 
 
 @pytest.mark.slow

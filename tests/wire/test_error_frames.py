@@ -37,6 +37,8 @@ REPORTS = [
     (0x200, "0000000000000300", "OTHER", "unspecified error", (3, 0)),
     (0x000, "0000000000000000", "OTHER", "unspecified error", None),
     (0x040, "", "BUS_OFF", "bus-off", None),
+    (0x204, "0020", "ERROR_PASSIVE", "error passive (sending)", (0, 0)),
+    (0x100, "0b3f881944000000", "RESTARTED", "controller restarted", None),  # details of classes that it isn't
 ]  # fmt: skip
 
 
