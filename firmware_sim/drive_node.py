@@ -161,12 +161,12 @@ class DriveNode:
             self._acted_commands += 1
         else:
             self._miss_command(t_ns)
+        if self._tripped:
+            self._clear_watchdogs(t_ns)
         if self._received_word is not None:
             self._obey_received(t_ns)
         if self._mode != self._wanted_mode:
             self._change_mode()
-        if self._tripped:
-            self._clear_watchdogs(t_ns)
         if self._is_braking:
             self._watch_standstill(t_ns)
         self._drive_motor()

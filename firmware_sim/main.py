@@ -21,7 +21,7 @@ from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
 from firmware_sim.contracts import CONTRACTS, is_fd
-from firmware_sim.pdo import LISTENED_IDS
+from firmware_sim.pdo_record import LISTENED_IDS
 from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
 from firmware_sim.truth import TRUTH_NAME, TruthLog
 

@@ -1,7 +1,5 @@
 """The PDOs of one emulated device: RPDO1… and TPDO1… by CiA 301, whatever a master maps into them.
 
-A PDO is written while it is invalid (bit 31 of its COB-ID): number of entries to 0, entries, number of entries, valid.
-
 transmission type   RPDO                        TPDO
 0                   acts at the next SYNC       at the SYNC after an event
 1 … 240             acts at the next SYNC       at every n-th SYNC
@@ -13,32 +11,16 @@ with the end-to-end header's objects are protected with the data ids of the mess
 Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.e2e import E2eStatus
-from firmware_sim.object_dictionary import NEVER_NS, Abort, ObjectDictionary, Send, refuse
-from firmware_sim.pdo_mapping import NOTHING, check_entry, lay_out
+from firmware_sim.object_dictionary import NEVER_NS, ObjectDictionary, Send
+from firmware_sim.pdo_record import EVENT_DRIVEN, PdoRecord
 
 RECEIVE, TRANSMIT = 0x1400, 0x1800
 COUNT = 4
-_NOT_VALID = 1 << 31  # of a COB-ID
-_IS_EXTENDED = 1 << 29
-_CYCLIC, _EVENT_DRIVEN = range(1, 241), (254, 255)
-_TYPES = (0, *_CYCLIC, *_EVENT_DRIVEN)
-_MAPPING = 0x200  # from a communication record to its mapping record
-
-LISTENED_IDS = frozenset(base + node for base in (0x200, 0x300, 0x400, 0x500) for node in range(1, 33))
-"""Identifiers that an RPDO may have: those of RPDO1 to 4 of nodes 1 to 32. A real controller's acceptance filter is no
-wider, and the emulator's kernel filter is this one."""
-
-
-def _is_restricted(can_id: int) -> bool:
-    """Whether an identifier is none for PDOs: CiA 301, table 34, and SYNC and EMCY."""
-    lowest = (0x000, 0x080, 0x101, 0x581, 0x601, 0x6E0, 0x701)
-    highest = (0x07F, 0x100, 0x180, 0x5FF, 0x67F, 0x6FF, 0x7FF)
-    return any(low <= can_id <= high for low, high in zip(lowest, highest, strict=True))
 
 
 class PdoUser(Protocol):
@@ -51,139 +33,14 @@ class PdoUser(Protocol):
         """Take note of the length of a frame for the device."""
 
 
-class _Pdo:
-    """Communication and mapping record of one PDO."""
-
-    is_received: bool
-
-    def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
-        dictionary = pdos.dictionary
-        self.layout = NOTHING
-        self._pdos = pdos
-        self._message = message
-        self.can_id = dictionary.value(index, 1) & 0x7FF
-        self._is_valid = not dictionary.value(index, 1) & _NOT_VALID
-        self.type = dictionary.value(index, 2)
-        self.inhibit_ns = dictionary.value_or(0, index, 3) * 100_000
-        self.timer_ns = dictionary.value_or(0, index, 5) * 1_000_000
-        mapping = index + _MAPPING
-        self._entries = [
-            dictionary.value(mapping, sub) for sub in range(1, 65) if dictionary.has(mapping, sub)
-        ]  # sub-indices without gaps
-        self._count = dictionary.value(mapping, 0)
-        self._lay_out(self._count)
-        dictionary.watch(index, 1, self._identify, self._check_cob_id)
-        dictionary.watch(index, 2, self._set_type, _check_type)
-        dictionary.watch(index, 3, self._set_inhibit, self._check_inhibit)
-        dictionary.watch(index, 5, self._set_timer)
-        # Entries before their number: a reset restores them in this order.
-        for place in range(len(self._entries)):
-            dictionary.watch(mapping, place + 1, self._setter(place), self._entry_check(place))
-        dictionary.watch(mapping, 0, self._map, self._check_count)
-
-    @property
-    def is_active(self) -> bool:
-        """Whether it is exchanged in Operational."""
-        return self._is_valid and self._count > 0
-
-    @property
-    def is_synchronous(self) -> bool:
-        return self.type not in _EVENT_DRIVEN
-
-    def restart(self) -> None:
-        """Begin the end-to-end sequence anew."""
-        raise NotImplementedError
-
-    def bind(self) -> None:
-        """Take over a new mapping."""
-        raise NotImplementedError
-
-    def _check_cob_id(self, value: int) -> None:
-        can_id = value & 0x7FF
-        if value & _IS_EXTENDED or value & 0x1FFFF800 or _is_restricted(can_id):
-            refuse(Abort.VALUE_RANGE)
-        if self.is_received and can_id not in LISTENED_IDS:
-            refuse(Abort.VALUE_RANGE)
-        if self._is_valid and not value & _NOT_VALID and can_id != self.can_id:
-            refuse(Abort.DEVICE_STATE)
-
-    def _identify(self, value: int) -> None:
-        self.can_id = value & 0x7FF
-        self._is_valid = not value & _NOT_VALID
-        self._pdos.refresh()
-
-    def _set_type(self, value: int) -> None:
-        self.type = value
-        self._pdos.refresh()
-
-    def _check_inhibit(self, value: int) -> None:
-        if self._is_valid and value * 100_000 != self.inhibit_ns:
-            refuse(Abort.DEVICE_STATE)
-
-    def _set_inhibit(self, tenths_ms: int) -> None:
-        self.inhibit_ns = tenths_ms * 100_000
-
-    def _set_timer(self, period_ms: int) -> None:
-        self.timer_ns = period_ms * 1_000_000
-        self._pdos.refresh()
-
-    def _entry_check(self, place: int) -> Callable[[int], None]:
-        def check(value: int) -> None:
-            if value == self._entries[place]:
-                return
-            if self._is_valid or self._count != 0:
-                refuse(Abort.DEVICE_STATE)
-            if value != 0:
-                check_entry(self._pdos.dictionary, value, self.is_received)
-
-        return check
-
-    def _setter(self, place: int) -> Callable[[int], None]:
-        def set_entry(value: int) -> None:
-            self._entries[place] = value
-
-        return set_entry
-
-    def _check_count(self, value: int) -> None:
-        if value == self._count:
-            return
-        if self._is_valid:
-            refuse(Abort.DEVICE_STATE)
-        if value > len(self._entries):
-            refuse(Abort.PDO_TOO_LONG)
-        self._lay_out(value)
-
-    def _map(self, value: int) -> None:
-        self._count = value
-        self._lay_out(value)
-        self._pdos.refresh()
-
-    def _lay_out(self, count: int) -> None:
-        """Lay out the first `count` entries, or refuse and leave everything as it is."""
-        layout = lay_out(self._pdos.dictionary, self._entries[:count], self.is_received, self._pdos.longest)
-        if layout.header_bytes and not self._has_data_ids(layout.header_bytes):
-            refuse(Abort.INCOMPATIBLE)
-        self.layout = layout
-
-    def _has_data_ids(self, header_bytes: int) -> bool:
-        message = self._message
-        return message is not None and message.is_protected and _header_bytes(message) == header_bytes
-
-
-def _header_bytes(message: MessageCodec) -> int:
-    """Return how many bytes a protected message's end-to-end header takes."""
-    header = message.signals[: len(message.signals) - len(message.values)]
-    sizes = {s.container: 1 if s.mask else (s.raw_high - s.raw_low).bit_length() // 8 for s in header}
-    return sum(sizes.values())
-
-
-class TransmitPdo(_Pdo):
+class TransmitPdo(PdoRecord):
     """One TPDO."""
 
     is_received = False
 
     def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
         super().__init__(pdos, index, message)
+        self._pdos = pdos
         self.is_due = False
         """Whether an event has happened that the bus hasn't seen."""
         self._reads: tuple[Callable[[], int], ...] = ()
@@ -199,13 +56,13 @@ class TransmitPdo(_Pdo):
 
     def restart(self) -> None:
         """Count the protected frames from their beginning."""
-        if self._message is not None and self._message.is_protected:
-            self._sender = self._message.sender()
+        if self.message is not None and self.message.is_protected:
+            self._sender = self.message.sender()
 
     def bind(self) -> None:
         """Take over a new mapping."""
         self._reads = tuple(self._pdos.dictionary.reader(*key) for key in self.layout.keys)
-        is_asynchronous = self.type == 0 or self.type in _EVENT_DRIVEN
+        is_asynchronous = self.type == 0 or self.type in EVENT_DRIVEN
         self.is_compared = is_asynchronous and not self._pdos.events.intersection(self.layout.keys)
         self._syncs = 0
         self.send = self._make_sender()
@@ -230,12 +87,22 @@ class TransmitPdo(_Pdo):
             data = pdos.header = sender.protect(frame)  # type: ignore[union-attr]
             send(can_id, data)
 
+        def send_protected_value() -> None:
+            frame = bytearray(length)
+            pack_into(frame, header_bytes, only())
+            frame[status_byte] = pdos.header_status() << status_shift & 0xFF
+            data = pdos.header = sender.protect(frame)  # type: ignore[union-attr]
+            send(can_id, data)
+
         def send_plain() -> None:
             send(can_id, pack(*[read() for read in reads]))
 
         def send_pair() -> None:
             send(can_id, pack(first(), second()))
 
+        if header_bytes and len(reads) == 1:
+            (only,) = reads
+            return send_protected_value
         if header_bytes:
             return send_protected
         if len(reads) != 2:
@@ -274,21 +141,24 @@ class TransmitPdo(_Pdo):
         return self._allowed_ns if self.is_due else self._timer_due_ns
 
 
-class ReceivePdo(_Pdo):
+class ReceivePdo(PdoRecord):
     """One RPDO."""
 
     is_received = True
 
     def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
         super().__init__(pdos, index, message)
+        self._pdos = pdos
         self.receiver = None if message is None or not message.is_protected else message.receiver()
         """Checks the frames of the contract's message; None where that isn't protected."""
         self.acted_ns: int | None = None
         """When its last frame acted; None before the first."""
-        self._writes: tuple[Callable[[int], object], ...] = ()
+        self.writes: tuple[Callable[[int], object], ...] = ()
+        """What takes the received values, in the order of the mapping."""
         self.pending: tuple[int, ...] | None = None
         """Values that wait for SYNC."""
-        self._is_command = False
+        self.is_command = False
+        """Whether this PDO counts as the device's command."""
         self._is_length_wrong = False
 
     def restart(self) -> None:
@@ -300,16 +170,12 @@ class ReceivePdo(_Pdo):
 
     def bind(self) -> None:
         """Take over a new mapping."""
-        self._writes = tuple(self._pdos.writer(*key) for key in self.layout.keys)
-        self._is_command = False
+        self.writes = tuple(self._pdos.writer(*key) for key in self.layout.keys)
+        self.is_command = False
 
     def forget(self) -> None:
         """Drop a frame that waits for SYNC."""
         self.pending = None
-
-    def make_command(self) -> None:
-        """Let this PDO count as the device's command."""
-        self._is_command = True
 
     def on_frame(self, data: bytes, t_ns: int) -> None:
         """Take a frame in; one that fails a check changes nothing."""
@@ -326,21 +192,8 @@ class ReceivePdo(_Pdo):
             self._is_length_wrong = False
             self._pdos.user.mind_length(True, t_ns)
         self.pending = layout.packing.unpack_from(data, layout.header_bytes)
-        if self.type in _EVENT_DRIVEN:
-            if self.act(t_ns):
-                self._pdos.is_commanded = True
-            self._pdos.user.act(t_ns)
-
-    def act(self, t_ns: int) -> bool:
-        """Write what waits; tell whether that was a command."""
-        values = self.pending
-        if values is None:
-            return False
-        self.pending = None
-        self.acted_ns = t_ns
-        for write, value in zip(self._writes, values, strict=False):  # as many as mapped
-            write(value)
-        return self._is_command
+        if self.type in EVENT_DRIVEN:
+            self._pdos.act_at_once(self, t_ns)
 
     def is_late(self, t_ns: int) -> bool:
         """Whether its deadline is over."""
@@ -369,8 +222,7 @@ class Pdos:
         """What goes into the status field of a header that is sent."""
         self.events: frozenset[tuple[int, int]] = frozenset()
         """Objects whose changes the device announces by `notify`."""
-        self.is_commanded = False
-        """Whether a command has acted since the last `act_on_sync`, without waiting for SYNC."""
+        self._is_commanded = False  # a command has acted since the last SYNC, without waiting for one
         self._writers: dict[tuple[int, int], Callable[[int], object]] = {}
         self._on_refresh = on_refresh
         self._is_operational = False
@@ -395,7 +247,7 @@ class Pdos:
     @property
     def is_commandable(self) -> bool:
         """Whether a PDO is exchanged that brings commands."""
-        return any(pdo._is_command for pdo in self._receiving)
+        return any(pdo.is_command for pdo in self._receiving)
 
     def accept(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
         """Give received values of an object to a function instead of writing the object as SDO does."""
@@ -442,7 +294,7 @@ class Pdos:
             found = [pdo for pdo in self._receiving if key in pdo.layout.keys]
             if found:
                 for pdo in found:
-                    pdo.make_command()
+                    pdo.is_command = True
                 return
 
     def restart(self) -> None:
@@ -452,10 +304,26 @@ class Pdos:
 
     def act_on_sync(self, t_ns: int) -> bool:
         """Let what waited for SYNC act; tell whether a command has acted since the SYNC before."""
-        is_commanded, self.is_commanded = self.is_commanded, False
-        for pdo in self._waiting:
-            if pdo.pending is not None and pdo.act(t_ns):
-                is_commanded = True
+        is_commanded, self._is_commanded = self._is_commanded, False
+        return self._act(self._waiting, t_ns) or is_commanded
+
+    def act_at_once(self, pdo: ReceivePdo, t_ns: int) -> None:
+        """Let a frame act that doesn't wait for SYNC."""
+        self._is_commanded |= self._act((pdo,), t_ns)
+        self.user.act(t_ns)
+
+    @staticmethod
+    def _act(pdos: Iterable[ReceivePdo], t_ns: int) -> bool:
+        """Write what waits; tell whether a command was among it."""
+        is_commanded = False
+        for pdo in pdos:
+            values = pdo.pending
+            if values is not None:
+                pdo.pending = None
+                pdo.acted_ns = t_ns
+                for write, value in zip(pdo.writes, values, strict=False):
+                    write(value)
+                is_commanded = is_commanded or pdo.is_command
         return is_commanded
 
     def find_late(self, t_ns: int) -> bool:
@@ -501,8 +369,3 @@ def _records(pdos: Pdos, first: int) -> list[int]:
 def _message(pdos: Pdos, messages: Mapping[int, MessageCodec], index: int) -> MessageCodec | None:
     """Return the contract's message with the default COB-ID of a record."""
     return messages.get(pdos.dictionary.value(index, 1) & 0x7FF)
-
-
-def _check_type(value: int) -> None:
-    if value not in _TYPES:
-        refuse(Abort.VALUE_RANGE)
