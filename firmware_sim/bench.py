@@ -11,6 +11,8 @@ Two clocks:
     wall   the body moves by the given clock on a 100 µs grid and a SYNC samples it where it is. The drives watch that
            SYNC keeps coming.
 
+By SYNC, heartbeats and deadlines go by the given clock while no SYNC comes, and so does the braking that they cause.
+
 The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
 0 for a master that begins at 1; from there the counter 1…240 is unwrapped.
 """
@@ -25,8 +27,10 @@ from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec, contract_folder
 from firmware_sim.body import Body
 from firmware_sim.contact import TICK_S
+from firmware_sim.contracts import Contract, contract_of, longest_pdo
+from firmware_sim.device import RESET_COMMUNICATION, RESET_NODE, Device
 from firmware_sim.drive_node import DriveNode, Motor
-from firmware_sim.object_dictionary import NEVER_NS, RESET_COMMUNICATION, RESET_NODE, Abort, Device, refuse
+from firmware_sim.object_dictionary import NEVER_NS, Abort, refuse
 from firmware_sim.scenario import Scenario
 from firmware_sim.sensor_node import SensorNode
 
@@ -52,11 +56,13 @@ class Bench:
         clock_mode: ClockMode = "sync",
         seed: int | None = None,
         on_truth: Callable[[int, int, Vector], None] | None = None,
+        contract: Contract | None = None,
     ) -> None:
         """Build and compile everything; nothing is sent before `boot`.
 
         send: called with (identifier, data). seed: outweighs the scenario's. on_truth: called each cycle with (cycle,
-        t_ns of the SYNC frame, block by TRUTH_LAYOUT), the block being valid until the next call.
+        t_ns of the SYNC frame, block by TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS
+        files the devices have; default: those that go with the codec's DBC.
         Raises CodecError when the DBC lacks a message, OSError when an EDS can't be read.
         """
         self.now_ns = 0
@@ -73,17 +79,19 @@ class Bench:
         self._is_started = False
         self._due_ns = NEVER_NS
         self._body_ns = 0
+        self.contract = contract or contract_of(codec)
         folder = contract_folder()
-        eds = [folder / ("drive.eds" if name.startswith("Drive") else "torque_sensor.eds") for name in _NODES]
+        files = [self.contract.drive_eds if n.startswith("Drive") else self.contract.sensor_eds for n in _NODES]
         ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
-        self.devices = tuple(Device(node_id, path, send) for node_id, path in zip(ids, eds, strict=True))
+        longest = longest_pdo(codec)
+        self.devices = tuple(
+            Device(node_id, folder / file, send, codec.by_id, longest) for node_id, file in zip(ids, files, strict=True)
+        )
         rated_Nm = scenario.arm.rated_torque_Nm
         self.drives = tuple(
-            DriveNode(self.devices[i], codec, i + 1, self._motor(i), rated_Nm[i], send, self._is_wall)
-            for i in range(JOINTS)
+            DriveNode(self.devices[i], codec, i + 1, self._motor(i), rated_Nm[i], self._is_wall) for i in range(JOINTS)
         )
-        self.sensors = tuple(SensorNode(self.devices[JOINTS + i], codec, i + 1, send) for i in range(JOINTS))
-        self._nodes = (*self.drives, *self.sensors)
+        self.sensors = tuple(SensorNode(self.devices[JOINTS + i], codec, i + 1) for i in range(JOINTS))
         self._period_ns = self.devices[0].value(0x1006) * 1000
         for device in self.devices:
             device.watch(0x1006, 0, check=self._check_period)
@@ -91,16 +99,14 @@ class Bench:
         self._body = self._make_body()
         self._sync_id = codec.message("Sync").can_id
         self._host_id = codec.node_id("HostHeartbeat")
-        self._commands: dict[int, Handler] = {
-            codec.message(f"Drive{i + 1}Command").can_id: self.drives[i].on_command for i in range(JOINTS)
-        }
+        self._commands: dict[int, tuple[Handler, ...]] = {}
+        self._senders: tuple[Callable[[], None], ...] = ()
+        for device in self.devices:
+            device.on_pdo_change = self._listen
         self._services: dict[int, Handler] = {
             codec.message("Nmt").can_id: self._on_nmt,
             codec.message("HostHeartbeat").can_id: self._on_host_heartbeat,
-            **{
-                codec.message(f"{name}SdoRequest").can_id: device.on_sdo
-                for name, device in zip(_NODES, self.devices, strict=True)
-            },
+            **{0x600 + device.node_id: device.on_sdo for device in self.devices},
         }
 
     @property
@@ -122,7 +128,7 @@ class Bench:
         """Power on at `t_ns`: every node announces itself."""
         self.now_ns = self._body_ns = t_ns
         for device in self.devices:
-            device.boot(t_ns)
+            device.power_on(t_ns)
         self._poll(t_ns)
 
     def on_frame(self, frame: Frame) -> None:
@@ -135,7 +141,8 @@ class Bench:
         if can_id == self._sync_id:
             self._on_sync(data, t_ns)
         elif can_id in self._commands:
-            self._commands[can_id](data, self.now_ns)
+            for take in self._commands[can_id]:
+                take(data, self.now_ns)
         elif can_id in self._services:
             self._services[can_id](data, self.now_ns)
             self._poll(self.now_ns)
@@ -185,10 +192,8 @@ class Bench:
         if not self._is_started and drive1.is_enabled and drive2.is_enabled:
             self._is_started = True
             body.start_scenario()
-        drive1.send_feedback()
-        drive2.send_feedback()
-        sensor1.send_torque()
-        sensor2.send_torque()
+        for send in self._senders:
+            send()
         if self._on_truth is not None:
             body.truth(self._truth)
             self._on_truth(self.cycle, t_ns, self._truth)
@@ -222,17 +227,31 @@ class Bench:
             self._body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode))
 
     def _move_to(self, t_ns: int) -> None:
-        """Let the bench's time reach `t_ns`, by wall clock the body too."""
+        """Let the bench's time reach `t_ns`; by wall clock the body too, by SYNC only if a drive is left alone.
+
+        A host that dies sends no SYNC. What its drives do then must end, so their braking goes by time.
+        """
         self.now_ns = max(self.now_ns, t_ns)
-        if not self._is_wall:
-            return
         drive1, drive2 = self.drives
+        if not self._is_wall and not (drive1.is_left_alone or drive2.is_left_alone):
+            self._body_ns = self.now_ns
+            return
+        step_ns = self._body_period_ns
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
         mode = (drive1.motor_mode, drive2.motor_mode)
-        while self._body_ns + _TICK_NS <= t_ns:
-            self._body_ns += _TICK_NS
+        while self._body_ns + step_ns <= t_ns:
+            self._body_ns += step_ns
             self._has_moved = True
             self._body.advance(torque_Nm, mode)
+
+    def _listen(self) -> None:
+        """Take over which PDOs the devices exchange."""
+        self._senders = tuple(send for device in self.devices for send in device.pdos.on_sync)
+        commands: dict[int, tuple[Handler, ...]] = {}
+        for device in self.devices:
+            for can_id, take in device.pdos.handlers():
+                commands[can_id] = (*commands.get(can_id, ()), take)
+        self._commands = commands
 
     def _poll(self, t_ns: int) -> None:
         """Do what is due by time and remember when to look again."""

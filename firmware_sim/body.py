@@ -64,6 +64,8 @@ class DriveMode(IntEnum):
     OFF = 0  # no torque, the arm coasts: Switched on and below, until the node enables
     TORQUE = 1  # follows the set-point: Operation enabled, until the node disables, stops or faults
     BRAKE = 2  # torque against the velocity: Quick stop and Fault reaction active, until the node sees standstill
+    BRAKE_SLOWLY = 3  # as BRAKE, on the slow-down ramp: half the damping
+    BRAKE_HARD = 4  # as BRAKE, up to the current limit: one and a half times the damping, the most that stays damped
 
 
 SUBSTEPS: Final = 1
@@ -82,6 +84,11 @@ _STATE: Final = _TICK + 10
 
 _TORQUE: Final = int(DriveMode.TORQUE)
 _BRAKE: Final = int(DriveMode.BRAKE)
+_BRAKE_SLOWLY: Final = int(DriveMode.BRAKE_SLOWLY)
+_BRAKE_HARD: Final = int(DriveMode.BRAKE_HARD)
+_SLOW_SHARE: Final = 0.5
+_HARD_SHARE: Final = 1.5
+"""Of BRAKE_DAMPING. The shortest time constant, 10 ms / 1.5, is four lags of the drive's velocity: no overshoot."""
 
 _PLACE: Final = {name: place.start for name, place in TRUTH_LAYOUT.slices.items()}
 _TRUE_Q: Final = _PLACE["q"]
@@ -129,9 +136,14 @@ def _torque_target(arm: Vector, joint: int, mode: int, setpoint_Nm: float, veloc
     limit_Nm = arm[TORQUE_LIMIT + joint]
     if mode == _TORQUE:
         return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
-    if mode == _BRAKE:
-        return float(min(max(-arm[BRAKE_DAMPING + joint] * velocity_rad_s, -limit_Nm), limit_Nm))
-    return 0.0
+    damping = arm[BRAKE_DAMPING + joint]
+    if mode == _BRAKE_SLOWLY:
+        damping *= _SLOW_SHARE
+    elif mode == _BRAKE_HARD:
+        damping *= _HARD_SHARE
+    elif mode != _BRAKE:
+        return 0.0
+    return float(min(max(-damping * velocity_rad_s, -limit_Nm), limit_Nm))
 
 
 @compiled

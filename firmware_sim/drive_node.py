@@ -1,60 +1,38 @@
 """An emulated torque drive: CiA 402 state machine, cyclic synchronous torque (mode 10), watchdogs.
 
-A command frame is checked end to end when it arrives, kept, and acts at the next SYNC. The motor has torque only in
-Operation enabled with mode 10; Quick stop active and Fault reaction active brake; everywhere else the arm coasts.
+A command frame is checked end to end when it arrives and, unless its PDO is mapped to act at once, acts at the next
+SYNC. The motor has torque only in Operation enabled with mode 10; Quick stop active and Fault reaction active
+brake, and so do shutdown and disable operation where 0x605B and 0x605C say so; everywhere else the arm coasts.
 
-Units on the wire: position in encoder counts, velocity in 0x606C's LSB, torque in per mille of rated torque 0x6076,
-rated torque in mNm. Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
+Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
+0x6076, rated torque in mNm. Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
 """
 
-import struct
 from collections.abc import Callable
 from typing import NamedTuple
 
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.e2e import E2eStatus
 from firmware_sim.body import DriveMode
+from firmware_sim.device import Device
 from firmware_sim.drive_states import STATE_BITS, DriveEvent, DriveState, decode_command, find_transition
-from firmware_sim.object_dictionary import (
-    EMCY_COMMUNICATION,
-    EMCY_HEARTBEAT,
-    EMCY_PDO_LENGTH,
-    EMCY_RPDO_TIMEOUT,
-    NEVER_NS,
-    Abort,
-    Device,
-    refuse,
-)
+from firmware_sim.drive_stops import DISABLE, FAULT_REACTIONS, QUICK_STOPS, RAMPS, Standstill, Stop
+from firmware_sim.object_dictionary import NEVER_NS, Abort, one_of, refuse
+from firmware_sim.sensing import VELOCITY_LSB_RAD_S
+from firmware_sim.torque_limits import TorqueLimits
+from firmware_sim.watchdogs import ERROR_CODES, Watchdog
 
-EMCY_SYNC = 0x8700
-"""CiA 402 "sync controller": CiA 301 has no code for a missing SYNC (0x8140 is recovery from bus-off)."""
 CYCLIC_SYNCHRONOUS_TORQUE = 10
 _NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
-
-_SYNC_PATIENCE_NS_PER_US = 1500  # an enabled drive faults after 1.5 periods (0x1006, µs) without SYNC
-_REST_RAD_S = 0.02  # standstill: a hundredth of the slowest motion that the arm makes
-_REST_NS = 10_000_000  # standstill lasts; passing through zero does not
-_LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never stands still
-_BRAKE_WATCH_NS = 1_000_000  # how often a free-running drive looks whether it stands still
-
-_COMMAND = struct.Struct("<Hh")
-_FEEDBACK = struct.Struct("<ii")
-_STATUS = struct.Struct("<HbhH")
+_NO_PATIENCE = 1 << 30  # a drive without 0x2200 doesn't count SYNCs
+_TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
+_BRAKE_WATCH_NS = 1_000_000  # how often a drive without SYNC looks whether it stands still
 
 _ENABLE_OPERATION_WORD = 0x0F
 _REMOTE, _INTERNAL_LIMIT, _FOLLOWS_TARGET = 1 << 9, 1 << 11, 1 << 12
-_STAY_IN_QUICK_STOP = 6  # 0x605A: brake, then stay in Quick stop active; 2: then Switch on disabled
-_BRAKE_THEN_DISABLE = 2
-_COAST = 0  # 0x605E: no torque at once; 2: brake first
-
-
-_MOTOR_MODES = dict.fromkeys(DriveState, DriveMode.OFF) | {
-    DriveState.OPERATION_ENABLED: DriveMode.TORQUE,
-    DriveState.QUICK_STOP_ACTIVE: DriveMode.BRAKE,
-    DriveState.FAULT_REACTION_ACTIVE: DriveMode.BRAKE,
-}
-_BRAKING = (DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE)
+_ENABLED = DriveState.OPERATION_ENABLED
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+_RAMPED = {DriveEvent.SHUTDOWN: 0x605B, DriveEvent.SWITCH_ON: 0x605C}  # option codes of transitions 8 and 5
+_EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
 
 
 class Motor(NamedTuple):
@@ -68,14 +46,7 @@ class DriveNode:
     """One drive on the bus. `motor_mode` and `torque_Nm` are what its motor is told until the next SYNC."""
 
     def __init__(
-        self,
-        device: Device,
-        codec: Codec,
-        number: int,
-        motor: Motor,
-        rated_torque_Nm: float,
-        send: Callable[[int, bytes], None],
-        is_free_running: bool,
+        self, device: Device, codec: Codec, number: int, motor: Motor, rated_torque_Nm: float, is_free_running: bool
     ) -> None:
         """Connect the node to its device.
 
@@ -86,66 +57,67 @@ class DriveNode:
         self.torque_Nm = 0.0
         self.state = DriveState.START
         self.has_news = False
-        """Whether the status frame is due because of a change."""
+        """Whether something has changed that the bus hasn't been told."""
+        self._pdos = device.pdos
+        self._tripped = device.watchdogs.tripped
         self._motor = motor
-        self._send = send
         self._is_free_running = is_free_running
-        command = codec.message(f"Drive{number}Command")
-        self._command_length = command.length
-        self._receiver = command.receiver()
-        self._feedback_id = codec.message(f"Drive{number}Feedback").can_id
-        self._status_id = codec.message(f"Drive{number}Status").can_id
         self._rated_mNm = round(rated_torque_Nm * 1000)
+        self._velocity_lsb_rad_s = _velocity_lsb(codec, number)
         self._position = self._velocity = 0
-        self._pending: tuple[int, int] | None = None
-        self._controlword = self._target = 0
+        self._limits = TorqueLimits(device, self._pdos)
+        self._demand = self._acted_commands = 0
+        self._received_word: int | None = None
+        self._controlword = 0
         self._error_code = 0
-        self._is_cause_present: Callable[[int], bool] | None = None
+        self._cause: Watchdog | None = None
+        self._is_found_by_time = False
+        self._stop = DISABLE
+        self._ramp_end: DriveEvent | None = None
+        self._is_braking = False
+        self._standstill = Standstill()
         self._silent_syncs = _NO_COMMAND_YET
-        self._sync_ns = self._command_ns = self._braking_since_ns = self._moving_ns = 0
-        self._command_frame = bytes(self._command_length)
-        self._is_length_wrong = False
-        self._mode = self._max_torque = self._patience_syncs = 0
-        self._is_receiving = self._is_sending_feedback = self._is_sending_status = False
-        self._status_period_ns = self._status_inhibit_ns = self._deadline_ns = self._sync_patience_ns = 0
-        self._status_due_ns = NEVER_NS
-        self._status_allowed_ns = 0
-        self._configure(codec)
+        self._sync_ns = 0
+        self._mode = self._wanted_mode = 0
+        self._patience_syncs = device.value_or(_NO_PATIENCE, 0x2200)
+        self._period_us = device.value(0x1006)
+        self._tenth_periods = device.value_or(_TENTH_PERIODS, 0x2201)
+        self._serve(codec)
+        self._configure()
         device.attach(self)
         self.restart(is_node_reset=True)
 
-    def _configure(self, codec: Codec) -> None:
-        """Connect the objects of the dictionary."""
+    def _serve(self, codec: Codec) -> None:
+        """Give the dictionary its live values."""
+        serve = self.device.serve
+        serve(0x2000, 1, lambda: codec.wire_version)
+        serve(0x2000, 2, lambda: codec.layout_digest)
+        serve(0x2202, 0, lambda: self._acted_commands & 0xFFFF)
+        serve(0x603F, 0, lambda: self._error_code)
+        serve(0x6040, 0, lambda: self._controlword)
+        serve(0x6041, 0, lambda: self.statusword)
+        serve(0x6061, 0, lambda: self._mode)
+        serve(0x6064, 0, lambda: self._position)
+        serve(0x606C, 0, lambda: self._velocity)
+        serve(0x6074, 0, lambda: self._demand)
+        serve(0x6076, 0, lambda: self._rated_mNm)
+        serve(0x6077, 0, lambda: self._torque_permille)
+
+    def _configure(self) -> None:
+        """Act on what is written, by SDO or PDO."""
         device = self.device
-        device.serve(0x2000, 1, lambda: codec.wire_version)
-        device.serve(0x2000, 2, lambda: codec.layout_digest)
-        device.serve(0x2100, 1, lambda: self._command_frame[0])
-        device.serve(0x2100, 2, lambda: self._command_frame[1])
-        device.serve(0x603F, 0, lambda: self._error_code)
-        device.serve(0x6040, 0, lambda: self._controlword)
-        device.serve(0x6041, 0, lambda: self.statusword)
-        device.serve(0x6061, 0, lambda: self._mode)
-        device.serve(0x6064, 0, lambda: self._position)
-        device.serve(0x606C, 0, lambda: self._velocity)
-        device.serve(0x6071, 0, lambda: self._target)
-        device.serve(0x6076, 0, lambda: self._rated_mNm)
-        device.serve(0x6077, 0, lambda: self._torque_permille)
+        self._pdos.events = _EVENTS
+        self._pdos.accept(0x6040, 0, self._receive_word)
         device.watch(0x6040, 0, check=self._obey_by_sdo)
-        device.watch(0x6071, 0, check=self._set_target)
-        device.watch(0x605A, 0, check=_one_of(_BRAKE_THEN_DISABLE, _STAY_IN_QUICK_STOP))
-        device.watch(0x605E, 0, check=_one_of(_COAST, _BRAKE_THEN_DISABLE))
-        device.watch(0x6060, 0, self._set_mode, _one_of(0, CYCLIC_SYNCHRONOUS_TORQUE))
-        device.watch(0x6072, 0, self._set_max_torque)
+        device.watch(0x605A, 0, check=one_of(*QUICK_STOPS))
+        device.watch(0x605B, 0, check=one_of(*RAMPS))
+        device.watch(0x605C, 0, check=one_of(*RAMPS))
+        device.watch(0x605E, 0, check=one_of(*FAULT_REACTIONS))
+        device.watch(0x6060, 0, self._want_mode, one_of(0, CYCLIC_SYNCHRONOUS_TORQUE))
         device.watch(0x6076, 0, check=self._check_rated_torque)
-        device.watch(0x1006, 0, self._set_sync_period)
-        device.watch(0x1400, 5, self._set_deadline)
-        device.watch(0x2200, 0, self._set_patience, _at_least_one)
-        device.watch(0x1801, 3, self._set_status_inhibit)
-        device.watch(0x1801, 5, self._set_status_period)
-        self._set_sync_period(device.value(0x1006))
-        self._set_max_torque(device.value(0x6072))
-        self._set_patience(device.value(0x2200))
-        self._set_status_period(device.value(0x1801, 5))
+        device.watch(0x1006, 0, self._set_period)
+        device.watch(0x2200, 0, self._set_patience)
+        device.watch(0x2201, 0, self._set_tolerance)
 
     @property
     def is_enabled(self) -> bool:
@@ -153,17 +125,23 @@ class DriveNode:
         return self.state is DriveState.OPERATION_ENABLED
 
     @property
+    def is_left_alone(self) -> bool:
+        """Whether it brakes because time, not SYNC, has shown that the master has gone, and it is still gone."""
+        is_reacting = self.state is DriveState.FAULT_REACTION_ACTIVE
+        return is_reacting and self._is_found_by_time and self._cause in self._tripped
+
+    @property
     def rejected_commands(self) -> int:
         """Command frames so far that failed the end-to-end check."""
-        return self._receiver.rejected
+        return self._pdos.rejected_frames
 
     @property
     def statusword(self) -> int:
         """0x6041. Target reached (bit 10) has no meaning in mode 10 and stays 0."""
         word = STATE_BITS[self.state] | _REMOTE
-        if self.is_enabled and self._mode == CYCLIC_SYNCHRONOUS_TORQUE:
+        if self.is_enabled and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None:
             word |= _FOLLOWS_TARGET
-            if abs(self._target) > self._max_torque:
+            if self._limits.is_limiting:
                 word |= _INTERNAL_LIMIT
         return word
 
@@ -172,52 +150,46 @@ class DriveNode:
         """0x603F: the fault that is latched, 0 for none."""
         return self._error_code
 
-    def on_command(self, data: bytes, t_ns: int) -> None:
-        """Take a command frame in, for the next SYNC; one that fails a check changes nothing."""
-        if not self._is_receiving:
-            return
-        if len(data) != self._command_length:
-            if not self._is_length_wrong:
-                self.device.report_error(EMCY_PDO_LENGTH, t_ns)
-            self._is_length_wrong = True
-            return
-        if self._receiver.check(data) > E2eStatus.OK_SOME_LOST:
-            return
-        if self._is_length_wrong:
-            self._is_length_wrong = False
-            if self._error_code == 0:
-                self.device.clear_error(t_ns)
-        self._command_frame = data
-        self._pending = _COMMAND.unpack_from(data, 2)
-
     def on_sync(self, position: int, velocity: int, t_ns: int) -> None:
-        """Let the pending command act. `position`, `velocity`: sampled at this SYNC."""
+        """Let the pending command act. `position`, `velocity`: sampled at this SYNC, in the body's LSBs."""
         self._sync_ns = t_ns
-        self._position, self._velocity = position, velocity
-        pending = self._pending
-        if pending is None:
-            self._miss_command(t_ns)
-        else:
-            self._pending = None
+        self._position = position
+        lsb_rad_s = self._velocity_lsb_rad_s
+        self._velocity = velocity if lsb_rad_s is None else round(self._motor.velocity_rad_s() / lsb_rad_s)
+        if self._pdos.act_on_sync(t_ns):
             self._silent_syncs = 0
-            self._command_ns = t_ns
-            controlword, self._target = pending
-            if controlword != _ENABLE_OPERATION_WORD or not self.is_enabled:
-                self._obey(controlword, t_ns)
-            self._controlword = controlword
-        if self.state in _BRAKING:
+            self._acted_commands += 1
+        else:
+            self._miss_command(t_ns)
+        if self._tripped:
+            self._clear_watchdogs(t_ns)
+        if self._received_word is not None:
+            self._obey_received(t_ns)
+        if self._mode != self._wanted_mode:
+            self._change_mode()
+        if self._is_braking:
             self._watch_standstill(t_ns)
         self._drive_motor()
+        if self._pdos.has_compared and self._pdos.compare():
+            self.has_news = True
 
-    def send_feedback(self) -> None:
-        """Send what was sampled at the last SYNC."""
-        if self._is_sending_feedback:
-            self._send(self._feedback_id, _FEEDBACK.pack(self._position, self._velocity))
+    def act(self, t_ns: int) -> None:
+        """Obey a command that doesn't wait for SYNC."""
+        if self._received_word is not None:
+            self._obey_received(t_ns)
+        self._drive_motor()
+
+    def mind_length(self, is_right: bool, t_ns: int) -> None:
+        """Report a command frame of the wrong length, once until a right one comes."""
+        if not is_right:
+            self.device.trip(Watchdog.LENGTH, t_ns)
+        else:
+            self.device.clear(Watchdog.LENGTH, t_ns)
 
     def on_lost_sync(self, t_ns: int) -> None:
         """Live through a period whose SYNC never came, in a bench that counts periods by SYNC counters."""
         self._miss_command(t_ns)
-        if self.state in _BRAKING:
+        if self._is_braking:
             self._watch_standstill(t_ns)
         self._drive_motor()
 
@@ -226,58 +198,65 @@ class DriveNode:
         due_ns = self.device.poll(t_ns)
         if self.is_enabled:
             due_ns = min(due_ns, self._watch_bus(t_ns))
-        if self._is_free_running and self.state in _BRAKING:
+        if self._is_braking and (self._is_free_running or self.is_left_alone):
             self._watch_standstill(t_ns)
             due_ns = min(due_ns, t_ns + _BRAKE_WATCH_NS)
-        if self._is_sending_status:
-            if (self.has_news and t_ns >= self._status_allowed_ns) or t_ns >= self._status_due_ns:
-                self._send_status(t_ns)
-            due_ns = min(due_ns, self._status_allowed_ns if self.has_news else self._status_due_ns)
+        if self.has_news:
+            self.has_news = False
+            self._pdos.notify()
+        due_ns = min(due_ns, self._pdos.poll(t_ns))
         self._drive_motor()
         return due_ns
 
     def leave_operational(self, t_ns: int) -> None:
         """Fault: without PDOs there is no command."""
         if self.state in _POWERED:
-            self._fault(EMCY_COMMUNICATION, t_ns)
+            self._fault(Watchdog.OPERATIONAL, t_ns)
+
+    def enter_operational(self, t_ns: int) -> None:
+        """Clear the watchdog; a fault stays latched."""
+        self.device.clear(Watchdog.OPERATIONAL, t_ns)
 
     def lose_heartbeat(self, t_ns: int) -> None:
         """Fault when powered."""
         if self.state in _POWERED:
-            self._fault(EMCY_HEARTBEAT, t_ns)
+            self._fault(Watchdog.HEARTBEAT, t_ns, is_found_by_time=True)
         else:
-            self.device.report_error(EMCY_HEARTBEAT, t_ns)
+            self.device.trip(Watchdog.HEARTBEAT, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
-        """Clear the error; a fault stays latched."""
-        if self._error_code == 0:
-            self.device.clear_error(t_ns)
-
-    def refresh(self) -> None:
-        """Take over which PDOs are exchanged; a new Operational begins with a status frame."""
-        device = self.device
-        self._is_receiving = device.is_pdo_active(0x1400)
-        self._is_sending_feedback = device.is_pdo_active(0x1800)
-        was_sending = self._is_sending_status
-        self._is_sending_status = device.is_pdo_active(0x1801)
-        self.has_news |= self._is_sending_status and not was_sending
-        if not self._is_receiving:
-            self._pending = None
+        """Clear the watchdog; a fault stays latched."""
+        self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def restart(self, is_node_reset: bool) -> None:
-        """Forget the command sequence; a node reset also runs the state machine from its start (0, 1)."""
-        self._receiver.restart()
-        self._pending = None
+        """Forget the last command; a node reset also runs the state machine from its start (0, 1)."""
+        self._received_word = None
         if not is_node_reset:
             return
         self._error_code = 0
-        self._is_cause_present = None
-        self._controlword = self._target = 0
+        self._cause = None
+        self.device.is_faulty = False
+        self._controlword = self._acted_commands = 0
+        self._limits.target = 0
+        self._mode = self._wanted_mode
+        self._ramp_end = None
         self._silent_syncs = _NO_COMMAND_YET
         self.state = DriveState.START
         self._apply(DriveEvent.POWER_ON, 0)
         self._apply(DriveEvent.INITIALISED, 0)
         self._drive_motor()
+
+    def _receive_word(self, controlword: int) -> None:
+        self._received_word = controlword
+
+    def _obey_received(self, t_ns: int) -> None:
+        """Carry out the controlword of a PDO."""
+        controlword, self._received_word = self._received_word, None
+        if controlword is None:
+            return
+        if controlword != _ENABLE_OPERATION_WORD or self.state is not _ENABLED:
+            self._obey(controlword, t_ns)
+        self._controlword = controlword
 
     def _obey_by_sdo(self, controlword: int) -> None:
         self._obey(controlword, self.device.now_ns)
@@ -293,91 +272,125 @@ class DriveNode:
             self._reset_fault(t_ns)
             return
         if event is DriveEvent.ENABLE_OPERATION:
-            if self.state is DriveState.SWITCHED_ON and not self._is_receiving:
+            if self.state is DriveState.SWITCHED_ON and not self._pdos.is_commandable:
                 return  # no torque without a way to command it
-            if self.state is DriveState.QUICK_STOP_ACTIVE and self.device.value(0x605A) != _STAY_IN_QUICK_STOP:
+            if self.state is DriveState.QUICK_STOP_ACTIVE and not self._stop.stays:
                 return
+        if self.is_enabled and event in _RAMPED:
+            if self._ramp_end is None:
+                self._ramp_down(event, t_ns)
+            return
         self._apply(event, t_ns)
+
+    def _ramp_down(self, event: DriveEvent, t_ns: int) -> None:
+        """Shut down or disable operation by way of its option code."""
+        stop = RAMPS[self.device.value_or(0, _RAMPED[event])]
+        if stop is DISABLE:
+            self._apply(event, t_ns)
+            return
+        self._ramp_end = event
+        self._brake(stop, t_ns)
 
     def _apply(self, event: DriveEvent, t_ns: int) -> None:
         transition = find_transition(self.state, event)
         if transition is None:
             return
         self.state = transition.target
-        self.motor_mode = _MOTOR_MODES[self.state]
+        self._ramp_end = None
+        self._is_braking = False
+        self.motor_mode = DriveMode.TORQUE if self.is_enabled else DriveMode.OFF
         self.has_news = True
-        if self.state in _BRAKING:
-            self._braking_since_ns = self._moving_ns = t_ns
+        if self.state is DriveState.QUICK_STOP_ACTIVE:
+            self._stop_by(QUICK_STOPS[self.device.value_or(2, 0x605A)], DriveEvent.QUICK_STOP_DONE, t_ns)
+        elif self.state is DriveState.FAULT_REACTION_ACTIVE:
+            self._stop_by(FAULT_REACTIONS[self.device.value_or(2, 0x605E)], DriveEvent.FAULT_REACTION_DONE, t_ns)
+
+    def _stop_by(self, stop: Stop, done: DriveEvent, t_ns: int) -> None:
+        if stop is DISABLE:
+            self._apply(done, t_ns)
+        else:
+            self._brake(stop, t_ns)
+
+    def _brake(self, stop: Stop, t_ns: int) -> None:
+        self._stop = stop
+        self.motor_mode = stop.mode
+        self._is_braking = True
+        self.has_news = True
+        self._standstill.begin(t_ns)
 
     def _reset_fault(self, t_ns: int) -> None:
         """Leave Fault, unless what caused it is still there."""
-        if self.state is not DriveState.FAULT or (self._is_cause_present is not None and self._is_cause_present(t_ns)):
+        if self.state is not DriveState.FAULT or self._is_cause_present(t_ns):
             return
         self._apply(DriveEvent.FAULT_RESET, t_ns)
         self._error_code = 0
-        self._is_cause_present = None
-        self.device.clear_error(t_ns)
+        self._cause = None
+        self.device.is_faulty = False
+        self.device.report_no_error(t_ns)
 
-    def _fault(self, code: int, t_ns: int) -> None:
+    def _fault(self, cause: Watchdog, t_ns: int, is_found_by_time: bool = False) -> None:
         """Latch a fault; the first one counts."""
         if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
             return
-        self._error_code = code
-        self._is_cause_present = {
-            EMCY_RPDO_TIMEOUT: self._is_command_missing,
-            EMCY_SYNC: self._is_sync_missing,
-            EMCY_HEARTBEAT: lambda _: self.device.is_heartbeat_lost,
-            EMCY_COMMUNICATION: lambda _: not self.device.is_operational,
-        }[code]
-        self._target = 0
+        self._error_code = ERROR_CODES[cause]
+        self._cause = cause
+        self._is_found_by_time = is_found_by_time
+        self.device.is_faulty = True
+        self._limits.target = 0
         self._apply(DriveEvent.FAULT_DETECTED, t_ns)
-        if self.device.value(0x605E) == _COAST:
-            self._apply(DriveEvent.FAULT_REACTION_DONE, t_ns)
         self._drive_motor()
-        self.device.report_error(code, t_ns)
+        self.device.trip(cause, t_ns)
+
+    def _is_cause_present(self, t_ns: int) -> bool:
+        """Whether a watchdog that stops the drive is tripped, or would be at once."""
+        if self._tripped - {Watchdog.LENGTH}:
+            return True
+        return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
+
+    def _clear_watchdogs(self, t_ns: int) -> None:
+        """At a SYNC: it has come, and maybe a command with it."""
+        self.device.clear(Watchdog.SYNC, t_ns)
+        if not self._is_command_missing(t_ns):
+            self.device.clear(Watchdog.COMMAND, t_ns)
 
     def _miss_command(self, t_ns: int) -> None:
         self._silent_syncs += 1
         if self.is_enabled and self._silent_syncs >= self._patience_syncs:
-            self._fault(EMCY_RPDO_TIMEOUT, t_ns)
+            self._fault(Watchdog.COMMAND, t_ns)
 
     def _watch_bus(self, t_ns: int) -> int:
         """Fault when SYNC or commands stay away for too long; return when to look again."""
         due_ns = NEVER_NS
         if self._is_free_running:
-            if self._is_sync_missing(t_ns):
-                self._fault(EMCY_SYNC, t_ns)
-            due_ns = self._sync_ns + self._sync_patience_ns
-        if self._deadline_ns:
-            if t_ns - self._command_ns >= self._deadline_ns:
-                self._fault(EMCY_RPDO_TIMEOUT, t_ns)
-            due_ns = min(due_ns, self._command_ns + self._deadline_ns)
-        return due_ns if self.is_enabled else t_ns
-
-    def _is_sync_missing(self, t_ns: int) -> bool:
-        return t_ns - self._sync_ns >= self._sync_patience_ns
+            patience_ns = self._period_us * self._tenth_periods * 100
+            if t_ns - self._sync_ns >= patience_ns:
+                self._fault(Watchdog.SYNC, t_ns, is_found_by_time=True)
+            due_ns = self._sync_ns + patience_ns
+        if self._pdos.find_late(t_ns):
+            self._fault(Watchdog.COMMAND, t_ns, is_found_by_time=True)
+        return min(due_ns, self._pdos.deadline_ns) if self.is_enabled else t_ns
 
     def _is_command_missing(self, t_ns: int) -> bool:
-        is_late = self._deadline_ns > 0 and t_ns - self._command_ns >= self._deadline_ns
-        return is_late or self._silent_syncs >= self._patience_syncs
+        return self._silent_syncs >= self._patience_syncs or self._pdos.find_late(t_ns)
 
     def _watch_standstill(self, t_ns: int) -> None:
         """End the braking once the motor stands still, or after the longest time."""
-        if abs(self._motor.velocity_rad_s()) > _REST_RAD_S:
-            self._moving_ns = t_ns
-        if t_ns - self._moving_ns < _REST_NS and t_ns - self._braking_since_ns < _LONGEST_BRAKING_NS:
+        if not self._standstill.is_reached(self._motor.velocity_rad_s(), t_ns):
             return
         if self.state is DriveState.FAULT_REACTION_ACTIVE:
             self._apply(DriveEvent.FAULT_REACTION_DONE, t_ns)
-        elif self.device.value(0x605A) == _BRAKE_THEN_DISABLE:
+        elif self._ramp_end is not None:
+            self._apply(self._ramp_end, t_ns)
+        elif not self._stop.stays:
             self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
 
     def _drive_motor(self) -> None:
         """Tell the motor what the state allows: torque only in Operation enabled with mode 10."""
-        if self.is_enabled and self._mode == CYCLIC_SYNCHRONOUS_TORQUE:
-            limit = self._max_torque
-            self.torque_Nm = max(-limit, min(limit, self._target)) * self._rated_mNm * 1e-6
+        if self.state is _ENABLED and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None:
+            self._demand = self._limits.demand()
+            self.torque_Nm = self._demand * self._rated_mNm * 1e-6
         else:
+            self._demand = 0
             self.torque_Nm = 0.0
 
     @property
@@ -385,55 +398,34 @@ class DriveNode:
         permille = round(self._motor.torque_Nm() * 1e6 / self._rated_mNm)
         return max(-0x8000, min(0x7FFF, permille))
 
-    def _send_status(self, t_ns: int) -> None:
-        self.has_news = False
-        self._status_allowed_ns = t_ns + self._status_inhibit_ns
-        self._status_due_ns = t_ns + self._status_period_ns if self._status_period_ns else NEVER_NS
-        status = _STATUS.pack(self.statusword, self._mode, self._torque_permille, self._error_code)
-        self._send(self._status_id, status)
+    def _want_mode(self, mode: int) -> None:
+        """Take another mode over: at the next SYNC while the motor has torque, at once elsewhere."""
+        self._wanted_mode = mode
+        if not self.is_enabled:
+            self._change_mode()
 
-    def _set_target(self, permille: int) -> None:
-        self._target = permille
-
-    def _set_mode(self, mode: int) -> None:
-        self.has_news |= mode != self._mode
-        self._mode = mode
+    def _change_mode(self) -> None:
+        self.has_news |= self._mode != self._wanted_mode
+        self._mode = self._wanted_mode
         self._drive_motor()
-
-    def _set_max_torque(self, permille: int) -> None:
-        self._max_torque = permille
 
     def _check_rated_torque(self, rated_mNm: int) -> None:
         """Accept the motor's rating only: it can't be changed."""
         if rated_mNm != self._rated_mNm:
             refuse(Abort.VALUE_RANGE)
 
-    def _set_sync_period(self, period_us: int) -> None:
-        self._sync_patience_ns = period_us * _SYNC_PATIENCE_NS_PER_US
+    def _set_period(self, period_us: int) -> None:
+        self._period_us = period_us
 
-    def _set_deadline(self, deadline_ms: int) -> None:
-        self._deadline_ns = deadline_ms * 1_000_000
+    def _set_tolerance(self, tenth_periods: int) -> None:
+        self._tenth_periods = tenth_periods
 
     def _set_patience(self, syncs: int) -> None:
-        """Set how many SYNCs in a row without a new valid command fault an enabled drive."""
         self._patience_syncs = syncs
 
-    def _set_status_inhibit(self, tenths_ms: int) -> None:
-        self._status_inhibit_ns = tenths_ms * 100_000
 
-    def _set_status_period(self, period_ms: int) -> None:
-        self._status_period_ns = period_ms * 1_000_000
-        self.has_news = True
-
-
-def _at_least_one(value: int) -> None:
-    if value < 1:
-        refuse(Abort.VALUE_RANGE)
-
-
-def _one_of(*allowed: int) -> Callable[[int], None]:
-    def check(value: int) -> None:
-        if value not in allowed:
-            refuse(Abort.VALUE_RANGE)
-
-    return check
+def _velocity_lsb(codec: Codec, number: int) -> float | None:
+    """Return the contract's LSB of velocity in rad/s, None when it is the body's own."""
+    signals = codec.message(f"Drive{number}Feedback").signals
+    scale = next(signal.scale for signal in signals if signal.name == "velocity")
+    return None if scale == VELOCITY_LSB_RAD_S else scale

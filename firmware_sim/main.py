@@ -17,9 +17,11 @@ from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
-from adacd_hil.wire.codec import CodecError, load_codec
+from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
+from firmware_sim.contracts import CONTRACTS, is_fd
+from firmware_sim.pdo_record import LISTENED_IDS
 from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
 from firmware_sim.truth import TRUTH_NAME, TruthLog
 
@@ -138,6 +140,13 @@ def cli() -> None:
 @click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
 @click.option("-c", "--channel", required=True, help="Channel of the interface, such as vcan0.")
 @click.option(
+    "--contract",
+    type=click.Choice(list(CONTRACTS)),
+    default="arm",
+    show_default=True,
+    help="Which devices: DBC and EDS files of this name.",
+)
+@click.option(
     "--clock",
     "clock_mode",
     type=click.Choice(get_args(ClockMode)),
@@ -162,6 +171,7 @@ def cli() -> None:
 def run(
     interface: str,
     channel: str,
+    contract: str,
     clock_mode: ClockMode,
     scenario: str,
     profile: str | None,
@@ -172,12 +182,12 @@ def run(
 ) -> int:
     """Run the emulated arm; prints "ready" on stderr once its nodes have announced themselves."""
     resolved = load_scenario(scenario, profile, seed)
-    codec = load_codec()
+    codec = load_codec(CONTRACTS[contract].path)
     if out is not None:
         _make_folder(out)
     clock = MonotonicClock()
     with ExitStack() as stack:
-        bus = open_bus(interface, channel, clock, [m.can_id for m in codec.messages.values() if "HOST" in m.senders])
+        bus = _open_bus(interface, channel, clock, codec)
         stack.callback(bus.close)
         stop = stack.enter_context(_stop_by_signal())
         truth = None
@@ -198,6 +208,13 @@ def run(
         print("ready", file=sys.stderr, flush=True)
         service.run()
         return _report(bench, resolved, clock_mode, truth, as_json)
+
+
+def _open_bus(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
+    """Open the devices' end; CAN FD only where the contract has such frames."""
+    heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
+    options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}
+    return open_bus(interface, channel, clock, sorted(heard), **options)
 
 
 def _make_folder(path: Path) -> None:

@@ -1,46 +1,60 @@
-"""The CANopen side of one emulated device: object dictionary, SDO server, NMT slave, heartbeats, EMCY.
+"""The object dictionary of one emulated device and the SDO server that strangers reach it by.
 
-The only door to `canopen` on the device side. `canopen` reads the EDS, keeps the written values and speaks SDO; it
-starts no thread here, because heartbeats and every other timer run on the bench's time, which comes in as `t_ns`.
-
-What a master may configure is what the device then does: a PDO can be switched off and on, its event and inhibit
-times changed, its mapping written again; another identifier, transmission type or mapping is refused, not stored.
-Source: CiA 301, 7.2 (services), 7.3 (NMT) and 7.5 (objects).
+The only door to `canopen` on the device side. `canopen` reads the EDS and keeps what was written; a read is answered by
+a live value where there is one, a write is checked before it is stored. Source: CiA 301, 7.2.4 (SDO), 7.4 (dictionary).
 """
 
-from collections import deque
+import struct
 from collections.abc import Callable
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
-from typing import NoReturn, Protocol
+from typing import NamedTuple, NoReturn
 
 import canopen
 from canopen.network import PeriodicMessageTask
+from canopen.objectdictionary import ODVariable, datatypes
+from canopen.sdo.server import SdoServer
 
 Send = Callable[[int, bytes], None]
 
 NEVER_NS = 1 << 62
 """Later than any time: nothing is due."""
-EMCY_COMMUNICATION = 0x8100
-EMCY_HEARTBEAT = 0x8130
-EMCY_PDO_LENGTH = 0x8210
-EMCY_RPDO_TIMEOUT = 0x8250
 
-_REGISTER_COMMUNICATION = 0x11  # 0x1001: generic and communication error
-_HISTORY_LENGTH = 4  # 0x1003 in the EDS
-_NOT_VALID = 1 << 31  # of a COB-ID entry
-_RTR_NOT_ALLOWED = 1 << 30
-_SYNCHRONOUS, _EVENT_DRIVEN = (1,), (254, 255)
+_FIRST_INDEX = 0x1000  # below are data types: dummy mapping entries, no objects
+_FORMATS = {
+    datatypes.BOOLEAN: "B",
+    datatypes.INTEGER8: "b",
+    datatypes.INTEGER16: "h",
+    datatypes.INTEGER32: "i",
+    datatypes.INTEGER64: "q",
+    datatypes.UNSIGNED8: "B",
+    datatypes.UNSIGNED16: "H",
+    datatypes.UNSIGNED32: "I",
+    datatypes.UNSIGNED64: "Q",
+}
+_EXPEDITED, _IS_SIZE_GIVEN, _IS_LAST = 0x02, 0x01, 0x01  # bits of command specifiers
+_RESPONSE_DOWNLOAD = 0x60
 
 
 class Abort(IntEnum):
-    """SDO abort codes, CiA 301 table 22, besides those that `canopen` gives by itself."""
+    """SDO abort codes, CiA 301 table 22."""
 
+    TOGGLE = 0x05030000
+    UNKNOWN_COMMAND = 0x05040001
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
-    NO_SUBINDEX = 0x06090011
     NOT_MAPPABLE = 0x06040041
+    PDO_TOO_LONG = 0x06040042
     INCOMPATIBLE = 0x06040043
+    LENGTH = 0x06070010
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
     VALUE_RANGE = 0x06090030
+    TOO_HIGH = 0x06090031
+    TOO_LOW = 0x06090032
     CANNOT_STORE = 0x08000020
     DEVICE_STATE = 0x08000022
     NO_DATA = 0x08000024
@@ -51,36 +65,24 @@ def refuse(code: Abort) -> NoReturn:
     raise canopen.SdoAbortedError(code)
 
 
-class NmtState(IntEnum):
-    """NMT states, CiA 301 figure 46. Every state but the first ends by an NMT command."""
+def one_of(*allowed: int) -> Callable[[int], None]:
+    """Make a check that refuses every value but the listed ones."""
 
-    INITIALISING = 0  # by itself: boot-up message, then Pre-operational
-    STOPPED = 4
-    OPERATIONAL = 5
-    PRE_OPERATIONAL = 127
+    def check(value: int) -> None:
+        if value not in allowed:
+            refuse(Abort.VALUE_RANGE)
 
-
-_COMMANDED_STATES = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
-RESET_NODE, RESET_COMMUNICATION = 129, 130
+    return check
 
 
-class Application(Protocol):
-    """What a device does besides communicating."""
+class Variable(NamedTuple):
+    """What mapping and access rules say of one numeric object. `format`: of `struct`, empty when it isn't a number."""
 
-    def leave_operational(self, t_ns: int) -> None:
-        """Act on leaving Operational; EMCY messages can still be sent."""
-
-    def lose_heartbeat(self, t_ns: int) -> None:
-        """Report and act on the loss of the master's heartbeat, before the device leaves Operational."""
-
-    def find_heartbeat(self, t_ns: int) -> None:
-        """Act on the return of the master's heartbeat."""
-
-    def refresh(self) -> None:
-        """Take over a new NMT state or PDO configuration."""
-
-    def restart(self, is_node_reset: bool) -> None:
-        """Begin anew: communication only, or all of the device."""
+    bits: int
+    format: str
+    is_mappable: bool
+    is_readable: bool
+    is_writable: bool
 
 
 class _Network(canopen.Network):
@@ -103,89 +105,123 @@ class _Network(canopen.Network):
         raise RuntimeError(f"periodic frame {can_id:#x}: timers belong to the bench")
 
 
+class _Server(SdoServer):
+    """canopen's SDO server, one transfer at a time: a segment that belongs to none is refused, lengths are held to."""
+
+    def __init__(self, node: "_Node") -> None:
+        node_id = int(node.id or 0)
+        super().__init__(0x600 + node_id, 0x580 + node_id, node)  # type: ignore[no-untyped-call]
+        self._local = node
+        self._announced: int | None = None
+        self._longest: int | None = None
+        self._end()
+
+    def on_request(self, can_id: int, data: bytes, timestamp: int) -> None:
+        is_segment = data[0] & 0xE0 in (0x00, 0x60)
+        if not is_segment:  # an abort names the object of the request that it answers
+            self._index, self._subindex = struct.unpack_from("<HB", data, 1)
+        super().on_request(can_id, data, timestamp)  # type: ignore[no-untyped-call]
+
+    def init_upload(self, request: bytes) -> None:
+        self._end()
+        super().init_upload(request)  # type: ignore[no-untyped-call]
+        self._is_uploading = bool(self._buffer)
+
+    def segmented_upload(self, command: int) -> None:
+        if not self._is_uploading:
+            refuse(Abort.UNKNOWN_COMMAND)
+        super().segmented_upload(command)  # type: ignore[no-untyped-call]
+        if not self._buffer:
+            self._end()
+
+    def init_download(self, request: bytes) -> None:
+        self._end()
+        command, index, subindex = struct.unpack_from("<BHB", request)
+        variable = self._local._find_object(index, subindex)
+        if not variable.writable:
+            refuse(Abort.READ_ONLY)
+        size = len(variable) // 8 if variable.data_type in datatypes.NUMBER_TYPES else None
+        if command & _EXPEDITED:
+            length = 4 - (command >> 2 & 3) if command & _IS_SIZE_GIVEN else min(size or 4, 4)
+            self._local.set_data(index, subindex, bytes(request[4 : 4 + length]), check_writable=True)
+        else:
+            self._announced = struct.unpack_from("<L", request, 4)[0] if command & _IS_SIZE_GIVEN else None
+            if size is not None and self._announced is not None:
+                _compare_lengths(self._announced, size)
+            self._longest = size if size is not None else self._announced
+            self._is_downloading = True
+        self.send_response(  # type: ignore[no-untyped-call]
+            struct.pack("<BHB4x", _RESPONSE_DOWNLOAD, index, subindex)
+        )
+
+    def segmented_download(self, command: int, request: bytes) -> None:
+        if not self._is_downloading:
+            refuse(Abort.UNKNOWN_COMMAND)
+        length = len(self._buffer or b"") + 7 - (command >> 1 & 7)
+        if self._longest is not None and length > self._longest:
+            refuse(Abort.TOO_LONG)
+        is_last = bool(command & _IS_LAST)
+        if is_last and self._announced is not None:
+            _compare_lengths(length, self._announced)
+        super().segmented_download(command, request)  # type: ignore[no-untyped-call]
+        if is_last:
+            self._end()
+
+    def block_upload(self, data: bytes) -> None:  # noqa: ARG002 (canopen's signature)
+        refuse(Abort.UNKNOWN_COMMAND)
+
+    def request_aborted(self, data: bytes) -> None:
+        super().request_aborted(data)  # type: ignore[no-untyped-call]
+        self._end()
+
+    def abort(self, abort_code: int = 0x08000000) -> None:
+        self._end()
+        super().abort(abort_code)  # type: ignore[no-untyped-call]
+
+    def _end(self) -> None:
+        self._buffer = bytearray()
+        self._toggle = 0
+        self._is_uploading = self._is_downloading = False
+        self._announced = self._longest = None
+
+
+def _compare_lengths(length: int, expected: int) -> None:
+    if length != expected:
+        refuse(Abort.TOO_LONG if length > expected else Abort.TOO_SHORT)
+
+
+@cache
+def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
+    """Read an EDS; nodes never change what was read."""
+    return canopen.import_od(str(path), node_id)
+
+
 class _Node(canopen.LocalNode):
     """canopen's local node with strict sub-indices and without its own heartbeat."""
 
     def __init__(self, node_id: int, eds_path: Path) -> None:
-        super().__init__(node_id, str(eds_path))
+        super().__init__(node_id, _read_eds(eds_path, node_id))
         self._write_callbacks.clear()  # NmtSlave.on_write would start a periodic task
-        # An abort before the first transfer needs an index to name.
-        self.sdo._index = self.sdo._subindex = 0
-        self.sdo._buffer = bytearray()
+        self.sdo = _Server(self)
+        self.sdo._index = self.sdo._subindex = 0  # an abort before the first transfer needs an index to name
 
-    def _find_object(self, index: int, subindex: int) -> canopen.objectdictionary.ODVariable:
+    def _find_object(self, index: int, subindex: int) -> ODVariable:
         """Find an object; unlike canopen's own, arrays and variables have no sub-indices that the EDS lacks."""
-        if index not in self.object_dictionary:
+        if index < _FIRST_INDEX or index not in self.object_dictionary:
             refuse(Abort.NO_OBJECT)
         entry = self.object_dictionary[index]
-        variables = {0: entry} if isinstance(entry, canopen.objectdictionary.ODVariable) else entry.subindices
+        variables = {0: entry} if isinstance(entry, ODVariable) else entry.subindices
         if subindex not in variables:
             refuse(Abort.NO_SUBINDEX)
         return variables[subindex]
 
 
-class _Pdo:
-    """One PDO's records, 0x14xx/0x16xx or 0x18xx/0x1Axx: what may be written, and whether the PDO is usable."""
-
-    def __init__(self, device: "Device", index: int) -> None:
-        self._device = device
-        self._index = index
-        self._mapping_index = index + 0x200
-        self._cob_id = device.value(index, 1) & ~(_NOT_VALID | _RTR_NOT_ALLOWED)
-        count = device.value(self._mapping_index, 0)
-        self._mapping = tuple(device.value(self._mapping_index, sub) for sub in range(1, count + 1))
-        is_synchronous = device.value(index, 2) in _SYNCHRONOUS
-        self._types = _SYNCHRONOUS if is_synchronous else _EVENT_DRIVEN
-        self._is_valid = self._is_mapped = True
-        device.watch(index, 1, self._validate, self._check_cob_id)
-        device.watch(index, 2, check=self._check_type)
-        device.watch(self._mapping_index, 0, self._map, self._check_count)
-        for sub in range(1, 9):
-            device.watch(self._mapping_index, sub, check=self._check_entry)
-
-    @property
-    def is_usable(self) -> bool:
-        return self._is_valid and self._is_mapped
-
-    def _check_cob_id(self, value: int) -> None:
-        if value & ~(_NOT_VALID | _RTR_NOT_ALLOWED) != self._cob_id:
-            refuse(Abort.VALUE_RANGE)
-
-    def _validate(self, value: int) -> None:
-        self._is_valid = not value & _NOT_VALID
-        self._device.refresh()
-
-    def _check_type(self, value: int) -> None:
-        if value not in self._types:
-            refuse(Abort.VALUE_RANGE)
-
-    def _check_entry(self, value: int) -> None:
-        if value not in (0, *self._mapping):
-            refuse(Abort.NOT_MAPPABLE)
-
-    def _check_count(self, value: int) -> None:
-        written = tuple(self._device.value(self._mapping_index, sub) for sub in range(1, min(value, 8) + 1))
-        if value != 0 and (value > 8 or written != self._mapping):
-            refuse(Abort.INCOMPATIBLE)
-
-    def _map(self, value: int) -> None:
-        self._is_mapped = value != 0
-        self._device.refresh()
-
-
-class Device:
-    """A CANopen device: everything but what its application does."""
+class ObjectDictionary:
+    """The objects of one device: values from the EDS, live values, checked writes, and SDO over the bus."""
 
     def __init__(self, node_id: int, eds_path: Path, send: Send) -> None:
-        """Read the EDS; nothing is sent before `boot`. Raises OSError when the EDS can't be read."""
+        """Read the EDS. Raises OSError when it can't be read."""
         self.node_id = node_id
-        self.state = NmtState.INITIALISING
-        self.is_operational = False
-        self.error_register = 0
-        self.now_ns = 0
-        """Time of the last SDO request, for what its writes start."""
-        self._send = send
-        self._application: Application | None = None
         self._readers: dict[tuple[int, int], Callable[[], int]] = {}
         self._checks: dict[tuple[int, int], list[Callable[[int], None]]] = {}
         self._appliers: dict[tuple[int, int], list[Callable[[int], None]]] = {}
@@ -193,23 +229,45 @@ class Device:
         self._node.associate_network(_Network(send))
         self._node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
         self._node.add_write_callback(self._write)  # type: ignore[no-untyped-call]
-        self._pdos = {index: _Pdo(self, index) for index in (0x1400, 0x1800, 0x1801) if index in self.objects}
-        self._producer = _HeartbeatProducer(self, send)
-        self._consumer = _HeartbeatConsumer(self)
-        self._errors = _ErrorReporter(self, send)
 
     @property
     def objects(self) -> canopen.ObjectDictionary:
         """The objects that the EDS lists."""
         return self._node.object_dictionary
 
-    def attach(self, application: Application) -> None:
-        """Connect what the device does."""
-        self._application = application
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """Whether the EDS lists this object."""
+        try:
+            self._node._find_object(index, subindex)
+        except canopen.SdoAbortedError:
+            return False
+        return True
+
+    def dummy_bits(self, index: int) -> int:
+        """Return the size of a data type that the EDS lets be mapped as a dummy (DummyUsage), 0 when it doesn't."""
+        if index >= _FIRST_INDEX or index not in self.objects:
+            return 0
+        return len(self.objects[index])
+
+    def find(self, index: int, subindex: int) -> Variable:
+        """Describe an object; an absent one refuses the SDO request in progress."""
+        found = self._node._find_object(index, subindex)
+        access = found.access_type
+        return Variable(
+            bits=len(found),
+            format=_FORMATS.get(found.data_type or 0, ""),
+            is_mappable=bool(found.pdo_mappable),
+            is_readable=access not in ("wo", "rww"),
+            is_writable=access in ("rw", "rww", "wo"),
+        )
 
     def serve(self, index: int, subindex: int, read: Callable[[], int]) -> None:
-        """Answer reads of an object with a live value."""
+        """Answer reads of an object with a live value. An object that the EDS lacks stays absent."""
         self._readers[index, subindex] = read
+
+    def reader(self, index: int, subindex: int) -> Callable[[], int]:
+        """Return a function that gives the present value of a numeric object, the live one where it is served."""
+        return self._readers.get((index, subindex)) or (lambda: self.value(index, subindex))
 
     def watch(
         self,
@@ -220,231 +278,69 @@ class Device:
     ) -> None:
         """Act on writes of an object: `check` may `refuse`, then `apply` takes the value over.
 
-        `apply` also gets the default when a reset restores it.
+        `apply` also gets the default when a reset restores it. An object that the EDS lacks is never written.
         """
+        if not self.has(index, subindex):
+            return
         if check is not None:
             self._checks.setdefault((index, subindex), []).append(check)
         if apply is not None:
             self._appliers.setdefault((index, subindex), []).append(apply)
 
     def value(self, index: int, subindex: int = 0) -> int:
-        """Return the present value of a numeric object."""
+        """Return the present value of a numeric object; an absent one refuses the SDO request in progress."""
         variable = self._node._find_object(index, subindex)
         return int(variable.decode_raw(self._node.get_data(index, subindex)))
 
-    def is_pdo_active(self, index: int) -> bool:
-        """Whether the PDO with this communication record (0x1400, 0x1800, 0x1801) is exchanged now."""
-        return self.is_operational and self._pdos[index].is_usable
+    def value_or(self, default: int, index: int, subindex: int = 0) -> int:
+        """Return the present value of a numeric object, `default` when the EDS lacks it."""
+        return self.value(index, subindex) if self.has(index, subindex) else default
 
-    def refresh(self) -> None:
-        """Let the application take over a new NMT state or PDO configuration."""
-        if self._application is not None:
-            self._application.refresh()
+    def default_or(self, default: int, index: int, subindex: int = 0) -> int:
+        """Return the EDS's value of a numeric object, `default` when it has none."""
+        if not self.has(index, subindex):
+            return default
+        value = self._node._find_object(index, subindex).default
+        return default if value is None else int(value)
 
-    def boot(self, t_ns: int) -> None:
-        """Announce the device and enter Pre-operational."""
-        self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
-        self._producer.restart(t_ns)
-        self._enter(NmtState.PRE_OPERATIONAL, t_ns)
+    def take_over(self, index: int, subindex: int, value: int) -> bool:
+        """Write an object as an SDO request would; False when it is refused."""
+        try:
+            data = self._node._find_object(index, subindex).encode_raw(value)
+            self._node.set_data(index, subindex, data, check_writable=True)
+        except canopen.SdoAbortedError:
+            return False
+        return True
 
-    def on_nmt(self, data: bytes, t_ns: int) -> None:
-        """Obey an NMT command, if it is for this device."""
-        if len(data) != 2 or data[1] not in (0, self.node_id):
-            return
-        command = data[0]
-        if command in _COMMANDED_STATES:
-            self._enter(_COMMANDED_STATES[command], t_ns)
-        elif command in (RESET_NODE, RESET_COMMUNICATION):
-            self._enter(NmtState.INITIALISING, t_ns)
-            self._reset(command == RESET_NODE)
-            self.boot(t_ns)
+    def on_request(self, data: bytes, t_ns: int) -> None:
+        """Answer an SDO request of 8 bytes."""
+        self._node.sdo.on_request(0x600 + self.node_id, data, t_ns)  # type: ignore[no-untyped-call]
 
-    def on_sdo(self, data: bytes, t_ns: int) -> None:
-        """Answer an SDO request."""
-        self.now_ns = t_ns
-        if len(data) == 8 and self.state != NmtState.STOPPED:
-            self._node.sdo.on_request(0x600 + self.node_id, data, t_ns)  # type: ignore[no-untyped-call]
-
-    def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """Take note of another node's heartbeat."""
-        self._consumer.on_heartbeat(node_id, t_ns)
-
-    @property
-    def is_heartbeat_lost(self) -> bool:
-        """Whether the master's heartbeat is monitored and missing."""
-        return self._consumer.is_lost
-
-    def lose_heartbeat(self, t_ns: int) -> None:
-        """React to the master's silence: the application, then Pre-operational (CiA 301, default of 0x1029)."""
-        if self._application is not None:
-            self._application.lose_heartbeat(t_ns)
-        if self.is_operational:
-            self._enter(NmtState.PRE_OPERATIONAL, t_ns)
-
-    def find_heartbeat(self, t_ns: int) -> None:
-        """Let the application know that the master is back."""
-        if self._application is not None:
-            self._application.find_heartbeat(t_ns)
-
-    def report_error(self, code: int, t_ns: int) -> None:
-        """Enter an error in 0x1001 and 0x1003 and send it as EMCY. All errors here are communication errors."""
-        self.error_register = _REGISTER_COMMUNICATION
-        self._errors.report(code, t_ns)
-
-    def clear_error(self, t_ns: int) -> None:
-        """Clear 0x1001 and say so by an EMCY with code 0."""
-        self.error_register = 0
-        self._errors.report(0, t_ns)
-
-    def poll(self, t_ns: int) -> int:
-        """Do what is due; return when something is due next."""
-        return min(self._producer.poll(t_ns), self._consumer.poll(t_ns), self._errors.poll(t_ns))
-
-    def _enter(self, state: NmtState, t_ns: int) -> None:
-        if self.is_operational and state != NmtState.OPERATIONAL and self._application is not None:
-            self._application.leave_operational(t_ns)
-        self.state = state
-        self.is_operational = state == NmtState.OPERATIONAL
-        self.refresh()
-
-    def _reset(self, is_node_reset: bool) -> None:
-        """Restore the EDS values: the communication profile's, or all."""
-        last = 0xFFFF if is_node_reset else 0x1FFF
+    def restore(self, last: int) -> None:
+        """Forget what was written to the objects up to the index `last`; those who watch get the defaults."""
         for index in [index for index in self._node.data_store if index <= last]:
             del self._node.data_store[index]
         for (index, subindex), appliers in self._appliers.items():
             if index <= last:
-                _call_all(appliers, self.value(index, subindex))
-        if is_node_reset:
-            self.error_register = 0
-        if self._application is not None:
-            self._application.restart(is_node_reset)
+                _call_all(appliers, self.default_or(0, index, subindex))
 
     def _read(self, index: int, subindex: int, od: object) -> int | None:  # noqa: ARG002 (canopen passes it by name)
         read = self._readers.get((index, subindex))
         return None if read is None else read()
 
-    def _write(self, index: int, subindex: int, od: canopen.objectdictionary.ODVariable, data: bytes) -> None:
+    def _write(self, index: int, subindex: int, od: ODVariable, data: bytes) -> None:
+        if od.data_type not in datatypes.NUMBER_TYPES:
+            return
+        value = int(od.decode_raw(bytes(data)))
+        if od.max is not None and value > od.max:
+            refuse(Abort.TOO_HIGH)
+        if od.min is not None and value < od.min:
+            refuse(Abort.TOO_LOW)
         key = (index, subindex)
-        if key in self._checks or key in self._appliers:
-            value = int(od.decode_raw(bytes(data)))
-            _call_all(self._checks.get(key, []), value)
-            _call_all(self._appliers.get(key, []), value)
+        _call_all(self._checks.get(key, []), value)
+        _call_all(self._appliers.get(key, []), value)
 
 
 def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
     for function in functions:
         function(value)
-
-
-class _HeartbeatProducer:
-    """0x1017: sends the NMT state every so many ms; the boot-up message is the first heartbeat."""
-
-    def __init__(self, device: Device, send: Send) -> None:
-        self._device = device
-        self._send = send
-        self._period_ns = 0
-        self._due_ns = NEVER_NS
-        device.watch(0x1017, 0, self._set_period)
-
-    def restart(self, t_ns: int) -> None:
-        self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
-
-    def poll(self, t_ns: int) -> int:
-        if t_ns >= self._due_ns:
-            self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
-            self._send(0x700 + self._device.node_id, bytes([self._device.state]))
-        return self._due_ns
-
-    def _set_period(self, period_ms: int) -> None:
-        self._period_ns = period_ms * 1_000_000
-        self.restart(self._device.now_ns)
-
-
-class _HeartbeatConsumer:
-    """0x1016:1: monitors one node from its first heartbeat on. A lost heartbeat is found again when one arrives."""
-
-    def __init__(self, device: Device) -> None:
-        self.is_lost = False
-        self._device = device
-        self._node_id = 0
-        self._timeout_ns = 0
-        self._due_ns = NEVER_NS
-        device.watch(0x1016, 1, self._configure)
-
-    def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        if self._timeout_ns == 0 or node_id != self._node_id:
-            return
-        self._due_ns = t_ns + self._timeout_ns
-        if self.is_lost:
-            self.is_lost = False
-            self._device.find_heartbeat(t_ns)
-
-    def poll(self, t_ns: int) -> int:
-        if t_ns >= self._due_ns:
-            self._due_ns = NEVER_NS
-            self.is_lost = True
-            self._device.lose_heartbeat(t_ns)
-        return self._due_ns
-
-    def _configure(self, value: int) -> None:
-        self._node_id = (value >> 16) & 0x7F
-        self._timeout_ns = (value & 0xFFFF) * 1_000_000
-        self._due_ns = NEVER_NS
-        self.is_lost = False
-
-
-class _ErrorReporter:
-    """EMCY producer with inhibit time (0x1014, 0x1015) and the error history (0x1003, newest first)."""
-
-    def __init__(self, device: Device, send: Send) -> None:
-        self._device = device
-        self._send = send
-        self._waiting: deque[bytes] = deque()
-        self._inhibit_ns = 0
-        self._allowed_ns = 0
-        self._is_valid = True
-        self._cob_id = 0x80 + device.node_id
-        self._history: deque[int] = deque(maxlen=_HISTORY_LENGTH)
-        device.serve(0x1001, 0, lambda: device.error_register)
-        device.serve(0x1003, 0, lambda: len(self._history))
-        for sub in range(1, _HISTORY_LENGTH + 1):
-            device.serve(0x1003, sub, lambda sub=sub: self._past_error(sub))  # type: ignore[misc]
-        device.watch(0x1003, 0, self._clear_history, self._check_zero)
-        device.watch(0x1014, 0, self._validate, self._check_cob_id)
-        device.watch(0x1015, 0, self._set_inhibit)
-
-    def report(self, code: int, t_ns: int) -> None:
-        if code != 0:
-            self._history.appendleft(code)
-        if self._is_valid and self._device.state in (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL):
-            self._waiting.append(code.to_bytes(2, "little") + bytes([self._device.error_register, 0, 0, 0, 0, 0]))
-            self.poll(t_ns)
-
-    def poll(self, t_ns: int) -> int:
-        while self._waiting and t_ns >= self._allowed_ns:
-            self._allowed_ns = t_ns + self._inhibit_ns
-            self._send(self._cob_id, self._waiting.popleft())
-        return self._allowed_ns if self._waiting else NEVER_NS
-
-    def _past_error(self, sub: int) -> int:
-        if sub > len(self._history):
-            refuse(Abort.NO_DATA)
-        return self._history[sub - 1]
-
-    def _check_zero(self, value: int) -> None:
-        if value != 0:
-            refuse(Abort.VALUE_RANGE)
-
-    def _clear_history(self, _value: int) -> None:
-        self._history.clear()
-
-    def _check_cob_id(self, value: int) -> None:
-        if value & ~_NOT_VALID != self._cob_id:
-            refuse(Abort.VALUE_RANGE)
-
-    def _validate(self, value: int) -> None:
-        self._is_valid = not value & _NOT_VALID
-
-    def _set_inhibit(self, tenths_ms: int) -> None:
-        self._inhibit_ns = tenths_ms * 100_000

@@ -1,14 +1,16 @@
-"""An emulated joint torque sensor: a CiA 404 analogue input whose process value is the torque in µNm.
+"""An emulated joint torque sensor: a CiA 404 analogue input whose process value is the torque in the contract's LSB.
 
-On every SYNC it sends the value under an end-to-end header; the header's status nibble carries the low bits of
+On every SYNC it sends the value. Where the frame has an end-to-end header, the header's status carries the low bits of
 0x6150, so that an overload is seen in the very frame that it spoils. Source: CiA 404, objects 0x6125, 0x6150, 0x9130.
 """
 
 from collections.abc import Callable
 
 from adacd_hil.wire.codec import Codec
-from firmware_sim.object_dictionary import EMCY_HEARTBEAT, NEVER_NS, Abort, Device, refuse
+from firmware_sim.device import Device
+from firmware_sim.object_dictionary import Abort, refuse
 from firmware_sim.sensing import TORQUE_COUNTS, TORQUE_LSB_NM
+from firmware_sim.watchdogs import Watchdog
 
 STATUS_NOT_VALID = 0x01
 STATUS_POSITIVE_OVERLOAD = 0x02
@@ -17,45 +19,40 @@ AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
 """What 0x6125 takes."""
 AUTOZERO_SAMPLES = 64
 """Samples whose mean becomes the zero: an eighth of the noise of one."""
+TEMPERATURE_CENTIDEGREES = 2500
+"""0x2111: the emulated sensor has room temperature, always."""
 
 _LOWEST_COUNT, _HIGHEST_COUNT = TORQUE_COUNTS
-_UNM_PER_COUNT = TORQUE_LSB_NM * 1e6
+_EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
 
 
 class SensorNode:
     """One torque sensor on the bus."""
 
-    def __init__(self, device: Device, codec: Codec, number: int, send: Callable[[int, bytes], None]) -> None:
+    def __init__(self, device: Device, codec: Codec, number: int) -> None:
         """Connect the node to its device. `number`: 1 or 2, as in the DBC's names."""
         self.device = device
         self.has_news = False
-        """Whether the status frame is due because of a change."""
-        self._send = send
-        self._message = codec.message(f"Sensor{number}Torque")
-        self._torque_id = self._message.can_id
-        self._status_id = codec.message(f"Sensor{number}Status").can_id
-        self._frame = bytes(self._message.length)
-        self._sender = self._message.sender()
+        """Whether something has changed that the bus hasn't been told."""
+        self._pdos = device.pdos
+        signals = codec.message(f"Sensor{number}Torque").signals
+        scale_Nm = next(signal.scale for signal in signals if signal.name == "torque")
+        self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / scale_Nm)  # exact: contracts have decimal fractions
         self._status = STATUS_NOT_VALID  # nothing measured yet
-        self._torque_uNm = 0
+        self._torque = self._counts = 0
         self._zero_counts = 0.0
         self._autozero_left = self._autozero_sum = 0
-        self._is_sending_torque = self._is_sending_status = False
-        self._status_period_ns = self._status_inhibit_ns = 0
-        self._status_due_ns = NEVER_NS
-        self._status_allowed_ns = 0
         device.serve(0x2000, 1, lambda: codec.wire_version)
         device.serve(0x2000, 2, lambda: codec.layout_digest)
-        device.serve(0x2100, 1, lambda: self._frame[0])
-        device.serve(0x2100, 2, lambda: self._frame[1])
+        device.serve(0x2110, 1, lambda: round(self._counts * self._lsbs_per_count))
+        device.serve(0x2111, 0, lambda: TEMPERATURE_CENTIDEGREES)
         device.serve(0x6150, 1, lambda: self._status)
-        device.serve(0x9130, 1, lambda: self._torque_uNm)
+        device.serve(0x9130, 1, lambda: self._torque)
         device.watch(0x6125, 1, check=self._start_autozero)
         device.watch(0x6131, 1, check=self._check_unchanged(0x6131))
         device.watch(0x6132, 1, check=self._check_unchanged(0x6132))
-        device.watch(0x1801, 3, self._set_status_inhibit)
-        device.watch(0x1801, 5, self._set_status_period)
-        self._set_status_period(device.value(0x1801, 5))
+        self._pdos.events = _EVENTS
+        self._pdos.header_status = lambda: self._status
         device.attach(self)
 
     def on_sync(self, counts: int) -> None:
@@ -70,51 +67,46 @@ class SensorNode:
             self.has_news = True
         if self._autozero_left:
             self._autozero(counts)
-        self._torque_uNm = round((counts - self._zero_counts) * _UNM_PER_COUNT)
-
-    def send_torque(self) -> None:
-        """Send what was sampled at the last SYNC, protected, with the status in the header."""
-        if self._is_sending_torque:
-            frame = self._message.encode_raw(self._torque_uNm)
-            frame[1] = self._status << 4
-            self._frame = protected = self._sender.protect(frame)
-            self._send(self._torque_id, protected)
+        self._torque = round((counts - self._zero_counts) * self._lsbs_per_count)
+        self._counts = counts
+        if self._pdos.has_compared and self._pdos.compare():
+            self.has_news = True
 
     def poll(self, t_ns: int) -> int:
         """Do what is due by time; return when something is due next."""
         due_ns = self.device.poll(t_ns)
-        if self._is_sending_status:
-            if (self.has_news and t_ns >= self._status_allowed_ns) or t_ns >= self._status_due_ns:
-                self._send_status(t_ns)
-            due_ns = min(due_ns, self._status_allowed_ns if self.has_news else self._status_due_ns)
-        return due_ns
+        if self.has_news:
+            self.has_news = False
+            self._pdos.notify()
+        return min(due_ns, self._pdos.poll(t_ns))
+
+    def act(self, t_ns: int) -> None:
+        """Do nothing: a sensor takes no commands."""
+
+    def mind_length(self, is_right: bool, t_ns: int) -> None:
+        """Do nothing: a sensor takes no commands."""
 
     def leave_operational(self, t_ns: int) -> None:
         """Do nothing: the frames end by themselves."""
 
+    def enter_operational(self, t_ns: int) -> None:
+        """Do nothing: the frames begin by themselves."""
+
     def lose_heartbeat(self, t_ns: int) -> None:
         """Report it."""
         self.has_news = True
-        self.device.report_error(EMCY_HEARTBEAT, t_ns)
+        self.device.trip(Watchdog.HEARTBEAT, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
         """Clear the error."""
         self.has_news = True
-        self.device.clear_error(t_ns)
-
-    def refresh(self) -> None:
-        """Take over which PDOs are exchanged; a new Operational begins with a status frame."""
-        self._is_sending_torque = self.device.is_pdo_active(0x1800)
-        was_sending = self._is_sending_status
-        self._is_sending_status = self.device.is_pdo_active(0x1801)
-        self.has_news |= self._is_sending_status and not was_sending
+        self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def restart(self, is_node_reset: bool) -> None:
-        """Count the frames anew; a node reset also forgets the zero."""
-        self._sender = self._message.sender()
+        """Forget the zero at a node reset."""
         if is_node_reset:
             self._status = STATUS_NOT_VALID
-            self._torque_uNm = 0
+            self._torque = self._counts = 0
             self._zero_counts = 0.0
             self._autozero_left = 0
 
@@ -138,16 +130,3 @@ class SensorNode:
                 refuse(Abort.VALUE_RANGE)
 
         return check
-
-    def _send_status(self, t_ns: int) -> None:
-        self.has_news = False
-        self._status_allowed_ns = t_ns + self._status_inhibit_ns
-        self._status_due_ns = t_ns + self._status_period_ns if self._status_period_ns else NEVER_NS
-        self._send(self._status_id, bytes([self._status, self.device.error_register]))
-
-    def _set_status_inhibit(self, tenths_ms: int) -> None:
-        self._status_inhibit_ns = tenths_ms * 100_000
-
-    def _set_status_period(self, period_ms: int) -> None:
-        self._status_period_ns = period_ms * 1_000_000
-        self.has_news = True

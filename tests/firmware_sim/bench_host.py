@@ -12,6 +12,7 @@ from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.bench import Bench
+from firmware_sim.contracts import CONTRACTS
 from firmware_sim.scenario import Scenario
 
 CODEC = load_codec()
@@ -28,9 +29,10 @@ def quiet_scenario(**changes: Any) -> Scenario:
 
 
 @cache
-def _dictionary(node: int) -> canopen.ObjectDictionary:
+def _dictionary(node: int, contract: str) -> canopen.ObjectDictionary:
     """Read the EDS of a node; the client's side never changes it."""
-    return canopen.import_od(str(contract_folder() / EDS[node]), node)
+    file = CONTRACTS[contract].drive_eds if node <= 2 else CONTRACTS[contract].sensor_eds
+    return canopen.import_od(str(contract_folder() / file), node)
 
 
 class _ClientNetwork(canopen.Network):
@@ -50,12 +52,20 @@ class _ClientNetwork(canopen.Network):
 class BenchHost:
     """Host's end of a bench. `frames`: everything the devices sent, oldest first."""
 
-    def __init__(self, scenario: Scenario | None = None, clock_mode: str = "sync", seed: int | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario | None = None,
+        clock_mode: str = "sync",
+        seed: int | None = None,
+        contract: str = "arm",
+    ) -> None:
+        codec = CODEC if contract == "arm" else load_codec(CONTRACTS[contract].path)
+        self.contract = contract
         self.frames: list[tuple[int, bytes]] = []
         self.truths: list[tuple[int, int, np.ndarray]] = []
         self.bench = Bench(
             scenario or quiet_scenario(),
-            CODEC,
+            codec,
             lambda can_id, data: self.frames.append((can_id, data)),
             clock_mode=clock_mode,
             seed=seed,
@@ -70,7 +80,7 @@ class BenchHost:
     def nodes(self) -> dict[int, canopen.RemoteNode]:
         """canopen's own view of the devices."""
         network = _ClientNetwork(self)
-        return {n: network.add_node(n, _dictionary(n)) for n in EDS}
+        return {n: network.add_node(n, _dictionary(n, self.contract)) for n in EDS}
 
     def put(self, can_id: int, data: bytes) -> None:
         self.bench.on_frame(Frame(can_id, bytes(data), self.t_ns))

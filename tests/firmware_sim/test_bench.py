@@ -1,12 +1,10 @@
 """The bench: order within a cycle, time, lost SYNCs, resets, determinism, and the contract's two descriptions."""
 
-import cantools
 import numpy as np
 import pytest
 from bench_host import (
     CODEC,
     DISABLE_VOLTAGE,
-    EDS,
     ENABLE,
     FAULT_RESET,
     PERIOD_NS,
@@ -15,15 +13,12 @@ from bench_host import (
     BenchHost,
     quiet_scenario,
 )
-from test_object_dictionary import default_of, eds_rows
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.wire.bus import EmbeddedBus, Frame
-from adacd_hil.wire.codec import contract_folder
 from firmware_sim.bench import Bench
 
 TWITCH = [{"at_s": 0.02, "link": 2, "point_m": 0.3, "force_N": 20.0, "duration_s": 0.02}]
-DATABASE = cantools.database.load_file(contract_folder() / "arm.dbc")
 
 
 def play(host: BenchHost, cycles: int = 300) -> None:
@@ -31,48 +26,6 @@ def play(host: BenchHost, cycles: int = 300) -> None:
     host.enable()
     for k in range(cycles):
         host.step(ENABLE, round(80 * np.sin(0.05 * k)))
-
-
-PDOS = [(1, 0x1400), (1, 0x1800), (1, 0x1801), (2, 0x1400), (2, 0x1800), (2, 0x1801)]
-PDOS += [(3, 0x1800), (3, 0x1801), (4, 0x1800), (4, 0x1801)]
-
-
-@pytest.mark.parametrize(("node", "record"), PDOS)
-def test_dbc_layout_and_eds_mapping_agree(node, record):
-    values = {(index, sub): default_of(default, node) for index, sub, _, default in eds_rows(node)}
-    types = _data_types(node)
-    message = DATABASE.get_message_by_frame_id(values[record, 1])
-    mapped = []
-    start = 0
-    for sub in range(1, values[record + 0x200, 0] + 1):
-        entry = values[record + 0x200, sub]
-        index, object_sub, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
-        assert types[index, object_sub][0] == bits
-        mapped.append((start, bits, types[index, object_sub][1]))
-        start += bits
-    assert message.length * 8 == start
-    signals = sorted(message.signals, key=lambda signal: signal.start)
-    laid_out = [(signal.start, signal.length, signal.is_signed) for signal in signals]
-    if any(signal.name == "e2e_counter" for signal in signals):
-        # One mapped byte (0x2100:2) holds both nibbles.
-        assert laid_out[1:3] == [(8, 4, False), (12, 4, False)]
-        laid_out[1:3] = [(8, 8, False)]
-    assert laid_out == mapped
-
-
-def _data_types(node: int) -> dict[tuple[int, int], tuple[int, bool]]:
-    """Map objects to (bits, is signed) by their CiA 301 data type."""
-    import configparser
-
-    sizes = {2: (8, True), 3: (16, True), 4: (32, True), 5: (8, False), 6: (16, False), 7: (32, False)}
-    parser = configparser.ConfigParser()
-    parser.read(contract_folder() / EDS[node])
-    types = {}
-    for section in parser.sections():
-        index, _, sub = section.partition("sub")
-        if len(index) == 4 and int(parser[section].get("DataType", "9"), 16) in sizes:
-            types[int(index, 16), int(sub or "0", 16)] = sizes[int(parser[section]["DataType"], 16)]
-    return types
 
 
 def test_a_sync_is_answered_by_feedback_and_torque_with_identifiers_ascending():

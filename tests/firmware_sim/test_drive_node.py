@@ -108,6 +108,11 @@ def test_controlwords_are_decoded_by_the_standards_bit_patterns(controlword, pre
     assert decode_command(controlword, previous) is event
 
 
+def emergency(code: int, watchdog: int, time_ms: int) -> bytes:
+    """Make the EMCY of a watchdog that has tripped."""
+    return struct.pack("<HBBI", code, 0x11, watchdog, time_ms)
+
+
 @pytest.fixture
 def host() -> BenchHost:
     return BenchHost()
@@ -299,10 +304,10 @@ def test_a_command_of_the_wrong_length_is_reported_once_and_changes_nothing(host
     for _ in range(2):
         host.put(0x201, host.command_frame(1, ENABLE, 500)[:5])
     host.sync()
-    assert host.taken(0x081) == [bytes([0x10, 0x82, 0x11, 0, 0, 0, 0, 0])]
+    assert host.taken(0x081) == [emergency(0x8210, 5, 2)]
     assert host.bench.drives[0].torque_Nm == 0.0
     host.step(ENABLE)
-    assert host.taken(0x081) == [bytes(8)]
+    assert host.taken(0x081) == [struct.pack("<HBBI", 0, 0, 5, 3)]
     assert host.read(1, 0x1001) == 0
 
 
@@ -324,7 +329,7 @@ def test_two_syncs_without_command_are_forgiven_and_hold_the_torque_and_the_thir
     host.sync()
     assert host.state_bits() == REACTION_BITS
     frames = host.take()
-    assert (0x081, bytes([0x50, 0x82, 0x11, 0, 0, 0, 0, 0])) in frames
+    assert (0x081, emergency(0x8250, 2, 6)) in frames
     assert host.read(1, 0x603F) == 0x8250
     status = next(data for can_id, data in frames if can_id == 0x281)
     assert struct.unpack("<HbhH", status)[3] == 0x8250
@@ -508,7 +513,7 @@ def test_by_wall_clock_one_and_a_half_periods_without_sync_fault_and_brake():
     assert host.state_bits() == ENABLED_BITS
     host.bench.advance_to(host.t_ns + PERIOD_NS * 3 // 2)
     assert host.state_bits() == REACTION_BITS
-    assert host.taken(0x081)[0] == bytes([0x00, 0x87, 0x11, 0, 0, 0, 0, 0])
+    assert host.taken(0x081)[0] == emergency(0x8700, 1, 4)
     host.t_ns += 1_000_000_000
     host.bench.advance_to(host.t_ns)
     assert host.state_bits() == FAULT_BITS
@@ -575,7 +580,9 @@ def test_status_comes_on_entering_operational_on_change_and_every_100_ms(host):
 
 
 def test_status_keeps_its_inhibit_time(host):
+    host.write(1, 0x1801, 1, 0x80000281)
     host.write(1, 0x1801, 3, 100)
+    host.write(1, 0x1801, 1, 0x281)
     host.nmt(START)
     host.take()
     for controlword in (SHUTDOWN, SWITCH_ON, SHUTDOWN, SWITCH_ON):

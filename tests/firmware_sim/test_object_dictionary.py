@@ -18,11 +18,12 @@ from bench_host import (
 )
 
 from adacd_hil.wire.codec import contract_folder
-from firmware_sim.object_dictionary import NmtState
+from firmware_sim.device import NmtState
+from firmware_sim.watchdogs import Watchdog
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
 WRONG_LENGTH, VALUE_RANGE, NO_DATA = 0x06070010, 0x06090030, 0x08000024
-NOT_MAPPABLE, INCOMPATIBLE, CANNOT_STORE, DEVICE_STATE = 0x06040041, 0x06040043, 0x08000020, 0x08000022
+TOO_HIGH, TOO_LOW, CANNOT_STORE = 0x06090031, 0x06090032, 0x08000020
 
 # What differs from the EDS default right after boot-up: live values.
 LIVE = {
@@ -32,6 +33,7 @@ LIVE = {
     (3, 0x2000, 1): CODEC.wire_version,
     (3, 0x2000, 2): CODEC.layout_digest,
     (3, 0x6150, 1): 1,
+    (3, 0x2111, 0): 2500,
 }
 
 
@@ -115,11 +117,9 @@ def test_reading_what_is_not_there_is_aborted(host, node, index, sub, code):
         (1, 0x1006, 0, struct.pack("<I", 1050), VALUE_RANGE),
         (1, 0x6060, 0, b"\x08", VALUE_RANGE),
         (1, 0x6076, 0, struct.pack("<I", 11999), VALUE_RANGE),
-        (1, 0x605A, 0, struct.pack("<h", 3), VALUE_RANGE),
-        (1, 0x1400, 1, struct.pack("<I", 0x202), VALUE_RANGE),
-        (1, 0x1800, 2, b"\xff", VALUE_RANGE),
-        (1, 0x1A00, 1, struct.pack("<I", 0x60770010), NOT_MAPPABLE),
-        (1, 0x1A00, 0, b"\x01", INCOMPATIBLE),
+        (1, 0x605A, 0, struct.pack("<h", 4), VALUE_RANGE),
+        (1, 0x2200, 0, b"\0", TOO_LOW),
+        (1, 0x2201, 0, struct.pack("<H", 10_001), TOO_HIGH),
         (1, 0x1003, 0, b"\x01", VALUE_RANGE),
         (1, 0x1014, 0, struct.pack("<I", 0x85), VALUE_RANGE),
         (3, 0x6125, 1, b"nero", CANNOT_STORE),
@@ -220,15 +220,13 @@ def test_another_masters_pdo_configuration_of_the_same_contract_is_accepted(host
     assert [can_id for can_id, _ in host.take()][-4:] == [0x181, 0x182, 0x183, 0x184]
 
 
-@pytest.mark.parametrize(("index", "sub", "off"), [(0x1800, 1, 0x80000181), (0x1A00, 0, 0)])
-def test_a_pdo_that_is_switched_off_is_not_sent_until_it_is_switched_on(host, index, sub, off):
-    on = host.read(1, index, sub)
+def test_a_pdo_that_is_switched_off_is_not_sent_until_it_is_switched_on(host):
     host.nmt(START)
-    host.write(1, index, sub, off)
+    host.write(1, 0x1800, 1, 0x80000181)
     host.take()
     host.sync()
     assert host.taken(0x181) == []
-    host.write(1, index, sub, on)
+    host.write(1, 0x1800, 1, 0x181)
     host.take()
     host.sync()
     assert len(host.taken(0x181)) == 1
@@ -244,19 +242,18 @@ def test_the_loss_of_the_masters_heartbeat_is_reported_and_ends_operational(host
     host.bench.advance_to(10_299_999_999)
     assert host.taken(0x083) == []
     host.bench.advance_to(10_300_000_000)
-    assert host.taken(0x083) == [bytes([0x30, 0x81, 0x11, 0, 0, 0, 0, 0])]
+    assert host.taken(0x083) == [struct.pack("<HBBI", 0x8130, 0x11, 3, 10_300)]
     assert host.bench.devices[2].state == NmtState.PRE_OPERATIONAL
     assert host.read(3, 0x1001) == 0x11
     assert host.read(3, 0x1003, 1) == 0x8130
     host.put(0x77F, b"\x05")
-    assert host.taken(0x083) == [bytes(8)]
+    assert host.taken(0x083) == [struct.pack("<HBBI", 0, 0, 3, 10_300)]
     assert host.read(3, 0x1001) == 0
 
 
 def test_the_error_history_holds_the_last_four_newest_first_and_can_be_cleared(host):
-    device = host.bench.devices[0]
-    for code in (0x8130, 0x8250, 0x8700, 0x8100, 0x8210):
-        device.report_error(code, 0)
+    for watchdog in (Watchdog.HEARTBEAT, Watchdog.COMMAND, Watchdog.SYNC, Watchdog.OPERATIONAL, Watchdog.LENGTH):
+        host.bench.devices[0].trip(watchdog, 0)
     assert host.read(1, 0x1003, 0) == 4
     assert [host.read(1, 0x1003, sub) for sub in (1, 2, 3, 4)] == [0x8210, 0x8100, 0x8700, 0x8250]
     host.write(1, 0x1003, 0, 0)
@@ -266,8 +263,8 @@ def test_the_error_history_holds_the_last_four_newest_first_and_can_be_cleared(h
 def test_emergency_messages_keep_their_inhibit_time_and_none_is_lost(host):
     host.write(1, 0x1015, 0, 50)
     host.take()
-    for code in (0x8130, 0x8250, 0x8700):
-        host.bench.devices[0].report_error(code, 0)
+    for watchdog in (Watchdog.HEARTBEAT, Watchdog.COMMAND, Watchdog.SYNC):
+        host.bench.devices[0].trip(watchdog, 0)
     sent = []
     for t_ms in range(12):
         host.bench._poll(t_ms * 1_000_000)
@@ -278,7 +275,7 @@ def test_emergency_messages_keep_their_inhibit_time_and_none_is_lost(host):
 def test_a_stopped_device_sends_no_emergency_message(host):
     host.nmt(STOP)
     host.take()
-    host.bench.devices[0].report_error(0x8130, 0)
+    host.bench.devices[0].trip(Watchdog.HEARTBEAT, 0)
     assert host.take() == []
 
 

@@ -1,0 +1,190 @@
+"""One emulated CANopen device: NMT slave with object dictionary, PDOs, heartbeats, EMCY and watchdogs.
+
+It starts no thread: heartbeats and every other timer run on the bench's time, which comes in as `t_ns`.
+Source: CiA 301, 7.2 (services), 7.3 (NMT).
+"""
+
+from collections.abc import Callable, Mapping
+from enum import IntEnum
+from pathlib import Path
+from typing import Protocol
+
+from adacd_hil.wire.codec import MessageCodec
+from firmware_sim.emergency import ErrorReporter
+from firmware_sim.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from firmware_sim.object_dictionary import ObjectDictionary, Send
+from firmware_sim.pdo import Pdos, PdoUser
+from firmware_sim.pdo_mapping import CLASSIC_BYTES
+from firmware_sim.watchdogs import Watchdog, Watchdogs
+
+_GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
+
+
+class NmtState(IntEnum):
+    """NMT states, CiA 301 figure 46. Every state but the first ends by an NMT command."""
+
+    INITIALISING = 0  # by itself: boot-up message, then Pre-operational
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+_COMMANDED_STATES = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
+_EMCY_STATES = (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL)
+RESET_NODE, RESET_COMMUNICATION = 129, 130
+
+
+class Application(PdoUser, Protocol):
+    """What a device does besides communicating."""
+
+    def leave_operational(self, t_ns: int) -> None:
+        """Act on leaving Operational; EMCY messages can still be sent."""
+
+    def enter_operational(self, t_ns: int) -> None:
+        """Act on entering Operational."""
+
+    def lose_heartbeat(self, t_ns: int) -> None:
+        """Report and act on the loss of the master's heartbeat, before the device leaves Operational."""
+
+    def find_heartbeat(self, t_ns: int) -> None:
+        """Act on the return of the master's heartbeat."""
+
+    def restart(self, is_node_reset: bool) -> None:
+        """Begin anew: communication only, or all of the device."""
+
+
+class Device(ObjectDictionary):
+    """A CANopen device: everything but what its application does."""
+
+    def __init__(
+        self,
+        node_id: int,
+        eds_path: Path,
+        send: Send,
+        messages: Mapping[int, MessageCodec] | None = None,
+        longest_pdo: int = CLASSIC_BYTES,
+    ) -> None:
+        """Read the EDS; nothing is sent before `boot`. Raises OSError when the EDS can't be read.
+
+        `messages`: the contract's, by identifier. `longest_pdo` in bytes.
+        """
+        super().__init__(node_id, eds_path, send)
+        self.state = NmtState.INITIALISING
+        self.is_operational = False
+        self.is_faulty = False
+        """Whether the application is in a fault, 0x1001 bit 0."""
+        self.now_ns = 0
+        """Time of the last request, for what it starts."""
+        self.power_on_ns = 0
+        """Where the device's own clock begins."""
+        self.on_pdo_change: Callable[[], None] = lambda: None
+        """Called when other PDOs are exchanged than before."""
+        self._send = send
+        self._application: Application | None = None
+        self._producer = HeartbeatProducer(self, send, lambda: self.state, lambda: self.now_ns)
+        self._consumer = HeartbeatConsumer(self, self)
+        self._errors = ErrorReporter(self, send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
+        self.watchdogs = Watchdogs(self)
+        self.pdos = Pdos(self, send, messages or {}, longest_pdo, self._announce_pdos)
+
+    @property
+    def error_register(self) -> int:
+        """0x1001."""
+        register = _GENERIC | _COMMUNICATION if self.watchdogs.tripped else 0
+        return register | (_GENERIC if self.is_faulty else 0)
+
+    @property
+    def is_heartbeat_lost(self) -> bool:
+        """Whether the master's heartbeat is monitored and missing."""
+        return self._consumer.is_lost
+
+    def attach(self, application: Application) -> None:
+        """Connect what the device does."""
+        self._application = application
+        self.pdos.user = application
+
+    def power_on(self, t_ns: int) -> None:
+        """Let the device's own clock begin, then boot."""
+        self.power_on_ns = t_ns
+        self.boot(t_ns)
+
+    def boot(self, t_ns: int) -> None:
+        """Announce the device and enter Pre-operational."""
+        self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
+        self._producer.restart(t_ns)
+        self._enter(NmtState.PRE_OPERATIONAL, t_ns)
+
+    def on_nmt(self, data: bytes, t_ns: int) -> None:
+        """Obey an NMT command, if it is for this device."""
+        if len(data) != 2 or data[1] not in (0, self.node_id):
+            return
+        self.now_ns = t_ns
+        command = data[0]
+        if command in _COMMANDED_STATES:
+            self._enter(_COMMANDED_STATES[command], t_ns)
+        elif command in (RESET_NODE, RESET_COMMUNICATION):
+            self._enter(NmtState.INITIALISING, t_ns)
+            self._reset(command == RESET_NODE)
+            self.boot(t_ns)
+
+    def on_sdo(self, data: bytes, t_ns: int) -> None:
+        """Answer an SDO request."""
+        self.now_ns = t_ns
+        if len(data) == 8 and self.state != NmtState.STOPPED:
+            self.on_request(data, t_ns)
+
+    def on_heartbeat(self, node_id: int, t_ns: int) -> None:
+        """Take note of another node's heartbeat."""
+        self._consumer.on_heartbeat(node_id, t_ns)
+
+    def lose_heartbeat(self, t_ns: int) -> None:
+        """React to the master's silence: the application, then Pre-operational (CiA 301, default of 0x1029)."""
+        if self._application is not None:
+            self._application.lose_heartbeat(t_ns)
+        if self.is_operational:
+            self._enter(NmtState.PRE_OPERATIONAL, t_ns)
+
+    def find_heartbeat(self, t_ns: int) -> None:
+        """Let the application know that the master is back."""
+        if self._application is not None:
+            self._application.find_heartbeat(t_ns)
+
+    def trip(self, watchdog: Watchdog, t_ns: int) -> None:
+        """Report a watchdog that trips; once, until it has cleared."""
+        self.watchdogs.trip(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+
+    def clear(self, watchdog: Watchdog, t_ns: int) -> None:
+        """Report that the cause of a tripped watchdog has gone, by an EMCY with code 0."""
+        self.watchdogs.clear(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+
+    def report_no_error(self, t_ns: int) -> None:
+        """Say by an EMCY with code 0 that a fault was reset."""
+        self._errors.report(0, t_ns)
+
+    def poll(self, t_ns: int) -> int:
+        """Do what is due; return when something is due next."""
+        return min(self._producer.poll(t_ns), self._consumer.poll(t_ns), self._errors.poll(t_ns))
+
+    def _announce_pdos(self) -> None:
+        self.on_pdo_change()
+
+    def _time_ms(self, t_ns: int) -> int:
+        return (t_ns - self.power_on_ns) // 1_000_000
+
+    def _enter(self, state: NmtState, t_ns: int) -> None:
+        was_operational, self.is_operational = self.is_operational, state == NmtState.OPERATIONAL
+        if was_operational and not self.is_operational and self._application is not None:
+            self._application.leave_operational(t_ns)
+        self.state = state
+        self.pdos.set_operational(self.is_operational, t_ns)
+        if self.is_operational and not was_operational and self._application is not None:
+            self._application.enter_operational(t_ns)
+
+    def _reset(self, is_node_reset: bool) -> None:
+        """Restore the EDS values: the communication profile's, or all."""
+        self.restore(0xFFFF if is_node_reset else 0x1FFF)
+        self.pdos.restart()
+        if is_node_reset:
+            self.watchdogs.reset()
+        if self._application is not None:
+            self._application.restart(is_node_reset)

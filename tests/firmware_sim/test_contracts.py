@@ -1,0 +1,228 @@
+"""The contracts that the emulator plays: DBC and EDS describe the same frames, and the devices send them."""
+
+import configparser
+import math
+import struct
+
+import cantools
+import pytest
+from bench_host import ENABLE, SHUTDOWN, START, SWITCH_ON, BenchHost, quiet_scenario
+
+from adacd_hil.wire.codec import contract_folder, load_codec
+from firmware_sim.contracts import CONTRACTS, contract_of
+from firmware_sim.sensing import TORQUE_LSB_NM
+
+BY_DEFAULT = [name for name in ("arm", "arm_fd") if CONTRACTS[name].path.exists()]
+"""Contracts whose drives need no mapping by a master."""
+PRESENT = [name for name, contract in CONTRACTS.items() if contract.path.exists()]
+SIZES = {2: (8, True), 3: (16, True), 4: (32, True), 5: (8, False), 6: (16, False), 7: (32, False)}
+HEADER_BITS = {0x2100: 16, 0x2101: 32}
+DRIVE_NODES, SENSOR_NODES = (1, 2), (3, 4)
+# What a master has to map on stock drives: record -> COB-ID base, type, entries.
+STOCK = {
+    0x1400: (0x200, 1, (0x60400010, 0x60710010)),
+    0x1800: (0x180, 1, (0x60640020, 0x606C0020)),
+    0x1801: (0x280, 255, (0x60410010, 0x60610008, 0x60770010, 0x603F0010)),
+}
+
+
+class Eds:
+    """Values and types of one EDS, read without canopen."""
+
+    def __init__(self, path, node: int) -> None:
+        parser = configparser.ConfigParser()
+        parser.read(path)
+        self.values, self.types = {}, {}
+        for section in parser.sections():
+            index, _, sub = section.partition("sub")
+            row = parser[section]
+            if len(index) != 4 or "DataType" not in row:
+                continue
+            key = int(index, 16), int(sub or "0", 16)
+            self.types[key] = SIZES.get(int(row["DataType"], 16))
+            text = row.get("DefaultValue", "0")
+            if self.types[key] is not None:
+                offset = node if text.startswith("$NODEID+") else 0
+                self.values[key] = offset + int(text.removeprefix("$NODEID+"), 0)
+
+    def layout(self, entries: tuple[int, ...]) -> list[tuple[int, int, bool]]:
+        """Place mapped objects: start bit, length, is signed; each entry's length must be the object's."""
+        places = []
+        start = 0
+        for entry in entries:
+            bits, is_signed = self.types[entry >> 16, entry >> 8 & 0xFF]
+            assert entry & 0xFF == bits
+            places.append((start, bits, is_signed))
+            start += bits
+        return places
+
+    def default_pdos(self) -> dict[int, tuple[int, ...]]:
+        """Give the entries of each PDO that exists at power-on, by its COB-ID."""
+        pdos = {}
+        for record in (*range(0x1400, 0x1404), *range(0x1800, 0x1804)):
+            cob_id = self.values.get((record, 1), 1 << 31)
+            if not cob_id >> 31:
+                count = self.values[record + 0x200, 0]
+                pdos[cob_id & 0x7FF] = tuple(self.values[record + 0x200, sub] for sub in range(1, count + 1))
+        return pdos
+
+
+def assert_same_layout(message, eds: Eds, entries: tuple[int, ...]) -> None:
+    mapped = eds.layout(entries)
+    assert mapped[-1][0] + mapped[-1][1] == message.length * 8
+    signals = sorted(message.signals, key=lambda signal: signal.start)
+    assert {signal.byte_order for signal in signals} == {"little_endian"}
+    laid_out = [(signal.start, signal.length, signal.is_signed) for signal in signals]
+    if any(signal.name == "e2e_counter" and signal.length == 4 for signal in signals):
+        assert laid_out[1:3] == [(8, 4, False), (12, 4, False)]
+        laid_out[1:3] = [(8, 8, False)]  # one mapped byte, 0x2100:2, holds both nibbles
+    assert laid_out == mapped
+
+
+def cyclic_ids(database) -> set[int]:
+    return {message.frame_id for message in database.messages if 0x180 < message.frame_id < 0x580}
+
+
+@pytest.mark.parametrize("name", BY_DEFAULT)
+def test_default_mappings_are_the_dbcs_frames_bit_for_bit(name):
+    contract = CONTRACTS[name]
+    database = cantools.database.load_file(contract.path)
+    seen = set()
+    for node in (*DRIVE_NODES, *SENSOR_NODES):
+        file = contract.drive_eds if node in DRIVE_NODES else contract.sensor_eds
+        eds = Eds(contract_folder() / file, node)
+        for can_id, entries in eds.default_pdos().items():
+            assert_same_layout(database.get_message_by_frame_id(can_id), eds, entries)
+            seen.add(can_id)
+    assert seen == cyclic_ids(database)
+
+
+def test_the_stock_sensors_mapping_and_what_is_to_be_mapped_on_stock_drives_are_the_dbcs_frames():
+    contract = CONTRACTS["arm_stock"]
+    database = cantools.database.load_file(contract.path)
+    seen = set()
+    for node in SENSOR_NODES:
+        eds = Eds(contract_folder() / contract.sensor_eds, node)
+        (pdo,) = eds.default_pdos().items()
+        assert_same_layout(database.get_message_by_frame_id(pdo[0]), eds, pdo[1])
+        seen.add(pdo[0])
+    for node in DRIVE_NODES:
+        eds = Eds(contract_folder() / contract.drive_eds, node)
+        for base, _, entries in STOCK.values():
+            assert_same_layout(database.get_message_by_frame_id(base + node), eds, entries)
+            seen.add(base + node)
+    assert seen == cyclic_ids(database)
+
+
+@pytest.mark.parametrize("name", PRESENT)
+def test_every_eds_lists_exactly_the_objects_that_it_describes(name):
+    for file in (CONTRACTS[name].drive_eds, CONTRACTS[name].sensor_eds):
+        parser = configparser.ConfigParser()
+        parser.read(contract_folder() / file)
+        listed = set()
+        for section in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
+            count = int(parser[section]["SupportedObjects"])
+            listed |= {int(parser[section][str(number)], 16) for number in range(1, count + 1)}
+        assert listed == {int(section, 16) for section in parser.sections() if len(section) == 4}
+
+
+@pytest.mark.parametrize("name", PRESENT)
+def test_the_contract_is_found_by_its_dbc(name):
+    assert contract_of(load_codec(CONTRACTS[name].path)) == CONTRACTS[name]
+
+
+def stock_host(**scenario) -> BenchHost:
+    host = BenchHost(quiet_scenario(**scenario), contract="arm_stock")
+    for node in DRIVE_NODES:
+        for record, (base, kind, entries) in STOCK.items():
+            host.write(node, record, 1, 1 << 31 | base + node)
+            host.write(node, record, 2, kind)
+            host.write(node, record + 0x200, 0, 0)
+            for sub, entry in enumerate(entries, start=1):
+                host.write(node, record + 0x200, sub, entry)
+            host.write(node, record + 0x200, 0, len(entries))
+            host.write(node, record, 1, base + node)
+        host.write(node, 0x1801, 5, 100)
+        host.write(node, 0x6060, 0, 10)
+    host.nmt(START)
+    return host
+
+
+def step(host: BenchHost, word: int, torque: int = 0) -> None:
+    for node in DRIVE_NODES:
+        host.put(0x200 + node, struct.pack("<Hh", word, torque))
+    host.sync()
+
+
+def test_a_stock_drive_runs_unprotected_in_increments_per_second():
+    host = stock_host(start_deg=[-30.0, -60.0])
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        step(host, word)
+    for _ in range(30):
+        step(host, ENABLE, 200)
+    host.take()
+    host.sync()
+    position, velocity = struct.unpack("<ii", host.taken(0x182)[0])
+    increments_per_rad = 65536 * 16 / (2 * math.pi)
+    assert position == pytest.approx(host.true("q")[1] * increments_per_rad, abs=1.0)
+    assert velocity == pytest.approx(host.true("dq")[1] * increments_per_rad, rel=0.15)
+    assert abs(velocity) > 1000
+    assert (host.read(1, 0x608F, 1), host.read(1, 0x6091, 1), host.read(1, 0x6091, 2)) == (65536, 16, 1)
+
+
+def test_a_stock_drive_watches_its_commands_by_the_event_timer_only():
+    host = stock_host()
+    host.write(1, 0x1400, 5, 5)
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        step(host, word)
+    for _ in range(5):
+        host.sync()
+    assert host.read(1, 0x603F) == 0x8250
+    assert host.read(2, 0x603F) == 0
+    for index in (0x2000, 0x2100, 0x2200, 0x2201, 0x2210):
+        assert host.abort_code(lambda i=index: host.nodes[1].sdo.upload(i, 0)) == 0x06020000
+
+
+def test_a_stock_sensor_sends_its_torque_and_nothing_else():
+    host = stock_host(torque_offset_Nm=[1.0, -2.0])
+    host.take()
+    for _ in range(200):
+        host.sync()
+    frames = host.take()
+    torques = [data for can_id, data in frames if can_id == 0x183]
+    assert len(torques) == 200
+    assert struct.unpack("<i", torques[0])[0] == round(round(1.0 / TORQUE_LSB_NM) * TORQUE_LSB_NM * 1e5)
+    assert {can_id for can_id, _ in frames if can_id & 0x7F in SENSOR_NODES} == {0x183, 0x184}
+
+
+@pytest.mark.parametrize("sub", [0, 1])
+def test_a_stock_sensors_mapping_is_fixed(sub):
+    host = BenchHost(contract="arm_stock")
+    assert host.abort_code(lambda: host.write(3, 0x1A00, sub, 0)) == 0x06010002
+    assert host.abort_code(lambda: host.write(3, 0x1800, 1, 0x80000183)) == 0x06010002
+
+
+@pytest.mark.skipif("arm_fd" not in BY_DEFAULT, reason="dbc/arm_fd.dbc is not in this tree")
+def test_fd_devices_exchange_one_protected_frame_each_way():
+    host = BenchHost(quiet_scenario(torque_offset_Nm=[1.0, 50.0]), contract="arm_fd")
+    host.start()
+    codec = load_codec(CONTRACTS["arm_fd"].path)
+    senders = {node: codec.message(f"Drive{node}Command").sender() for node in DRIVE_NODES}
+    receivers = {name: codec.message(name).receiver() for name in ("Drive1Feedback", "Sensor1Torque", "Sensor2Torque")}
+    for word, torque in ((SHUTDOWN, 0), (SWITCH_ON, 0), (ENABLE, 0), (ENABLE, 300)):
+        host.take()
+        for node, sender in senders.items():
+            body = struct.pack("<HhhH", word, torque, -50, 200)
+            host.put(0x200 + node, sender.protect(bytearray(4) + body))
+        host.sync()
+        frames = dict(host.take())
+        for name, receiver in receivers.items():
+            assert receiver.check(frames[codec.message(name).can_id]) == 0
+    assert host.bench.drives[0].torque_Nm == pytest.approx(0.2 * 12.0)
+    feedback = struct.unpack_from("<iiHbBhHhH", frames[0x181], 4)
+    assert feedback[2:5] == (0x1A37 | 0x0800, 10, 0)
+    assert feedback[6:] == (0, 200, 4)
+    assert len(frames[0x181]) == 24
+    torque, gross, status, register, temperature = struct.unpack_from("<iiBBh", frames[0x184], 4)
+    assert (torque, gross, status, register, temperature) == (gross, torque, 3, 0, 2500)
+    assert frames[0x184][3] == 3

@@ -1,0 +1,210 @@
+"""How the emulated drive stops, by each option code, and which torque it is limited to; seen in state and motion."""
+
+import pytest
+from bench_host import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, BenchHost
+
+from firmware_sim.body import DriveMode
+
+DISABLED, READY, SWITCHED_ON, ENABLED, STOPPING, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
+SLOWLY, RAMP, HARD = DriveMode.BRAKE_SLOWLY, DriveMode.BRAKE, DriveMode.BRAKE_HARD
+
+
+def moving_host(option: int | None = None, code: int = 0) -> BenchHost:
+    host = BenchHost()
+    if option is not None:
+        for node in (1, 2):
+            host.write(node, option, 0, code)
+    host.enable()
+    for _ in range(40):
+        host.step(ENABLE, 300)
+    return host
+
+
+def keep(host: BenchHost, word: int, cycles: int = 1100) -> None:
+    for _ in range(cycles):
+        host.step(word)
+
+
+@pytest.mark.parametrize(
+    ("option", "codes"),
+    [
+        (0x605A, {0, 1, 2, 3, 5, 6, 7}),
+        (0x605B, {0, 1}),
+        (0x605C, {0, 1}),
+        (0x605E, {0, 1, 2, 3}),
+    ],
+)
+@pytest.mark.parametrize("code", [-2, -1, 0, 1, 2, 3, 4, 5, 6, 7, 8])
+def test_an_option_code_is_taken_or_refused(option, codes, code):
+    host = BenchHost()
+    if code in codes:
+        host.write(1, option, 0, code)
+        assert host.read(1, option) == code
+    else:
+        assert host.abort_code(lambda: host.write(1, option, 0, code)) == 0x06090030
+
+
+@pytest.mark.parametrize(
+    ("code", "mode", "end"),
+    [
+        (1, SLOWLY, DISABLED),
+        (2, RAMP, DISABLED),
+        (3, HARD, DISABLED),
+        (5, SLOWLY, STOPPING),
+        (6, RAMP, STOPPING),
+        (7, HARD, STOPPING),
+    ],
+)
+def test_quick_stop_brakes_by_its_ramp_and_ends_as_its_code_says(code, mode, end):
+    host = moving_host(0x605A, code)
+    host.step(QUICK_STOP)
+    assert host.state_bits() == STOPPING
+    assert host.bench.drives[0].motor_mode == mode
+    host.step(QUICK_STOP)
+    host.step(QUICK_STOP)
+    assert (host.true("tau_J") * host.true("dq")).max() < 0.0
+    keep(host, QUICK_STOP)
+    assert host.state_bits() == end
+    assert abs(host.true("dq")).max() < 0.02
+
+
+def test_quick_stop_code_0_disables_the_drive_at_once():
+    host = moving_host(0x605A, 0)
+    host.step(QUICK_STOP)
+    assert host.state_bits() == DISABLED
+    assert host.bench.drives[0].motor_mode == DriveMode.OFF
+
+
+def damping(code: int) -> float:
+    """Return the braking torque of joint 1 per its velocity, Nm s/rad, one period after the braking began."""
+    host = moving_host(0x605A, code)
+    host.step(QUICK_STOP)
+    body = host.bench._body
+    return -body.motor_torque_Nm[0] / body.drive_velocity_rad_s[0]
+
+
+def test_the_ramps_brake_with_half_all_and_one_and_a_half_of_the_damping():
+    slow, ramp, hard = (damping(code) for code in (5, 6, 7))
+    assert ramp == pytest.approx(12.5, rel=0.05)
+    assert slow == pytest.approx(0.5 * 12.5, rel=0.05)
+    assert hard == pytest.approx(1.5 * 12.5, rel=0.05)
+
+
+@pytest.mark.parametrize("code", [5, 6, 7])
+def test_operation_resumes_only_from_a_quick_stop_that_stays(code):
+    host = moving_host(0x605A, code)
+    keep(host, QUICK_STOP, 3)
+    host.step(ENABLE)
+    assert host.state_bits() == ENABLED
+    host = moving_host(0x605A, code - 4)
+    keep(host, QUICK_STOP, 3)
+    host.step(ENABLE)
+    assert host.state_bits() == STOPPING
+
+
+@pytest.mark.parametrize(("option", "word", "end"), [(0x605B, SHUTDOWN, READY), (0x605C, SWITCH_ON, SWITCHED_ON)])
+def test_shutdown_and_disable_operation_may_ramp_down_first(option, word, end):
+    host = moving_host(option, 1)
+    host.step(word, 300)
+    assert host.state_bits() == ENABLED
+    assert host.statusword() & 0x1000 == 0  # the target isn't followed any more
+    assert host.bench.drives[0].motor_mode == SLOWLY
+    host.step(ENABLE, 300)  # changes nothing: the stop goes on
+    assert host.bench.drives[0].torque_Nm == 0.0
+    for _ in range(1100):
+        host.step(word)
+    assert host.state_bits() == end
+    assert abs(host.true("dq")).max() < 0.02
+
+
+@pytest.mark.parametrize(("option", "word", "end"), [(0x605B, SHUTDOWN, READY), (0x605C, SWITCH_ON, SWITCHED_ON)])
+def test_without_a_ramp_they_disable_at_once(option, word, end):
+    host = moving_host(option, 0)
+    host.step(word)
+    assert host.state_bits() == end
+    assert host.bench.drives[0].motor_mode == DriveMode.OFF
+
+
+@pytest.mark.parametrize(("word", "end"), [(DISABLE_VOLTAGE, DISABLED), (QUICK_STOP, STOPPING)])
+def test_a_ramp_gives_way_to_a_stronger_stop(word, end):
+    host = moving_host(0x605B, 1)
+    host.step(SHUTDOWN)
+    host.step(word)
+    assert host.state_bits() == end
+
+
+@pytest.mark.parametrize(("code", "mode"), [(1, SLOWLY), (2, RAMP), (3, HARD)])
+def test_a_fault_brakes_by_its_reaction_code(code, mode):
+    host = moving_host(0x605E, code)
+    for _ in range(4):
+        host.sync()
+    assert host.bench.drives[0].motor_mode == mode
+    for _ in range(1100):
+        host.sync()
+    assert host.state_bits() == FAULT
+    assert abs(host.true("dq")).max() < 0.02
+
+
+def demand_with(host: BenchHost, target: int, **objects: int) -> tuple[int, bool]:
+    """Return 0x6074 and the internal limit's bit for a target, with objects written before."""
+    for name, value in objects.items():
+        host.write(1, int(name[1:], 16), 0, value)
+    host.step(ENABLE, target)
+    return host.read(1, 0x6074), bool(host.statusword() & 0x0800)
+
+
+@pytest.mark.parametrize(
+    ("target", "objects", "demand", "is_limited"),
+    [
+        (400, {}, 400, False),
+        (1000, {}, 1000, False),
+        (1001, {}, 1000, True),
+        (-1001, {}, -1000, True),
+        (300, {"x6072": 300}, 300, False),
+        (301, {"x6072": 300}, 300, True),
+        (301, {"x60E0": 300}, 300, True),
+        (-301, {"x60E0": 300}, -301, False),
+        (-301, {"x60E1": 300}, -300, True),
+        (301, {"x60E1": 300}, 301, False),
+        (500, {"x6072": 400, "x60E0": 200}, 200, True),
+        (500, {"x6072": 200, "x60E0": 400}, 200, True),
+        (100, {"x60B2": 50}, 150, False),
+        (100, {"x60B2": -150}, -50, False),
+        (250, {"x60B2": 51, "x6072": 300}, 300, True),
+        (0, {"x6072": 0}, 0, False),
+        (1, {"x6072": 0}, 0, True),
+    ],
+)
+def test_of_all_limits_the_smallest_counts_and_shows(target, objects, demand, is_limited):
+    host = BenchHost()
+    host.enable()
+    assert demand_with(host, target, **objects) == (demand, is_limited)
+    assert host.bench.drives[0].torque_Nm == pytest.approx(demand * 12e-3)
+
+
+def test_without_operation_there_is_no_demand():
+    host = BenchHost()
+    host.start()
+    host.step(SHUTDOWN, 500)
+    assert host.read(1, 0x6074) == 0
+
+
+def test_another_mode_takes_effect_at_the_next_sync_while_enabled_and_at_once_elsewhere():
+    host = BenchHost()
+    host.write(1, 0x6060, 0, 10)
+    assert host.read(1, 0x6061) == 10
+    host.enable()
+    host.step(ENABLE, 100)
+    host.write(1, 0x6060, 0, 0)
+    assert host.read(1, 0x6061) == 10
+    assert host.bench.drives[0].torque_Nm == pytest.approx(1.2)
+    host.step(ENABLE, 100)
+    assert host.read(1, 0x6061) == 0
+    assert host.bench.drives[0].torque_Nm == 0.0
+
+
+def test_encoder_and_gear_give_the_counts_of_a_joint_revolution():
+    host = BenchHost()
+    increments = host.read(1, 0x608F, 1) / host.read(1, 0x608F, 2)
+    assert increments * host.read(1, 0x6091, 1) / host.read(1, 0x6091, 2) == 1 << 20
+    assert host.read(1, 0x6502) == 1 << 9

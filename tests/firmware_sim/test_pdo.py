@@ -1,0 +1,299 @@
+"""PDOs that a master maps as it likes: rules of CiA 301 over the wire, and what then goes over the bus."""
+
+import struct
+
+import pytest
+from bench_host import ENABLE, RESET_COMMUNICATION, SHUTDOWN, START, SWITCH_ON, BenchHost
+
+NO_OBJECT, NO_SUBINDEX, NOT_MAPPABLE, TOO_LONG = 0x06020000, 0x06090011, 0x06040041, 0x06040042
+INCOMPATIBLE, VALUE_RANGE, DEVICE_STATE, READ_ONLY = 0x06040043, 0x06090030, 0x08000022, 0x06010002
+INVALID = 1 << 31
+COMMAND = (0x60400010, 0x60710010)
+
+
+@pytest.fixture
+def host() -> BenchHost:
+    return BenchHost()
+
+
+def entry(index: int, bits: int, sub: int = 0) -> int:
+    return index << 16 | sub << 8 | bits
+
+
+def remap(
+    host: BenchHost, node: int, record: int, entries: tuple[int, ...], *, can_id: int, kind: int = 1, timer_ms: int = 0
+) -> None:
+    """Write a PDO's records in the order that CiA 301 asks for."""
+    host.write(node, record, 1, INVALID | can_id)
+    host.write(node, record, 2, kind)
+    host.write(node, record, 5, timer_ms)
+    host.write(node, record + 0x200, 0, 0)
+    for sub, value in enumerate(entries, start=1):
+        host.write(node, record + 0x200, sub, value)
+    host.write(node, record + 0x200, 0, len(entries))
+    host.write(node, record, 1, can_id)
+
+
+def abort_of(host: BenchHost, index: int, sub: int, value: int, node: int = 1) -> int:
+    return host.abort_code(lambda: host.write(node, index, sub, value))
+
+
+@pytest.mark.parametrize(
+    ("record", "sub", "value", "code"),
+    [
+        (0x1400, 1, 0x202, DEVICE_STATE),
+        (0x1600, 0, 0, DEVICE_STATE),
+        (0x1600, 1, 0x60400010, DEVICE_STATE),
+        (0x1800, 1, 0x191, DEVICE_STATE),
+        (0x1801, 3, 10, DEVICE_STATE),
+        (0x1A00, 0, 1, DEVICE_STATE),
+        (0x1A00, 2, 0x60770010, DEVICE_STATE),
+    ],
+)
+def test_a_pdo_that_exists_is_not_changed(host, record, sub, value, code):
+    before = host.read(1, record, sub)
+    assert abort_of(host, record, sub, value) == code
+    assert host.read(1, record, sub) == before
+
+
+@pytest.mark.parametrize("can_id", [0x000, 0x001, 0x07F, 0x080, 0x081, 0x101, 0x180, 0x581, 0x601, 0x6E0, 0x701, 0x7FF])
+@pytest.mark.parametrize("record", [0x1401, 0x1802])
+def test_an_identifier_of_another_service_is_refused(host, record, can_id):
+    assert abort_of(host, record, 1, can_id) == VALUE_RANGE
+
+
+@pytest.mark.parametrize("cob_id", [0x2000_0185, 0x0000_0985, 0x1234_5678])
+def test_an_identifier_of_29_bits_is_refused(host, cob_id):
+    assert abort_of(host, 0x1802, 1, cob_id) == VALUE_RANGE
+
+
+def test_an_identifier_that_the_controller_does_not_listen_to_is_refused(host):
+    assert abort_of(host, 0x1401, 1, 0x190) == VALUE_RANGE
+    host.write(1, 0x1401, 1, 0x310)
+
+
+@pytest.mark.parametrize("kind", [241, 251, 252, 253])
+@pytest.mark.parametrize("record", [0x1400, 0x1801])
+def test_a_transmission_type_that_does_not_exist_is_refused(host, record, kind):
+    assert abort_of(host, record, 2, kind) == VALUE_RANGE
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 240, 254, 255])
+@pytest.mark.parametrize("record", [0x1400, 0x1801])
+def test_every_transmission_type_of_the_standard_is_taken(host, record, kind):
+    host.write(1, record, 2, kind)
+    assert host.read(1, record, 2) == kind
+
+
+@pytest.mark.parametrize(
+    ("record", "value", "code"),
+    [
+        (0x1602, entry(0x5000, 16), NO_OBJECT),
+        (0x1602, entry(0x6071, 16, 1), NO_SUBINDEX),
+        (0x1602, entry(0x6076, 32), NOT_MAPPABLE),  # the EDS says so
+        (0x1602, entry(0x6064, 32), NOT_MAPPABLE),  # can't be written
+        (0x1602, entry(0x6071, 8), NOT_MAPPABLE),  # has 16 bits
+        (0x1602, entry(0x0005, 16), NOT_MAPPABLE),  # a dummy of 8 bits
+        (0x1602, entry(0x0004, 32), NOT_MAPPABLE),  # DummyUsage lacks it
+        (0x1A02, entry(0x0005, 8), NOT_MAPPABLE),  # dummies are for receiving
+        (0x1A02, entry(0x6040, 16), NOT_MAPPABLE),  # rww: for receiving
+        (0x1A02, entry(0x1008, 8), NOT_MAPPABLE),
+        (0x1A02, entry(0x1018, 32, 1), NOT_MAPPABLE),
+    ],
+)
+def test_what_can_not_be_mapped_is_refused_with_the_reason(host, record, value, code):
+    code = {0x0004: NO_OBJECT}.get(value >> 16, code)
+    assert abort_of(host, record, 1, value) == code
+
+
+def test_a_mapping_is_refused_as_a_whole_when_it_is_longer_than_a_frame(host):
+    for sub, value in enumerate((0x60640020, 0x606C0020, 0x60410010), start=1):
+        host.write(1, 0x1A02, sub, value)
+    assert abort_of(host, 0x1A02, 0, 3) == TOO_LONG
+    assert host.read(1, 0x1A02, 0) == 0
+    host.write(1, 0x1A02, 0, 2)
+
+
+def test_more_entries_than_there_are_is_refused(host):
+    assert abort_of(host, 0x1A02, 0, 9) == TOO_LONG
+
+
+def test_an_entry_that_was_never_written_is_refused_with_the_number_of_entries(host):
+    assert abort_of(host, 0x1A02, 0, 1) == NO_OBJECT
+
+
+def test_entries_are_fixed_while_their_number_is_not_zero(host):
+    host.write(1, 0x1A02, 1, 0x60770010)
+    host.write(1, 0x1A02, 0, 1)
+    assert abort_of(host, 0x1A02, 1, 0x60640020) == DEVICE_STATE
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        (entry(0x2100, 8, 1), entry(0x6064, 32)),  # half a header
+        (entry(0x6064, 32), entry(0x2100, 8, 1), entry(0x2100, 8, 2)),  # not leading
+    ],
+)
+def test_an_end_to_end_header_leads_and_is_whole(host, entries):
+    for sub, value in enumerate(entries, start=1):
+        host.write(1, 0x1A02, sub, value)
+    assert abort_of(host, 0x1A02, 0, len(entries)) == INCOMPATIBLE
+
+
+def test_a_header_on_a_message_without_data_ids_is_refused(host):
+    for sub, value in enumerate((entry(0x2100, 8, 1), entry(0x2100, 8, 2), entry(0x6064, 32)), start=1):
+        host.write(1, 0x1A02, sub, value)
+    assert abort_of(host, 0x1A02, 0, 3) == INCOMPATIBLE
+
+
+def test_what_is_mapped_is_sent_in_that_order_under_the_new_identifier(host):
+    remap(host, 1, 0x1802, (0x60410010, 0x60610008, 0x603F0010, 0x60770010), can_id=0x1C1)
+    host.write(1, 0x6060, 0, 10)
+    host.nmt(START)
+    host.take()
+    host.sync()
+    assert host.taken(0x1C1) == [struct.pack("<HbHh", 0x0250, 10, 0, 0)]
+
+
+@pytest.mark.parametrize(("kind", "count"), [(1, 12), (2, 6), (5, 2)])
+def test_a_synchronous_pdo_comes_on_every_nth_sync(host, kind, count):
+    remap(host, 1, 0x1802, (0x60410010,), can_id=0x1C1, kind=kind)
+    host.nmt(START)
+    host.take()
+    for _ in range(12):
+        host.sync()
+    assert len(host.taken(0x1C1)) == count
+
+
+def test_type_0_comes_with_the_sync_after_an_event(host):
+    remap(host, 1, 0x1802, (0x60410010,), can_id=0x1C1, kind=0)
+    host.start()
+    host.sync()
+    host.take()
+    for _ in range(5):
+        host.sync()
+    assert host.taken(0x1C1) == []
+    host.step(SHUTDOWN)
+    host.sync()
+    assert len(host.taken(0x1C1)) == 1
+
+
+def test_an_event_driven_pdo_without_a_state_in_it_comes_when_its_content_changes(host):
+    remap(host, 1, 0x1802, (0x60740010,), can_id=0x1C1, kind=255)
+    host.enable()
+    host.step(ENABLE)
+    host.take()
+    for _ in range(5):
+        host.step(ENABLE)
+    assert host.taken(0x1C1) == []
+    host.step(ENABLE, 100)
+    host.step(ENABLE, 100)
+    assert host.taken(0x1C1) == [struct.pack("<h", 100)]
+
+
+def test_the_event_timer_sends_without_an_event(host):
+    remap(host, 1, 0x1802, (0x60410010,), can_id=0x1C1, kind=254, timer_ms=20)
+    host.nmt(START)
+    host.take()
+    host.bench.advance_to(100_000_000)
+    assert len(host.taken(0x1C1)) == 5
+
+
+def drive_by(host: BenchHost, can_id: int, *words: tuple[int, int]) -> None:
+    for word, torque in words:
+        host.put(can_id, struct.pack("<Hh", word, torque))
+        host.sync()
+
+
+def test_an_unprotected_command_is_taken_when_the_master_maps_it_so(host):
+    host.write(1, 0x6060, 0, 10)
+    remap(host, 1, 0x1400, COMMAND, can_id=0x201)
+    host.nmt(START)
+    drive_by(host, 0x201, (SHUTDOWN, 0), (SWITCH_ON, 0), (ENABLE, 0), (ENABLE, 250))
+    assert host.state_bits() == 0x27
+    assert host.bench.drives[0].torque_Nm == pytest.approx(3.0)
+
+
+def test_a_command_of_type_255_acts_without_waiting_for_sync(host):
+    host.write(1, 0x6060, 0, 10)
+    remap(host, 1, 0x1400, COMMAND, can_id=0x201, kind=255)
+    host.nmt(START)
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        host.put(0x201, struct.pack("<Hh", word, 0))
+    host.put(0x201, struct.pack("<Hh", ENABLE, 250))
+    assert host.state_bits() == 0x27
+    assert host.bench.drives[0].torque_Nm == pytest.approx(3.0)
+    for _ in range(2):
+        host.sync()
+    assert host.state_bits() == 0x27
+    host.sync()
+    host.sync()
+    assert host.read(1, 0x603F) == 0x8250
+
+
+def test_one_frame_commands_both_drives_by_dummy_entries(host):
+    dummies = (entry(0x0006, 16), entry(0x0006, 16))
+    remap(host, 1, 0x1400, (*COMMAND, *dummies), can_id=0x210)
+    remap(host, 2, 0x1400, (*dummies, *COMMAND), can_id=0x210)
+    host.start()
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        host.put(0x210, struct.pack("<HhHh", word, 100, word, -200))
+        host.sync()
+    assert [drive.torque_Nm for drive in host.bench.drives] == pytest.approx([1.2, -1.2])
+
+
+def test_controlword_and_torque_may_come_in_two_pdos(host):
+    host.write(1, 0x6060, 0, 10)
+    remap(host, 1, 0x1400, (0x60400010,), can_id=0x201, kind=255)
+    remap(host, 1, 0x1401, (0x60710010, 0x60B20010), can_id=0x301)
+    host.nmt(START)
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        host.put(0x301, struct.pack("<hh", 0, 0))
+        host.sync()
+        host.put(0x201, struct.pack("<H", word))
+    host.put(0x301, struct.pack("<hh", 100, 50))
+    host.sync()
+    assert host.bench.drives[0].torque_Nm == pytest.approx(1.8)
+    for _ in range(3):
+        host.put(0x201, struct.pack("<H", ENABLE))  # the word alone is no command
+        host.sync()
+    assert host.read(1, 0x603F) == 0x8250
+
+
+def test_a_received_value_that_the_object_can_not_take_changes_nothing(host):
+    remap(host, 1, 0x1401, (0x60600008,), can_id=0x301, kind=255)
+    host.nmt(START)
+    host.put(0x301, b"\x0a")
+    assert host.read(1, 0x6061) == 10
+    host.put(0x301, b"\x08")
+    assert host.read(1, 0x6061) == 10
+
+
+def test_without_a_pdo_that_brings_commands_there_is_no_operation(host):
+    host.write(1, 0x1400, 1, INVALID | 0x201)
+    host.start()
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        host.write(1, 0x6040, 0, word)
+    assert host.state_bits() == 0x23
+
+
+def test_a_reset_of_communication_restores_mapping_and_identifier(host):
+    remap(host, 1, 0x1800, (0x60410010,), can_id=0x1C1, kind=2)
+    host.nmt(RESET_COMMUNICATION)
+    host.nmt(START)
+    host.take()
+    host.sync()
+    assert [len(data) for data in host.taken(0x181)] == [8]
+    assert (host.read(1, 0x1800, 1), host.read(1, 0x1800, 2), host.read(1, 0x1A00, 0)) == (0x181, 1, 2)
+
+
+def test_the_content_of_a_received_frame_is_checked_with_the_mapped_header_only(host):
+    remap(host, 1, 0x1400, (entry(0x2100, 8, 1), entry(0x2100, 8, 2), *COMMAND), can_id=0x201)
+    host.start()
+    host.step(SHUTDOWN)
+    assert host.state_bits() == 0x21
+    host.put(0x201, struct.pack("<BBHh", 0, 0, SWITCH_ON, 0))
+    host.sync()
+    assert host.state_bits() == 0x21
+    assert host.bench.drives[0].rejected_commands == 1

@@ -1,0 +1,136 @@
+"""The emulated devices' SDO server against CiA 301: each abort code over the wire, frame by frame and by canopen."""
+
+import struct
+
+import pytest
+from bench_host import BenchHost
+
+TOGGLE, UNKNOWN_COMMAND = 0x05030000, 0x05040001
+WRITE_ONLY, READ_ONLY, NO_OBJECT, NO_SUBINDEX = 0x06010001, 0x06010002, 0x06020000, 0x06090011
+WRONG_LENGTH, LONG, SHORT = 0x06070010, 0x06070012, 0x06070013
+VALUE, HIGH, LOW, STATE = 0x06090030, 0x06090031, 0x06090032, 0x08000022
+
+
+@pytest.fixture
+def host() -> BenchHost:
+    return BenchHost()
+
+
+def ask(host: BenchHost, request: bytes, node: int = 1) -> bytes:
+    """Send one request frame; return the one answer."""
+    host.take()
+    host.put(0x600 + node, request.ljust(8, b"\0"))
+    (answer,) = host.taken(0x580 + node)
+    return answer
+
+
+def frame(command: int, index: int, sub: int = 0, data: bytes = b"") -> bytes:
+    return struct.pack("<BHB4s", command, index, sub, data)
+
+
+def aborted(index: int, sub: int, code: int) -> bytes:
+    return struct.pack("<BHBI", 0x80, index, sub, code)
+
+
+@pytest.mark.parametrize(
+    ("node", "index", "sub", "data", "code"),
+    [
+        (1, 0x5FFF, 0, None, NO_OBJECT),
+        (1, 0x5FFF, 0, b"\0", NO_OBJECT),
+        (1, 0x0005, 0, None, NO_OBJECT),  # a dummy is no object
+        (1, 0x1018, 5, None, NO_SUBINDEX),
+        (1, 0x6040, 1, b"\0\0", NO_SUBINDEX),
+        (1, 0x6041, 0, b"\0\0", READ_ONLY),
+        (1, 0x1008, 0, b"name", READ_ONLY),
+        (3, 0x6125, 1, None, WRITE_ONLY),
+        (1, 0x6040, 0, b"\0", WRONG_LENGTH),
+        (1, 0x6040, 0, b"\0\0\0\0", WRONG_LENGTH),
+        (1, 0x6060, 0, b"\x08", VALUE),
+        (1, 0x605E, 0, b"\x04\0", VALUE),
+        (1, 0x1016, 1, struct.pack("<I", 0x0080_0064), VALUE),  # node 128
+        (1, 0x1019, 0, b"\xf1", HIGH),
+        (1, 0x2200, 0, b"\0", LOW),
+        (1, 0x1400, 1, struct.pack("<I", 0x301), STATE),
+    ],
+)
+def test_a_request_that_can_not_be_served_is_aborted_with_its_reason(host, node, index, sub, data, code):
+    sdo = host.nodes[node].sdo
+    assert host.abort_code(lambda: sdo.upload(index, sub) if data is None else sdo.download(index, sub, data)) == code
+
+
+def test_another_period_is_a_matter_of_the_devices_state(host):
+    host.sync()
+    assert host.abort_code(lambda: host.write(1, 0x1006, 0, 2000)) == STATE
+
+
+@pytest.mark.parametrize("command", [0xE0, 0xFF, 0xA0, 0xC0, 0xC6])
+def test_an_unknown_command_or_a_block_transfer_is_aborted_by_name(host, command):
+    assert ask(host, frame(command, 0x1008)) == aborted(0x1008, 0, UNKNOWN_COMMAND)
+
+
+@pytest.mark.parametrize("command", [0x60, 0x70, 0x00, 0x01])
+def test_a_segment_that_belongs_to_no_transfer_is_aborted(host, command):
+    host.nodes[1].sdo.upload(0x1000, 0)
+    assert ask(host, bytes([command])) == aborted(0x1000, 0, UNKNOWN_COMMAND)
+
+
+def test_a_long_value_comes_in_segments_with_alternating_toggle(host):
+    assert ask(host, frame(0x40, 0x1008)) == frame(0x41, 0x1008, 0, struct.pack("<I", 22))
+    first, second, third, last = (ask(host, bytes([command])) for command in (0x60, 0x70, 0x60, 0x70))
+    assert (first[0], second[0], third[0], last[0]) == (0x00, 0x10, 0x00, 0x1D)
+    assert (first[1:] + second[1:] + third[1:] + last[1:]).rstrip(b"\0") == b"adacd-hil torque drive"
+    assert ask(host, b"\x60") == aborted(0x1008, 0, UNKNOWN_COMMAND)  # over
+
+
+def test_a_toggle_bit_that_stands_still_ends_the_upload(host):
+    ask(host, frame(0x40, 0x1008))
+    ask(host, b"\x60")
+    assert ask(host, b"\x60") == aborted(0x1008, 0, TOGGLE)
+    assert ask(host, b"\x70") == aborted(0x1008, 0, UNKNOWN_COMMAND)
+
+
+def test_a_number_may_be_written_in_segments(host):
+    assert ask(host, frame(0x21, 0x6040, 0, struct.pack("<I", 2)))[0] == 0x60
+    assert ask(host, bytes([0x0B, 0x06, 0x00]))[0] == 0x20
+    assert host.read(1, 0x6040) == 6
+
+
+def test_a_toggle_bit_that_stands_still_ends_the_download(host):
+    ask(host, frame(0x20, 0x1006))
+    ask(host, bytes([0x0A, 0xE8, 0x03]))
+    assert ask(host, bytes([0x0B, 0x00, 0x00])) == aborted(0x1006, 0, TOGGLE)
+    assert host.read(1, 0x1006) == 1000
+
+
+@pytest.mark.parametrize(("size", "code"), [(3, LONG), (1, SHORT)])
+def test_an_announced_size_that_is_not_the_objects_is_aborted_at_once(host, size, code):
+    assert ask(host, frame(0x21, 0x6040, 0, struct.pack("<I", size))) == aborted(0x6040, 0, code)
+
+
+@pytest.mark.parametrize(("segment", "code"), [(bytes([0x09, 1, 2, 3]), LONG), (bytes([0x0D, 1]), SHORT)])
+def test_segments_that_are_not_as_long_as_announced_are_aborted(host, segment, code):
+    ask(host, frame(0x21, 0x6040, 0, struct.pack("<I", 2)))
+    assert ask(host, segment) == aborted(0x6040, 0, code)
+    assert host.read(1, 0x6040) == 0
+
+
+def test_segments_of_an_unannounced_size_must_fit_the_object(host):
+    ask(host, frame(0x20, 0x6040))
+    assert ask(host, bytes([0x0D, 1])) == aborted(0x6040, 0, WRONG_LENGTH)
+
+
+def test_a_read_only_object_is_refused_before_its_segments(host):
+    assert ask(host, frame(0x21, 0x1018, 1, struct.pack("<I", 4))) == aborted(0x1018, 1, READ_ONLY)
+
+
+def test_an_expedited_write_without_a_size_takes_the_objects_length(host):
+    assert ask(host, frame(0x22, 0x6040, 0, b"\x06\0\xaa\xaa"))[0] == 0x60
+    assert host.read(1, 0x6040) == 6
+
+
+def test_a_client_that_aborts_ends_the_transfer_and_gets_no_answer(host):
+    ask(host, frame(0x40, 0x1008))
+    host.take()
+    host.put(0x601, aborted(0x1008, 0, 0x05040000))
+    assert host.take() == []
+    assert ask(host, b"\x60") == aborted(0x1008, 0, UNKNOWN_COMMAND)

@@ -1,0 +1,256 @@
+"""The emulated devices' watchdogs: each trips, says which and when, clears by itself, and leaves the fault latched."""
+
+import struct
+
+import pytest
+from bench_host import (
+    CODEC,
+    ENABLE,
+    FAULT_RESET,
+    PERIOD_NS,
+    PRE_OPERATIONAL,
+    RESET_COMMUNICATION,
+    RESET_NODE,
+    START,
+    BenchHost,
+    quiet_scenario,
+)
+from test_main import ScriptedBus, enabling_script
+
+from adacd_hil.clock import VirtualClock
+from firmware_sim.bench import Bench
+from firmware_sim.main import Service, StopRequest
+
+SYNC, COMMAND, HEARTBEAT, OPERATIONAL, LENGTH = 1, 2, 3, 4, 5
+CODES = {SYNC: 0x8700, COMMAND: 0x8250, HEARTBEAT: 0x8130, OPERATIONAL: 0x8100, LENGTH: 0x8210}
+FAULT_BITS, DISABLED_BITS, ENABLED_BITS = 0x08, 0x40, 0x27
+HOST_BEAT = (0x77F, b"\x05")
+MS = 1_000_000
+
+
+class Watched:
+    """A bench whose drives are enabled, with everything watched; `lose` and `find` take a cause away and back."""
+
+    def __init__(self, watchdog: int) -> None:
+        self.host = BenchHost(clock_mode="wall" if watchdog == SYNC else "sync")
+        self.watchdog = watchdog
+        if watchdog == HEARTBEAT:
+            self.host.write(1, 0x1016, 1, 127 << 16 | 50)
+        self.host.enable()
+        self.host.step(ENABLE)
+        if watchdog == HEARTBEAT:
+            self.host.put(*HOST_BEAT)
+        self.host.take()
+
+    def lose(self) -> None:
+        host = self.host
+        if self.watchdog == SYNC:
+            host.t_ns += 2 * PERIOD_NS
+            host.bench.advance_to(host.t_ns)
+        elif self.watchdog == COMMAND:
+            for _ in range(3):
+                host.step(ENABLE, joints=(2,))
+        elif self.watchdog == HEARTBEAT:
+            for _ in range(51):
+                host.step(ENABLE)
+        elif self.watchdog == OPERATIONAL:
+            host.nmt(PRE_OPERATIONAL, 1)
+        else:
+            host.put(0x201, b"\0")
+
+    def find(self) -> None:
+        host = self.host
+        if self.watchdog == HEARTBEAT:
+            host.put(*HOST_BEAT)
+        if self.watchdog in (HEARTBEAT, OPERATIONAL):
+            host.nmt(START, 1)
+        host.step(ENABLE)  # out of sequence where the drive hasn't listened for a while
+        host.step(ENABLE)
+
+    def emergencies(self) -> list[tuple[int, int, int, int]]:
+        """Take the EMCYs of drive 1: code, register, watchdog, ms."""
+        return [struct.unpack("<HBBI", data) for data in self.host.taken(0x081)]
+
+    def settle(self) -> None:
+        """Let the fault reaction end."""
+        for _ in range(1100):
+            if self.watchdog == HEARTBEAT:
+                self.host.put(*HOST_BEAT)
+            self.host.step(ENABLE)
+
+
+FAULTING = (SYNC, COMMAND, HEARTBEAT, OPERATIONAL)
+
+
+@pytest.mark.parametrize("watchdog", CODES)
+def test_an_emergency_says_which_watchdog_tripped_and_when(watchdog):
+    watched = Watched(watchdog)
+    before_ms = watched.host.bench.now_ns // MS
+    watched.lose()
+    (error,) = watched.emergencies()
+    assert error[:3] == (CODES[watchdog], 0x11, watchdog)
+    assert before_ms <= error[3] <= watched.host.bench.now_ns // MS
+    host = watched.host
+    assert (host.read(1, 0x2210, 1), host.read(1, 0x2210, 2)) == (watchdog, error[3])
+    counts = [host.read(1, 0x2210, 2 + number) for number in CODES]
+    assert counts == [1 if number == watchdog else 0 for number in CODES]
+
+
+@pytest.mark.parametrize("watchdog", CODES)
+def test_it_clears_when_its_cause_has_gone_and_the_fault_stays(watchdog):
+    watched = Watched(watchdog)
+    watched.lose()
+    watched.emergencies()
+    watched.find()
+    clearing = [error for error in watched.emergencies() if error[0] == 0]
+    faulted = watchdog in FAULTING
+    assert [(code, register, number) for code, register, number, _ in clearing] == [(0, int(faulted), watchdog)]
+    assert watched.host.read(1, 0x1001) == int(faulted)
+    assert watched.host.read(1, 0x603F) == (CODES[watchdog] if faulted else 0)
+
+
+@pytest.mark.parametrize("watchdog", FAULTING)
+def test_fault_reset_is_refused_while_the_cause_lasts_and_works_by_its_edge_after(watchdog):
+    watched = Watched(watchdog)
+    watched.lose()
+    host = watched.host
+    for _ in range(60):  # the reaction ends at rest
+        host.t_ns += PERIOD_NS
+        if watchdog in (SYNC,):
+            host.bench.advance_to(host.t_ns)
+        elif watchdog == COMMAND:
+            host.step(ENABLE, joints=(2,))
+        else:
+            host.step(ENABLE)
+    assert host.state_bits(1) == FAULT_BITS
+    host.write(1, 0x6040, 0, 0)
+    host.write(1, 0x6040, 0, FAULT_RESET)
+    assert host.state_bits(1) == FAULT_BITS
+    watched.find()
+    host.write(1, 0x6040, 0, FAULT_RESET)
+    assert host.state_bits(1) == DISABLED_BITS
+    host.take()
+    assert host.read(1, 0x1001) == 0
+
+
+def test_a_watchdog_that_trips_again_is_counted_and_reported_again():
+    watched = Watched(LENGTH)
+    for count in (1, 2, 3):
+        watched.lose()
+        watched.lose()
+        assert watched.host.read(1, 0x2210, 7) == count
+        assert [error[0] for error in watched.emergencies()] == [0x8210]
+        watched.find()
+        assert [error[:3] for error in watched.emergencies()] == [(0, 0, LENGTH)]
+
+
+def test_several_tripped_watchdogs_keep_the_communication_error_until_the_last_has_cleared():
+    watched = Watched(HEARTBEAT)
+    watched.lose()
+    watched.host.put(0x201, b"\0")
+    watched.host.nmt(START, 1)
+    watched.host.put(0x201, b"\0")
+    assert watched.host.read(1, 0x1001) == 0x11
+    watched.host.step(ENABLE)
+    assert watched.host.read(1, 0x1001) == 0x11
+    watched.host.put(*HOST_BEAT)
+    assert watched.host.read(1, 0x1001) == 0x01
+
+
+def test_a_heartbeat_that_is_no_longer_watched_is_not_missing():
+    watched = Watched(HEARTBEAT)
+    watched.lose()
+    watched.emergencies()
+    watched.host.write(1, 0x1016, 1, 0)
+    assert [error[:3] for error in watched.emergencies()] == [(0, 1, HEARTBEAT)]
+
+
+def test_a_reset_of_the_node_forgets_what_has_tripped():
+    watched = Watched(COMMAND)
+    watched.lose()
+    watched.host.nmt(RESET_NODE, 1)
+    assert [watched.host.read(1, 0x2210, sub) for sub in range(1, 8)] == [0] * 7
+
+
+def test_a_reset_of_communication_keeps_the_count():
+    watched = Watched(COMMAND)
+    watched.lose()
+    watched.host.nmt(RESET_COMMUNICATION, 1)
+    assert watched.host.read(1, 0x2210, 1) == COMMAND
+
+
+@pytest.mark.parametrize(("tenths", "patience_ns"), [(15, 1_500_000), (20, 2_000_000), (500, 50_000_000)])
+def test_the_sync_tolerance_is_a_number_of_tenths_of_the_period(tenths, patience_ns):
+    host = BenchHost(clock_mode="wall")
+    for node in (1, 2):
+        host.write(node, 0x2201, 0, tenths)
+    host.enable()
+    last_ns = host.t_ns
+    host.bench.advance_to(last_ns + patience_ns - 1)
+    assert host.state_bits() == ENABLED_BITS
+    host.bench.advance_to(last_ns + patience_ns)
+    assert host.read(1, 0x603F) == 0x8700
+
+
+@pytest.mark.parametrize("node", [1, 3])
+def test_the_devices_time_begins_at_power_on(node):
+    host = BenchHost()
+    host.bench.boot(5_000 * MS)
+    host.write(node, 0x1016, 1, 127 << 16 | 50)
+    host.put(*HOST_BEAT)
+    host.bench.advance_to(5_100 * MS)
+    assert host.read(node, 0x2210, 2) == 50
+
+
+def serve_dying_host(deadline: tuple[int, bytes] | None, reaction: int, end_ms: int) -> tuple[ScriptedBus, Bench]:
+    """Enable and turn both drives by SYNC, then let the host die at 50 ms."""
+    clock, stop = VirtualClock(), StopRequest()
+    bus = ScriptedBus(clock, stop, end_ms * MS)
+    bench = Bench(quiet_scenario(), CODEC, bus.send)
+    service = Service(bench, bus, clock, "sync", stop)
+    service.boot()
+    script = []
+    for joint in (1, 2):
+        script.append((0, 0x600 + joint, bytes([0x2B, 0x5E, 0x60, 0, reaction, 0, 0, 0])))
+        if deadline is not None:
+            script.append((0, 0x600 + joint, deadline[1]))
+    host = BenchHost()
+    for t_ms, can_id, data in enabling_script(50):
+        if can_id in (0x201, 0x202) and t_ms > 3:
+            data = host.command_frame(can_id - 0x200, ENABLE, 300)  # noqa: PLW2901
+        elif can_id in (0x201, 0x202):
+            data = host.command_frame(can_id - 0x200, (0x06, 0x07, 0x0F)[t_ms - 1])  # noqa: PLW2901
+        script.append((t_ms, can_id, data))
+        if can_id == 0x080:
+            script.append((t_ms, *HOST_BEAT))
+    bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in script)
+    service.run()
+    return bus, bench
+
+
+HEARTBEAT_300 = (0x1016, bytes([0x23, 0x16, 0x10, 1, 0x2C, 0x01, 0x7F, 0]))
+DEADLINE_300 = (0x1400, bytes([0x2B, 0x00, 0x14, 5, 0x2C, 0x01, 0, 0]))
+
+
+@pytest.mark.parametrize("reaction", [0, 1, 2, 3])
+@pytest.mark.parametrize(("deadline", "code"), [(HEARTBEAT_300, 0x8130), (DEADLINE_300, 0x8250)])
+def test_by_sync_too_a_host_that_dies_leaves_no_torque_after_the_watchdogs_time(deadline, code, reaction):
+    bus, bench = serve_dying_host(deadline, reaction, 1_500)
+    emergencies = [(t_ns, data) for t_ns, can_id, data in bus.sent if can_id == 0x081]
+    assert [struct.unpack_from("<H", data)[0] for _, data in emergencies] == [code]
+    assert 350 * MS <= emergencies[0][0] <= 371 * MS
+    assert [drive.torque_Nm for drive in bench.drives] == [0.0, 0.0]
+    assert [drive.state.value for drive in bench.drives] == ["fault", "fault"]
+    assert [drive.motor_mode for drive in bench.drives] == [0, 0]
+    if reaction != 0:
+        assert max(map(abs, bench._body.drive_velocity_rad_s)) < 0.02
+    statuses = [data for _, can_id, data in bus.sent if can_id == 0x281]
+    if deadline is DEADLINE_300:  # after a lost heartbeat the node is in Pre-operational
+        assert statuses[-1][0] & 0x4F == FAULT_BITS
+
+
+def test_by_sync_a_host_that_pauses_within_the_watchdogs_time_finds_everything_as_it_left_it():
+    bus, bench = serve_dying_host(HEARTBEAT_300, 2, 340)
+    assert [drive.state.value for drive in bench.drives] == ["operation enabled"] * 2
+    assert [can_id for _, can_id, _ in bus.sent if can_id in (0x081, 0x082)] == []
+    assert bench.cycle == 49
