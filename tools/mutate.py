@@ -72,6 +72,7 @@ class Mutant:
 
     file: str
     line: int
+    where: str  # class and function, empty outside of any
     kind: str
     start: int
     end: int
@@ -79,9 +80,18 @@ class Mutant:
     before: str  # the line or lines concerned, on one line
     after: str
 
+    @property
+    def key(self) -> "Key":
+        """Return what identifies it in the list of equivalents."""
+        return self.file, self.where, self.before, self.after
+
     def apply(self, source: bytes) -> bytes:
         """Return the changed text."""
         return source[: self.start] + self.text.encode() + source[self.end :]
+
+
+Key = tuple[str, str, str, str]
+"""File, where, before, after: what identifies a mutant in the list of equivalents, whatever its line number."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +149,7 @@ class _Finder(ast.NodeVisitor):
         for line in source.splitlines(keepends=True):
             self._line_starts.append(self._line_starts[-1] + len(line))
         self._depth = 0  # of functions
+        self._scope: list[str] = []
         self.mutants: list[Mutant] = []
 
     # -- places
@@ -158,7 +169,7 @@ class _Finder(ast.NodeVisitor):
         before = _one_line(self._source[first:last])
         after = _one_line(self._source[first:start] + text.encode() + self._source[end:last])
         if before != after:
-            self.mutants.append(Mutant(self._file, line, kind, start, end, text, before, after))
+            self.mutants.append(Mutant(self._file, line, ".".join(self._scope), kind, start, end, text, before, after))
 
     def _replace(self, node: ast.expr, kind: str, new: ast.expr) -> None:
         self._add(node, kind, f"({ast.unparse(ast.fix_missing_locations(new))})")
@@ -233,13 +244,17 @@ class _Finder(ast.NodeVisitor):
         self._visit_body(node.body)
 
     def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        self._scope.append(node.name)
         self._visit_body(node.body)
+        self._scope.pop()
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         for default in (*node.args.defaults, *(d for d in node.args.kw_defaults if d is not None)):
             self.visit(default)
         self._depth += 1
+        self._scope.append(node.name)
         self._visit_body(node.body)
+        self._scope.pop()
         self._depth -= 1
 
     def _visit_body(self, body: Sequence[ast.stmt]) -> None:
@@ -520,15 +535,15 @@ def _read_target(file: str) -> bytes:
     return source
 
 
-def _read_equivalent() -> dict[tuple[str, str, str], str]:
-    """Read the list: (file, line before, line after) → reason."""
+def _read_equivalent() -> dict[Key, str]:
+    """Read the list: what identifies each mutant → the reason."""
     if not EQUIVALENT.exists():
         return {}
     entries = tomllib.loads(EQUIVALENT.read_text()).get("equivalent", [])
     for entry in entries:
-        if set(entry) != {"file", "before", "after", "reason"} or not all(entry.values()):
-            raise UsageError(f"{EQUIVALENT.name}: an entry has file, before, after and reason, not {sorted(entry)}")
-    return {(e["file"], _squeeze(e["before"]), _squeeze(e["after"])): e["reason"] for e in entries}
+        if set(entry) != {"file", "where", "before", "after", "reason"} or not entry["reason"]:
+            raise UsageError(f"{EQUIVALENT.name}: an entry has file, where, before, after and reason: {entry}")
+    return {(e["file"], e["where"], _squeeze(e["before"]), _squeeze(e["after"])): e["reason"] for e in entries}
 
 
 def _squeeze(text: str) -> str:
@@ -551,9 +566,8 @@ def run(
         tests = {file: _expand(globs) for file, globs in targets.items()}
         timeouts_s = _measure(pool, sources, tests)
         mutants = [m for file, source in sources.items() for m in find_mutants(file, source, _load_original(file))]
-        keys = {(m.file, m.before, m.after) for m in mutants}
-        problems = [f"{file}: no such mutant: {after}" for file, before, after in listed if file in sources
-                    and (file, before, after) not in keys]  # fmt: skip
+        keys = {mutant.key for mutant in mutants}
+        problems = [f"{key[0]}: no such mutant: {key[3]}" for key in listed if key[0] in sources and key not in keys]
         if sample is not None and sample < len(mutants):
             mutants = sorted(random.Random(seed).sample(mutants, sample), key=lambda m: (m.file, m.start, m.text))
         work = ((m, m.file, m.apply(sources[m.file]), tests[m.file], timeouts_s[m.file]) for m in mutants)
@@ -571,10 +585,10 @@ def run(
     return sorted(verdicts, key=lambda v: (v.mutant.file, v.mutant.start, v.mutant.text)), problems
 
 
-def _judge(mutant: Mutant, status: int | None, listed: dict[tuple[str, str, str], str]) -> str:
+def _judge(mutant: Mutant, status: int | None, listed: dict[Key, str]) -> str:
     if status == _NOT_IMPORTED:
         raise UsageError(f"the tests of {mutant.file} don't import it")
-    if (mutant.file, mutant.before, mutant.after) in listed:
+    if mutant.key in listed:
         return EQUIVALENT_STATUS
     if status is None:
         return TIMEOUT
