@@ -34,6 +34,9 @@ pytestmark = [
 DURATION_S = float(os.environ.get("ADACD_HIL_FUZZ_S", "5"))
 RANDOM = ("-I", "r", "-L", "r", "-D", "r")
 FOREIGN = ("-I", "3FF", "-L", "r", "-D", "r")
+IMPATIENT = "[bus]\nfeedback_timeout_ms = 100\n"
+"""In lockstep each cycle waits that long for a node that a random NMT command has silenced, half a second of cycles
+after the fault included."""
 GAPS_MS = ("2", "0")
 """Between frames of random identifiers. At full rate hardly a run gets through its boot; at 2 ms most do, and the flood
 meets a moving arm."""
@@ -83,10 +86,10 @@ def cangen(*arguments: str, gap_ms: str = "0") -> Iterator[None]:
             process.terminate()
 
 
-def short_run(folder: Path) -> Played:
-    """Boot, enable, adapt for half a second, park."""
+def short_run(folder: Path, extra: str = "") -> Played:
+    """Boot, enable, adapt for half a second, park; `extra` is more of the configuration."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "short.toml").write_text(SHORT_RUN)
+    (folder / "short.toml").write_text(SHORT_RUN + extra)
     return run_on_vcan(folder, "--clock", "lockstep", "--config", str(folder / "short.toml"))
 
 
@@ -110,7 +113,7 @@ def test_runs_through_a_flood_of_random_frames_end_safely_and_the_next_one_succe
         while len(endings) < len(GAPS_MS) or time.monotonic() < end_s:
             gap_ms = GAPS_MS[len(endings) % len(GAPS_MS)]
             with cangen(*RANDOM, gap_ms=gap_ms):
-                played = short_run(tmp_path / f"run{len(endings)}")
+                played = short_run(tmp_path / f"run{len(endings)}", IMPATIENT)
             check_ending(played)
             endings.append(played.status)
         after = short_run(tmp_path / "after")
