@@ -6,6 +6,7 @@ concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 
 import configparser
 import logging
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -88,6 +89,8 @@ class CanopenBus:
         """Gets every frame that arrives while an answer is awaited, besides canopen."""
         self._bus = bus
         self._network = _Network(self._send)
+        self.malformed_frames = 0
+        """Frames so far whose length or content doesn't fit what their identifier says they are."""
 
     def add_node(self, node_id: int, objects: Any, on_emergency: Callable[[EmcyError], None] | None = None) -> Any:
         """Return canopen's node with the objects of `read_eds`.
@@ -130,9 +133,13 @@ class CanopenBus:
         return False
 
     def accept(self, frame: Frame) -> None:
-        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY."""
-        if not frame.is_error and frame.data:
+        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY. What canopen can't read is dropped, counted."""
+        if frame.is_error:
+            return
+        try:
             self._network.notify(frame.can_id, bytearray(frame.data), frame.t_ns * 1e-9)
+        except (struct.error, KeyError):  # canopen trusts lengths and NMT states
+            self.malformed_frames += 1
 
 
 @contextmanager

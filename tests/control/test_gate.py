@@ -1,5 +1,6 @@
 """The last stage before the wire, densely around every bound."""
 
+import itertools
 import math
 
 import numpy as np
@@ -13,7 +14,13 @@ from adacd_hil.control.gate import Gate, GateFlag
 PERIOD_S = 0.001
 LIMIT_NM = (12.0, 6.0)
 STEP_NM = (2.0, 1.0)
-SETTINGS = ArmSettings(torque_limit_Nm=LIMIT_NM, torque_rate_limit_Nm_s=(2000.0, 1000.0))
+RATE_NM_S = (2000.0, 1000.0)
+SETTINGS = ArmSettings(torque_limit_Nm=LIMIT_NM, torque_rate_limit_Nm_s=RATE_NM_S)
+UNRATED = ArmSettings(torque_limit_Nm=LIMIT_NM, torque_rate_limit_Nm_s=(1e6, 1e6))
+"""Rates that no torque within the limits can break: the torque limit alone."""
+
+JOINTS_AND_SIGNS = list(itertools.product((0, 1), (1.0, -1.0)))
+OFFSETS = [sign * 10.0**exponent for exponent in range(-12, 4) for sign in (1.0, -1.0)]
 
 
 def limited(gate: Gate, tau_d: tuple[float, float], is_open: bool = True) -> tuple[tuple[float, float], GateFlag]:
@@ -25,88 +32,155 @@ def limited(gate: Gate, tau_d: tuple[float, float], is_open: bool = True) -> tup
 def gate_at(tau: tuple[float, float]) -> Gate:
     """Make a gate that has let `tau` through."""
     gate = Gate(SETTINGS, PERIOD_S)
-    for _ in range(10):
+    for _ in range(20):
         reached, _ = limited(gate, tau)
     assert reached == tau
     return gate
 
 
+def at_joint(joint: int, value: float, other: float = 0.0) -> tuple[float, float]:
+    return (value, other) if joint == 0 else (other, value)
+
+
 def around(bound: float) -> list[float]:
-    return [math.nextafter(bound, 0.0), bound, math.nextafter(bound, math.inf), bound * 1.001, bound * 1.5]
+    """Values about a positive bound, from 1e-12 to 1e3 off it, the neighbouring floats and the bound itself."""
+    return [bound, math.nextafter(bound, -math.inf), math.nextafter(bound, math.inf), *(bound + d for d in OFFSETS)]
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+AROUND = range(len(around(1.0)))
+
+
+@pytest.mark.parametrize("index", AROUND)
+@pytest.mark.parametrize(("joint", "sign"), JOINTS_AND_SIGNS)
+def test_torque_is_clipped_exactly_at_its_limit(joint: int, sign: float, index: int) -> None:
+    wanted = sign * around(LIMIT_NM[joint])[index]
+    reached, flags = limited(Gate(UNRATED, PERIOD_S), at_joint(joint, wanted))
+    is_inside = -LIMIT_NM[joint] <= wanted <= LIMIT_NM[joint]
+    expected = (wanted, GateFlag.NONE) if is_inside else (math.copysign(LIMIT_NM[joint], wanted), GateFlag.TORQUE)
+    assert (reached, flags) == (at_joint(joint, expected[0]), expected[1])
+
+
+@pytest.mark.parametrize("index", AROUND)
+@pytest.mark.parametrize(("joint", "sign"), JOINTS_AND_SIGNS)
+def test_the_change_from_rest_is_clipped_exactly_at_its_limit(joint: int, sign: float, index: int) -> None:
+    wanted = sign * around(STEP_NM[joint])[index]
+    reached, flags = limited(Gate(SETTINGS, PERIOD_S), at_joint(joint, wanted))
+    is_inside = -STEP_NM[joint] <= wanted <= STEP_NM[joint]
+    expected = wanted if is_inside else math.copysign(STEP_NM[joint], wanted)
+    assert reached == at_joint(joint, expected)
+    assert bool(flags & GateFlag.RATE) is not is_inside
+    assert bool(flags & GateFlag.TORQUE) is (abs(wanted) > LIMIT_NM[joint])
+
+
+@pytest.mark.parametrize("index", AROUND)
+@pytest.mark.parametrize("start", [4.0, -4.0, 0.3, 11.999])
 @pytest.mark.parametrize("joint", [0, 1])
-@pytest.mark.parametrize("index", range(5))
-def test_torque_is_clipped_exactly_at_its_limit(joint: int, index: int, sign: float) -> None:
-    start = [0.0, 0.0]
-    start[joint] = sign * (LIMIT_NM[joint] - 0.5 * STEP_NM[joint])
-    wanted = list(start)
-    wanted[joint] = sign * min(around(LIMIT_NM[joint])[index], LIMIT_NM[joint] + 0.4 * STEP_NM[joint])
-    reached, flags = limited(gate_at((start[0], start[1])), (wanted[0], wanted[1]))
-    is_inside = abs(wanted[joint]) <= LIMIT_NM[joint]
-    expected = wanted[joint] if is_inside else sign * LIMIT_NM[joint]
-    assert (reached[joint], bool(flags & GateFlag.TORQUE)) == (expected, not is_inside)
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_the_change_from_anywhere_is_clipped_exactly_at_its_limit(
+    joint: int, start: float, direction: float, index: int
+) -> None:
+    start = start * LIMIT_NM[joint] / LIMIT_NM[0]
+    wanted = start + direction * around(STEP_NM[joint])[index]
+    reached, flags = limited(gate_at(at_joint(joint, start)), at_joint(joint, wanted))
+    clipped = max(-LIMIT_NM[joint], min(LIMIT_NM[joint], wanted))
+    lowest, highest = start - STEP_NM[joint], start + STEP_NM[joint]
+    expected_flags = GateFlag.NONE
+    if clipped != wanted:
+        expected_flags |= GateFlag.TORQUE
+    if not lowest <= clipped <= highest:
+        expected_flags |= GateFlag.RATE
+    assert (reached, flags) == (at_joint(joint, max(lowest, min(highest, clipped))), expected_flags)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize("joint", [0, 1])
-@pytest.mark.parametrize("index", range(5))
-def test_the_change_is_clipped_exactly_at_its_limit(joint: int, index: int, sign: float) -> None:
-    wanted = [0.0, 0.0]
-    wanted[joint] = sign * around(STEP_NM[joint])[index]
-    reached, flags = limited(Gate(SETTINGS, PERIOD_S), (wanted[0], wanted[1]))
-    is_inside = abs(wanted[joint]) <= STEP_NM[joint]
-    expected = wanted[joint] if is_inside else sign * STEP_NM[joint]
-    assert (reached[joint], bool(flags & GateFlag.RATE)) == (expected, not is_inside)
+@pytest.mark.parametrize(("joint", "sign"), JOINTS_AND_SIGNS)
+def test_both_limits_show_when_both_clip(joint: int, sign: float) -> None:
+    _, flags = limited(Gate(SETTINGS, PERIOD_S), at_joint(joint, sign * 100.0))
+    assert flags == GateFlag.TORQUE | GateFlag.RATE
 
 
-@given(
-    wanted=st.lists(
-        st.tuples(st.floats(allow_nan=True, allow_infinity=True), st.floats(allow_nan=True, allow_infinity=True)),
-        min_size=1,
-        max_size=30,
-    )
+@pytest.mark.parametrize(("joint", "sign"), JOINTS_AND_SIGNS)
+def test_the_other_joint_passes_bit_for_bit_while_one_is_clipped(joint: int, sign: float) -> None:
+    reached, _ = limited(Gate(SETTINGS, PERIOD_S), at_joint(joint, sign * 100.0, other=0.1234567890123))
+    assert reached[1 - joint] == 0.1234567890123
+
+
+ANY_TORQUE = st.one_of(
+    st.floats(-30.0, 30.0),
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.sampled_from([s * b for b in (*LIMIT_NM, *STEP_NM) for s in (1.0, -1.0)]),
 )
-def test_nothing_that_leaves_the_gate_breaks_a_limit(wanted: list[tuple[float, float]]) -> None:
+SEQUENCE = st.lists(st.tuples(ANY_TORQUE, ANY_TORQUE, st.sampled_from([True, True, True, False])), max_size=40)
+
+
+@given(sequence=SEQUENCE)
+def test_whatever_is_asked_limit_and_step_hold_and_a_closed_gate_gives_zero(
+    sequence: list[tuple[float, float, bool]],
+) -> None:
     gate = Gate(SETTINGS, PERIOD_S)
-    for tau_d in wanted:
-        reached, _ = limited(gate, tau_d)
-        assert all(abs(tau) <= bound for tau, bound in zip(reached, LIMIT_NM, strict=True))
+    last = (0.0, 0.0)
+    for tau1, tau2, is_open in sequence:
+        reached, flags = limited(gate, (tau1, tau2), is_open)
+        is_finite = math.isfinite(tau1) and math.isfinite(tau2)
+        if not (is_open and is_finite):
+            assert reached == (0.0, 0.0)
+            assert flags is (GateFlag.CLOSED if is_finite else GateFlag.NOT_A_NUMBER)
+        else:
+            for now, before, bound, step in zip(reached, last, LIMIT_NM, STEP_NM, strict=True):
+                assert -bound <= now <= bound
+                assert before - step <= now <= before + step
+        last = reached
 
 
-@given(wanted=st.lists(st.tuples(st.floats(-30, 30), st.floats(-30, 30)), min_size=2, max_size=30))
-def test_no_step_breaks_the_rate(wanted: list[tuple[float, float]]) -> None:
-    gate = Gate(SETTINGS, PERIOD_S)
-    passed = [(0.0, 0.0)] + [limited(gate, tau_d)[0] for tau_d in wanted]
-    steps = np.abs(np.diff(np.array(passed), axis=0))
-    assert np.all(steps <= np.array(STEP_NM) * (1 + 1e-12))
-
-
-@given(tau=st.tuples(st.floats(-1.9, 1.9), st.floats(-0.9, 0.9)))
+@given(tau=st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0)))
 def test_what_is_inside_passes_bit_for_bit(tau: tuple[float, float]) -> None:
     assert limited(Gate(SETTINGS, PERIOD_S), tau) == (tau, GateFlag.NONE)
 
 
+@pytest.mark.parametrize("is_open", [True, False])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("joint", [0, 1])
-def test_a_torque_that_is_not_finite_zeroes_both_joints(joint: int, bad: float) -> None:
-    wanted = [1.0, 0.5]
-    wanted[joint] = bad
-    assert limited(gate_at((1.0, 0.5)), (wanted[0], wanted[1])) == ((0.0, 0.0), GateFlag.NOT_A_NUMBER)
+def test_a_torque_that_is_not_finite_zeroes_both_joints(joint: int, bad: float, is_open: bool) -> None:
+    gate = gate_at((1.0, 0.5))
+    wanted = at_joint(joint, bad, other=0.4)
+    assert limited(gate, wanted, is_open) == ((0.0, 0.0), GateFlag.NOT_A_NUMBER)
+
+
+@pytest.mark.parametrize("closing", [((math.nan, 0.0), True), ((12.0, 6.0), False)])
+def test_after_a_zero_torque_rises_from_zero_again(closing: tuple[tuple[float, float], bool]) -> None:
+    gate = gate_at((12.0, 6.0))
+    limited(gate, *closing)
+    assert limited(gate, (12.0, 6.0)) == (STEP_NM, GateFlag.RATE)
 
 
 def test_a_closed_gate_zeroes_the_torque_at_once() -> None:
     assert limited(gate_at((12.0, 6.0)), (12.0, 6.0), is_open=False) == ((0.0, 0.0), GateFlag.CLOSED)
 
 
-def test_torque_rises_from_zero_when_the_gate_opens_again() -> None:
-    gate = gate_at((12.0, 6.0))
-    limited(gate, (12.0, 6.0), is_open=False)
-    assert limited(gate, (12.0, 6.0)) == (STEP_NM, GateFlag.RATE)
+@pytest.mark.parametrize("pattern", list(itertools.product((True, False), repeat=5)))
+def test_in_every_sequence_of_open_and_closed_torque_counts_the_cycles_since_the_gate_opened(
+    pattern: tuple[bool, ...],
+) -> None:
+    gate = Gate(SETTINGS, PERIOD_S)
+    cycles = 0
+    for is_open in pattern:
+        cycles = cycles + 1 if is_open else 0
+        reached, _ = limited(gate, (12.0, -6.0), is_open)
+        assert reached == (cycles * STEP_NM[0], -cycles * STEP_NM[1])
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_fall_is_limited_as_a_rise_is(sign: float) -> None:
     reached, flags = limited(gate_at((sign * 11.0, 0.0)), (sign * 5.0, 0.0))
     assert (reached[0], flags) == (sign * (11.0 - STEP_NM[0]), GateFlag.RATE)
+
+
+@pytest.mark.parametrize("period_s", [0.0005, 0.001, 0.004])
+def test_the_step_is_the_rate_times_the_period(period_s: float) -> None:
+    reached, _ = limited(Gate(SETTINGS, period_s), (12.0, -6.0))
+    assert reached == (RATE_NM_S[0] * period_s, -RATE_NM_S[1] * period_s)
+
+
+def test_the_flags_have_the_numbers_that_logs_hold() -> None:
+    numbers = {flag.name: int(flag) for flag in GateFlag}
+    assert numbers == {"TORQUE": 1, "RATE": 2, "NOT_A_NUMBER": 4, "CLOSED": 8}
+    assert GateFlag.NONE.value == 0

@@ -49,6 +49,12 @@ def test_the_hand_written_table_covers_all_states_and_events():
     assert covered == set(itertools.product((state.name for state in SchemeState), named))
 
 
+def test_events_are_numbered_in_order_of_precedence():
+    assert [(event.name, event.value) for event in SchemeEvent] == [
+        (name, number) for number, name in enumerate(["NONE", *EVENTS.split()])
+    ]
+
+
 SETTINGS = settings_with(
     safety={"commission_cycles": 20, "phase_timeout_s": 0.1},
     termination={"timeout_s": 1.0},
@@ -222,6 +228,14 @@ def test_a_phase_that_takes_too_long_faults(state, cycles, reason):
     assert run.supervisor.fault is reason
 
 
+def test_an_arm_that_never_completes_a_cycle_faults_in_time():
+    run = Run()
+    arm = DISABLED._replace(is_complete=False)
+    assert run.step(arm, cycles=99) is SchemeState.INIT
+    assert run.step(arm) is SchemeState.FAULT
+    assert run.supervisor.fault is FaultReason.COMMISSION_TIMEOUT
+
+
 def test_skipped_periods_count_toward_a_timeout():
     run = run_in(SchemeState.ADAPT)
     assert run.step(GOOD._replace(periods=999)) is SchemeState.ADAPT
@@ -239,6 +253,17 @@ def test_a_state_without_a_time_limit_lasts(state):
     assert run_in(state).step(cycles=5000) is state
 
 
+def test_an_arm_that_rests_in_payload_waits_until_the_payload_has_been_changed():
+    assert run_in(SchemeState.PAYLOAD).step(observation=Observation.AT_REST, cycles=200) is SchemeState.PAYLOAD
+
+
+def test_each_step_returns_the_state_that_it_leads_to():
+    supervisor = Supervisor(SETTINGS)
+    arm = DISABLED._replace(is_complete=False)
+    assert supervisor.step(arm, Request.NONE, int(Observation.NONE), False) is SchemeState.INIT
+    assert supervisor.step(DISABLED, Request.NONE, int(Observation.NONE), False) is SchemeState.COMMISSION
+
+
 @pytest.mark.parametrize("state", [SchemeState.ADAPT, SchemeState.PAYLOAD])
 def test_a_touch_while_disarmed_is_no_collision(state):
     assert run_in(state).step(observation=Observation.CONTACT) is state
@@ -252,6 +277,16 @@ def test_a_collision_outranks_the_announcement_of_a_payload():
 def test_the_arm_counts_as_stopped_after_fifty_milliseconds_at_rest():
     run = run_in(SchemeState.REACT)
     assert run.step(observation=Observation.AT_REST, cycles=49) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
+
+
+def test_rest_counts_from_the_first_cycle_on():
+    run = Run()
+    run.step(DISABLED, observation=RESTING, cycles=21)
+    run.step(observation=Observation.AT_REST)
+    run.step(observation=Observation.AT_REST | Observation.ADAPTED)
+    assert run.step(observation=Observation.AT_REST | Observation.CONTACT) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES - 25) is SchemeState.REACT
     assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
 
 

@@ -1,0 +1,147 @@
+"""cangen at full rate on the arm's own bus: what host and emulated devices still promise while it floods them.
+
+Random identifiers hit everything that CANopen leaves unprotected: SYNC moves the devices, NMT stops them, SDO answers
+and status frames lie. So no run through such a flood is promised to succeed. Promised is: no crash and no hang; the run
+ends with a documented status, and one that was cut short is a safety stop (4) or devices missing (5); whatever the run
+took is in a readable log, its bad frames counted; afterwards no drive is enabled; the emulator serves the next run,
+which, when the flood is over, succeeds as if nothing had been. An arm that nobody enables stays without torque. A flood
+on an identifier that isn't the arm's is filtered in the kernel and changes no decision, to the bit.
+
+By the environment variable ADACD_HIL_FUZZ_S the campaign takes longer: `tools/fuzz.py --cangen 60`.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from experiment_runs import BIN, Played, run_on_vcan
+
+from adacd_hil.log.reader import read_log, topic_bytes
+
+pytestmark = [
+    pytest.mark.vcan,
+    pytest.mark.slow,
+    pytest.mark.wallclock,
+    pytest.mark.skipif(shutil.which("cangen") is None, reason="cangen (Debian package can-utils) is not installed"),
+]
+
+DURATION_S = float(os.environ.get("ADACD_HIL_FUZZ_S", "5"))
+RANDOM = ("-I", "r", "-L", "r", "-D", "r")
+FOREIGN = ("-I", "3FF", "-L", "r", "-D", "r")
+IMPATIENT = "[bus]\nfeedback_timeout_ms = 100\n"
+"""In lockstep each cycle waits that long for a node that a random NMT command has silenced, half a second of cycles
+after the fault included."""
+GAPS_MS = ("2", "0")
+"""Between frames of random identifiers. At full rate hardly a run gets through its boot; at 2 ms most do, and the flood
+meets a moving arm."""
+FOREIGN_GAP_MS = "0.2"
+"""On an identifier that isn't the arm's. At full rate cangen leaves a machine with one CPU no time for the run."""
+SHORT_RUN = '[operator]\nscript = [{ at_s = 0.5, request = "finish" }]\n'
+OK, PARTIAL, SAFETY_STOP, BUS_MISSING = 0, 3, 4, 5
+SAFE_STATES = {
+    "not ready to switch on",
+    "switch on disabled",
+    "ready to switch on",
+    "switched on",
+    "fault reaction active",
+    "fault",
+}
+
+
+@contextlib.contextmanager
+def emulated_arm(folder: Path, outcome: list[dict[str, object]]) -> Iterator["subprocess.Popen[str]"]:
+    """Run the emulator; after the block `outcome` holds what it reported, and it has ended by itself with status 0."""
+    command = [BIN / "firmware-sim", "run", "-i", "socketcan", "-c", "vcan0", "--scenario", "idle", "--json"]
+    with subprocess.Popen(
+        [*command, "--out", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.strip() == "ready":
+                break
+        try:
+            yield process
+            assert process.poll() is None, "the emulator ended during the flood"
+        finally:
+            process.terminate()
+            stdout, stderr = process.communicate(timeout=60)
+        assert (process.returncode, "Traceback" in stderr) == (0, False), stderr
+        outcome.append(json.loads(stdout))
+
+
+@contextlib.contextmanager
+def cangen(*arguments: str, gap_ms: str = "0") -> Iterator[None]:
+    """Flood vcan0 while the block lasts; a full transmit queue doesn't end it."""
+    with subprocess.Popen(["cangen", "vcan0", "-g", gap_ms, "-i", *arguments]) as process:
+        try:
+            yield
+            assert process.poll() is None, "cangen ended by itself"
+        finally:
+            process.terminate()
+
+
+def short_run(folder: Path, extra: str = "") -> Played:
+    """Boot, enable, adapt for half a second, park; `extra` is more of the configuration."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "short.toml").write_text(SHORT_RUN + extra)
+    return run_on_vcan(folder, "--clock", "lockstep", "--config", str(folder / "short.toml"))
+
+
+def check_ending(played: Played) -> None:
+    """The host ended in a documented way, said why, and left a readable log."""
+    assert "Traceback" not in played.stderr, played.stderr
+    assert played.status in (OK, PARTIAL, SAFETY_STOP, BUS_MISSING), played.stderr
+    if played.status in (OK, PARTIAL, SAFETY_STOP) and "state" in played.json:
+        is_faulted = played.json["state"] == "FAULT"
+        assert is_faulted is (played.status == SAFETY_STOP)
+    if played.status == BUS_MISSING:
+        assert len(played.error_lines) == 1, played.stderr
+    read_log(played.log)
+
+
+def test_runs_through_a_flood_of_random_frames_end_safely_and_the_next_one_succeeds(tmp_path: Path) -> None:
+    outcome: list[dict[str, object]] = []
+    endings: list[int] = []
+    with emulated_arm(tmp_path, outcome):
+        end_s = time.monotonic() + DURATION_S
+        while len(endings) < len(GAPS_MS) or time.monotonic() < end_s:
+            gap_ms = GAPS_MS[len(endings) % len(GAPS_MS)]
+            with cangen(*RANDOM, gap_ms=gap_ms):
+                played = short_run(tmp_path / f"run{len(endings)}", IMPATIENT)
+            check_ending(played)
+            endings.append(played.status)
+        after = short_run(tmp_path / "after")
+    print(f"cangen: {len(endings)} runs, exit statuses {sorted(endings)}")
+    assert after.status == OK, after.stderr
+    (described,) = outcome
+    assert set(described["drive_states"]) <= SAFE_STATES  # type: ignore[call-overload]
+
+
+def test_a_flood_of_random_frames_moves_no_arm_that_nobody_enables(tmp_path: Path) -> None:
+    outcome: list[dict[str, object]] = []
+    with emulated_arm(tmp_path, outcome), cangen(*RANDOM):
+        time.sleep(DURATION_S / 2)
+    (described,) = outcome
+    assert set(described["drive_states"]) <= SAFE_STATES  # type: ignore[call-overload]
+    truth = read_log(tmp_path / "truth.mcap").topics.get("/truth")
+    assert truth is not None, "no random SYNC in all that time"
+    assert len(truth.t_ns) > 0
+    assert float(abs(truth["tau_J"]).max()) == 0.0
+
+
+def test_a_flood_that_is_not_the_arms_changes_no_decision(tmp_path: Path) -> None:
+    outcome: list[dict[str, object]] = []
+    with emulated_arm(tmp_path, outcome):
+        quiet = short_run(tmp_path / "quiet")
+    with emulated_arm(tmp_path, outcome), cangen(*FOREIGN, gap_ms=FOREIGN_GAP_MS):
+        flooded = short_run(tmp_path / "flooded")
+    assert (quiet.status, flooded.status) == (OK, OK), flooded.stderr
+    for topic in ("/scheme", "/control"):
+        assert topic_bytes(flooded.log, topic) == topic_bytes(quiet.log, topic)
+    assert [described["rejected_commands"] for described in outcome] == [[0, 0], [0, 0]]
