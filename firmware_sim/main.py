@@ -16,7 +16,7 @@ from adacd_hil.clock import Clock, MonotonicClock, wall_ns
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
-from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
@@ -91,20 +91,38 @@ class Service:
         self._bench.boot(self._time_ns)
 
     def run(self) -> None:
-        """Serve. Raises BusError."""
-        bench, bus = self._bench, self._bus
+        """Serve; an interface that goes down is awaited, as by a device whose cable is pulled. Raises BusError."""
         while not self._stop.is_made:
-            cycle = bench.cycle
-            frame = bus.receive(self._patience_s())
-            if frame is not None:
-                self._heard_ns = frame.t_ns
-                bench.on_frame(frame)
-                self._has_been_operational = self._has_been_operational or bench.is_operational
-            if bench.cycle != cycle:
-                self._time_ns = self._heard_ns
-            else:
-                self._pass_time(self._clock.now_ns() if frame is None else frame.t_ns, frame is None)
+            try:
+                frame = self._serve()
+            except InterfaceDownError:
+                self._await_interface()
+                continue
             if self._is_once and frame is None and self._is_host_gone():
+                return
+
+    def _serve(self) -> Frame | None:
+        """Wait for one frame and act on it; without one, let time pass."""
+        bench = self._bench
+        cycle = bench.cycle
+        frame = self._bus.receive(self._patience_s())
+        if frame is not None:
+            self._heard_ns = frame.t_ns
+            bench.on_frame(frame)
+            self._has_been_operational = self._has_been_operational or bench.is_operational
+        if bench.cycle != cycle:
+            self._time_ns = self._heard_ns
+        else:
+            self._pass_time(self._clock.now_ns() if frame is None else frame.t_ns, frame is None)
+        return frame
+
+    def _await_interface(self) -> None:
+        while not self._stop.is_made:
+            try:
+                self._bus.recover()
+            except BusError:
+                self._clock.sleep_until_ns(self._clock.now_ns() + _LONGEST_WAIT_NS)
+            else:
                 return
 
     def _patience_s(self) -> float:

@@ -1,14 +1,13 @@
 """The bit budget of a contract, as text and as JSON."""
 
-import difflib
 import textwrap
-from pathlib import Path
 from typing import Any
 
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.config import load_settings
+from adacd_hil.device.contract import find_contract
 from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, us
-from adacd_hil.wire.codec import CodecError, contract_folder, load_codec
+from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.response_time import Response
 
 _COLUMNS = ("id", "message", "bytes", "trigger", "every ms", "bits", "µs", "response µs", "disturbed µs", "deadline µs")
@@ -18,19 +17,6 @@ _LEGEND = (
     "bits at worst-case stuffing, intermission included; CAN FD: nominal + data rate",
     "response in operation; disturbed: with an SDO frame per cycle and every EMCY at once; > : no bound, at least this",
 )
-
-
-def find_contract(name_or_file: str) -> Path:
-    """Find the DBC that a name (`arm`) or a path stands for. Raises CodecError with the nearest name."""
-    path = Path(name_or_file)
-    if path.suffix or path.exists():
-        return path
-    names = sorted(entry.stem for entry in contract_folder().glob("*.dbc"))
-    if name_or_file in names:
-        return contract_folder() / f"{name_or_file}.dbc"
-    nearest = difflib.get_close_matches(name_or_file, names, n=1)
-    hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; there are: {', '.join(names)}"
-    raise CodecError(f"contract {name_or_file!r} is neither one of the package's nor a file{hint}")
 
 
 def judge(

@@ -6,12 +6,11 @@ from adacd_hil.analysis.report import Report, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.report import TRUTH_NAME
-from adacd_hil.cli.run import interruptible, make_clock
+from adacd_hil.cli.run import contract_of, interruptible, make_clock
 from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.wire.bus import EmbeddedBus
-from adacd_hil.wire.codec import load_codec
 from firmware_sim.bench import Bench
 from firmware_sim.scenario import load_scenario
 from firmware_sim.truth import TruthLog
@@ -23,7 +22,7 @@ def play(config: str, profile: str | None, seed: int | None, clock_name: str, ou
     """Play the experiment and report it. Raises ConfigError, CodecError, LogError, CommandError."""
     settings = load_settings(config, profile)
     scenario = load_scenario(SCENARIO, settings.arm.profile, seed)
-    codec = load_codec()
+    codec = contract_of(settings, out)
     clock = make_clock(clock_name)
     bus = EmbeddedBus(clock)
     out.mkdir(parents=True, exist_ok=True)

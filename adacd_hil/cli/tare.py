@@ -7,15 +7,15 @@ from typing import Any
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
-from adacd_hil.cli.run import check_clock, interruptible, make_clock, received_ids
+from adacd_hil.cli.run import check_clock, interruptible, make_clock, received_ids, with_dbc
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.exchange import SilenceError
 from adacd_hil.control.tare import TareRefusedError
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.control.tare_session import TareInterruptedError, TareSession
 from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.contract import load_contract
 from adacd_hil.wire.bus import open_bus
-from adacd_hil.wire.codec import load_codec
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ def tare_on_bus(
 ) -> StoredTare:
     """Tare the sensors of an arm on a bus. Raises ConfigError, CodecError, BusError, CommandError, OSError."""
     check_clock(clock_name, interface, channel)
-    settings = _with_options(load_settings(config, profile), poses, seconds)
+    settings = with_dbc(_with_options(load_settings(config, profile), poses, seconds), dbc)
     # A file that is no tare isn't overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
-    codec = load_codec(dbc)
+    codec = load_contract(settings)
     clock = make_clock(clock_name)
-    bus = open_bus(interface, channel, clock, received_ids(codec), bitrate)
+    bus = open_bus(interface, channel, clock, received_ids(codec), bitrate, codec.is_fd)
     progress = Progress()
     try:
         session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)

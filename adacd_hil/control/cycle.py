@@ -76,6 +76,7 @@ class Cycle:
         """Prepare. `stopwatch`: what durations within a cycle are measured by, default the host's clock."""
         self._period_s = settings.bus.period_s
         self._heartbeat_cycles = max(1, round(settings.bus.heartbeat_ms * 1e-3 / self._period_s))
+        self._watch_cycles = max(1, self._heartbeat_cycles // 10)
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
@@ -93,6 +94,7 @@ class Cycle:
         self._state = SchemeState.INIT
         self._enabled_cycle: int | None = None
         self._faulted_cycle: int | None = None
+        self._lost: list[str] = []
         self._interrupts = 0
         self._is_finishing = False
 
@@ -114,7 +116,7 @@ class Cycle:
         output = None
         while not self._is_over(output):
             tick = self._pacer.next()
-            arm = self._exchange.read(tick)
+            arm = self._watch(self._exchange.read(tick))
             request = self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
@@ -126,6 +128,14 @@ class Cycle:
         fault = output.fault if output is not None else FaultReason.NONE
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
+
+    def _watch(self, arm: ArmState) -> ArmState:
+        """Take a device that has fallen silent or left Operational for a fault of the arm."""
+        if arm.cycle % self._watch_cycles == 0:
+            self._lost = self._master.watch(arm.t_ns)
+        if self._lost and arm.fault is FaultReason.NONE:
+            return arm._replace(fault=FaultReason.HEARTBEAT)
+        return arm
 
     def _request(self, tick: Tick) -> Request:
         """Ask the operator; what concerns the end of the run stays here."""
@@ -195,7 +205,8 @@ class Cycle:
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
-        details = "; ".join([output.fault.name, *self._arm.describe_faults()])
+        causes = [*self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
+        details = "; ".join([output.fault.name, *causes])
         return Event("error", "supervisor", f"{text}: {details}")
 
     def _follow_state(self, state: SchemeState, cycle: int) -> None:
@@ -204,6 +215,7 @@ class Cycle:
             self._enabled_cycle = cycle
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle
+            self._exchange.expect_little()
 
     def _is_over(self, output: SchemeOutput | None) -> bool:
         if output is None:

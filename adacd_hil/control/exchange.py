@@ -15,6 +15,8 @@ FEEDBACK_SHARE = 0.7
 the worst, and two commands need 230 µs before the next SYNC."""
 _MOST_FRAMES = 1000
 """Frames taken at once, so that a bus that somebody floods can't hold up the cycle: a classic one carries 21 per ms."""
+_LITTLE_PATIENCE_S = 0.02
+"""Lockstep after a fault: a device that is there answers within 1 ms, and half a second of cycles is still to come."""
 
 
 class SilenceError(RuntimeError):
@@ -36,6 +38,10 @@ class Exchange:
         self._patience_s = (
             settings.bus.feedback_timeout_ms * 1e-3 if is_lockstep else FEEDBACK_SHARE * settings.bus.period_s
         )
+
+    def expect_little(self) -> None:
+        """Wait for less from now on in lockstep: after a fault a device may be gone for good."""
+        self._patience_s = min(self._patience_s, _LITTLE_PATIENCE_S)
 
     def read(self, tick: Tick) -> ArmState:
         """Send SYNC and take in what the devices sampled on it. Raises BusError, and SilenceError in lockstep."""

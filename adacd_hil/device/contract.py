@@ -75,7 +75,7 @@ def load_contract(settings: Settings) -> Codec:
     name = settings.devices.contract
     if not name:
         return composed
-    codec = load_codec(_find_contract(name))
+    codec = load_codec(find_contract(name))
     _compare(codec, composed, name)
     return codec
 
@@ -98,7 +98,8 @@ def compose(settings: Settings, devices: list[Device]) -> Codec:
     return parse_codec(text.encode(), Path(COMPOSED_NAME))
 
 
-def _find_contract(name: str) -> Path:
+def find_contract(name: str) -> Path:
+    """Find the DBC that a name (`arm`) or a path stands for. Raises ConfigError with the nearest name."""
     folder = contract_folder()
     if (folder / f"{name}.dbc").is_file():
         return folder / f"{name}.dbc"
@@ -108,7 +109,7 @@ def _find_contract(name: str) -> Path:
     known = sorted(path.stem for path in folder.glob("*.dbc"))
     nearest = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}"
-    raise ConfigError(f"`devices.contract` = {name!r} is neither in dbc/ nor a file; {hint}")
+    raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint}")
 
 
 def _compare(codec: Codec, composed: Codec, name: str) -> None:

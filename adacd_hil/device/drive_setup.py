@@ -38,6 +38,8 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> None:
                 slave.write_checked(index, 0, torque_limit_permille(settings, joint), "per mille")
     if profile.command_watchdog == "0x2200":
         slave.write_checked(0x2200, 0, settings.bus.command_patience_cycles, "SYNCs")
+    if slave.device.can("sync_tolerance"):
+        slave.write_checked(0x2201, 0, round(10 * settings.bus.sync_patience_periods), "tenths of a period")
     _enter_mode(slave)
 
 

@@ -15,11 +15,20 @@ from typing import NamedTuple
 from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, toml_names
 from adacd_hil.wire.codec import contract_folder
 
-FEATURES = ("heartbeat_consumer", "sync_counter", "option_codes", "torque_limits", "autozero", "watchdog_in_emcy")
+FEATURES = (
+    "heartbeat_consumer",
+    "sync_counter",
+    "option_codes",
+    "torque_limits",
+    "sync_tolerance",
+    "autozero",
+    "watchdog_in_emcy",
+)
 """What a profile may name: the host uses an object of these kinds only where the EDS lists it too.
 
 heartbeat_consumer 0x1016; sync_counter 0x1019; option_codes 0x605A, 0x605E; torque_limits 0x6072, 0x60E0, 0x60E1;
-autozero 0x6125; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the device's time in ms.
+sync_tolerance 0x2201; autozero 0x6125; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the
+device's time in ms.
 """
 EMCY_INHIBIT_100US = 100
 """0x1015 of every device that has it: one EMCY per device and 10 ms, so that a storm of errors can't take the bus."""

@@ -106,7 +106,7 @@ def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (("--dbc", "arn"), "contract 'arn' is neither one of the package's nor a file; did you mean 'arm'?"),
+        (("--dbc", "arn"), "contract 'arn' is neither in dbc/ nor a file; did you mean 'arm'?"),
         (("--dbc", "none.dbc"), "DBC none.dbc: No such file"),
         (("--config", "papper"), "did you mean 'paper'?"),
     ],
