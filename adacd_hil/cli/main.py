@@ -5,7 +5,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +15,9 @@ from adacd_hil.config import ConfigError, builtin_names
 from adacd_hil.log.errors import LogError
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError
+
+if TYPE_CHECKING:
+    from adacd_hil.cli.connection import Connection
 
 _CODES = (
     (ConfigError, ExitCode.USAGE),
@@ -59,9 +62,38 @@ _profile = click.option(
     "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
 )
 _json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
+_interface = click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
+_channel = click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0.")
+_bitrate = click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
+_dbc = click.option(
+    "--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the package's."
+)
 _clock = functools.partial(
     click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
 )
+
+
+def _on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
+    """Give a command the options of a bus; it takes them as a `Connection` before its own."""
+
+    @functools.wraps(command)
+    def connect(
+        interface: str,
+        channel: str,
+        bitrate: int | None,
+        config: str,
+        profile: str | None,
+        dbc: Path | None,
+        **own: Any,
+    ) -> ExitCode:
+        from adacd_hil.cli.connection import Connection
+
+        return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
+
+    explained: Callable[..., None] = _explained(connect)
+    for option in (_dbc, _profile, _config, _bitrate, _channel, _interface):
+        explained = option(explained)
+    return explained
 
 
 @click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
@@ -88,11 +120,11 @@ def demo(config: str, out: Path, seed: int | None, clock: str, profile: str | No
 
 
 @cli.command(epilog=EPILOG)
-@click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
-@click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0.")
-@click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
+@_interface
+@_channel
+@_bitrate
 @_config
-@click.option("--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the package's.")
+@_dbc
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/run"), show_default=True)
 @_clock(default="realtime")
 @_profile
@@ -135,6 +167,47 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
         print(json.dumps([entry.as_json() for entry in reports], indent=2))
     else:
         print("\n\n".join(entry.as_text() for entry in reports))
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option(
+    "--seconds", type=click.FloatRange(0.1, 600.0), default=1.5, show_default=True, help="How long to listen."
+)
+@_json
+def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
+    """Find the nodes on a bus: what they are, what they send, and whether that is the configured arm.
+
+    Sends SDO uploads only and changes no node's state. Exit status 5 when a node is missing or not the expected one.
+    """
+    from adacd_hil.cli.scan import as_text, scan_bus
+
+    result, code = scan_bus(connection, seconds)
+    print(json.dumps(result, indent=2) if as_json else as_text(result))
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option(
+    "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
+)
+@click.option(
+    "--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: nothing holds the arm."
+)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for a log; default: none.")
+@_json
+def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
+    """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
+
+    Below 0.90 the connection is not sufficient (exit status 1), below 0.95 there is a warning. The drives are not
+    enabled unless asked for.
+    """
+    from adacd_hil.cli.commtest import as_text, run_commtest
+
+    result, code = run_commtest(connection, seconds, is_enabling, out)
+    print(json.dumps(result, indent=2) if as_json else as_text(result))
     return code
 
 
