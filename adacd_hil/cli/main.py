@@ -211,6 +211,42 @@ def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: P
     return code
 
 
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option("--move", "is_moving", is_flag=True, help="Ask for each joint to be moved by hand, to check its signs.")
+@_json
+def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode:
+    """Check host, bus and arm one by one, and say what to do about what is wrong. The drives are never enabled.
+
+    Exit status 1 when a check failed. Resets the nodes' communication and leaves them pre-operational; does neither
+    when it hears another master.
+    """
+    from adacd_hil.cli import doctor as command
+
+    findings, code = command.examine(connection, is_moving)
+    print(json.dumps(command.as_json(findings), indent=2) if as_json else command.as_text(findings))
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
+@click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
+@click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
+@_json
+def monitor(
+    connection: "Connection", node_id: int | None, once: bool, seconds: float | None, as_json: bool
+) -> ExitCode:
+    """Watch a bus: nodes, messages with rate, age, checks and values, load. Sends nothing.
+
+    Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
+    """
+    from adacd_hil.cli.monitor import PLAIN_S, watch
+
+    listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
+    return watch(connection, node_id, listened_s, listened_s is None, as_json)
+
+
 def main() -> None:
     """Enter here from the console script."""
     cli.main(prog_name="adacd-hil")

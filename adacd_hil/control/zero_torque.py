@@ -56,11 +56,16 @@ class ZeroTorqueLoop:
         """End after the present cycle. Safe in a signal handler."""
         self._is_interrupted = True
 
-    def run(self, duration_s: float, observe: Callable[[ZeroTorqueCycle], None]) -> FaultReason:
+    def run(
+        self,
+        duration_s: float,
+        observe: Callable[[ZeroTorqueCycle], None],
+        is_over: Callable[[], bool] = lambda: False,
+    ) -> FaultReason:
         """Cycle for a while, then disable the drives; returns what a device faulted with. Raises BusError."""
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
         fault = FaultReason.NONE
-        while self._clock.now_ns() < end_ns and not self._is_interrupted and fault is FaultReason.NONE:
+        while self._clock.now_ns() < end_ns and not (self._is_interrupted or is_over() or fault):
             cycle = self._cycle(self._is_enabling, quick_stop=False)
             fault = self._fault(cycle.state)
             observe(cycle)
