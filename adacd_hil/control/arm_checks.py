@@ -31,8 +31,6 @@ from adacd_hil.wire.traffic import Traffic, listen
 
 LISTEN_S = 0.5
 """For other masters: five of the usual heartbeats of 100 ms."""
-MOVE_S = 15.0
-"""How long the user has to move a joint."""
 HIGH_LOAD_PERCENT = 80.0
 """Above this the worst case (stuff bits, a status and an SDO frame) does not fit a period."""
 _PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
@@ -43,7 +41,8 @@ class ArmExamination:
     """What is examined, and what the checks have learnt so far.
 
     open_bus: opens the bus, receiving everything. read_link: the interface's present state. ask: None when nobody can
-    move the arm, with the reason in `no_move_reason`; else tells the user what to do. cycle_s: how long the cycle runs.
+    move the arm, with the reason in `no_move_reason`; else tells the user what to do.
+    cycle_s: how long the cycle runs. move_s: how long the user has to move a joint.
     """
 
     settings: Settings
@@ -56,6 +55,7 @@ class ArmExamination:
     ask: Callable[[str], None] | None = None
     no_move_reason: str = "give --move and move the joints when asked"
     cycle_s: float = 1.0
+    move_s: float = 15.0
     _tap: Tap | None = None
     _bus: Bus | None = None
     _loop: ZeroTorqueLoop | None = None
@@ -349,11 +349,15 @@ def _check_joint(joint: int) -> Callable[[ArmExamination], Outcome]:
     def check(patient: ArmExamination) -> Outcome:
         if patient.ask is None:
             return skipped(patient.no_move_reason)
-        motion = HandMotion(joint)
+        tau_J = patient.joint_values("tau_J")
+        if not len(tau_J):
+            return skipped("no complete cycle")
+        motion = HandMotion(joint, tau_J.mean(axis=0))
         patient.ask(
-            f"move joint {joint + 1} by hand toward +q, at least {motion.WANTED_DEG:g} degrees, within {MOVE_S:g} s"
+            f"move joint {joint + 1} by hand toward +q, at least {motion.WANTED_DEG:g} degrees, "
+            f"within {patient.move_s:g} s"
         )
-        patient.loop.run(MOVE_S, motion.observe, lambda: motion.is_done)
+        patient.loop.run(patient.move_s, motion.observe, lambda: motion.is_done)
         return motion.judge()
 
     return check

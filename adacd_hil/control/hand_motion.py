@@ -19,17 +19,17 @@ _DOMINANCE = 2.0
 
 
 class HandMotion:
-    """Watches the cycles in which the user moves joint `joint` (0, 1) toward +q."""
+    """Watches the cycles in which the user moves joint `joint` (0, 1) toward +q. `zero_Nm` (2,): torque at rest."""
 
     WANTED_DEG = 10.0
 
-    def __init__(self, joint: int) -> None:
+    def __init__(self, joint: int, zero_Nm: Vector) -> None:
         self._joint = joint
         self._start: Vector | None = None
         self._last: Vector | None = None
         self._way = np.zeros(JOINTS)
         self._work_J = np.zeros(JOINTS)
-        self._zero_Nm = np.zeros(JOINTS)
+        self._zero_Nm = zero_Nm
 
     @property
     def is_done(self) -> bool:
@@ -42,7 +42,7 @@ class HandMotion:
         if not state.is_complete:
             return
         if self._start is None or self._last is None:
-            self._start, self._last, self._zero_Nm = state.q, state.q, state.tau_J
+            self._start = self._last = state.q
             return
         self._work_J += (state.tau_J - self._zero_Nm) * (state.q - self._last)
         self._last = state.q

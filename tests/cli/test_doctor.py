@@ -20,7 +20,9 @@ EARLIER = [Finding(name, Status.OK, "", "") for name in PASSED]
 
 
 def doctor(rig: BenchBus, ask: Callable[[str], None] | None = None) -> dict[str, Finding]:
-    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None, ask=ask, cycle_s=0.4)
+    patient = ArmExamination(
+        rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None, ask=ask, cycle_s=0.4, move_s=1.0
+    )
     findings = diagnose(ARM_CHECKS, patient, lambda finding: None, EARLIER)
     assert patient.leave() == ""
     return {finding.name: finding for finding in findings}
@@ -188,6 +190,54 @@ def test_lost_feedback_fails_the_rate() -> None:
     finding = doctor(rig)["rate"]
     assert finding.status is Status.FAILED
     assert "80.0 % of the periods complete" in finding.reason
+
+
+def move_by_hand(rig: BenchBus, speed_rad_s: tuple[float, float], torque_Nm: float) -> Callable[[str], None]:
+    """Return an `ask` at which, asked for joint 1, the joints begin to move and both sensors see a torque."""
+    drives = [CODEC.message(f"Drive{joint}Feedback") for joint in (1, 2)]
+    sensors = [CODEC.message(f"Sensor{joint}Torque") for joint in (1, 2)]
+    senders = {message.can_id: message.sender() for message in sensors}
+    begin_ns: list[int] = []
+
+    def tamper(can_id: int, data: bytes) -> bytes:
+        if can_id in senders:
+            (measured_Nm,) = CODEC.by_id[can_id].decode_values(data)
+            pushed_Nm = torque_Nm if begin_ns and rig.clock.now_ns() > begin_ns[0] + 5_000_000 else 0.0
+            return senders[can_id].protect(CODEC.by_id[can_id].encode(measured_Nm + pushed_Nm))
+        for message, speed in zip(drives, speed_rad_s, strict=True):
+            if can_id == message.can_id and begin_ns:
+                position, _ = message.decode_values(data)
+                moved = speed * (rig.clock.now_ns() - begin_ns[0]) * 1e-9
+                return bytes(message.encode(position + moved, speed))
+        return data
+
+    def ask(line: str) -> None:
+        if line.startswith("move joint 1 "):
+            begin_ns.append(rig.clock.now_ns())
+
+    rig.tamper = tamper
+    return ask
+
+
+@pytest.mark.parametrize(
+    ("speed_rad_s", "torque_Nm", "status", "text"),
+    [
+        ((0.5, 0.1), -0.3, Status.OK, "right joint, right signs"),
+        ((0.5, 0.1), +0.3, Status.FAILED, "the torque has the motion's sign"),
+        ((0.5, 0.1), 0.0, Status.WARNING, "too little torque"),
+        ((-0.5, 0.1), -0.3, Status.FAILED, "position decreases toward +q"),
+        ((0.1, 0.5), -0.3, Status.FAILED, "drive 2 reports the motion of joint 1"),
+        ((0.5, 0.4), -0.3, Status.WARNING, "both joints moved"),
+        ((0.05, 0.0), -0.3, Status.WARNING, "not moved by 10 deg in time"),
+    ],
+)
+def test_a_joint_moved_by_hand_tells_its_order_and_signs(
+    speed_rad_s: tuple[float, float], torque_Nm: float, status: Status, text: str
+) -> None:
+    rig = BenchBus()
+    finding = doctor(rig, move_by_hand(rig, speed_rad_s, torque_Nm))["joint 1"]
+    assert finding.status is status
+    assert text in finding.reason
 
 
 def test_a_check_whose_prerequisite_failed_is_skipped_with_the_reason_behind_it() -> None:
