@@ -208,10 +208,16 @@ def test_monitor_survives_a_full_bus_and_ends_with_ctrl_c(tmp_path: Path) -> Non
 def test_monitor_with_json_ends_with_one_snapshot_at_ctrl_c(tmp_path: Path) -> None:
     with other_program("while True: send(0x701, b'\\5'); time.sleep(0.01)"):
         process = subprocess.Popen(
-            [BIN / "adacd-hil", "monitor", *ON_VCAN, "--seconds", "600", "--json"], stdout=subprocess.PIPE, text=True
+            [BIN / "adacd-hil", "monitor", *ON_VCAN, "--seconds", "600", "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(8)
+        assert process.stderr is not None
+        assert process.stderr.readline() == "listening on vcan0\n"
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+            can.bind(("vcan0",))
+            can.recv(16)  # the other program has begun
         process.send_signal(signal.SIGINT)
         stdout, _ = process.communicate(timeout=60)
     (node,) = json.loads(stdout)["nodes"]

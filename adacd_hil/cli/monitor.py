@@ -72,8 +72,10 @@ class Monitor:
         """Take in what comes for a while. Raises BusError."""
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
         accept: Callable[[Frame], None] = self._view.accept
-        while not self.is_stopped and (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
+        while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
             accept(frame)
+            if self.is_stopped:
+                return
             while (waiting := self._bus.receive(0.0)) is not None:  # a batch, looking at the clock every so often
                 accept(waiting)
                 if self._view.frames % 256 == 0:
@@ -109,13 +111,19 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
         monitor = Monitor(connection, bus, clock, node_id)
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         with on_interrupt(monitor.stop):
-            while not monitor.is_stopped and (end_ns is None or clock.now_ns() < end_ns):
-                left_s = screen.redraw_s if end_ns is None else (end_ns - clock.now_ns()) * 1e-9
-                monitor.listen(min(left_s, screen.redraw_s))
-                if is_live and not as_json and not monitor.is_stopped:
-                    screen.draw(as_text(monitor.describe()))
-            described = monitor.describe()
-    screen.end(json.dumps(described, indent=2) if as_json else as_text(described))
+            if not is_live:
+                print(f"listening on {bus.channel}", file=sys.stderr, flush=True)
+            try:
+                while True:
+                    left_s = screen.redraw_s if end_ns is None else (end_ns - clock.now_ns()) * 1e-9
+                    monitor.listen(min(left_s, screen.redraw_s))
+                    if monitor.is_stopped or (end_ns is not None and clock.now_ns() >= end_ns):
+                        break
+                    if is_live and not as_json:
+                        screen.draw(as_text(monitor.describe()))
+            finally:  # a bus that fails leaves its last table, too
+                described = monitor.describe()
+                screen.end(json.dumps(described, indent=2) if as_json else as_text(described))
     return ExitCode.OK
 
 
@@ -128,6 +136,7 @@ def _describe(snapshot: Snapshot) -> dict[str, Any]:
     return {
         "frames": snapshot.frames,
         "error_frames": snapshot.error_frames,
+        "strange_frames": snapshot.strange_frames,
         "load_percent": round(snapshot.load_percent, 2),
         "nodes": [asdict(node) | {"age_s": round(node.age_s, 3)} for node in snapshot.nodes],
         "messages": [_describe_message(message) for message in snapshot.messages],
@@ -170,12 +179,14 @@ def as_text(described: dict[str, Any]) -> str:
 
 
 def _head(described: dict[str, Any]) -> str:
-    missed = described["not_processed"]
+    missed, strange = described["not_processed"], described["strange_frames"]
     parts = [
         f"load {described['load_percent']:.1f} %",
         f"{described['frames']} frames",
         f"{described['error_frames']} error frames",
     ]
+    if strange:
+        parts.append(f"{strange} that a bus of the contract can't carry")
     if missed is not None:
         parts.append(f"{missed} not processed")
     if described["bus_state"]:

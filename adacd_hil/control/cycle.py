@@ -15,7 +15,7 @@ from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import Pacer, Tick
+from adacd_hil.control.realtime import FEEDBACK_SHARE, Pacer, Tick
 from adacd_hil.control.reference import Reference
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
@@ -36,9 +36,6 @@ from adacd_hil.scheme.pipeline import Pipeline
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.tap import Tap
 
-FEEDBACK_SHARE = 0.7
-"""Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
-the worst, and two commands need 230 µs before the next SYNC."""
 FAULT_LINGER_S = 0.5
 """How long a faulted run goes on, so that the drives' quick stop is in the log."""
 DISABLE_CYCLES = 20

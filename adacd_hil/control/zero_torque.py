@@ -7,9 +7,8 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
-from adacd_hil.control.cycle import FEEDBACK_SHARE
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.realtime import GridPacer
+from adacd_hil.control.realtime import FEEDBACK_SHARE, GridPacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason

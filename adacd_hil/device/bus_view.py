@@ -50,10 +50,14 @@ class MessageView:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The bus as seen up to now. load: percent, since the snapshot before."""
+    """The bus as seen up to now. load: percent, since the snapshot before.
+
+    strange_frames: of a length that the contract's bus can't carry; the load leaves them out.
+    """
 
     frames: int
     error_frames: int
+    strange_frames: int
     load_percent: float
     nodes: list[NodeView]
     messages: list[MessageView]
@@ -101,11 +105,11 @@ class BusView:
         """Begin at `t_ns`; the bit rates in bit/s are for the load."""
         self.frames = 0
         self._codec = codec
-        self._load = LoadMeter(bitrate, data_bitrate)
+        self._load = LoadMeter(bitrate, data_bitrate, t_ns)
         self._entries: dict[int, _Entry] = {}
         self._error_frames = 0
         self._marks: deque[tuple[int, dict[int, int]]] = deque([(t_ns, {})], maxlen=2)
-        self._load_ns = t_ns
+        self._strange_frames = 0
 
     def accept(self, frame: Frame) -> None:
         """Take in one frame."""
@@ -113,7 +117,10 @@ class BusView:
         if frame.is_error:
             self._error_frames += 1
             return
-        self._load.add(frame)
+        try:
+            self._load.add(frame)
+        except ValueError:  # a length that the contract's bus can't carry
+            self._strange_frames += 1
         entry = self._entries.get(frame.can_id)
         if entry is None:
             entry = self._entries[frame.can_id] = _Entry(self._codec.by_id.get(frame.can_id))
@@ -128,12 +135,11 @@ class BusView:
             for can_id in sorted(self._entries)
             if node_id is None or (can_id <= 0x7FF and can_id & 0x7F == node_id)
         }
-        load_percent = self._load.take_percent((t_ns - self._load_ns) * 1e-9)
-        self._load_ns = t_ns
         snapshot = Snapshot(
             frames=self.frames,
             error_frames=self._error_frames,
-            load_percent=load_percent,
+            strange_frames=self._strange_frames,
+            load_percent=self._load.take(t_ns).percent,
             nodes=[
                 self._node(can_id & 0x7F, entry, t_ns)
                 for can_id, entry in wanted.items()

@@ -97,12 +97,12 @@ class Node:
 
 @dataclass(frozen=True)
 class Expected:
-    """A node that the configuration expects."""
+    """A node that the configuration expects. None: its EDS doesn't say, so anything will do."""
 
     name: str
     node_id: int
-    vendor: int
-    product: int
+    vendor: int | None
+    product: int | None
 
 
 @dataclass(frozen=True)
@@ -197,8 +197,12 @@ def expected_nodes(nodes: Mapping[str, Any]) -> list[Expected]:
     """List what the master of an arm expects; `nodes`: its canopen nodes by name, each with its EDS."""
     expected = []
     for name, node in nodes.items():
-        identity = node.object_dictionary[0x1018]
-        expected.append(Expected(name, node.id, identity[1].default, identity[2].default))
+        identity = node.object_dictionary.get(0x1018)
+        vendor, product = (
+            None if identity is None or subindex not in identity.subindices else identity[subindex].default
+            for subindex in (1, 2)
+        )
+        expected.append(Expected(name, node.id, vendor, product))
     return expected
 
 
@@ -224,6 +228,8 @@ def _difference(node: Node, wanted: Expected) -> str:
         ("vendor", node.vendor, wanted.vendor),
         ("product", node.product, wanted.product),
     ):
+        if value is None:
+            continue
         if found is None:
             return f"{wanted.name} expected; tells no {what}"
         if found != value:

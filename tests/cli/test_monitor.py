@@ -81,7 +81,7 @@ def test_without_a_terminal_lines_are_plain() -> None:
 
 def test_a_silent_bus_is_said_to_be() -> None:
     result = CliRunner().invoke(cli, ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1"))
-    assert (result.exit_code, result.stderr) == (0, "")
+    assert (result.exit_code, result.stderr) == (0, "listening on silent\n")
     assert result.stdout == "load 0.0 %, 0 frames, 0 error frames\n\nnothing heard\n"
 
 

@@ -93,6 +93,13 @@ def test_the_load_is_that_since_the_snapshot_before() -> None:
     assert second.load_percent == 0.0
 
 
+def test_a_frame_too_long_for_the_contracts_bus_is_counted_and_left_out_of_the_load() -> None:
+    seen = view()
+    seen.accept(Frame(0x055, bytes(12), MS))
+    snapshot = seen.snapshot(2 * MS)
+    assert (snapshot.strange_frames, snapshot.load_percent, snapshot.messages[0].count) == (1, 0.0, 1)
+
+
 def test_error_frames_are_counted_apart() -> None:
     seen = view()
     seen.accept(Frame(0x040, bytes(8), MS, is_error=True))

@@ -61,6 +61,15 @@ def test_nodes_in_operation_are_seen_with_what_they_produce() -> None:
     assert [(talk.can_id, round(talk.rate_Hz or 0)) for talk in found.others] == [(0x080, 1000)]
 
 
+def test_an_operational_node_without_heartbeat_is_told_by_its_pdos() -> None:
+    rig = BenchBus()
+    rig.start()
+    rig.add_host()
+    rig.tamper = lambda can_id, data: None if can_id & 0x780 == 0x700 else data
+    rig.forget()
+    assert {node.state_text for node in look(rig, 0.5).nodes} == {"operational (sends PDOs)"}
+
+
 def test_a_missing_node_is_named() -> None:
     rig = BenchBus()
     rig.silence(3)
@@ -79,6 +88,13 @@ def test_another_product_than_the_expected_one_is_a_difference() -> None:
     found = look(rig)
     expected = [dataclasses.replace(node, product=0x403) for node in expected_nodes(rig.master.nodes)]
     assert compare(found, expected)[1] == "Drive1 expected; product is not 0x403"
+
+
+def test_an_identity_that_is_not_expected_to_be_known_is_not_compared() -> None:
+    rig = BenchBus()
+    found = look(rig)
+    expected = [dataclasses.replace(node, vendor=None, product=None) for node in expected_nodes(rig.master.nodes)]
+    assert set(compare(found, expected).values()) == {""}
 
 
 def test_a_node_that_is_only_heard_is_found_and_does_not_answer() -> None:
