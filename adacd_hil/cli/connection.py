@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import Clock
@@ -43,6 +44,11 @@ class Connection:
             raise CommandError(str(error), ExitCode.BUS_MISSING) from None
         finally:
             bus.close()
+
+
+def raise_interrupt() -> NoReturn:
+    """End a command from within a signal handler, through its `finally` blocks. Raises KeyboardInterrupt."""
+    raise KeyboardInterrupt
 
 
 @contextmanager

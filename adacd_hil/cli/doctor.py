@@ -3,7 +3,7 @@
 import sys
 from typing import Any
 
-from adacd_hil.cli.connection import Connection
+from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
@@ -46,7 +46,8 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
     elif is_moving:
         patient.no_move_reason = "nobody to ask: stdin is not a terminal"
     try:
-        findings += diagnose(ARM_CHECKS, patient, _report, findings)
+        with on_interrupt(raise_interrupt):
+            findings += diagnose(ARM_CHECKS, patient, _report, findings)
     finally:
         trouble = patient.leave()
     if trouble:

@@ -36,6 +36,8 @@ def _explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
     def run(*args: Any, **kwargs: Any) -> None:
         try:
             code = command(*args, **kwargs)
+        except KeyboardInterrupt:
+            _fail("interrupted", ExitCode.INTERRUPTED)
         except CommandError as error:
             _fail(str(error), error.code)
         except tuple(kind for kind, _ in _CODES) as error:
