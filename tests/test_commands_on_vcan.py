@@ -172,6 +172,37 @@ def test_doctor_tells_a_missing_arm_and_a_missing_interface(tmp_path: Path) -> N
     assert "vcan9 is no CAN interface; present: vcan0, vcan1" in done.stdout
 
 
+def test_an_interrupted_doctor_leaves_the_nodes_pre_operational(arm: Path) -> None:
+    with listening() as frames:
+        process = subprocess.Popen(
+            [BIN / "adacd-hil", "doctor", *ON_VCAN], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert process.stderr is not None
+        assert any(line == "PDO map: ok\n" for line in process.stderr)
+        process.send_signal(signal.SIGTERM)
+        stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stdout) == (130, "")
+    assert stderr.splitlines()[-1] == "adacd-hil: interrupted"
+    assert [data for can_id, data in frames if can_id == 0x000][-1] == b"\x80\x00"
+
+
+def test_one_node_that_is_out_of_reach_is_named_by_scan_and_doctor(arm: Path, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+        can.bind(("vcan0",))
+        nmt = "00000000 02000000 {:02x}03000000000000"  # to node 3
+        can.send(bytes.fromhex(nmt.format(2)))  # stopped: no SDO, no PDO
+        scanned = command(tmp_path, "scan", "--json")
+        done = command(tmp_path, "doctor", "--json")
+        can.send(bytes.fromhex(nmt.format(128)))
+    verdicts = {node["node"]: node["verdict"] for node in scanned.json["nodes"]}
+    found = {check["name"]: check for check in done.json["checks"]}
+    assert (scanned.status, done.status) == (5, 1)
+    assert (verdicts[1], verdicts[2], verdicts[4]) == ("", "", "")
+    assert "Sensor1 expected" in verdicts[3]
+    assert "Sensor1 expected" in found["nodes"]["reason"]
+    assert found["boot"]["reason"] == "needs `nodes`, which failed"
+
+
 def test_monitor_shows_the_bus_and_sends_nothing(arm: Path, tmp_path: Path) -> None:
     source = (
         "send(0x000, b'\\1\\0')\n"

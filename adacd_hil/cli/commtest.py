@@ -150,6 +150,7 @@ def describe(report: CommunicationReport, settings: Settings, scheduler: str) ->
         "period_us": settings.bus.period_us,
         "scheduler": scheduler,
         "load_percent": round(report.load_percent, 2),
+        "warnings": _warnings(report, scheduler),
         "devices": {name: dataclasses.asdict(device) for name, device in report.devices.items()},
         "times_us": {
             name: {
@@ -162,6 +163,19 @@ def describe(report: CommunicationReport, settings: Settings, scheduler: str) ->
             for name, values in times_us.items()
         },
     }
+
+
+def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
+    """Say what makes the figures worth less."""
+    warnings = []
+    if not scheduler.startswith("SCHED_FIFO"):
+        warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
+    silent = [name for name, device in report.devices.items() if not any(device.ages)]
+    if silent:
+        warnings.append(f"never a cyclic frame from {', '.join(silent)}")
+    if report.overruns:
+        warnings.append(f"{report.overruns} of {report.periods} periods were skipped: this host was late")
+    return warnings
 
 
 def as_text(described: dict[str, Any]) -> str:
@@ -197,7 +211,8 @@ def _percentile_text(found: dict[str, float]) -> str:
 
 
 def _findings(described: dict[str, Any]) -> list[str]:
-    lines = [f"event: {line}" for line in described["events"]]
+    lines = [f"warning: {line}" for line in described["warnings"]]
+    lines += [f"event: {line}" for line in described["events"]]
     lines += [f"device: {line}" for line in described["device_faults"]]
     if described["fault"] != FaultReason.NONE.name:
         lines.append(f"stopped: {described['fault']}")
