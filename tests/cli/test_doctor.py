@@ -7,7 +7,7 @@ import pytest
 from bench_bus import CODEC, BenchBus
 
 from adacd_hil.cli.doctor import as_json, as_text
-from adacd_hil.control.arm_checks import ARM_CHECKS, ArmExamination
+from adacd_hil.control.arm_checks import ARM_CHECKS, ArmExamination, check_pdo_map
 from adacd_hil.control.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.object_dictionary import NmtState
@@ -107,9 +107,20 @@ def break_pdo_map(rig: BenchBus, index: int, subindex: int, value: int) -> None:
 def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, value: int, reason: str) -> None:
     rig = BenchBus()
     break_pdo_map(rig, index, subindex, value)
-    finding = doctor(rig)["PDO map"]
+    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
+    patient.connect()
+    finding = check_pdo_map(patient)
     assert finding.status is Status.FAILED
     assert reason in finding.reason
+
+
+def test_an_object_mapped_with_another_width_is_told_though_the_length_is_right() -> None:
+    rig = BenchBus()
+    break_pdo_map(rig, 0x1A00, 1, 0x60640010)
+    break_pdo_map(rig, 0x1A00, 2, 0x606C0030)
+    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
+    patient.connect()
+    assert "Drive1Feedback.position: 0x6064 with 16 bits at bit 0" in check_pdo_map(patient).reason
 
 
 def change_torque(rig: BenchBus, change: Callable[[int, float], float]) -> None:
@@ -148,7 +159,14 @@ def test_a_torque_that_is_not_plausible_at_rest_is_told(
 
 def test_a_saturated_sensor_is_told() -> None:
     rig = BenchBus()
-    rig.tamper = lambda can_id, data: b"\x02" + data[1:] if can_id == 0x283 else data
+    sender = CODEC.message("Sensor1Torque").sender()
+
+    def saturate(can_id: int, data: bytes) -> bytes:
+        if can_id == 0x183:  # the header's status nibble
+            return sender.protect(bytearray(data[:1] + b"\x20" + data[2:]))
+        return b"\x02" + data[1:] if can_id == 0x283 else data
+
+    rig.tamper = saturate
     findings = doctor(rig)
     assert findings["saturation"].status is Status.FAILED
     assert "POSITIVE_OVERLOAD" in findings["saturation"].reason
