@@ -4,6 +4,7 @@ import contextlib
 import json
 import signal
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -237,9 +238,9 @@ def test_monitor_survives_a_full_bus_and_ends_with_ctrl_c(tmp_path: Path) -> Non
 
 
 def test_monitor_with_json_ends_with_one_snapshot_at_ctrl_c(tmp_path: Path) -> None:
-    with other_program("while True: send(0x701, b'\\5'); time.sleep(0.01)"):
+    with other_program("while True: send(0x709, b'\\5'); time.sleep(0.01)"):
         process = subprocess.Popen(
-            [BIN / "adacd-hil", "monitor", *ON_VCAN, "--seconds", "600", "--json"],
+            [BIN / "adacd-hil", "monitor", *ON_VCAN, "--seconds", "600", "--node", "9", "--json"],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -247,6 +248,7 @@ def test_monitor_with_json_ends_with_one_snapshot_at_ctrl_c(tmp_path: Path) -> N
         assert process.stderr is not None
         assert process.stderr.readline() == "listening on vcan0\n"
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+            can.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", 0x709, 0x7FF))
             can.bind(("vcan0",))
             can.recv(16)  # the other program has begun
         process.send_signal(signal.SIGINT)
