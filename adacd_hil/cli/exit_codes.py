@@ -1,9 +1,12 @@
 """What the commands' exit statuses mean; the same numbers in every command."""
 
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
-from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import FaultReason
+
+if TYPE_CHECKING:
+    from adacd_hil.control.session import SessionSummary  # it compiles: seconds that a command without a run can spare
 
 
 class ExitCode(IntEnum):
@@ -32,7 +35,7 @@ class CommandError(Exception):
         self.code = code
 
 
-def exit_code(summary: SessionSummary) -> ExitCode:
+def exit_code(summary: "SessionSummary") -> ExitCode:
     """Choose the exit code of a run; the gravest reason wins."""
     if summary.result is None:
         return ExitCode.SAFETY_STOP if summary.has_started else ExitCode.BUS_MISSING

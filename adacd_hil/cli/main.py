@@ -5,7 +5,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +15,9 @@ from adacd_hil.config import ConfigError, builtin_names
 from adacd_hil.log.errors import LogError
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError
+
+if TYPE_CHECKING:
+    from adacd_hil.cli.connection import Connection
 
 _CODES = (
     (ConfigError, ExitCode.USAGE),
@@ -33,6 +36,8 @@ def _explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
     def run(*args: Any, **kwargs: Any) -> None:
         try:
             code = command(*args, **kwargs)
+        except KeyboardInterrupt:
+            _fail("interrupted", ExitCode.INTERRUPTED)
         except CommandError as error:
             _fail(str(error), error.code)
         except tuple(kind for kind, _ in _CODES) as error:
@@ -68,6 +73,29 @@ _json = click.option("--json", "as_json", is_flag=True, help="Print the result a
 _clock = functools.partial(
     click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
 )
+
+
+def _on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
+    """Give a command the options of a bus; it takes them as a `Connection` before its own."""
+
+    @functools.wraps(command)
+    def connect(
+        interface: str,
+        channel: str,
+        bitrate: int | None,
+        config: str,
+        profile: str | None,
+        dbc: Path | None,
+        **own: Any,
+    ) -> ExitCode:
+        from adacd_hil.cli.connection import Connection
+
+        return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
+
+    explained: Callable[..., None] = _explained(connect)
+    for option in (_dbc, _profile, _config, _bitrate, _channel, _interface):
+        explained = option(explained)
+    return explained
 
 
 @click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
@@ -211,6 +239,83 @@ def budget(
     found, notes, code = budgets.judge(dbc, config, period_us, bitrate, data_bitrate)
     print(json.dumps(budgets.as_json(found, notes), indent=2) if as_json else budgets.as_text(found, notes))
     return code
+
+
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option(
+    "--seconds", type=click.FloatRange(0.1, 600.0), default=1.5, show_default=True, help="How long to listen."
+)
+@_json
+def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
+    """Find the nodes on a bus: what they are, what they send, and whether that is the configured arm.
+
+    Sends SDO uploads only and changes no node's state. Exit status 5 when a node is missing or not the expected one.
+    """
+    from adacd_hil.cli.scan import as_text, scan_bus
+
+    result, code = scan_bus(connection, seconds)
+    print(json.dumps(result, indent=2) if as_json else as_text(result))
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option(
+    "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
+)
+@click.option(
+    "--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: nothing holds the arm."
+)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for a log; default: none.")
+@_json
+def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
+    """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
+
+    Below 0.90 the connection is not sufficient (exit status 1), below 0.95 there is a warning. The drives are not
+    enabled unless asked for.
+    """
+    from adacd_hil.cli.commtest import as_text, run_commtest
+
+    result, code = run_commtest(connection, seconds, is_enabling, out)
+    print(json.dumps(result, indent=2) if as_json else as_text(result))
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option("--move", "is_moving", is_flag=True, help="Ask for each joint to be moved by hand, to check its signs.")
+@_json
+def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode:
+    """Check host, bus and arm one by one, and say what to do about what is wrong. The drives are never enabled.
+
+    Exit status 1 when a check failed. Resets the nodes' communication and leaves them pre-operational; does neither
+    when it hears another master.
+    """
+    from adacd_hil.cli import doctor as command
+
+    findings, code = command.examine(connection, is_moving)
+    print(json.dumps(command.as_json(findings), indent=2) if as_json else command.as_text(findings))
+    return code
+
+
+@cli.command(epilog=EPILOG)
+@_on_bus
+@click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
+@click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
+@click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
+@_json
+def monitor(
+    connection: "Connection", node_id: int | None, once: bool, seconds: float | None, as_json: bool
+) -> ExitCode:
+    """Watch a bus: nodes, messages with rate, age, checks and values, load. Sends nothing.
+
+    Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
+    """
+    from adacd_hil.cli.monitor import PLAIN_S, watch
+
+    listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
+    return watch(connection, node_id, listened_s, listened_s is None, as_json)
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ ANSWER_TIMEOUT_S = 0.5
 """Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
 _SDO_ABORT = 0x80
+_ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index: CiA 301, table 22
 
 # canopen reports what it also raises; the raised form is ours to print.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -153,3 +154,14 @@ def explained(name: str, node_id: int, what: str) -> Iterator[None]:
         raise DeviceError(f"{name} (node {node_id}): no SDO answer within {ANSWER_TIMEOUT_S:g} s ({what})") from None
     except (SdoError, KeyError) as error:
         raise DeviceError(f"{name} (node {node_id}): {what}: {error}") from None
+
+
+def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:
+    """Read an object as the node sends it; None when the node has no such object. Raises DeviceError, BusError."""
+    with explained("node", node.id, f"object 0x{index:04X}:{subindex}"):
+        try:
+            return bytes(node.sdo.upload(index, subindex))
+        except SdoAbortedError as error:
+            if error.code not in _ABSENT:
+                raise
+            return None

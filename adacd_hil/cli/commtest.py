@@ -1,0 +1,227 @@
+"""Communication test: a while of cycles at zero torque, and a verdict on the connection."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.analysis.histogram import bar_chart, doubling_bins, percentiles
+from adacd_hil.cli.connection import Connection, on_interrupt
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.config import Settings, to_toml
+from adacd_hil.control.communication_test import CommunicationReport, CommunicationTest, Verdict
+from adacd_hil.control.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.network import Master
+from adacd_hil.log.channels import ChannelId, pack_cycle
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import CycleRecord, FaultReason
+from adacd_hil.scheduling import RealtimeGrant, freeze_garbage, request_realtime
+from adacd_hil.wire.bitrate import read_bitrates
+from adacd_hil.wire.bus import BusError
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.tap import Tap
+
+LOG_NAME = "commtest.mcap"
+_EXIT = {Verdict.GOOD: ExitCode.OK, Verdict.WARNING: ExitCode.OK, Verdict.NOT_SUFFICIENT: ExitCode.FAILURE}
+_FIRST_BIN_US = 10.0
+_BINS = 12
+
+
+def run_commtest(
+    connection: Connection, seconds: float, is_enabling: bool, out: Path | None
+) -> tuple[dict[str, Any], ExitCode]:
+    """Boot the arm, cycle at zero torque, judge. Exit code: FAILURE when the connection is not sufficient.
+
+    Raises ConfigError, CodecError, BusMissingError, LogError, CommandError.
+    """
+    settings, codec = connection.load()
+    clock = MonotonicClock()
+    with connection.bus(clock) as bus:
+        tap = Tap(bus, clock)
+        arm, master = Arm(settings, codec, tap), Master(settings, codec, tap)
+        _progress(f"looking for the arm on {bus.channel}")
+        try:
+            master.reset()
+            master.identify()
+            master.configure()
+        except DeviceError as error:
+            raise CommandError(str(error), ExitCode.BUS_MISSING) from None
+        boot_frames = tap.take()
+        grant = request_realtime()
+        for line in grant.missing:
+            _progress(f"not granted: {line}")
+        recorder = None if out is None else _open_log(out, settings, codec, connection, grant)
+        log_error = ""
+        try:
+            if recorder is not None:
+                recorder.cycle(clock.now_ns(), [], boot_frames)
+            loop = ZeroTorqueLoop(settings, tap, clock, arm, master, is_enabling)
+            test = CommunicationTest(settings, arm, *read_bitrates(codec))
+            _progress(f"testing for {seconds:g} s, drives {'enabled, torque zero' if is_enabling else 'not enabled'}")
+            fault = _run(loop, master, test, recorder, seconds)
+        finally:
+            if recorder is not None:
+                summary = recorder.close()
+                log_error = "" if summary.is_complete else summary.error or f"log lacks {summary.dropped} packets"
+    described = describe(test.report(), settings, grant.scheduler)
+    described |= {"fault": fault.name, "is_interrupted": loop.is_interrupted, "device_faults": arm.describe_faults()}
+    described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
+    if recorder is not None:
+        described |= {"log": str(recorder.path), "log_error": log_error}
+    return described, _exit_code(test.report(), fault, loop.is_interrupted, bool(log_error))
+
+
+def _run(
+    loop: ZeroTorqueLoop, master: Master, test: CommunicationTest, recorder: Recorder | None, seconds: float
+) -> FaultReason:
+    freeze_garbage()
+
+    def observe(cycle: ZeroTorqueCycle) -> None:
+        test.observe(cycle)
+        if recorder is not None:
+            recorder.cycle(cycle.state.t_ns, [(ChannelId.CYCLE, pack_cycle(_record(cycle, loop)))], cycle.frames)
+
+    with on_interrupt(loop.interrupt):
+        try:
+            master.start()
+            return loop.run(seconds, observe)
+        except BusError as error:
+            raise CommandError(str(error), ExitCode.SAFETY_STOP) from None
+        finally:
+            master.stop()
+
+
+def _record(cycle: ZeroTorqueCycle, loop: ZeroTorqueLoop) -> CycleRecord:
+    state = cycle.state
+    return CycleRecord(
+        cycle=state.cycle,
+        lateness_ns=cycle.lateness_ns,
+        feedback_ns=cycle.feedback_ns,
+        command_ns=cycle.command_ns,
+        overruns=loop.pacer.overruns,
+        frames_missing=sum(age != 0 for age in (*state.age_q, *state.age_tau_J)),
+    )
+
+
+def _exit_code(report: CommunicationReport, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
+    if fault is not FaultReason.NONE:
+        return ExitCode.SAFETY_STOP
+    if is_interrupted:
+        return ExitCode.INTERRUPTED
+    code = _EXIT[report.verdict]
+    return ExitCode.PARTIAL if code is ExitCode.OK and has_lost_log else code
+
+
+def _open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, grant: RealtimeGrant) -> Recorder:
+    out.mkdir(parents=True, exist_ok=True)
+    return Recorder(
+        out / LOG_NAME,
+        codec_path=codec.path,
+        attachments={codec.path.name: codec.text, "config.toml": to_toml(settings).encode()},
+        metadata={
+            "command": "commtest",
+            "config": settings.name,
+            "interface": connection.interface,
+            "channel": connection.channel,
+            "clock": "realtime",
+            "scheduler": grant.scheduler,
+            "period_us": str(settings.bus.period_us),
+        },
+        epoch_ns=wall_ns() - MonotonicClock().now_ns(),
+    )
+
+
+def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
+    """Put the report into plain values; times in µs."""
+    times_us = {
+        "sync_lateness": report.lateness_ns / 1000.0,
+        "sync_to_last_feedback": report.feedback_ns / 1000.0,
+        "sync_to_last_command": report.command_ns / 1000.0,
+    }
+    return {
+        "verdict": report.verdict.value,
+        "share": round(report.share, 6),
+        "cycles": report.cycles,
+        "complete": report.complete,
+        "overruns": report.overruns,
+        "period_us": settings.bus.period_us,
+        "scheduler": scheduler,
+        "load_percent": round(report.load_percent, 2),
+        "warnings": _warnings(report, scheduler),
+        "devices": {name: dataclasses.asdict(device) for name, device in report.devices.items()},
+        "times_us": {
+            name: {
+                "percentiles": percentiles(values),
+                "bins": [
+                    {"below": None if bound == float("inf") else bound, "count": count}
+                    for bound, count in doubling_bins(values, _FIRST_BIN_US, _BINS)
+                ],
+            }
+            for name, values in times_us.items()
+        },
+    }
+
+
+def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
+    """Say what makes the figures worth less."""
+    warnings = []
+    if not scheduler.startswith("SCHED_FIFO"):
+        warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
+    silent = [name for name, device in report.devices.items() if not any(device.ages)]
+    if silent:
+        warnings.append(f"never a cyclic frame from {', '.join(silent)}")
+    if report.overruns:
+        warnings.append(f"{report.overruns} of {report.periods} periods were skipped: this host was late")
+    return warnings
+
+
+def as_text(described: dict[str, Any]) -> str:
+    """Write the result for people."""
+    lines = [
+        f"cycles {described['cycles']}, complete {described['complete']}, overruns {described['overruns']}, "
+        f"period {described['period_us']} µs, {described['scheduler']}, bus load {described['load_percent']:.1f} %"
+    ]
+    for name, device in described["devices"].items():
+        checks = ", ".join(f"{count} {status}" for status, count in device["checks"].items() if count) or "no frame"
+        if not device["is_protected"]:
+            checks = f"unprotected, {device['checks'].get('IMPLAUSIBLE', 0)} implausible"
+        lines.append(f"{name}: fresh in {100.0 * device['share']:.2f} % of the periods; {checks}")
+    for name, device in described["devices"].items():
+        ages = device["ages"]
+        oldest = max((age for age, count in enumerate(ages) if count), default=0)
+        labels = [f"{age}" if age < len(ages) - 1 else f">= {age}" for age in range(oldest + 1)]
+        lines += ["", f"age of {name}, cycles"]
+        lines += bar_chart([*labels, "never"], [*ages[: oldest + 1], device["never"]])
+    for name, times in described["times_us"].items():
+        lines += ["", f"{name.replace('_', ' ')}, µs: " + _percentile_text(times["percentiles"])]
+        previous, labels = 0.0, []
+        for entry in times["bins"]:
+            labels.append(f">= {previous:g}" if entry["below"] is None else f"< {entry['below']:g}")
+            previous = entry["below"] or previous
+        lines += bar_chart(labels, [entry["count"] for entry in times["bins"]])
+    lines += ["", *_findings(described)]
+    return "\n".join(lines)
+
+
+def _percentile_text(found: dict[str, float]) -> str:
+    return ", ".join(f"{name} {value:.0f}" for name, value in found.items()) or "no value"
+
+
+def _findings(described: dict[str, Any]) -> list[str]:
+    lines = [f"warning: {line}" for line in described["warnings"]]
+    lines += [f"event: {line}" for line in described["events"]]
+    lines += [f"device: {line}" for line in described["device_faults"]]
+    if described["fault"] != FaultReason.NONE.name:
+        lines.append(f"stopped: {described['fault']}")
+    if described.get("log"):
+        lines.append(f"log: {described['log']}" + (f" ({described['log_error']})" if described["log_error"] else ""))
+    verdict, share = described["verdict"], 100.0 * described["share"]
+    lines.append(f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from 95 %)")
+    return lines
+
+
+def _progress(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

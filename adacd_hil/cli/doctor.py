@@ -1,0 +1,76 @@
+"""Doctor: checks the host, the bus and the arm one by one, each with a reason and a remedy."""
+
+import sys
+from typing import Any
+
+from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
+from adacd_hil.cli.exit_codes import ExitCode
+from adacd_hil.cli.table import format_table
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.control.arm_checks import ARM_CHECKS, ArmExamination
+from adacd_hil.control.diagnosis import Finding, Status, diagnose, summarise
+from adacd_hil.control.host_checks import HOST_CHECKS, Host
+from adacd_hil.scheduling import request_realtime
+from adacd_hil.wire.bitrate import read_bitrates
+from adacd_hil.wire.bus import open_bus
+from adacd_hil.wire.link import Link, read_link
+
+_MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", Status.SKIPPED: "skipped"}
+
+
+def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], ExitCode]:
+    """Run all checks; the drives stay disabled, the nodes end pre-operational. Exit code: FAILURE when one failed.
+
+    Raises ConfigError, CodecError.
+    """
+    settings, codec = connection.load()
+    bitrate, data_bitrate = read_bitrates(codec)
+    clock = MonotonicClock()
+
+    def link() -> Link | None:
+        return read_link(connection.channel) if connection.interface == "socketcan" else None
+
+    host = Host(connection.interface, connection.channel, link(), bitrate, data_bitrate, request_realtime)
+    findings = diagnose(HOST_CHECKS, host, _report)
+    patient = ArmExamination(
+        settings,
+        codec,
+        clock,
+        lambda: open_bus(connection.interface, connection.channel, clock, None, connection.bitrate),
+        link,
+        bitrate,
+        data_bitrate,
+    )
+    if is_moving and sys.stdin is not None and sys.stdin.isatty():
+        patient.ask = lambda line: print(f">>> {line}", file=sys.stderr, flush=True)
+    elif is_moving:
+        patient.no_move_reason = "nobody to ask: stdin is not a terminal"
+    try:
+        with on_interrupt(raise_interrupt):
+            findings += diagnose(ARM_CHECKS, patient, _report, findings)
+    finally:
+        trouble = patient.leave()
+    if trouble:
+        findings.append(Finding("end", Status.FAILED, f"nodes were not stopped: {trouble}", "cut the drives' power"))
+    has_failed = any(finding.status is Status.FAILED for finding in findings)
+    return findings, ExitCode.FAILURE if has_failed else ExitCode.OK
+
+
+def _report(finding: Finding) -> None:
+    print(f"{finding.name}: {finding.status.value}", file=sys.stderr, flush=True)
+
+
+def as_json(findings: list[Finding]) -> dict[str, Any]:
+    """Put the findings into plain values."""
+    checks = [finding._asdict() | {"status": finding.status.value} for finding in findings]
+    return {"checks": checks, "summary": summarise(findings)}
+
+
+def as_text(findings: list[Finding]) -> str:
+    """Write the findings for people: one line each, its remedy below."""
+    rows = []
+    for finding in findings:
+        rows.append((_MARKS[finding.status], finding.name, finding.reason))
+        if finding.remedy:
+            rows.append(("", "", f"-> {finding.remedy}"))
+    return f"{format_table(('', '', ''), rows)}\n\n{summarise(findings)}"

@@ -1,0 +1,208 @@
+"""Monitor: a live table of what is on the bus. Listens only."""
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from adacd_hil.cli.connection import Connection, on_interrupt
+from adacd_hil.cli.exit_codes import ExitCode
+from adacd_hil.cli.table import format_table
+from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.device.bus_view import BusView, MessageView, Snapshot
+from adacd_hil.wire.bitrate import read_bitrates
+from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.link import carried_frames, read_link
+from adacd_hil.wire.traffic import receive_until
+
+REDRAW_S = 0.2
+"""Of a terminal, 5 Hz: what the eye follows."""
+PLAIN_S = 1.0
+"""Between tables where there is no terminal."""
+_LINK_S = 1.0
+_HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
+
+
+class Screen:
+    """Where tables go: redrawn in place on a terminal, one after the other elsewhere."""
+
+    def __init__(self, is_terminal: bool, write: Callable[[str], None]) -> None:
+        self._is_terminal = is_terminal
+        self._write = write
+
+    @property
+    def redraw_s(self) -> float:
+        """Time between two tables."""
+        return REDRAW_S if self._is_terminal else PLAIN_S
+
+    def draw(self, text: str) -> None:
+        """Show a table, cut to the terminal; a full one comes at the end."""
+        if not self._is_terminal:
+            self._write(text + "\n\n")
+            return
+        columns, rows = shutil.get_terminal_size()
+        lines = [line[: columns - 1] + _CLEAR_LINE for line in text.splitlines()[: rows - 1]]
+        self._write(_HOME + "\n".join(lines) + "\n" + _CLEAR_BELOW)
+
+    def end(self, text: str) -> None:
+        """Show the last table."""
+        self._write((_HOME + _CLEAR_BELOW if self._is_terminal else "") + text + "\n")
+
+
+class Monitor:
+    """Feeds a view from a bus and describes it."""
+
+    def __init__(self, connection: Connection, bus: Bus, clock: Clock, node_id: int | None) -> None:
+        _, codec = connection.load()
+        self._bus, self._clock, self._node_id = bus, clock, node_id
+        self._link_name = connection.channel if connection.interface == "socketcan" else None
+        self._carried = self._count_carried()
+        self._view = BusView(codec, *read_bitrates(codec), clock.now_ns())
+        self._state = ""
+        self._state_ns = -round(_LINK_S * 1e9)
+        self.is_stopped = False
+
+    def stop(self) -> None:
+        """End the present `listen` soon. Safe in a signal handler."""
+        self.is_stopped = True
+
+    def listen(self, duration_s: float) -> None:
+        """Take in what comes for a while. Raises BusError."""
+        end_ns = self._clock.now_ns() + round(duration_s * 1e9)
+        accept: Callable[[Frame], None] = self._view.accept
+        while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
+            accept(frame)
+            if self.is_stopped:
+                return
+            while (waiting := self._bus.receive(0.0)) is not None:  # a batch, looking at the clock every so often
+                accept(waiting)
+                if self._view.frames % 256 == 0:
+                    break
+
+    def describe(self) -> dict[str, Any]:
+        """Put what has been seen into plain values."""
+        now_ns = self._clock.now_ns()
+        if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:
+            link = read_link(self._link_name)
+            self._state, self._state_ns = (link.state or link.kind) if link else "gone", now_ns
+        snapshot = self._view.snapshot(now_ns, self._node_id)
+        return _describe(snapshot) | {"bus_state": self._state, "not_processed": self._count_missed()}
+
+    def _count_carried(self) -> int | None:
+        return None if self._link_name is None else carried_frames(self._link_name)
+
+    def _count_missed(self) -> int | None:
+        """Count frames that the interface carried and this process has not seen: lost, or still waiting."""
+        now = self._count_carried()
+        return None if now is None or self._carried is None else max(0, now - self._carried - self._view.frames)
+
+
+def watch(connection: Connection, node_id: int | None, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
+    """Listen for `seconds` (None: until interrupted) and print; `is_live`: also on the way. Interrupted is OK.
+
+    Raises ConfigError, CodecError, BusMissingError, CommandError.
+    """
+    clock = MonotonicClock()
+    connection.load()  # what is wrong with the configuration comes before what is wrong with the bus
+    screen = Screen(sys.stdout.isatty() and is_live and not as_json, _write)
+    with connection.bus(clock) as bus:
+        monitor = Monitor(connection, bus, clock, node_id)
+        end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
+        with on_interrupt(monitor.stop):
+            if not is_live:
+                print(f"listening on {bus.channel}", file=sys.stderr, flush=True)
+            try:
+                while True:
+                    left_s = screen.redraw_s if end_ns is None else (end_ns - clock.now_ns()) * 1e-9
+                    monitor.listen(min(left_s, screen.redraw_s))
+                    if monitor.is_stopped or (end_ns is not None and clock.now_ns() >= end_ns):
+                        break
+                    if is_live and not as_json:
+                        screen.draw(as_text(monitor.describe()))
+            finally:  # a bus that fails leaves its last table, too
+                described = monitor.describe()
+                screen.end(json.dumps(described, indent=2) if as_json else as_text(described))
+    return ExitCode.OK
+
+
+def _write(text: str) -> None:
+    sys.stdout.write(text)
+    sys.stdout.flush()
+
+
+def _describe(snapshot: Snapshot) -> dict[str, Any]:
+    return {
+        "frames": snapshot.frames,
+        "error_frames": snapshot.error_frames,
+        "strange_frames": snapshot.strange_frames,
+        "load_percent": round(snapshot.load_percent, 2),
+        "nodes": [asdict(node) | {"age_s": round(node.age_s, 3)} for node in snapshot.nodes],
+        "messages": [_describe_message(message) for message in snapshot.messages],
+    }
+
+
+def _describe_message(message: MessageView) -> dict[str, Any]:
+    return {
+        "id": message.can_id,
+        "message": message.name,
+        "is_known": message.is_known,
+        "is_protected": message.is_protected,
+        "count": message.count,
+        "rate_Hz": round(message.rate_Hz, 1),
+        "age_s": round(message.age_s, 4),
+        "lost": message.lost,
+        "errors": message.errors,
+        "data": message.data.hex(),
+        "values": {name: value for name, value, _ in message.values},
+        "units": {name: unit for name, _, unit in message.values},
+    }
+
+
+def as_text(described: dict[str, Any]) -> str:
+    """Write the table for people."""
+    parts = [_head(described)]
+    if described["nodes"]:
+        rows = [
+            (str(node["node_id"]), node["name"], node["state"], f"{1000.0 * node['age_s']:.0f}")
+            for node in described["nodes"]
+        ]
+        parts.append(format_table(("node", "name", "state", "heartbeat ms ago"), rows, right=(0, 3)))
+    messages = described["messages"]
+    if messages:
+        head = ("id", "message", "Hz", "age ms", "lost", "bad", "values")
+        parts.append(format_table(head, [_row(message) for message in messages], right=(2, 3, 4, 5)))
+    else:
+        parts.append("nothing heard")
+    return "\n\n".join(parts)
+
+
+def _head(described: dict[str, Any]) -> str:
+    missed, strange = described["not_processed"], described["strange_frames"]
+    parts = [
+        f"load {described['load_percent']:.1f} %",
+        f"{described['frames']} frames",
+        f"{described['error_frames']} error frames",
+    ]
+    if strange:
+        parts.append(f"{strange} that a bus of the contract can't carry")
+    if missed is not None:
+        parts.append(f"{missed} not processed")
+    if described["bus_state"]:
+        parts.append(f"bus {described['bus_state']}")
+    return ", ".join(parts)
+
+
+def _row(message: dict[str, Any]) -> tuple[str, ...]:
+    values = message["values"]
+    text = ", ".join(f"{name} {value:g} {message['units'][name]}".rstrip() for name, value in values.items())
+    return (
+        f"0x{message['id']:03X}",
+        message["message"],
+        f"{message['rate_Hz']:.1f}",
+        f"{1000.0 * message['age_s']:.1f}",
+        str(message["lost"]) if message["is_protected"] else "-",
+        str(message["errors"]) if message["is_known"] else "-",
+        text or f"[{message['data']}]",
+    )

@@ -1,0 +1,386 @@
+"""Doctor's checks of the arm on its bus: who is there, whether they are as agreed, and what they measure at rest.
+
+The drives are never asked for more than Disable voltage. `ArmExamination.leave` puts the nodes back to pre-operational.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.clock import Clock
+from adacd_hil.config import Settings
+from adacd_hil.control.communication_test import CommunicationReport, CommunicationTest, Verdict
+from adacd_hil.control.diagnosis import Check, Outcome, failed, ok, skipped, warning
+from adacd_hil.control.hand_motion import HandMotion
+from adacd_hil.control.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.canopen_bus import read_object
+from adacd_hil.device.network import Master
+from adacd_hil.device.pdo_map import contract_differences, read_pdos
+from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, message_name, survey
+from adacd_hil.device.torque_sensor import SensorStatus
+from adacd_hil.records import JOINTS
+from adacd_hil.wire.bus import Bus, BusError
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.link import Link
+from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.traffic import Traffic, listen
+
+LISTEN_S = 0.5
+"""For other masters: five of the usual heartbeats of 100 ms."""
+HIGH_LOAD_PERCENT = 80.0
+"""Above this the worst case (stuff bits, a status and an SDO frame) does not fit a period."""
+_PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
+
+
+@dataclass
+class ArmExamination:
+    """What is examined, and what the checks have learnt so far.
+
+    open_bus: opens the bus, receiving everything. read_link: the interface's present state. ask: None when nobody can
+    move the arm, with the reason in `no_move_reason`; else tells the user what to do.
+    cycle_s: how long the cycle runs. move_s: how long the user has to move a joint.
+    """
+
+    settings: Settings
+    codec: Codec
+    clock: Clock
+    open_bus: Callable[[], Bus]
+    read_link: Callable[[], Link | None]
+    bitrate: int = 1_000_000
+    data_bitrate: int = 0
+    ask: Callable[[str], None] | None = None
+    no_move_reason: str = "give --move and move the joints when asked"
+    cycle_s: float = 1.0
+    move_s: float = 15.0
+    _tap: Tap | None = None
+    _bus: Bus | None = None
+    _loop: ZeroTorqueLoop | None = None
+    _has_reset: bool = False
+    cycles: list[ZeroTorqueCycle] = field(default_factory=list)
+    traffic: Traffic = field(default_factory=Traffic)
+
+    def connect(self) -> None:
+        """Open the bus and put arm and master on it. Raises BusMissingError."""
+        self._bus = self.open_bus()
+        self._tap = Tap(self._bus, self.clock)
+        self.arm = Arm(self.settings, self.codec, self._tap)
+        self.master = Master(self.settings, self.codec, self._tap)
+
+    @property
+    def tap(self) -> Tap:
+        """The open bus."""
+        assert self._tap is not None
+        return self._tap
+
+    @property
+    def loop(self) -> ZeroTorqueLoop:
+        """The loop of this examination; its cycles count on."""
+        if self._loop is None:
+            self._loop = ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
+        return self._loop
+
+    def reset(self) -> None:
+        """Reset the nodes' communication; from here on they have to be left safe. Raises DeviceError, BusError."""
+        self._has_reset = True
+        self.master.reset()
+
+    def leave(self) -> str:
+        """Put the nodes back to pre-operational and close the bus; returns what went wrong, "" when nothing did."""
+        trouble = ""
+        if self._has_reset:
+            try:
+                self.master.stop()
+            except BusError as error:
+                trouble = str(error)
+        if self._bus is not None:
+            with suppress(BusError):
+                self._bus.close()
+        return trouble
+
+    def communication(self) -> CommunicationReport:
+        """Judge the connection by the cycles so far."""
+        test = CommunicationTest(self.settings, self.arm, self.bitrate, self.data_bitrate)
+        for cycle in self.cycles:
+            test.observe(cycle)
+        return test.report()
+
+    def joint_values(self, name: str) -> NDArray[np.float64]:
+        """Return q, dq or tau_J of the cycles with complete data, (n, 2)."""
+        values = [getattr(cycle.state, name) for cycle in self.cycles if cycle.state.is_complete]
+        return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
+
+
+def check_bus(patient: ArmExamination) -> Outcome:
+    """Check that the bus opens."""
+    patient.connect()
+    return ok(f"{patient.tap.channel} is open")
+
+
+def check_other_masters(patient: ArmExamination) -> Outcome:
+    """Check that nobody else plays the host."""
+    traffic = Traffic()
+    listen(patient.tap, patient.clock, LISTEN_S, traffic)
+    patient.tap.take()
+    host_ids = {message.can_id for message in patient.codec.messages.values() if "HOST" in message.senders}
+    heard = [message_name(patient.codec, can_id) for can_id in sorted(host_ids & traffic.talks.keys())]
+    if heard:
+        return failed(f"somebody else sends {', '.join(heard)}", "end the other program; an arm has one master")
+    return ok(f"none in {LISTEN_S:g} s; {len(traffic.talks)} identifiers heard, {traffic.error_frames} error frames")
+
+
+def check_nodes(patient: ArmExamination) -> Outcome:
+    """Check that the expected nodes are there, with the expected identity."""
+    expected = expected_nodes(patient.master.nodes)
+    found = survey(patient.tap, patient.clock, 0.0)
+    verdicts = compare(found, expected)
+    wrong = [f"node {node}: {text}" for node, text in verdicts.items() if text not in ("", "unexpected")]
+    if wrong:
+        return failed("; ".join(wrong), "check power, wiring, node id (0x100B or the maker's tool) and configuration")
+    strangers = [str(node) for node, text in verdicts.items() if text]
+    if strangers:
+        return warning(f"node {', '.join(strangers)} is not in the configuration", "take it off the bus if it can be")
+    return ok(", ".join(f"{node.name} (node {node.node_id})" for node in expected))
+
+
+def check_boot(patient: ArmExamination) -> Outcome:
+    """Check that each node boots after a reset of communication."""
+    patient.reset()
+    return ok("all nodes booted after a reset of communication")
+
+
+def check_contract(patient: ArmExamination) -> Outcome:
+    """Check that host and devices are made for the same contract."""
+    codec = patient.codec
+    lacking = []
+    for name, node in patient.master.nodes.items():
+        version, digest = read_object(node, 0x2000, 1), read_object(node, 0x2000, 2)
+        if version is None or digest is None:
+            lacking.append(name)
+            continue
+        pair = int.from_bytes(version, "little"), int.from_bytes(digest, "little")
+        if pair != (codec.wire_version, codec.layout_digest):
+            return failed(
+                f"{name}: wire version {pair[0]}, layout digest 0x{pair[1]:08X}; the DBC's are "
+                f"{codec.wire_version}, 0x{codec.layout_digest:08X}",
+                "give host and devices the same DBC file",
+            )
+    if lacking:
+        return skipped(f"{', '.join(lacking)} has no contract object 0x2000; the PDO map is compared instead")
+    return ok(f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}")
+
+
+def check_set_up(patient: ArmExamination) -> Outcome:
+    """Check that the nodes take identity check and set-up as a run does them."""
+    patient.master.identify()
+    patient.master.configure()
+    return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")
+
+
+def check_pdo_map(patient: ArmExamination) -> Outcome:
+    """Check that the PDOs that the devices have configured are those of the contract."""
+    lines = []
+    for name, node in patient.master.nodes.items():
+        lines += [f"{name}: {line}" for line in contract_differences(patient.codec, node.id, read_pdos(node))]
+    if lines:
+        return failed("; ".join(lines), "choose the contract that the devices have, or map their PDOs by its layout")
+    return ok("read back, equal to the contract")
+
+
+def check_protection(patient: ArmExamination) -> Outcome:
+    """List the cyclic frames that carry no end-to-end header."""
+    names = [
+        message.name
+        for message in patient.codec.messages.values()
+        if message.can_id & 0x780 in _PDOS and not message.is_protected
+    ]
+    if names:
+        return warning(
+            f"unprotected: {', '.join(names)}",
+            "plausibility alone guards them; a CAN FD contract has room for a header in every frame",
+        )
+    return ok("every cyclic frame has an end-to-end header")
+
+
+def check_cycle(patient: ArmExamination) -> Outcome:
+    """Run cycles at the period, drives not enabled."""
+    patient.tap.take()
+    patient.master.start()
+    patient.loop.run(patient.cycle_s, patient.cycles.append)
+    for cycle in patient.cycles:
+        for is_sent, frame in cycle.frames:
+            if not is_sent:
+                patient.traffic.accept(frame)
+    return ok(f"{len(patient.cycles)} cycles, torque zero, drives not enabled")
+
+
+def check_rate(patient: ArmExamination) -> Outcome:
+    """Check that SYNC and feedback keep the period."""
+    report = patient.communication()
+    elapsed_s = report.periods * patient.settings.bus.period_s
+    rates = ", ".join(
+        f"{name} {device.share * report.periods / elapsed_s:.0f}/s" for name, device in report.devices.items()
+    )
+    text = (
+        f"SYNC {report.cycles / elapsed_s:.0f}/s of {1e6 / patient.settings.bus.period_us:.0f}, {rates}; "
+        f"{100.0 * report.share:.1f} % of the periods complete, {report.overruns} skipped"
+    )
+    remedy = (
+        "`adacd-hil commtest` shows what is late; see `scheduler` and `preemption`, or choose a longer bus.period_us"
+    )
+    if report.verdict is Verdict.NOT_SUFFICIENT:
+        return failed(text, remedy)
+    return warning(text, remedy) if report.verdict is Verdict.WARNING else ok(text)
+
+
+def check_load(patient: ArmExamination) -> Outcome:
+    """Check that the bus has room for what is not cyclic."""
+    load = patient.communication().load_percent
+    text = f"{load:.1f} % at {patient.bitrate} bit/s"
+    if load > HIGH_LOAD_PERCENT:
+        return warning(text, "choose a longer bus.period_us or CAN FD; `adacd-hil budget` shows what takes the time")
+    return ok(text)
+
+
+def check_heartbeats(patient: ArmExamination) -> Outcome:
+    """Check that each node says that it lives and is operational."""
+    expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
+    silent, odd, slow = [], [], []
+    for name, node in patient.master.nodes.items():
+        talk = patient.traffic.talks.get(0x700 + node.id)
+        if talk is None:
+            silent.append(name)
+        elif talk.data != b"\x05":
+            odd.append(f"{name} is {NMT_STATES.get(talk.data[0] & 0x7F if talk.data else -1, 'in an unknown state')}")
+        elif talk.rate_Hz is not None and talk.rate_Hz < expected_Hz / 1.5:
+            slow.append(f"{name} {talk.rate_Hz:.1f}/s")
+    if silent:
+        return failed(f"no heartbeat from {', '.join(silent)}", "the node must produce 0x1017; is it still powered?")
+    if odd:
+        return failed(f"{', '.join(odd)}, after NMT start", "see the node's EMCY and its manual")
+    if slow:
+        return warning(
+            f"slower than {expected_Hz:g}/s: {', '.join(slow)}", "a loaded bus delays heartbeats: see `load`"
+        )
+    return ok(f"all operational, every {patient.settings.bus.heartbeat_ms} ms")
+
+
+def check_devices(patient: ArmExamination) -> Outcome:
+    """Check that no drive is in fault, no device reports an error."""
+    lines = [line for line in patient.arm.describe_faults() if ": status" not in line]
+    events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
+    if lines or events:
+        return warning("; ".join([*lines, *events]), "a run resets the fault if its cause has gone")
+    return ok("no fault, no EMCY")
+
+
+def check_saturation(patient: ArmExamination) -> Outcome:
+    """Check that no sensor is saturated or invalid."""
+    told = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
+    text = ", ".join(f"{name} {status!r}" for name, status in told.items())
+    if any(status & SensorStatus.NOT_VALID for status in told.values()):
+        return failed(text, "see the sensor's EMCY; check its cable to the strain gauge")
+    if told:
+        return failed(text, "take the load off the joint; the arm must hang free")
+    return ok("within range")
+
+
+def check_rest(patient: ArmExamination) -> Outcome:
+    """Check that the arm stands still with its drives off."""
+    dq = patient.joint_values("dq")
+    if not len(dq):
+        return skipped("no complete cycle")
+    fastest = np.abs(dq).max(axis=0)
+    bound = patient.settings.safety.rest_velocity_rad_s
+    text = ", ".join(f"joint {joint + 1} up to {fastest[joint]:.4f} rad/s" for joint in range(JOINTS))
+    if np.any(fastest > bound):
+        return failed(f"{text}, above {bound:g}", "let the arm come to rest and keep hands off")
+    return ok(text)
+
+
+def check_torque_zero(patient: ArmExamination) -> Outcome:
+    """Check that the torque at rest is near zero."""
+    tau_J = patient.joint_values("tau_J")
+    if not len(tau_J):
+        return skipped("no complete cycle")
+    mean = tau_J.mean(axis=0)
+    bound = patient.settings.safety.rest_torque_Nm
+    text = ", ".join(f"joint {joint + 1} {mean[joint]:+.4f} Nm" for joint in range(JOINTS))
+    remedy = "let the arm hang free, then `adacd-hil tare`"
+    if np.any(np.abs(mean) > bound):
+        return failed(f"{text}, above {bound:g}", remedy)
+    if np.any(np.abs(mean) > patient.settings.detector.threshold_Nm):
+        return warning(f"{text}: more than the detection threshold", remedy)
+    return ok(text)
+
+
+def check_noise(patient: ArmExamination) -> Outcome:
+    """Check that the torque signal is alive and quiet."""
+    tau_J = patient.joint_values("tau_J")
+    if len(tau_J) < 2:
+        return skipped("no complete cycles")
+    spread = tau_J.std(axis=0)
+    text = ", ".join(f"joint {joint + 1} {1000.0 * spread[joint]:.3f} mNm rms" for joint in range(JOINTS))
+    if np.any(np.ptp(tau_J, axis=0) == 0.0):
+        return warning(f"{text}: a value that never changes", "check the cable to the strain gauge")
+    if np.any(spread > np.array(patient.settings.detector.threshold_Nm) / 3.0):
+        return warning(
+            f"{text}: three of it exceed the detection threshold", "check shield and ground; move drive cables away"
+        )
+    return ok(text)
+
+
+def check_bus_errors(patient: ArmExamination) -> Outcome:
+    """Check that the bus stayed without errors while the cycle ran."""
+    link = patient.read_link()
+    errors = patient.traffic.error_frames
+    counters = ""
+    if link is not None and link.state is not None:
+        counters = f", {link.state}, error counters rx {link.rx_errors or 0}, tx {link.tx_errors or 0}"
+    if errors or (link is not None and link.state not in (None, "ERROR-ACTIVE")):
+        return warning(f"{errors} error frames{counters}", "check wiring, termination and bit rate")
+    return ok(f"no error frame{counters}")
+
+
+def _check_joint(joint: int) -> Callable[[ArmExamination], Outcome]:
+    def check(patient: ArmExamination) -> Outcome:
+        if patient.ask is None:
+            return skipped(patient.no_move_reason)
+        tau_J = patient.joint_values("tau_J")
+        if not len(tau_J):
+            return skipped("no complete cycle")
+        motion = HandMotion(joint, tau_J.mean(axis=0))
+        patient.ask(
+            f"move joint {joint + 1} by hand toward +q, at least {motion.WANTED_DEG:g} degrees, "
+            f"within {patient.move_s:g} s"
+        )
+        patient.loop.run(patient.move_s, motion.observe, lambda: motion.is_done)
+        return motion.judge()
+
+    return check
+
+
+ARM_CHECKS: tuple[Check[ArmExamination], ...] = (
+    Check("bus", check_bus, ("kernel", "interface", "controller")),
+    Check("other masters", check_other_masters, ("bus",)),
+    Check("nodes", check_nodes, ("bus", "other masters")),
+    Check("boot", check_boot, ("bus", "other masters", "nodes")),
+    Check("contract", check_contract, ("boot",)),
+    Check("set-up", check_set_up, ("boot", "contract")),
+    Check("PDO map", check_pdo_map, ("boot", "set-up")),
+    Check("protection", check_protection),
+    Check("cycle", check_cycle, ("boot", "contract", "set-up", "PDO map")),
+    Check("rate", check_rate, ("cycle",)),
+    Check("load", check_load, ("cycle",)),
+    Check("heartbeat", check_heartbeats, ("cycle",)),
+    Check("devices", check_devices, ("cycle",)),
+    Check("saturation", check_saturation, ("cycle",)),
+    Check("rest", check_rest, ("cycle",)),
+    Check("torque zero", check_torque_zero, ("cycle", "rest", "saturation")),
+    Check("torque noise", check_noise, ("cycle", "rest", "saturation")),
+    Check("bus errors", check_bus_errors, ("cycle",)),
+    *(Check(f"joint {joint + 1}", _check_joint(joint), ("cycle", "rest")) for joint in range(JOINTS)),
+)

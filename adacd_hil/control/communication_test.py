@@ -1,0 +1,157 @@
+"""The communication test: whether every cycle brings complete fresh data, and how late each part of it is.
+
+Judged as libfranka's `examples/communication_test.cpp` does by its success rate: below 0.90 the connection isn't
+sufficient, below 0.95 it is poor. A period that was skipped counts as one without data.
+"""
+
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.config import Settings
+from adacd_hil.control.zero_torque import ZeroTorqueCycle
+from adacd_hil.device.arm import Arm
+from adacd_hil.records import JOINTS
+from adacd_hil.wire.load import LoadMeter
+
+SUFFICIENT_SHARE = 0.90
+GOOD_SHARE = 0.95
+OLDEST_CYCLES = 10
+"""Ages from here on are one bin."""
+_LOAD_CYCLES = 1000
+"""Cycles at the end of the test whose frames make the bus load."""
+
+
+class Verdict(Enum):
+    """What the share of complete cycles says."""
+
+    GOOD = "good"
+    WARNING = "warning"
+    NOT_SUFFICIENT = "not sufficient"
+
+
+def judge(share: float) -> Verdict:
+    """Judge the share of cycles with complete fresh data, 0…1."""
+    if share < SUFFICIENT_SHARE:
+        return Verdict.NOT_SUFFICIENT
+    return Verdict.WARNING if share < GOOD_SHARE else Verdict.GOOD
+
+
+@dataclass(frozen=True)
+class DeviceReport:
+    """One device: share of periods with a fresh value, and how often each age occurred, in cycles.
+
+    checks: what its frames' checks found, by name. never: cycles before its first frame.
+    """
+
+    share: float
+    ages: list[int]
+    never: int
+    checks: dict[str, int]
+    is_protected: bool
+
+
+@dataclass(frozen=True)
+class CommunicationReport:
+    """What the test measured. Times in ns, one per cycle; `feedback_ns` of complete cycles only. load: percent."""
+
+    cycles: int
+    overruns: int
+    complete: int
+    devices: dict[str, DeviceReport]
+    lateness_ns: NDArray[np.int64]
+    feedback_ns: NDArray[np.int64]
+    command_ns: NDArray[np.int64]
+    load_percent: float
+
+    @property
+    def periods(self) -> int:
+        """Periods that passed, with those that were skipped."""
+        return self.cycles + self.overruns
+
+    @property
+    def share(self) -> float:
+        """Share of the periods that brought complete fresh data; 0 when there was none."""
+        return self.complete / self.periods if self.periods else 0.0
+
+    @property
+    def verdict(self) -> Verdict:
+        """What this share says."""
+        return judge(self.share)
+
+
+@dataclass
+class CommunicationTest:
+    """Collects the cycles of a test: give `observe` to the loop, then ask for the `report`."""
+
+    settings: Settings
+    arm: Arm
+    bitrate: int
+    data_bitrate: int = 0
+    _lateness: list[int] = field(default_factory=list)
+    _feedback: list[int] = field(default_factory=list)
+    _command: list[int] = field(default_factory=list)
+    _ages: list[tuple[int, ...]] = field(default_factory=list)
+    _recent: deque[ZeroTorqueCycle] = field(default_factory=lambda: deque(maxlen=_LOAD_CYCLES))
+    _overruns: int = 0
+
+    def observe(self, cycle: ZeroTorqueCycle) -> None:
+        """Take in one cycle."""
+        state = cycle.state
+        self._lateness.append(cycle.lateness_ns)
+        self._command.append(cycle.command_ns)
+        if state.is_complete:
+            self._feedback.append(cycle.feedback_ns)
+        self._ages.append((*state.age_q, *state.age_tau_J))
+        if len(self._ages) > 1:  # what is skipped before the first cycle isn't the test's
+            self._overruns += state.periods - 1
+        self._recent.append(cycle)
+
+    def report(self) -> CommunicationReport:
+        """Sum up what was observed."""
+        cycles = len(self._ages)
+        ages = np.array(self._ages, dtype=np.int64).reshape(cycles, 2 * JOINTS)
+        periods = cycles + self._overruns
+        names = [drive.name for drive in self.arm.drives] + [sensor.name for sensor in self.arm.sensors]
+        return CommunicationReport(
+            cycles=cycles,
+            overruns=self._overruns,
+            complete=len(self._feedback),
+            devices={name: self._device(ages[:, place], periods, place) for place, name in enumerate(names)},
+            lateness_ns=np.array(self._lateness, dtype=np.int64),
+            feedback_ns=np.array(self._feedback, dtype=np.int64),
+            command_ns=np.array(self._command, dtype=np.int64),
+            load_percent=self._load_percent(),
+        )
+
+    def _device(self, ages: NDArray[np.int64], periods: int, place: int) -> DeviceReport:
+        seen = ages[np.cumsum(ages == 0) > 0]
+        counts = np.bincount(np.minimum(seen, OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
+        if place < JOINTS:
+            drive = self.arm.drives[place]
+            checks, is_protected = {"IMPLAUSIBLE": drive.implausible_frames}, drive.feedback_message.is_protected
+        else:
+            sensor = self.arm.sensors[place - JOINTS]
+            checks = {status.name: count for status, count in sensor.end_to_end.tally()}
+            is_protected = sensor.torque_message.is_protected
+        fresh = int(np.count_nonzero(ages == 0))
+        return DeviceReport(
+            share=fresh / periods if periods else 0.0,
+            ages=counts.tolist(),
+            never=len(ages) - len(seen),
+            checks=checks,
+            is_protected=is_protected,
+        )
+
+    def _load_percent(self) -> float:
+        meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
+        for cycle in self._recent:
+            for _, frame in cycle.frames:
+                with suppress(ValueError):  # a stranger's, of a length that the contract's bus can't carry
+                    meter.add(frame)
+        periods = sum(cycle.state.periods for cycle in self._recent)
+        return meter.take(periods * self.settings.bus.period_ns).percent

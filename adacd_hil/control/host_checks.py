@@ -1,0 +1,227 @@
+"""Doctor's checks of the host: kernel, CAN interface, permissions, scheduler."""
+
+import errno
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from adacd_hil.control.diagnosis import Check, Outcome, failed, ok, skipped, warning
+from adacd_hil.scheduling import RealtimeGrant
+from adacd_hil.wire.bus import can_interfaces
+from adacd_hil.wire.link import MTU_FD, Link
+
+QUEUE_FRAMES = 10
+"""txqueuelen to have: the kernel's default, three cycles' worth of a cycle's three frames."""
+LONG_QUEUE_FRAMES = 100
+"""From here on a dead bus keeps over 30 cycles of old commands for when it comes back."""
+_SAMPLE_POINT = (0.70, 0.90)
+"""CiA 301 table 1 recommends 87.5 %; 70 to 90 % works with it on the short bus of an arm."""
+_CAP_NET_ADMIN = 12
+
+
+@dataclass(frozen=True)
+class Host:
+    """What is examined. `link`: None when there is no such CAN interface. `root`: where /proc and /sys are."""
+
+    interface: str
+    channel: str
+    link: Link | None
+    bitrate: int
+    data_bitrate: int
+    request_realtime: Callable[[], RealtimeGrant]
+    root: Path = Path("/")
+
+    @property
+    def is_socketcan(self) -> bool:
+        """Whether the kernel carries the frames."""
+        return self.interface == "socketcan"
+
+
+def check_kernel(host: Host) -> Outcome:
+    """Check that SocketCAN is there and lets us in."""
+    if not host.is_socketcan:
+        return skipped(f"interface {host.interface} does not use the kernel's CAN")
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError as error:
+        if error.errno == errno.EAFNOSUPPORT:
+            return failed(
+                "this kernel has no SocketCAN", "modprobe can-raw; for a trial, tools/with-vcan brings its own"
+            )
+        return failed(f"no raw CAN socket: {error.strerror}", "modprobe can-raw, or allow raw sockets (CAP_NET_RAW)")
+    return ok("SocketCAN, raw sockets allowed")
+
+
+def check_interface(host: Host) -> Outcome:
+    """Check that the interface exists and is up."""
+    if not host.is_socketcan:
+        return skipped(f"interface {host.interface} is python-can's own")
+    name, link = host.channel, host.link
+    if link is None:
+        present = ", ".join(can_interfaces()) or "none"
+        return failed(f"{name} is no CAN interface; present: {present}", "plug the adapter in, or name another with -c")
+    if not link.is_up:
+        return failed(f"{name} is down", f"ip link set {name} up type can bitrate {host.bitrate}")
+    if link.is_virtual:
+        return ok(f"{name} is up, {link.kind}: virtual, without bit rate and arbitration")
+    return ok(f"{name} is up, hardware" + (f" ({link.kind})" if link.kind else ""))
+
+
+def _with_hardware(check: Callable[[Host, Link], Outcome]) -> Callable[[Host], Outcome]:
+    """Skip a check that says nothing of a virtual bus."""
+
+    def run(host: Host) -> Outcome:
+        if host.link is None:
+            return skipped("no SocketCAN interface")
+        if host.link.is_virtual:
+            return skipped(f"{host.link.kind} has none")
+        return check(host, host.link)
+
+    return run
+
+
+def check_bitrate(host: Host, link: Link) -> Outcome:
+    """Check that the bit rates are the contract's."""
+    if link.bitrate is None:
+        return skipped("the kernel does not tell it here; install iproute2")
+    remedy = f"ip link set {link.name} down; ip link set {link.name} up type can bitrate {host.bitrate}"
+    if host.data_bitrate:
+        remedy += f" dbitrate {host.data_bitrate} fd on"
+    if link.bitrate != host.bitrate:
+        return failed(f"{link.bitrate} bit/s, the contract has {host.bitrate}", remedy)
+    if host.data_bitrate and link.data_bitrate != host.data_bitrate:
+        return failed(f"data phase {link.data_bitrate or 0} bit/s, the contract has {host.data_bitrate}", remedy)
+    return ok(f"{link.bitrate} bit/s" + (f", data phase {link.data_bitrate}" if host.data_bitrate else ""))
+
+
+def check_sample_point(_host: Host, link: Link) -> Outcome:
+    """Check that the sample point suits the devices'."""
+    if link.sample_point is None:
+        return skipped("the kernel does not tell it here; install iproute2")
+    text = f"{100.0 * link.sample_point:.1f} %"
+    low, high = _SAMPLE_POINT
+    if not low <= link.sample_point <= high:
+        return warning(f"{text} is outside {low:.0%} to {high:.0%}", "add `sample-point 0.875` to `ip link set`")
+    return ok(text)
+
+
+def check_restart(_host: Host, link: Link) -> Outcome:
+    """Check what happens after bus-off."""
+    if link.restart_ms is None:
+        return skipped("the kernel does not tell it here; install iproute2")
+    if link.restart_ms == 0:
+        return warning(
+            "off: after bus-off the interface stays silent",
+            f"`ip link set {link.name} type can restart-ms 100`, or restart it by hand when that happens",
+        )
+    return ok(f"{link.restart_ms} ms after bus-off")
+
+
+def check_controller(_host: Host, link: Link) -> Outcome:
+    """Check that the controller takes part in the bus."""
+    if link.state is None:
+        return skipped("the kernel does not tell it here; install iproute2")
+    counters = f"{link.state}, error counters rx {link.rx_errors or 0}, tx {link.tx_errors or 0}"
+    if link.state == "BUS-OFF":
+        return failed(counters, f"find the cause, then `ip link set {link.name} type can restart`")
+    if link.state != "ERROR-ACTIVE":
+        return warning(counters, "check wiring, termination (60 ohm between CAN_H and CAN_L) and bit rate")
+    return ok(counters)
+
+
+def check_queue(host: Host) -> Outcome:
+    """Check that the transmit queue holds no more than what is worth sending."""
+    if host.link is None:
+        return skipped("no SocketCAN interface")
+    length, name = host.link.txqueuelen, host.link.name
+    if host.link.qdisc == "noqueue":
+        return ok(f"no queue (qdisc noqueue; txqueuelen {length})")
+    if length >= LONG_QUEUE_FRAMES:
+        return warning(
+            f"txqueuelen {length}: when the bus dies, up to {length} old commands wait for it to come back",
+            f"ip link set {name} txqueuelen {QUEUE_FRAMES}",
+        )
+    return ok(f"txqueuelen {length}")
+
+
+def check_mtu(host: Host) -> Outcome:
+    """Check that CAN FD frames fit, where the contract has some."""
+    if host.link is None:
+        return skipped("no SocketCAN interface")
+    if not host.data_bitrate:
+        return ok(f"{host.link.mtu}, classic frames fit")
+    if host.link.mtu < MTU_FD:
+        return failed(f"{host.link.mtu}: no CAN FD frames", f"ip link set {host.link.name} mtu {MTU_FD}, or `fd on`")
+    return ok(f"{host.link.mtu}, CAN FD frames fit")
+
+
+def check_permissions(host: Host) -> Outcome:
+    """Check that this process may empty the interface's queue after a fault."""
+    if not host.is_socketcan:
+        return skipped(f"interface {host.interface} has no queue in the kernel")
+    try:
+        status = (host.root / "proc/self/status").read_text()
+        effective = int(next(line for line in status.splitlines() if line.startswith("CapEff:")).split()[1], 16)
+    except (OSError, StopIteration, ValueError):
+        return skipped("/proc does not tell")
+    if not effective >> _CAP_NET_ADMIN & 1:
+        return warning(
+            "without CAP_NET_ADMIN: the interface's queue can't be emptied after a fault",
+            "run as root, or with ambient CAP_NET_ADMIN (capsh, systemd AmbientCapabilities)",
+        )
+    return ok("CAP_NET_ADMIN: the interface's queue can be emptied")
+
+
+def check_scheduler(host: Host) -> Outcome:
+    """Check that real-time priority and locked memory are granted."""
+    grant = host.request_realtime()
+    if grant.missing:
+        reasons, remedies = zip(*(line.split("; ", 1) for line in grant.missing), strict=True)
+        return warning(f"not granted: {', '.join(reasons)}", "; ".join(remedies))
+    return ok(f"{grant.scheduler}, memory locked")
+
+
+def check_preemption(host: Host) -> Outcome:
+    """Check that the kernel wakes a real-time process in time."""
+    version = _read(host.root / "proc/version")
+    if _read(host.root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
+        return ok("PREEMPT_RT")
+    kind = "PREEMPT" if "PREEMPT" in version else "no preemption named"
+    return warning(f"{kind}: single cycles can be late by milliseconds", "install a PREEMPT_RT kernel (linux-image-rt)")
+
+
+def check_processor(host: Host) -> Outcome:
+    """Check that the processor's clock is steady, and say which processors are isolated."""
+    folder = host.root / "sys/devices/system/cpu"
+    isolated = _read(folder / "isolated") or "none"
+    governors = sorted({_read(path) for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor")})
+    if not governors:
+        return skipped(f"no frequency scaling to look at; isolated processors: {isolated}")
+    text = f"governor {', '.join(governors)}; isolated processors: {isolated}"
+    if governors != ["performance"]:
+        return warning(text, "cpupower frequency-set -g performance")
+    return ok(text)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""
+
+
+HOST_CHECKS: tuple[Check[Host], ...] = (
+    Check("kernel", check_kernel),
+    Check("interface", check_interface, ("kernel",)),
+    Check("bit rate", _with_hardware(check_bitrate), ("interface",)),
+    Check("sample point", _with_hardware(check_sample_point), ("interface",)),
+    Check("restart", _with_hardware(check_restart), ("interface",)),
+    Check("controller", _with_hardware(check_controller), ("interface",)),
+    Check("queue", check_queue, ("interface",)),
+    Check("mtu", check_mtu, ("interface",)),
+    Check("permissions", check_permissions),
+    Check("scheduler", check_scheduler),
+    Check("preemption", check_preemption),
+    Check("processor", check_processor),
+)

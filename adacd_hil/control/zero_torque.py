@@ -1,0 +1,109 @@
+"""A loop of zero torque on the fixed grid: SYNC, receive, write zero; for tests of the connection."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from adacd_hil.clock import Clock
+from adacd_hil.config import Settings
+from adacd_hil.control.gate import Gate
+from adacd_hil.control.realtime import FEEDBACK_SHARE, GridPacer
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.network import Master
+from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.tap import Tap
+
+DISABLE_CYCLES = 20
+"""Cycles of disabling at the end; drives need two."""
+
+
+class ZeroTorqueCycle(NamedTuple):
+    """How one cycle went; times in ns. feedback_ns: SYNC to the last cyclic frame, -1 when not all came."""
+
+    state: ArmState
+    lateness_ns: int
+    feedback_ns: int
+    command_ns: int
+    frames: list[tuple[bool, Frame]]
+
+
+class ZeroTorqueLoop:
+    """Cycles of an arm that has been started. `is_enabling`: the drives are asked to enable, with zero torque."""
+
+    def __init__(
+        self, settings: Settings, bus: Tap, clock: Clock, arm: Arm, master: Master, is_enabling: bool = False
+    ) -> None:
+        self.pacer = GridPacer(clock, settings.bus.period_ns)
+        self._clock = clock
+        self._bus, self._arm, self._master = bus, arm, master
+        self._is_enabling = is_enabling
+        self._is_interrupted = False
+        self._patience_ns = round(FEEDBACK_SHARE * settings.bus.period_ns)
+        self._heartbeat_cycles = max(1, settings.bus.heartbeat_ms * 1000 // settings.bus.period_us)
+        self._max_age_cycles = settings.bus.max_age_cycles
+        self._gate = Gate(settings.arm, settings.bus.period_s)
+        self._tau_d, self._tau_c = np.zeros(JOINTS), np.zeros(JOINTS)
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether somebody asked for the end."""
+        return self._is_interrupted
+
+    def interrupt(self) -> None:
+        """End after the present cycle. Safe in a signal handler."""
+        self._is_interrupted = True
+
+    def run(
+        self,
+        duration_s: float,
+        observe: Callable[[ZeroTorqueCycle], None],
+        is_over: Callable[[], bool] = lambda: False,
+    ) -> FaultReason:
+        """Cycle for a while, then disable the drives; returns what a device faulted with. Raises BusError."""
+        end_ns = self._clock.now_ns() + round(duration_s * 1e9)
+        fault = FaultReason.NONE
+        while self._clock.now_ns() < end_ns and not (self._is_interrupted or is_over() or fault):
+            cycle = self._cycle(self._is_enabling, quick_stop=False)
+            fault = self._fault(cycle.state)
+            observe(cycle)
+        self.disable(quick_stop=fault is not FaultReason.NONE)
+        return fault
+
+    def _fault(self, state: ArmState) -> FaultReason:
+        """Say what ends a test with enabled drives; without torque nothing has to."""
+        if not self._is_enabling:
+            return FaultReason.NONE
+        if state.is_enabled and max(*state.age_q, *state.age_tau_J) > self._max_age_cycles:
+            return FaultReason.DATA_AGE
+        return state.fault
+
+    def disable(self, quick_stop: bool = False) -> None:
+        """Take the drives out of operation. Raises BusError."""
+        for _ in range(DISABLE_CYCLES):
+            self._cycle(False, quick_stop)
+
+    def _cycle(self, is_enabling: bool, quick_stop: bool) -> ZeroTorqueCycle:
+        bus, arm, clock = self._bus, self._arm, self._clock
+        tick = self.pacer.next()
+        while (late := bus.receive(0.0)) is not None:  # belongs to the cycle before
+            self._accept(late)
+        sync_ns = clock.now_ns()
+        arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
+        left_ns = self._patience_ns
+        while not arm.has_all_frames and (frame := bus.receive(max(left_ns, 0) * 1e-9)) is not None:
+            self._accept(frame)
+            left_ns = self._patience_ns - (clock.now_ns() - sync_ns)
+        feedback_ns = clock.now_ns() - sync_ns if arm.is_complete else -1
+        state = arm.state()
+        self._gate.limit(self._tau_d, is_enabling and state.is_enabled, self._tau_c)
+        arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
+        command_ns = clock.now_ns() - sync_ns
+        if tick.cycle % self._heartbeat_cycles == 0:
+            self._master.send_heartbeat()
+        return ZeroTorqueCycle(state, tick.lateness_ns, feedback_ns, command_ns, bus.take())
+
+    def _accept(self, frame: Frame) -> None:
+        if not self._arm.accept(frame):
+            self._master.accept(frame)

@@ -1,0 +1,246 @@
+"""Who is on the bus: CANopen nodes found by asking and by listening, and every identifier that is heard.
+
+Sends SDO uploads only and changes no node's state, so it works beside a running master. Source: CiA 301 (4.2), clauses
+7.2.4 (SDO), 7.2.8 (NMT, boot-up, heartbeat), 7.3.3 (predefined connection set), objects 0x1000, 0x1001, 0x1008, 0x1018.
+"""
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from adacd_hil.clock import Clock
+from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
+from adacd_hil.wire.bus import Bus
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.traffic import Talk, Traffic, listen
+
+LISTEN_S = 1.5
+"""Default time to listen: longer than the usual heartbeat and status periods of up to 1 s."""
+_NODE_IDS = range(1, 128)
+_BETWEEN_REQUESTS_S = 0.002
+"""Request and answer are 270 bits at worst, 0.27 ms at 1 Mbit/s: the rest is for the bus's own traffic."""
+_ANSWER_S = 0.1
+_UPLOAD_DEVICE_TYPE = bytes.fromhex("4000100000000000")
+_IDENTITY = ("vendor", "product", "revision", "serial")
+
+NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+_PROFILES = {401: "I/O", 402: "drive", 404: "measuring device", 405: "PLC", 406: "encoder", 408: "hydraulic drive"}
+
+# Predefined connection set, CiA 301 table 38: function code to what a node sends with it.
+_PRODUCED = {
+    0x080: "EMCY",
+    0x180: "TPDO1",
+    0x280: "TPDO2",
+    0x380: "TPDO3",
+    0x480: "TPDO4",
+    0x580: "SDO response",
+    0x700: "heartbeat",
+}
+_CONSUMED = {0x200: "RPDO1", 0x300: "RPDO2", 0x400: "RPDO3", 0x500: "RPDO4", 0x600: "SDO request"}
+_BROADCAST = {0x000: "NMT", 0x080: "SYNC", 0x100: "TIME"}
+_TPDOS = (0x180, 0x280, 0x380, 0x480)
+
+
+def function_name(can_id: int) -> str:
+    """Name what CiA 301's predefined connection set uses an identifier for; "" when it is not one of them."""
+    if can_id > 0x7FF:
+        return ""
+    function, node_id = can_id & 0x780, can_id & 0x7F
+    if can_id in _BROADCAST:
+        return _BROADCAST[can_id]
+    return {**_PRODUCED, **_CONSUMED}.get(function, "") if node_id else ""
+
+
+@dataclass
+class Node:
+    """One CANopen node. None: not told (it didn't answer, or has no such object).
+
+    nmt_state: 0, 4, 5, 127 from its heartbeat or boot-up. emergencies: (error code, error register), oldest first.
+    answers: whether it answered SDO.
+    """
+
+    node_id: int
+    device_type: int | None = None
+    name: str | None = None
+    vendor: int | None = None
+    product: int | None = None
+    revision: int | None = None
+    serial: int | None = None
+    error_register: int | None = None
+    nmt_state: int | None = None
+    has_pdos: bool = False
+    answers: bool = False
+    emergencies: list[tuple[int, int]] = field(default_factory=list)
+    produces: list[Talk] = field(default_factory=list)
+
+    @property
+    def device_text(self) -> str:
+        """Describe 0x1000: the low 16 bits are the number of the device profile."""
+        if self.device_type is None:
+            return "?"
+        profile = self.device_type & 0xFFFF
+        if profile == 0:
+            return "no profile"
+        return f"CiA {profile} {_PROFILES.get(profile, '')}".strip()
+
+    @property
+    def state_text(self) -> str:
+        """Describe the NMT state, as told by heartbeats or as PDOs, which only an operational node sends, show it."""
+        if self.has_pdos and self.nmt_state in (None, 0):
+            return "operational (sends PDOs)"
+        if self.nmt_state is None:
+            return "? (no heartbeat)"
+        return NMT_STATES.get(self.nmt_state, f"unknown ({self.nmt_state})")
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A node that the configuration expects. None: its EDS doesn't say, so anything will do."""
+
+    name: str
+    node_id: int
+    vendor: int | None
+    product: int | None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was found. `others`: identifiers that belong to no node found; `duration_s`: how long it was listened."""
+
+    nodes: list[Node]
+    others: list[Talk]
+    error_frames: int
+    duration_s: float
+
+
+def survey(
+    bus: Bus, clock: Clock, duration_s: float = LISTEN_S, progress: Callable[[str], None] = lambda _: None
+) -> Survey:
+    """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of whoever is there.
+
+    Raises BusError.
+    """
+    tap = Tap(bus, clock)
+    traffic = Traffic()
+    begin_ns = clock.now_ns()
+    progress(f"asking nodes {_NODE_IDS[0]} to {_NODE_IDS[-1]} on {bus.channel}")
+    for node_id in _NODE_IDS:
+        tap.send(0x600 + node_id, _UPLOAD_DEVICE_TYPE)
+        listen(tap, clock, _BETWEEN_REQUESTS_S, traffic)
+    listen(tap, clock, max(_ANSWER_S, duration_s - (clock.now_ns() - begin_ns) * 1e-9), traffic)
+    elapsed_s = (clock.now_ns() - begin_ns) * 1e-9
+    nodes = _collect(tap, traffic)
+    canopen = CanopenBus(tap)
+    for node in nodes.values():
+        if node.answers:
+            progress(f"reading node {node.node_id}")
+            _identify(canopen, node)
+    others = _assign(nodes, traffic)
+    return Survey(list(nodes.values()), others, traffic.error_frames, elapsed_s)
+
+
+def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
+    """Make the nodes that were heard, ascending."""
+    found: dict[int, Node] = {}
+    for is_sent, frame in tap.take():
+        function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
+        if is_sent or frame.is_error or frame.can_id > 0x7FF or node_id == 0:
+            continue
+        node = found.get(node_id) or Node(node_id)
+        if function == 0x580 and frame.data[1:4] == _UPLOAD_DEVICE_TYPE[1:4]:
+            node.answers = True
+            if frame.data[0] & 0xE2 == 0x42:  # expedited upload response
+                node.device_type = struct.unpack_from("<I", frame.data, 4)[0]
+        elif function == 0x700 and len(frame.data) == 1:
+            node.nmt_state = frame.data[0] & 0x7F
+        elif function == 0x080 and len(frame.data) == 8:
+            node.emergencies.append((frame.data[0] | frame.data[1] << 8, frame.data[2]))
+        else:
+            continue
+        found[node_id] = node
+    for node in found.values():
+        node.has_pdos = any(function + node.node_id in traffic.talks for function in _TPDOS)
+    return dict(sorted(found.items()))
+
+
+def _identify(canopen: CanopenBus, node: Node) -> None:
+    """Read what a node says of itself; what it doesn't tell stays None."""
+    remote = canopen.add_node(node.node_id, None)
+    try:
+        name = read_object(remote, 0x1008)
+        node.name = None if name is None else name.rstrip(b"\0").decode("ascii", "replace").strip()
+        register = read_object(remote, 0x1001)
+        node.error_register = None if register is None else int.from_bytes(register, "little")
+        for subindex, what in enumerate(_IDENTITY, start=1):
+            value = read_object(remote, 0x1018, subindex)
+            setattr(node, what, None if value is None else int.from_bytes(value, "little"))
+    except DeviceError:
+        node.answers = False  # it fell silent or refuses: what was read stands
+
+
+def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
+    """Give each identifier to the node that produces it by the predefined connection set; return the rest."""
+    others = []
+    for talk in traffic.sorted():
+        node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= 0x7FF else None
+        if node is not None and talk.can_id & 0x780 in _PRODUCED and talk.can_id not in _BROADCAST:
+            if talk.can_id & 0x780 != 0x580:  # answers to us
+                node.produces.append(talk)
+        else:
+            others.append(talk)
+    return others
+
+
+def expected_nodes(nodes: Mapping[str, Any]) -> list[Expected]:
+    """List what the master of an arm expects; `nodes`: its canopen nodes by name, each with its EDS."""
+    expected = []
+    for name, node in nodes.items():
+        identity = node.object_dictionary.get(0x1018)
+        vendor, product = (
+            None if identity is None or subindex not in identity.subindices else identity[subindex].default
+            for subindex in (1, 2)
+        )
+        expected.append(Expected(name, node.id, vendor, product))
+    return expected
+
+
+def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
+    """Say for each node, found or expected, how it fits the configuration: "" when it does."""
+    wanted = {node.node_id: node for node in expected}
+    present = {node.node_id: node for node in found.nodes}
+    verdicts = {}
+    for node_id in sorted({*wanted, *present}):
+        if node_id not in present:
+            verdicts[node_id] = f"missing: {wanted[node_id].name} expected"
+        elif node_id not in wanted:
+            verdicts[node_id] = "unexpected"
+        else:
+            verdicts[node_id] = _difference(present[node_id], wanted[node_id])
+    return verdicts
+
+
+def _difference(node: Node, wanted: Expected) -> str:
+    if not node.answers:
+        return f"{wanted.name} expected; does not answer SDO"
+    for what, found, value in (
+        ("vendor", node.vendor, wanted.vendor),
+        ("product", node.product, wanted.product),
+    ):
+        if value is None:
+            continue
+        if found is None:
+            return f"{wanted.name} expected; tells no {what}"
+        if found != value:
+            return f"{wanted.name} expected; {what} is not 0x{value:X}"
+    return ""
+
+
+def message_name(codec: Codec, can_id: int) -> str:
+    """Name an identifier: the contract's message, else CiA 301's use of it in parentheses, else "unknown"."""
+    message = codec.by_id.get(can_id)
+    if message is not None:
+        return message.name
+    function = function_name(can_id)
+    return f"({function})" if function else "unknown"

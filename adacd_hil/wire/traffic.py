@@ -1,0 +1,82 @@
+"""Who sends what: every identifier seen on a bus, with count, rate, lengths and its last frame."""
+
+from dataclasses import dataclass
+
+from adacd_hil.clock import Clock
+from adacd_hil.wire.bus import Bus, Frame
+
+_SLICE_S = 0.02
+"""How long one wait on the bus may take while listening: how soon the end is noticed on a silent bus."""
+
+
+@dataclass
+class Talk:
+    """One identifier's frames so far."""
+
+    can_id: int
+    count: int
+    first_ns: int
+    last_ns: int
+    shortest: int
+    longest: int
+    data: bytes
+
+    @property
+    def rate_Hz(self) -> float | None:
+        """Mean rate between the first and the last frame; None for a single frame."""
+        span_ns = self.last_ns - self.first_ns
+        return (self.count - 1) * 1e9 / span_ns if span_ns > 0 else None
+
+    @property
+    def length(self) -> str:
+        """Count of data bytes, as a range when it changes."""
+        return str(self.longest) if self.shortest == self.longest else f"{self.shortest}-{self.longest}"
+
+
+class Traffic:
+    """All identifiers seen so far. Error frames are counted apart."""
+
+    def __init__(self) -> None:
+        self.talks: dict[int, Talk] = {}
+        self.error_frames = 0
+
+    def accept(self, frame: Frame) -> None:
+        """Count one frame."""
+        if frame.is_error:
+            self.error_frames += 1
+            return
+        can_id, data, t_ns, _ = frame
+        length = len(data)
+        talk = self.talks.get(can_id)
+        if talk is None:
+            self.talks[can_id] = Talk(can_id, 1, t_ns, t_ns, length, length, data)
+            return
+        talk.count += 1
+        talk.last_ns = t_ns
+        talk.data = data
+        if length < talk.shortest:
+            talk.shortest = length
+        elif length > talk.longest:
+            talk.longest = length
+
+    def sorted(self) -> list[Talk]:
+        """List what was seen, identifiers ascending."""
+        return [self.talks[can_id] for can_id in sorted(self.talks)]
+
+
+def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
+    """Wait for one frame until `end_ns`; None when the time is over. Raises BusError."""
+    while (now_ns := clock.now_ns()) < end_ns:
+        slice_ns = min(end_ns, now_ns + round(_SLICE_S * 1e9))
+        frame = bus.receive((slice_ns - now_ns) * 1e-9)
+        if frame is not None:
+            return frame
+        clock.sleep_until_ns(slice_ns)  # a virtual clock moves here; a real one is already there
+    return None
+
+
+def listen(bus: Bus, clock: Clock, duration_s: float, traffic: Traffic) -> None:
+    """Take in what passes for a while, sending nothing. Raises BusError."""
+    end_ns = clock.now_ns() + round(duration_s * 1e9)
+    while (frame := receive_until(bus, clock, end_ns)) is not None:
+        traffic.accept(frame)

@@ -1,0 +1,53 @@
+"""What `commtest` prints, from a test against the emulator in virtual time."""
+
+import json
+
+from bench_bus import BenchBus
+
+from adacd_hil.cli.commtest import as_text, describe
+from adacd_hil.control.communication_test import CommunicationTest
+from adacd_hil.control.zero_torque import ZeroTorqueLoop
+
+
+def judged(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> dict:
+    rig.start()
+    rig.tap.take()
+    loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
+    test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
+    loop.run(0.2, test.observe)
+    described = describe(test.report(), rig.settings, scheduler)
+    return described | {"fault": "NONE", "device_faults": [], "events": []}
+
+
+def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
+    lines = as_text(judged(BenchBus())).splitlines()
+    assert lines[0].startswith("cycles 200, complete 200, overruns 0, period 1000 µs, SCHED_FIFO 80, bus load ")
+    assert lines[1] == "Drive1: fresh in 100.00 % of the periods; unprotected, 0 implausible"
+    assert lines[3].startswith("Sensor1: fresh in 100.00 % of the periods; 220 OK")
+    assert "sync lateness, µs: p50 0, p99 0, p99.9 0, max 0" in lines
+    assert lines[-1] == "good: 100.00 % of the periods brought complete fresh data (good from 95 %)"
+    assert not any(line.startswith("warning") for line in lines)
+
+
+def test_the_load_is_that_of_the_cyclic_frames() -> None:
+    # 657 bits without stuffing, 795 at worst, of 1000 per period; status frames and heartbeats every 100 ms
+    assert 65.0 < judged(BenchBus())["load_percent"] < 81.0
+
+
+def test_a_silent_device_and_a_missing_priority_are_warned_of() -> None:
+    rig = BenchBus()
+    rig.tamper = lambda can_id, data: None if can_id == 0x184 else data
+    described = judged(rig, "SCHED_OTHER")
+    assert described["warnings"] == [
+        "without real-time priority (SCHED_OTHER) the times are those of a busy desktop",
+        "never a cyclic frame from Sensor2",
+    ]
+    lines = as_text(described).splitlines()
+    assert lines[4].startswith("Sensor2: fresh in 0.00 % of the periods; ")
+    assert "sync to last feedback, µs: no value" in lines
+    assert lines[-1].startswith("not sufficient: 0.00 %")
+
+
+def test_the_report_is_json() -> None:
+    described = judged(BenchBus())
+    assert json.loads(json.dumps(described)) == described

@@ -1,0 +1,284 @@
+"""Doctor's findings about an emulated arm in virtual time; what it sends is judged on the wire."""
+
+import json
+from collections.abc import Callable
+
+import pytest
+from bench_bus import CODEC, BenchBus
+
+from adacd_hil.cli.doctor import as_json, as_text
+from adacd_hil.control.arm_checks import ARM_CHECKS, ArmExamination, check_pdo_map
+from adacd_hil.control.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
+from adacd_hil.wire.codec import load_codec
+from firmware_sim.object_dictionary import NmtState
+
+COMMAND = CODEC.message("Drive1Command")
+pytestmark = pytest.mark.slow
+
+PASSED = ("kernel", "interface", "controller")
+EARLIER = [Finding(name, Status.OK, "", "") for name in PASSED]
+
+
+def doctor(rig: BenchBus, ask: Callable[[str], None] | None = None) -> dict[str, Finding]:
+    patient = ArmExamination(
+        rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None, ask=ask, cycle_s=0.4, move_s=1.0
+    )
+    findings = diagnose(ARM_CHECKS, patient, lambda finding: None, EARLIER)
+    assert patient.leave() == ""
+    return {finding.name: finding for finding in findings}
+
+
+def statuses(findings: dict[str, Finding], status: Status) -> list[str]:
+    return [name for name, finding in findings.items() if finding.status is status]
+
+
+def test_a_sound_arm_passes_everything_but_what_it_lacks() -> None:
+    findings = doctor(BenchBus())
+    assert statuses(findings, Status.FAILED) == []
+    assert statuses(findings, Status.WARNING) == ["protection"]
+    assert statuses(findings, Status.SKIPPED) == ["joint 1", "joint 2"]
+    assert findings["rate"].reason.startswith("SYNC 1000/s of 1000, Drive1 1000/s")
+    assert findings["protection"].reason.startswith("unprotected: Drive1Feedback, Drive2Feedback")
+
+
+def test_the_drives_are_asked_for_no_voltage_only_and_the_nodes_end_pre_operational() -> None:
+    rig = BenchBus()
+    doctor(rig)
+    commands = [frame for frame in rig.sent if frame.can_id in (0x201, 0x202)]
+    assert len(commands) > 800
+    assert {tuple(map(int, COMMAND.decode_values(frame.data))) for frame in commands} == {(0, 0)}
+    assert {device.state for device in rig.bench.devices} == {NmtState.PRE_OPERATIONAL}
+
+
+def test_another_master_stops_the_examination_before_anything_is_sent() -> None:
+    rig = BenchBus()
+    rig.start()
+    rig.add_host()
+    findings = doctor(rig)
+    assert findings["other masters"].status is Status.FAILED
+    assert "Sync" in findings["other masters"].reason
+    assert rig.sent == []
+    assert findings["cycle"].reason == "needs `other masters`, which failed"
+    assert {device.state for device in rig.bench.devices} == {NmtState.OPERATIONAL}
+
+
+@pytest.mark.parametrize("can_id", [0x77F, 0x201, 0x000, 0x601])
+def test_each_kind_of_host_frame_shows_another_master(can_id: int) -> None:
+    rig = BenchBus()
+    rig.bus.deliver(can_id, b"\x05\x00\x00\x00\x00\x00")
+    assert CODEC.by_id[can_id].name in doctor(rig)["other masters"].reason
+
+
+def test_a_missing_node_fails_and_nothing_is_reset() -> None:
+    rig = BenchBus()
+    rig.silence(2)
+    findings = doctor(rig)
+    assert findings["nodes"].reason == "node 2: missing: Drive2 expected"
+    assert findings["nodes"].remedy
+    assert not any(frame.can_id == 0x000 for frame in rig.sent)
+
+
+def test_another_contract_is_told_and_stops_the_set_up(tmp_path) -> None:
+    rig = BenchBus()
+    other = tmp_path / "other.dbc"
+    other.write_bytes(CODEC.text.replace(b"0|32@1- (5.9921124526782858e-06,0)", b"0|32@1- (5e-06,0)"))
+    patient = ArmExamination(rig.settings, load_codec(other), rig.clock, lambda: rig.bus, lambda: None)
+    findings = {finding.name: finding for finding in diagnose(ARM_CHECKS, patient, lambda finding: None, EARLIER)}
+    assert findings["contract"].status is Status.FAILED
+    assert "the DBC's are 1, 0x" in findings["contract"].reason
+    assert findings["set-up"].reason == "needs `contract`, which failed"
+
+
+def break_pdo_map(rig: BenchBus, index: int, subindex: int, value: int) -> None:
+    """Let a device answer SDO with another mapping than it has."""
+    rig.bench.devices[0].serve(index, subindex, lambda: value)
+
+
+@pytest.mark.parametrize(
+    ("index", "subindex", "value", "reason"),
+    [
+        (0x1A00, 1, 0x60640010, "Drive1Feedback: 48 bits are mapped, the contract has 64"),
+        (0x1A00, 1, 0x60630020, "Drive1Feedback.position: 0x6063 with 32 bits at bit 0, not 0x6064 with 32"),
+        (0x1800, 1, 0x80000181, "Drive1Feedback: the device has no PDO with identifier 0x181"),
+        (0x1400, 1, 0x00000211, "Drive1Command: the device has no PDO with identifier 0x201"),
+        (0x1600, 3, 0x60710010, "Drive1Command.controlword: 0x6071 with 16 bits at bit 16, not 0x6040 with 16"),
+    ],
+)
+def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, value: int, reason: str) -> None:
+    rig = BenchBus()
+    break_pdo_map(rig, index, subindex, value)
+    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
+    patient.connect()
+    finding = check_pdo_map(patient)
+    assert finding.status is Status.FAILED
+    assert reason in finding.reason
+
+
+def test_an_object_mapped_with_another_width_is_told_though_the_length_is_right() -> None:
+    rig = BenchBus()
+    break_pdo_map(rig, 0x1A00, 1, 0x60640010)
+    break_pdo_map(rig, 0x1A00, 2, 0x606C0030)
+    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
+    patient.connect()
+    assert "Drive1Feedback.position: 0x6064 with 16 bits at bit 0" in check_pdo_map(patient).reason
+
+
+def change_torque(rig: BenchBus, change: Callable[[int, float], float]) -> None:
+    """Let sensor 1 measure something else: `change` of (frame's number, torque)."""
+    message = CODEC.message("Sensor1Torque")
+    sender, count = message.sender(), [0]
+
+    def tamper(can_id: int, data: bytes) -> bytes:
+        if can_id != message.can_id:
+            return data
+        count[0] += 1
+        (torque_Nm,) = message.decode_values(data)
+        return sender.protect(message.encode(change(count[0], torque_Nm)))
+
+    rig.tamper = tamper
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "status", "text"),
+    [
+        (lambda k, tau: tau + 1.2, "torque zero", Status.FAILED, "above 1"),
+        (lambda k, tau: tau - 0.3, "torque zero", Status.WARNING, "more than the detection threshold"),
+        (lambda k, tau: 0.01, "torque noise", Status.WARNING, "never changes"),
+        (lambda k, tau: tau + 0.1 * (-1) ** k, "torque noise", Status.WARNING, "three of it exceed"),
+    ],
+)
+def test_a_torque_that_is_not_plausible_at_rest_is_told(
+    change: Callable[[int, float], float], name: str, status: Status, text: str
+) -> None:
+    rig = BenchBus()
+    change_torque(rig, change)
+    finding = doctor(rig)[name]
+    assert finding.status is status
+    assert text in finding.reason
+
+
+def test_a_saturated_sensor_is_told() -> None:
+    rig = BenchBus()
+    sender = CODEC.message("Sensor1Torque").sender()
+
+    def saturate(can_id: int, data: bytes) -> bytes:
+        if can_id == 0x183:  # the header's status nibble
+            return sender.protect(bytearray(data[:1] + b"\x20" + data[2:]))
+        return b"\x02" + data[1:] if can_id == 0x283 else data
+
+    rig.tamper = saturate
+    findings = doctor(rig)
+    assert findings["saturation"].status is Status.FAILED
+    assert "POSITIVE_OVERLOAD" in findings["saturation"].reason
+    assert findings["torque zero"].status is Status.SKIPPED
+
+
+def test_a_moving_arm_fails_rest_and_leaves_its_torque_unjudged() -> None:
+    rig = BenchBus()
+    message = CODEC.message("Drive1Feedback")
+
+    def move(can_id: int, data: bytes) -> bytes:
+        if can_id != message.can_id:
+            return data
+        position, _ = message.decode_values(data)
+        return bytes(message.encode(position, 0.2))
+
+    rig.tamper = move
+    findings = doctor(rig)
+    assert findings["rest"].status is Status.FAILED
+    assert findings["torque zero"].reason == "needs `rest`, which failed"
+
+
+def test_a_node_without_heartbeat_is_told() -> None:
+    rig = BenchBus()
+    rig.tamper = lambda can_id, data: None if can_id == 0x704 and data != b"\x00" else data
+    finding = doctor(rig)["heartbeat"]
+    assert (finding.status, finding.reason) == (Status.FAILED, "no heartbeat from Sensor2")
+
+
+def test_lost_feedback_fails_the_rate() -> None:
+    rig = BenchBus()
+    count = [0]
+
+    def lose(can_id: int, data: bytes) -> bytes | None:
+        count[0] += can_id == 0x181
+        return None if can_id == 0x181 and count[0] % 5 == 0 else data
+
+    rig.tamper = lose
+    finding = doctor(rig)["rate"]
+    assert finding.status is Status.FAILED
+    assert "80.0 % of the periods complete" in finding.reason
+
+
+def move_by_hand(rig: BenchBus, speed_rad_s: tuple[float, float], torque_Nm: float) -> Callable[[str], None]:
+    """Return an `ask` at which, asked for joint 1, the joints begin to move and both sensors see a torque."""
+    drives = [CODEC.message(f"Drive{joint}Feedback") for joint in (1, 2)]
+    sensors = [CODEC.message(f"Sensor{joint}Torque") for joint in (1, 2)]
+    senders = {message.can_id: message.sender() for message in sensors}
+    begin_ns: list[int] = []
+
+    def tamper(can_id: int, data: bytes) -> bytes:
+        if can_id in senders:
+            (measured_Nm,) = CODEC.by_id[can_id].decode_values(data)
+            pushed_Nm = torque_Nm if begin_ns and rig.clock.now_ns() > begin_ns[0] + 5_000_000 else 0.0
+            return senders[can_id].protect(CODEC.by_id[can_id].encode(measured_Nm + pushed_Nm))
+        for message, speed in zip(drives, speed_rad_s, strict=True):
+            if can_id == message.can_id and begin_ns:
+                position, _ = message.decode_values(data)
+                moved = speed * (rig.clock.now_ns() - begin_ns[0]) * 1e-9
+                return bytes(message.encode(position + moved, speed))
+        return data
+
+    def ask(line: str) -> None:
+        if line.startswith("move joint 1 "):
+            begin_ns.append(rig.clock.now_ns())
+
+    rig.tamper = tamper
+    return ask
+
+
+@pytest.mark.parametrize(
+    ("speed_rad_s", "torque_Nm", "status", "text"),
+    [
+        ((0.5, 0.1), -0.3, Status.OK, "right joint, right signs"),
+        ((0.5, 0.1), +0.3, Status.FAILED, "the torque has the motion's sign"),
+        ((0.5, 0.1), 0.0, Status.WARNING, "too little torque"),
+        ((-0.5, 0.1), -0.3, Status.FAILED, "position decreases toward +q"),
+        ((0.1, 0.5), -0.3, Status.FAILED, "drive 2 reports the motion of joint 1"),
+        ((0.5, 0.4), -0.3, Status.WARNING, "both joints moved"),
+        ((0.05, 0.0), -0.3, Status.WARNING, "not moved by 10 deg in time"),
+    ],
+)
+def test_a_joint_moved_by_hand_tells_its_order_and_signs(
+    speed_rad_s: tuple[float, float], torque_Nm: float, status: Status, text: str
+) -> None:
+    rig = BenchBus()
+    finding = doctor(rig, move_by_hand(rig, speed_rad_s, torque_Nm))["joint 1"]
+    assert finding.status is status
+    assert text in finding.reason
+
+
+def test_a_check_whose_prerequisite_failed_is_skipped_with_the_reason_behind_it() -> None:
+    checks = [
+        Check("a", lambda _: failed("broken", "mend it")),
+        Check("b", lambda _: ok("fine"), ("a",)),
+        Check("c", lambda _: ok("fine"), ("b",)),
+        Check("d", lambda _: warning("odd", "look at it")),
+        Check("e", lambda _: ok("fine"), ("d",)),
+    ]
+    findings = diagnose(checks, None, lambda finding: None)
+    assert [finding.status.value for finding in findings] == ["failed", "skipped", "skipped", "warning", "ok"]
+    assert findings[2].reason == "needs `a`, which failed"
+    assert summarise(findings) == "1 ok, 1 warning, 1 failed, 2 skipped"
+
+
+def test_the_report_has_a_remedy_under_what_is_wrong() -> None:
+    findings = [Finding("a", Status.OK, "fine", ""), Finding("bb", Status.FAILED, "broken", "mend it")]
+    assert as_text(findings).splitlines() == [
+        "ok      a   fine",
+        "FAILED  bb  broken",
+        "            -> mend it",
+        "",
+        "1 ok, 0 warning, 1 failed, 0 skipped",
+    ]
+    assert json.loads(json.dumps(as_json(findings)))["checks"][1]["status"] == "failed"

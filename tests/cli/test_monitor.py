@@ -1,0 +1,104 @@
+"""What `monitor` prints, and that it only listens."""
+
+import json
+
+from bench_bus import CODEC, BenchBus
+from click.testing import CliRunner
+
+from adacd_hil.cli.connection import Connection
+from adacd_hil.cli.main import cli
+from adacd_hil.cli.monitor import Monitor, Screen, as_text
+from adacd_hil.wire.bus import Frame
+
+
+def monitor(rig: BenchBus, node_id: int | None = None) -> Monitor:
+    return Monitor(Connection("embedded", "embedded", None, "paper", None, None), rig.bus, rig.clock, node_id)
+
+
+def test_the_table_shows_nodes_messages_and_load() -> None:
+    rig = BenchBus()
+    rig.start()
+    rig.add_host()
+    rig.bus.deliver(0x055, b"\xab\xcd")
+    watched = monitor(rig)
+    watched.listen(1.0)
+    lines = [line.split() for line in as_text(watched.describe()).splitlines()]
+    assert ["1", "Drive1", "operational"] in [line[:3] for line in lines]
+    (feedback,) = [line for line in lines if "Drive1Feedback" in line]
+    assert (feedback[0], feedback[4:6]) == ("0x181", ["-", "0"])
+    assert 970.0 <= float(feedback[2]) <= 1000.0  # up to one slice of waiting is still in the queue
+    assert feedback[6:9] == ["position", "-0.523597", "rad,"]
+    assert ["0x055", "unknown", "1.0"] in [line[:3] for line in lines]
+    assert rig.sent == []
+
+
+def test_the_node_filter_shows_one_node() -> None:
+    rig = BenchBus()
+    rig.start()
+    rig.add_host()
+    watched = monitor(rig, node_id=3)
+    watched.listen(0.5)
+    assert {message["message"] for message in watched.describe()["messages"]} == {
+        "Sensor1Torque",
+        "Sensor1Status",
+        "Sensor1Heartbeat",
+    }
+
+
+def test_a_full_bus_ends_in_time_and_misses_nothing() -> None:
+    rig = BenchBus()
+    inner = rig.bus.receive
+
+    def flood(timeout_s: float) -> Frame:  # a frame is always waiting
+        rig.clock.sleep_until_ns(rig.clock.now_ns() + 50_000)
+        return inner(0.0) or Frame(0x7FF, bytes(8), rig.clock.now_ns())
+
+    rig.bus.receive = flood  # type: ignore[method-assign]
+    watched = monitor(rig)
+    begin_ns = rig.clock.now_ns()
+    watched.listen(0.2)
+    assert 0.2 <= (rig.clock.now_ns() - begin_ns) * 1e-9 < 0.215  # a batch later at most
+    assert watched.describe()["frames"] in range(4000, 4300)
+
+
+def test_a_terminal_is_redrawn_in_place_and_not_scrolled() -> None:
+    written: list[str] = []
+    screen = Screen(True, written.append)
+    screen.draw("\n".join(str(number) for number in range(200)))
+    screen.end("last")
+    assert written[0].startswith("\x1b[H0\x1b[K\n1\x1b[K\n")
+    assert written[0].count("\n") < 200
+    assert written[1] == "\x1b[H\x1b[Jlast\n"
+    assert screen.redraw_s == 0.2
+
+
+def test_without_a_terminal_lines_are_plain() -> None:
+    written: list[str] = []
+    screen = Screen(False, written.append)
+    screen.draw("a\nb")
+    assert written == ["a\nb\n\n"]
+
+
+def test_a_silent_bus_is_said_to_be() -> None:
+    result = CliRunner().invoke(cli, ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1"))
+    assert (result.exit_code, result.stderr) == (0, "listening on silent\n")
+    assert result.stdout == "load 0.0 %, 0 frames, 0 error frames\n\nnothing heard\n"
+
+
+def test_json_is_one_snapshot() -> None:
+    result = CliRunner().invoke(cli, ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1", "--json"))
+    described = json.loads(result.stdout)
+    assert (described["frames"], described["messages"], described["not_processed"]) == (0, [], None)
+
+
+def test_every_signal_of_the_contract_can_be_shown() -> None:
+    rig = BenchBus()
+    watched = monitor(rig)
+    for message in CODEC.messages.values():
+        data = message.sender().protect(bytearray(message.length)) if message.is_protected else bytes(message.length)
+        rig.bus.deliver(message.can_id, data)
+    watched.listen(0.1)
+    described = {row["message"]: row for row in watched.describe()["messages"]}
+    assert {name: tuple(row["values"]) for name, row in described.items()} == {
+        message.name: tuple(signal.name for signal in message.values) for message in CODEC.messages.values()
+    }

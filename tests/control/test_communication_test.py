@@ -1,0 +1,132 @@
+"""The communication test against the emulator in virtual time; verdicts, shares and times are known exactly."""
+
+import numpy as np
+import pytest
+from bench_bus import PERIOD_NS, BenchBus
+
+from adacd_hil.control.communication_test import CommunicationReport, CommunicationTest, Verdict, judge
+from adacd_hil.control.zero_torque import DISABLE_CYCLES, ZeroTorqueLoop
+from adacd_hil.records import FaultReason
+from adacd_hil.wire.codec import load_codec
+
+COMMAND = load_codec().message("Drive1Command")
+COMMANDS = (0x201, 0x202)
+
+
+def run(rig: BenchBus, seconds: float = 0.2, is_enabling: bool = False) -> tuple[CommunicationReport, FaultReason]:
+    rig.start()
+    loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master, is_enabling)
+    test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
+    rig.tap.take()
+    fault = loop.run(seconds, test.observe)
+    return test.report(), fault
+
+
+def commands(rig: BenchBus) -> set[tuple[int, int]]:
+    """Return all (controlword, target torque) on the wire."""
+    return {tuple(map(int, COMMAND.decode_values(frame.data))) for frame in rig.sent if frame.can_id in COMMANDS}
+
+
+def test_an_undisturbed_connection_is_good_and_complete() -> None:
+    report, fault = run(BenchBus())
+    assert (report.cycles, report.complete, report.overruns) == (200, 200, 0)
+    assert (report.verdict, report.share, fault) == (Verdict.GOOD, 1.0, FaultReason.NONE)
+    assert [device.ages[0] for device in report.devices.values()] == [200] * 4
+
+
+def test_the_drives_are_never_asked_for_more_than_no_voltage() -> None:
+    rig = BenchBus()
+    run(rig)
+    assert commands(rig) == {(0x0000, 0)}
+
+
+def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end() -> None:
+    rig = BenchBus()
+    report, fault = run(rig, is_enabling=True)
+    assert (report.verdict, fault) == (Verdict.GOOD, FaultReason.NONE)
+    assert commands(rig) == {(0x0000, 0), (0x0006, 0), (0x0007, 0), (0x000F, 0)}
+    last = [frame for frame in rig.sent if frame.can_id in COMMANDS][-2 * DISABLE_CYCLES :]
+    assert {int(COMMAND.decode_values(frame.data)[0]) for frame in last} == {0}
+    assert not any(drive.is_enabled for drive in rig.bench.drives)
+
+
+def test_a_drive_that_drops_out_ends_an_enabled_test_with_quick_stop() -> None:
+    rig = BenchBus()
+    rig.start()
+    loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master, is_enabling=True)
+    cycles = []
+
+    def disturb(cycle) -> None:
+        cycles.append(cycle)
+        if len(cycles) == 50:
+            rig.bench.devices[0].on_nmt(b"\x80\x01", rig.clock.now_ns())
+
+    assert loop.run(1.0, disturb) is not FaultReason.NONE
+    assert len(cycles) < 60
+    last = [frame for frame in rig.sent if frame.can_id in COMMANDS][-1]
+    assert COMMAND.decode_values(last.data) == (0x0002, 0)
+
+
+def test_every_fifteenth_torque_frame_lost_is_a_warning_and_told_by_device() -> None:
+    rig = BenchBus()
+    count = [0]
+
+    def lose(can_id: int, data: bytes) -> bytes | None:
+        count[0] += can_id == 0x183
+        return None if can_id == 0x183 and count[0] % 15 == 0 else data
+
+    rig.tamper = lose
+    report, _ = run(rig, 0.3)
+    assert report.verdict is Verdict.WARNING
+    assert report.complete == 280
+    assert [round(device.share, 3) for device in report.devices.values()] == [1.0, 1.0, 0.933, 1.0]
+    sensor = report.devices["Sensor1"]
+    assert (sensor.ages[:3], sensor.checks["OK_SOME_LOST"]) == ([280, 20, 0], 21)  # one more while disabling
+
+
+def test_a_device_that_never_answers_is_not_sufficient() -> None:
+    rig = BenchBus()
+    rig.tamper = lambda can_id, data: None if can_id == 0x182 else data
+    report, _ = run(rig)
+    assert (report.verdict, report.share) == (Verdict.NOT_SUFFICIENT, 0.0)
+    assert (report.devices["Drive2"].never, sum(report.devices["Drive2"].ages)) == (200, 0)
+    assert report.feedback_ns.size == 0
+
+
+def test_skipped_periods_count_as_without_data() -> None:
+    rig = BenchBus()
+    rig.start()
+    begin_ns = rig.clock.now_ns()
+    rig.clock.oversleep_ns = lambda t_ns: 20 * PERIOD_NS + 5_000 if t_ns == begin_ns + 51 * PERIOD_NS else 0
+    loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
+    test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
+    loop.run(0.2, test.observe)
+    report = test.report()
+    assert (report.overruns, report.cycles, report.periods) == (20, 180, 200)
+    assert (report.share, report.verdict) == (0.9, Verdict.WARNING)
+    assert report.lateness_ns.max() == 5_000
+
+
+@pytest.mark.parametrize(
+    ("share", "verdict"),
+    [
+        (1.0, Verdict.GOOD),
+        (0.95, Verdict.GOOD),
+        (np.nextafter(0.95, 0.0), Verdict.WARNING),
+        (0.90, Verdict.WARNING),
+        (np.nextafter(0.90, 0.0), Verdict.NOT_SUFFICIENT),
+        (0.0, Verdict.NOT_SUFFICIENT),
+    ],
+)
+def test_verdicts_change_at_the_bounds(share: float, verdict: Verdict) -> None:
+    assert judge(share) is verdict
+
+
+def test_an_interrupt_ends_the_loop_and_disables() -> None:
+    rig = BenchBus()
+    rig.start()
+    loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
+    seen = []
+    loop.run(10.0, lambda cycle: (seen.append(cycle), loop.interrupt())[0])
+    assert len(seen) == 1
+    assert sum(frame.can_id == 0x201 for frame in rig.sent) == 1 + DISABLE_CYCLES

@@ -1,0 +1,183 @@
+"""Doctor's checks of the host, as rows: what the kernel says, and what is made of it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from adacd_hil.control.diagnosis import Status
+from adacd_hil.control.host_checks import HOST_CHECKS, Host
+from adacd_hil.scheduling import RealtimeGrant
+from adacd_hil.wire.link import Link, parse_ip_link
+
+GRANTED = RealtimeGrant("SCHED_FIFO 80", ())
+CAN0 = Link(
+    name="can0",
+    is_up=True,
+    kind="can",
+    mtu=72,
+    txqueuelen=10,
+    qdisc="pfifo_fast",
+    bitrate=1_000_000,
+    data_bitrate=5_000_000,
+    sample_point=0.875,
+    restart_ms=100,
+    state="ERROR-ACTIVE",
+    rx_errors=0,
+    tx_errors=0,
+    bus_offs=0,
+)
+RUN = {check.name: check.run for check in HOST_CHECKS}
+
+
+def host(link: Link | None = CAN0, **changes: Any) -> Host:
+    return dataclasses.replace(Host("socketcan", "can0", link, 1_000_000, 0, lambda: GRANTED), **changes)
+
+
+@pytest.mark.parametrize(
+    ("check", "changes", "status", "text"),
+    [
+        ("interface", {}, Status.OK, "can0 is up, hardware"),
+        ("interface", {"is_up": False}, Status.FAILED, "can0 is down"),
+        ("interface", {"kind": "vcan"}, Status.OK, "virtual"),
+        ("bit rate", {}, Status.OK, "1000000 bit/s"),
+        ("bit rate", {"bitrate": 500_000}, Status.FAILED, "500000 bit/s, the contract has 1000000"),
+        ("bit rate", {"bitrate": None}, Status.SKIPPED, "install iproute2"),
+        ("bit rate", {"kind": "vcan"}, Status.SKIPPED, "vcan has none"),
+        ("sample point", {}, Status.OK, "87.5 %"),
+        ("sample point", {"sample_point": 0.70}, Status.OK, "70.0 %"),
+        ("sample point", {"sample_point": 0.69}, Status.WARNING, "outside 70% to 90%"),
+        ("sample point", {"sample_point": 0.91}, Status.WARNING, "outside 70% to 90%"),
+        ("restart", {}, Status.OK, "100 ms"),
+        ("restart", {"restart_ms": 0}, Status.WARNING, "stays silent"),
+        ("controller", {}, Status.OK, "ERROR-ACTIVE"),
+        ("controller", {"state": "ERROR-PASSIVE", "tx_errors": 128}, Status.WARNING, "tx 128"),
+        ("controller", {"state": "BUS-OFF"}, Status.FAILED, "BUS-OFF"),
+        ("queue", {}, Status.OK, "txqueuelen 10"),
+        ("queue", {"txqueuelen": 99}, Status.OK, "txqueuelen 99"),
+        ("queue", {"txqueuelen": 100}, Status.WARNING, "up to 100 old commands"),
+        ("queue", {"txqueuelen": 4096, "qdisc": "noqueue"}, Status.OK, "noqueue"),
+        ("mtu", {"mtu": 16}, Status.OK, "16, classic frames fit"),
+    ],
+)
+def test_an_interface_is_judged_by_what_the_kernel_says(
+    check: str, changes: dict[str, Any], status: Status, text: str
+) -> None:
+    outcome = RUN[check](host(dataclasses.replace(CAN0, **changes)))
+    assert outcome.status is status
+    assert text in outcome.reason
+    assert bool(outcome.remedy) is (status in (Status.WARNING, Status.FAILED))
+
+
+@pytest.mark.parametrize(
+    ("check", "changes", "status", "text"),
+    [
+        ("mtu", {}, Status.OK, "CAN FD frames fit"),
+        ("mtu", {"mtu": 16}, Status.FAILED, "no CAN FD frames"),
+        ("bit rate", {}, Status.OK, "data phase 5000000"),
+        ("bit rate", {"data_bitrate": 2_000_000}, Status.FAILED, "data phase 2000000 bit/s, the contract has 5000000"),
+        ("bit rate", {"data_bitrate": None}, Status.FAILED, "data phase 0 bit/s, the contract has 5000000"),
+    ],
+)
+def test_a_contract_with_can_fd_needs_its_data_phase(
+    check: str, changes: dict[str, Any], status: Status, text: str
+) -> None:
+    outcome = RUN[check](host(dataclasses.replace(CAN0, **changes), data_bitrate=5_000_000))
+    assert outcome.status is status
+    assert text in outcome.reason
+
+
+def test_an_interface_that_is_not_there_is_named_with_those_that_are() -> None:
+    outcome = RUN["interface"](host(None))
+    assert outcome.status is Status.FAILED
+    assert outcome.reason.startswith("can0 is no CAN interface; present: ")
+
+
+@pytest.mark.parametrize("check", ["kernel", "interface", "permissions"])
+def test_python_cans_own_interfaces_have_no_kernel_to_look_at(check: str) -> None:
+    assert RUN[check](host(None, interface="virtual")).status is Status.SKIPPED
+
+
+def test_what_is_not_granted_is_told_with_its_remedy() -> None:
+    grant = RealtimeGrant("SCHED_OTHER", ("SCHED_FIFO: no; allow it", "locked memory: no; allow that"))
+    outcome = RUN["scheduler"](host(request_realtime=lambda: grant))
+    assert outcome.reason == "not granted: SCHED_FIFO: no, locked memory: no"
+    assert outcome.remedy == "allow it; allow that"
+
+
+@pytest.mark.parametrize(
+    ("files", "check", "status", "text"),
+    [
+        ({"proc/self/status": "Name:\tx\nCapEff:\t0000000000001000\n"}, "permissions", Status.OK, "CAP_NET_ADMIN"),
+        ({"proc/self/status": "CapEff:\t0000000000002fff\n"}, "permissions", Status.WARNING, "without CAP_NET_ADMIN"),
+        ({}, "permissions", Status.SKIPPED, "/proc"),
+        ({"proc/version": "Linux #1 SMP PREEMPT_RT Debian"}, "preemption", Status.OK, "PREEMPT_RT"),
+        ({"sys/kernel/realtime": "1\n"}, "preemption", Status.OK, "PREEMPT_RT"),
+        ({"proc/version": "Linux #1 SMP PREEMPT_DYNAMIC"}, "preemption", Status.WARNING, "PREEMPT: single"),
+        ({"proc/version": "Linux #1 SMP"}, "preemption", Status.WARNING, "no preemption named"),
+        (
+            {
+                "sys/devices/system/cpu/isolated": "2-3\n",
+                "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance\n",
+            },
+            "processor",
+            Status.OK,
+            "isolated processors: 2-3",
+        ),
+        (
+            {
+                "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance\n",
+                "sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "powersave\n",
+            },
+            "processor",
+            Status.WARNING,
+            "governor performance, powersave",
+        ),
+        ({}, "processor", Status.SKIPPED, "no frequency scaling"),
+    ],
+)
+def test_the_machine_is_judged_by_its_files(
+    tmp_path: Path, files: dict[str, str], check: str, status: Status, text: str
+) -> None:
+    for name, content in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)
+    outcome = RUN[check](host(root=tmp_path))
+    assert outcome.status is status
+    assert text in outcome.reason
+
+
+def test_a_link_is_read_from_iproute2() -> None:
+    shown = {
+        "ifname": "can0",
+        "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"],
+        "mtu": 72,
+        "qdisc": "pfifo_fast",
+        "txqlen": 10,
+        "link_type": "can",
+        "linkinfo": {
+            "info_kind": "can",
+            "info_data": {
+                "state": "ERROR-ACTIVE",
+                "berr_counter": {"tx": 0, "rx": 0},
+                "restart_ms": 100,
+                "bittiming": {"bitrate": 1_000_000, "sample_point": "0.875", "tq": 12},
+                "data_bittiming": {"bitrate": 5_000_000, "sample_point": "0.750"},
+            },
+            "info_xstats": {"bus_off": 0},
+        },
+    }
+    assert parse_ip_link(shown) == CAN0
+
+
+def test_a_vcan_has_no_bit_timing() -> None:
+    shown = {"ifname": "vcan0", "flags": ["UP"], "mtu": 72, "txqlen": 1000, "link_type": "can"}
+    link = parse_ip_link(shown | {"linkinfo": {"info_kind": "vcan"}})
+    assert link is not None
+    assert (link.bitrate, link.restart_ms, link.state, link.is_virtual) == (None, None, None, True)
+
+
+def test_what_is_no_can_is_no_link() -> None:
+    assert parse_ip_link({"ifname": "lo", "flags": ["UP"], "link_type": "loopback", "mtu": 65536}) is None

@@ -1,0 +1,150 @@
+"""The survey finds who is on the bus by SDO uploads and listening, and disturbs nobody."""
+
+import dataclasses
+
+import pytest
+from bench_bus import CODEC, BenchBus
+
+from adacd_hil.device.survey import Survey, compare, expected_nodes, function_name, message_name, survey
+
+
+def look(rig: BenchBus, duration_s: float = 1.5) -> Survey:
+    return survey(rig.bus, rig.clock, duration_s)
+
+
+def verdicts(rig: BenchBus, found: Survey) -> dict[int, str]:
+    return compare(found, expected_nodes(rig.master.nodes))
+
+
+def test_every_node_is_found_with_its_identity() -> None:
+    rig = BenchBus()
+    found = look(rig)
+    told = [(n.node_id, n.device_text, n.name, n.vendor, n.product, n.serial, n.error_register) for n in found.nodes]
+    assert told == [
+        (1, "CiA 402 drive", "adacd-hil torque drive", 0x41444143, 0x402, 1, 0),
+        (2, "CiA 402 drive", "adacd-hil torque drive", 0x41444143, 0x402, 2, 0),
+        (3, "CiA 404 measuring device", "adacd-hil joint torque sensor", 0x41444143, 0x404, 3, 0),
+        (4, "CiA 404 measuring device", "adacd-hil joint torque sensor", 0x41444143, 0x404, 4, 0),
+    ]
+    assert verdicts(rig, found) == {1: "", 2: "", 3: "", 4: ""}
+
+
+def test_nothing_but_sdo_uploads_is_sent() -> None:
+    rig = BenchBus()
+    look(rig)
+    assert {frame.can_id & 0x780 for frame in rig.sent} == {0x600}
+    uploads = {frame.data[0] & 0xEF for frame in rig.sent}  # initiate and segment, either toggle
+    assert uploads == {0x40, 0x60}
+    assert {frame.can_id & 0x7F for frame in rig.sent} == set(range(1, 128))
+
+
+@pytest.mark.parametrize("is_started", [False, True])
+def test_no_node_changes_its_state(is_started: bool) -> None:
+    rig = BenchBus()
+    if is_started:
+        rig.start()
+    before = [device.state for device in rig.bench.devices]
+    look(rig)
+    assert [device.state for device in rig.bench.devices] == before
+
+
+def test_nodes_in_operation_are_seen_with_what_they_produce() -> None:
+    rig = BenchBus()
+    rig.start()
+    rig.add_host()
+    found = look(rig)
+    assert [node.state_text for node in found.nodes] == ["operational"] * 4
+    produced = {
+        message_name(CODEC, talk.can_id): (talk.length, round(talk.rate_Hz or 0)) for talk in found.nodes[0].produces
+    }
+    assert produced == {"Drive1Feedback": ("8", 1000), "Drive1Status": ("7", 10), "Drive1Heartbeat": ("1", 10)}
+    assert [(talk.can_id, round(talk.rate_Hz or 0)) for talk in found.others] == [(0x080, 1000)]
+
+
+def test_an_operational_node_without_heartbeat_is_told_by_its_pdos() -> None:
+    rig = BenchBus()
+    rig.start()
+    rig.add_host()
+    rig.tamper = lambda can_id, data: None if can_id & 0x780 == 0x700 else data
+    rig.forget()
+    assert {node.state_text for node in look(rig, 0.5).nodes} == {"operational (sends PDOs)"}
+
+
+def test_a_missing_node_is_named() -> None:
+    rig = BenchBus()
+    rig.silence(3)
+    assert verdicts(rig, look(rig)) == {1: "", 2: "", 3: "missing: Sensor1 expected", 4: ""}
+
+
+def test_a_node_that_is_not_expected_is_said_to_be() -> None:
+    rig = BenchBus()
+    found = look(rig)
+    expected = [node for node in expected_nodes(rig.master.nodes) if node.node_id != 2]
+    assert compare(found, expected)[2] == "unexpected"
+
+
+def test_another_product_than_the_expected_one_is_a_difference() -> None:
+    rig = BenchBus()
+    found = look(rig)
+    expected = [dataclasses.replace(node, product=0x403) for node in expected_nodes(rig.master.nodes)]
+    assert compare(found, expected)[1] == "Drive1 expected; product is not 0x403"
+
+
+def test_an_identity_that_is_not_expected_to_be_known_is_not_compared() -> None:
+    rig = BenchBus()
+    found = look(rig)
+    expected = [dataclasses.replace(node, vendor=None, product=None) for node in expected_nodes(rig.master.nodes)]
+    assert set(compare(found, expected).values()) == {""}
+
+
+def test_a_node_that_is_only_heard_is_found_and_does_not_answer() -> None:
+    rig = BenchBus()
+    rig.bus.deliver(0x709, b"\x05")
+    rig.bus.deliver(0x089, b"\x10\x83\x11\0\0\0\0\0")
+    node = next(node for node in look(rig).nodes if node.node_id == 9)
+    assert (node.answers, node.state_text, node.emergencies) == (False, "operational", [(0x8310, 0x11)])
+
+
+def test_what_is_not_canopen_is_listed_by_identifier() -> None:
+    rig = BenchBus()
+    rig.bus.deliver(0x055, b"\x01\x02\x03")
+    rig.bus.deliver(0x055, b"\x01")
+    (talk,) = look(rig).others
+    assert (talk.can_id, talk.length, talk.count, message_name(CODEC, talk.can_id)) == (0x055, "1-3", 2, "unknown")
+
+
+def test_an_abort_of_0x1000_still_shows_a_node() -> None:
+    rig = BenchBus()
+    rig.bus.deliver(0x58A, bytes.fromhex("8000100000000206"))
+    node = next(node for node in look(rig).nodes if node.node_id == 10)
+    assert (node.device_type, node.device_text) == (None, "?")
+
+
+def test_an_empty_bus_has_nobody() -> None:
+    rig = BenchBus()
+    rig.tamper = lambda can_id, data: None
+    rig.forget()
+    found = look(rig, 0.2)
+    assert (found.nodes, found.others) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("can_id", "name"),
+    [
+        (0x000, "NMT"),
+        (0x080, "SYNC"),
+        (0x081, "EMCY"),
+        (0x100, "TIME"),
+        (0x181, "TPDO1"),
+        (0x200, ""),
+        (0x201, "RPDO1"),
+        (0x4FF, "TPDO4"),
+        (0x581, "SDO response"),
+        (0x67F, "SDO request"),
+        (0x701, "heartbeat"),
+        (0x7E5, ""),
+        (0x18FF1234, ""),
+    ],
+)
+def test_identifiers_are_named_as_in_the_predefined_connection_set(can_id: int, name: str) -> None:
+    assert function_name(can_id) == name

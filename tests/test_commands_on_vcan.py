@@ -1,0 +1,257 @@
+"""The commands that look at an arm, each as a process, against the emulator on real SocketCAN."""
+
+import contextlib
+import json
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from experiment_runs import BIN, Played, adacd_hil, emulator
+
+from adacd_hil.log.reader import read_log
+from adacd_hil.wire.codec import contract_folder
+
+pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+
+ON_VCAN = ("-i", "socketcan", "-c", "vcan0")
+CONTROLWORD = slice(2, 4)
+
+
+def command(folder: Path, *arguments: str) -> Played:
+    return adacd_hil(folder, arguments[0], *ON_VCAN, *arguments[1:])
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Run one emulated arm for all tests of this file that don't need their own."""
+    folder = tmp_path_factory.mktemp("arm")
+    with emulator(folder, "--scenario", "idle"):
+        yield folder
+
+
+@contextlib.contextmanager
+def other_program(source: str) -> Iterator[None]:
+    """Run a program with a raw socket `can` on vcan0 while the block lasts."""
+    opening = (
+        "import socket, struct, time\n"
+        "can = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)\n"
+        "can.bind(('vcan0',))\n"
+        "def send(can_id, data): can.send(struct.pack('=IB3x8s', can_id, len(data), data))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", opening + source])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+@contextlib.contextmanager
+def listening() -> Iterator[list[tuple[int, bytes]]]:
+    """Collect what is on vcan0 during the block; filled when it ends."""
+    frames: list[tuple[int, bytes]] = []
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+        can.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 23)
+        can.bind(("vcan0",))
+        yield frames
+        can.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                packed = can.recv(16)
+                frames.append((int.from_bytes(packed[:4], sys.byteorder), packed[8 : 8 + packed[4]]))
+
+
+def test_scan_finds_the_arm(arm: Path) -> None:
+    scanned = command(arm, "scan", "--json")
+    assert scanned.status == 0, scanned.stderr
+    nodes = [(node["node"], node["device"], node["serial"], node["verdict"]) for node in scanned.json["nodes"]]
+    assert nodes == [
+        (1, "CiA 402 drive", 1, ""),
+        (2, "CiA 402 drive", 2, ""),
+        (3, "CiA 404 measuring device", 3, ""),
+        (4, "CiA 404 measuring device", 4, ""),
+    ]
+
+
+def test_scan_sends_uploads_only_and_lists_strangers(arm: Path) -> None:
+    with other_program("while True: send(0x055, b'abc'); time.sleep(0.01)"), listening() as frames:
+        scanned = command(arm, "scan", "--json")
+    (stranger,) = scanned.json["others"]
+    assert (stranger["id"], stranger["message"], stranger["length"]) == (0x055, "unknown", "3")
+    requests = [(can_id, data[0] & 0xEF) for can_id, data in frames if can_id & 0x780 == 0x600]
+    assert {code for _, code in requests} == {0x40, 0x60}
+    assert {can_id & 0x780 for can_id, _ in frames if can_id != 0x055} <= {0x580, 0x600, 0x700}
+
+
+def test_scan_of_an_empty_bus_says_who_is_missing(tmp_path: Path) -> None:
+    scanned = adacd_hil(tmp_path, "scan", "-i", "socketcan", "-c", "vcan1", "--seconds", "0.2")
+    assert scanned.status == 5
+    assert scanned.stdout.splitlines()[-1] == "nodes: 0 as expected, 4 missing"
+
+
+@pytest.mark.wallclock
+def test_commtest_boots_cycles_judges_and_logs(arm: Path, tmp_path: Path) -> None:
+    with listening() as frames:
+        tested = command(tmp_path, "commtest", "--seconds", "1", "--json", "--out", str(tmp_path))
+    result = tested.json
+    expected = {"good": 0, "warning": 0, "not sufficient": 1}[result["verdict"]]  # the machine may stall
+    assert tested.status == expected
+    assert (result["cycles"] + result["overruns"], result["fault"]) == (pytest.approx(1000, abs=100), "NONE")
+    words = {data[CONTROLWORD] for can_id, data in frames if can_id in (0x201, 0x202)}
+    assert words == {b"\x00\x00"}
+    assert frames[-1] != (0x000, b"\x01\x00")
+    log = read_log(tmp_path / "commtest.mcap")
+    assert log.is_complete
+    assert len(log.topics["/cycle"]["cycle"]) == result["cycles"]
+
+
+@pytest.mark.wallclock
+def test_commtest_with_enabled_drives_commands_no_torque(arm: Path, tmp_path: Path) -> None:
+    config = tmp_path / "patient.toml"  # stalls of the machine are not what is tested
+    config.write_text("[bus]\ncommand_patience_cycles = 250\nmax_age_cycles = 100\n")
+    with listening() as frames:
+        tested = command(tmp_path, "commtest", "--seconds", "1", "--enable", "--config", str(config), "--json")
+    assert tested.status in (0, 1), tested.stderr
+    commands = [data for can_id, data in frames if can_id in (0x201, 0x202)]
+    assert {data[4:6] for data in commands} == {b"\x00\x00"}
+    assert b"\x0f\x00" in {data[CONTROLWORD] for data in commands}
+    assert commands[-1][CONTROLWORD] == b"\x00\x00"
+
+
+def test_commtest_names_the_node_that_is_missing(tmp_path: Path) -> None:
+    tested = adacd_hil(tmp_path, "commtest", "-i", "socketcan", "-c", "vcan1")
+    assert (tested.status, tested.stdout) == (5, "")
+    assert "no boot-up from Drive1 (node 1)" in tested.stderr
+
+
+@pytest.mark.wallclock
+def test_doctor_passes_the_arm_and_leaves_it_pre_operational(arm: Path, tmp_path: Path) -> None:
+    with listening() as frames:
+        done = command(tmp_path, "doctor", "--json")
+    found = {check["name"]: check for check in done.json["checks"]}
+    failures = [name for name, check in found.items() if check["status"] == "failed"]
+    assert failures in ([], ["rate"])  # the machine may stall
+    assert done.status == (1 if failures else 0)
+    assert found["interface"]["reason"] == "vcan0 is up, vcan: virtual, without bit rate and arbitration"
+    assert found["PDO map"]["status"] == "ok"
+    assert [data for can_id, data in frames if can_id == 0x000][-1] == b"\x80\x00"
+    assert {data[CONTROLWORD] for can_id, data in frames if can_id in (0x201, 0x202)} == {b"\x00\x00"}
+
+
+def test_doctor_stops_when_another_master_is_present(arm: Path, tmp_path: Path) -> None:
+    source = "while True: send(0x080, b'\\1'); send(0x77F, b'\\5'); time.sleep(0.01)"
+    with other_program(source), listening() as frames:
+        done = command(tmp_path, "doctor", "--json")
+    found = {check["name"]: check for check in done.json["checks"]}
+    assert done.status == 1
+    assert found["other masters"]["reason"] == "somebody else sends Sync, HostHeartbeat"
+    assert found["cycle"]["status"] == "skipped"
+    assert not any(can_id in (0x000, 0x201, 0x202) or can_id & 0x780 == 0x600 for can_id, _ in frames)
+
+
+def test_doctor_tells_another_contract(arm: Path, tmp_path: Path) -> None:
+    text = (contract_folder() / "arm.dbc").read_text()
+    other = tmp_path / "other.dbc"
+    other.write_text(text.replace("SG_ torque : 16|32@1- (1e-06,0)", "SG_ torque : 16|32@1- (1e-05,0)"))
+    done = command(tmp_path, "doctor", "--dbc", str(other), "--json")
+    found = {check["name"]: check for check in done.json["checks"]}
+    assert (done.status, found["contract"]["status"]) == (1, "failed")
+    assert found["contract"]["remedy"] == "give host and devices the same DBC file"
+
+
+def test_doctor_tells_a_missing_arm_and_a_missing_interface(tmp_path: Path) -> None:
+    done = adacd_hil(tmp_path, "doctor", "-i", "socketcan", "-c", "vcan1")
+    assert done.status == 1
+    assert "FAILED   nodes" in done.stdout
+    done = adacd_hil(tmp_path, "doctor", "-i", "socketcan", "-c", "vcan9")
+    assert done.status == 1
+    assert "vcan9 is no CAN interface; present: vcan0, vcan1" in done.stdout
+
+
+def test_an_interrupted_doctor_leaves_the_nodes_pre_operational(arm: Path) -> None:
+    with listening() as frames:
+        process = subprocess.Popen(
+            [BIN / "adacd-hil", "doctor", *ON_VCAN], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert process.stderr is not None
+        assert any(line == "PDO map: ok\n" for line in process.stderr)
+        process.send_signal(signal.SIGTERM)
+        stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stdout) == (130, "")
+    assert stderr.splitlines()[-1] == "adacd-hil: interrupted"
+    assert [data for can_id, data in frames if can_id == 0x000][-1] == b"\x80\x00"
+
+
+def test_one_node_that_is_out_of_reach_is_named_by_scan_and_doctor(arm: Path, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+        can.bind(("vcan0",))
+        nmt = "00000000 02000000 {:02x}03000000000000"  # to node 3
+        can.send(bytes.fromhex(nmt.format(2)))  # stopped: no SDO, no PDO
+        scanned = command(tmp_path, "scan", "--json")
+        done = command(tmp_path, "doctor", "--json")
+        can.send(bytes.fromhex(nmt.format(128)))
+    verdicts = {node["node"]: node["verdict"] for node in scanned.json["nodes"]}
+    found = {check["name"]: check for check in done.json["checks"]}
+    assert (scanned.status, done.status) == (5, 1)
+    assert (verdicts[1], verdicts[2], verdicts[4]) == ("", "", "")
+    assert "Sensor1 expected" in verdicts[3]
+    assert "Sensor1 expected" in found["nodes"]["reason"]
+    assert found["boot"]["reason"] == "needs `nodes`, which failed"
+
+
+def test_monitor_shows_the_bus_and_sends_nothing(arm: Path, tmp_path: Path) -> None:
+    source = (
+        "send(0x000, b'\\1\\0')\n"
+        "k = 0\n"
+        "while True: k = k % 240 + 1; send(0x080, bytes((k,))); send(0x055, b'x'); time.sleep(0.005)"
+    )
+    with other_program(source), listening() as frames:
+        watched = command(tmp_path, "monitor", "--seconds", "1", "--json")
+    messages = {row["message"]: row for row in watched.json["messages"]}
+    assert watched.status == 0
+    assert {"Sync", "Drive1Feedback", "Sensor2Torque", "unknown"} <= set(messages)
+    assert messages["Drive1Feedback"]["values"]["position"] == pytest.approx(-0.5236, abs=0.01)
+    assert messages["Sensor1Torque"]["errors"] == 0
+    assert {can_id for can_id, _ in frames if can_id & 0x780 in (0x200, 0x600)} == set()
+    assert watched.json["bus_state"] == "vcan"
+
+
+@pytest.mark.wallclock
+def test_monitor_survives_a_full_bus_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+    flood = "while True:\n for k in range(50): send(k * 37 % 2048, bytes(8))\n time.sleep(0.005)"
+    with other_program(flood):
+        process = subprocess.Popen(
+            [BIN / "adacd-hil", "monitor", *ON_VCAN], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stderr) == (0, "")
+    assert first.startswith("load ")
+    assert "\x1b" not in stdout
+
+
+def test_monitor_with_json_ends_with_one_snapshot_at_ctrl_c(tmp_path: Path) -> None:
+    with other_program("while True: send(0x709, b'\\5'); time.sleep(0.01)"):
+        process = subprocess.Popen(
+            [BIN / "adacd-hil", "monitor", *ON_VCAN, "--seconds", "600", "--node", "9", "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stderr is not None
+        assert process.stderr.readline() == "listening on vcan0\n"
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+            can.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", 0x709, 0x7FF))
+            can.bind(("vcan0",))
+            can.recv(16)  # the other program has begun
+        process.send_signal(signal.SIGINT)
+        stdout, _ = process.communicate(timeout=60)
+    (node,) = json.loads(stdout)["nodes"]
+    assert (process.returncode, node["state"]) == (0, "operational")
