@@ -39,7 +39,7 @@ def run_commtest(
     """
     settings, codec = connection.load()
     clock = MonotonicClock()
-    with connection.bus(clock) as bus:
+    with connection.bus(clock, codec.is_fd) as bus:
         tap = Tap(bus, clock)
         arm, master = Arm(settings, codec, tap), Master(settings, codec, tap)
         _progress(f"looking for the arm on {bus.channel}")

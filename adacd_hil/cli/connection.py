@@ -1,5 +1,6 @@
 """What the commands that work on a bus share: settings, contract, an open bus, and an orderly end."""
 
+import dataclasses
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,10 +9,48 @@ from pathlib import Path
 from typing import NoReturn
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.clock import Clock
+from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.config import Settings, load_settings
-from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
-from adacd_hil.wire.codec import Codec, load_codec
+from adacd_hil.device.contract import load_contract, write_contract
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError, is_hardware, open_bus
+from adacd_hil.wire.codec import Codec
+
+
+def make_clock(name: str) -> Clock:
+    """Make the clock of a run: `lockstep` or `realtime`."""
+    return VirtualClock() if name == "lockstep" else MonotonicClock()
+
+
+def check_clock(name: str, interface: str, channel: str) -> None:
+    """Raise CommandError for lockstep on hardware, which has no time for it."""
+    if name == "lockstep" and is_hardware(interface, channel):
+        raise CommandError(
+            f"--clock lockstep is for emulated arms; {interface} {channel} is hardware and needs --clock realtime",
+            ExitCode.USAGE,
+        )
+
+
+def received_ids(codec: Codec) -> list[int]:
+    """List the identifiers that the host receives."""
+    return [message.can_id for message in codec.messages.values() if "HOST" not in message.senders]
+
+
+def with_dbc(settings: Settings, dbc: Path | None) -> Settings:
+    """Let the option --dbc outweigh the configuration's contract."""
+    if dbc is None:
+        return settings
+    return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(dbc)))
+
+
+def contract_of(settings: Settings, out: Path) -> Codec:
+    """Load the contract of the configured devices; one that is composed from their profiles is written to `out`.
+
+    Raises ConfigError, CodecError, OSError.
+    """
+    codec = load_contract(settings)
+    if not codec.path.is_file():
+        out.mkdir(parents=True, exist_ok=True)
+    return write_contract(codec, out)
 
 
 @dataclass(frozen=True)
@@ -27,15 +66,16 @@ class Connection:
 
     def load(self) -> tuple[Settings, Codec]:
         """Read configuration and contract. Raises ConfigError, CodecError."""
-        return load_settings(self.config, self.profile), load_codec(self.dbc)
+        settings = with_dbc(load_settings(self.config, self.profile), self.dbc)
+        return settings, load_contract(settings)
 
     @contextmanager
-    def bus(self, clock: Clock) -> Iterator[Bus]:
+    def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:
         """Open the bus, receiving everything, while the block lasts. Raises BusMissingError.
 
         A bus that fails in the block ends the command as missing: nothing has been enabled on it.
         """
-        bus = open_bus(self.interface, self.channel, clock, None, self.bitrate)
+        bus = open_bus(self.interface, self.channel, clock, None, self.bitrate, is_fd)
         try:
             yield bus
         except BusMissingError:

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from adacd_hil.analysis.report import Report, write_report
+from adacd_hil.cli.connection import contract_of, make_clock, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.report import TRUTH_NAME
-from adacd_hil.cli.run import contract_of, interruptible, make_clock
 from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
@@ -43,7 +43,7 @@ def play(config: str, profile: str | None, seed: int | None, clock_name: str, ou
             metadata={"scenario": SCENARIO, "seed": str(scenario.seed)},
             progress=progress,
         )
-        with interruptible(session):
+        with on_interrupt(session.interrupt):
             summary = session.run()
     if summary.result is not None:
         played_s = summary.result.cycles * settings.bus.period_s

@@ -36,7 +36,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
         settings,
         codec,
         clock,
-        lambda: open_bus(connection.interface, connection.channel, clock, None, connection.bitrate),
+        lambda: open_bus(connection.interface, connection.channel, clock, None, connection.bitrate, codec.is_fd),
         link,
         bitrate,
         data_bitrate,

@@ -105,9 +105,9 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
     Raises ConfigError, CodecError, BusMissingError, CommandError.
     """
     clock = MonotonicClock()
-    connection.load()  # what is wrong with the configuration comes before what is wrong with the bus
+    _, codec = connection.load()  # what is wrong with the configuration comes before what is wrong with the bus
     screen = Screen(sys.stdout.isatty() and is_live and not as_json, _write)
-    with connection.bus(clock) as bus:
+    with connection.bus(clock, codec.is_fd) as bus:
         monitor = Monitor(connection, bus, clock, node_id)
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         with on_interrupt(monitor.stop):

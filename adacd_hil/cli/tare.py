@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from adacd_hil.cli.connection import check_clock, make_clock, on_interrupt, received_ids, with_dbc
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
-from adacd_hil.cli.run import check_clock, interruptible, make_clock, received_ids, with_dbc
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.exchange import SilenceError
 from adacd_hil.control.tare import TareRefusedError
@@ -80,7 +80,7 @@ def tare_on_bus(
     progress = Progress()
     try:
         session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
-        with interruptible(session):
+        with on_interrupt(session.interrupt):
             tare = session.run()
     except TareRefusedError as reason:
         raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None

@@ -4,10 +4,6 @@ from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock, VirtualClock
 
-FEEDBACK_SHARE = 0.7
-"""Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
-the worst, and two commands need 230 µs before the next SYNC."""
-
 
 class Tick(NamedTuple):
     """The beginning of one cycle. `periods` since the previous one, 1 unless periods were skipped."""

@@ -7,8 +7,9 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
+from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.realtime import FEEDBACK_SHARE, GridPacer
+from adacd_hil.control.realtime import GridPacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
@@ -40,7 +41,7 @@ class ZeroTorqueLoop:
         self._bus, self._arm, self._master = bus, arm, master
         self._is_enabling = is_enabling
         self._is_interrupted = False
-        self._patience_ns = round(FEEDBACK_SHARE * settings.bus.period_ns)
+        self._exchange = Exchange(settings, bus, arm, master, clock, is_lockstep=False)
         self._heartbeat_cycles = max(1, settings.bus.heartbeat_ms * 1000 // settings.bus.period_us)
         self._max_age_cycles = settings.bus.max_age_cycles
         self._gate = Gate(settings.arm, settings.bus.period_s)
@@ -87,23 +88,12 @@ class ZeroTorqueLoop:
     def _cycle(self, is_enabling: bool, quick_stop: bool) -> ZeroTorqueCycle:
         bus, arm, clock = self._bus, self._arm, self._clock
         tick = self.pacer.next()
-        while (late := bus.receive(0.0)) is not None:  # belongs to the cycle before
-            self._accept(late)
-        sync_ns = clock.now_ns()
-        arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
-        left_ns = self._patience_ns
-        while not arm.has_all_frames and (frame := bus.receive(max(left_ns, 0) * 1e-9)) is not None:
-            self._accept(frame)
-            left_ns = self._patience_ns - (clock.now_ns() - sync_ns)
-        feedback_ns = clock.now_ns() - sync_ns if arm.is_complete else -1
-        state = arm.state()
+        state = self._exchange.read(tick)
+        sync_ns = self._exchange.sync_ns
+        feedback_ns = self._exchange.feedback_ns - sync_ns if arm.is_complete else -1
         self._gate.limit(self._tau_d, is_enabling and state.is_enabled, self._tau_c)
         arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
         command_ns = clock.now_ns() - sync_ns
         if tick.cycle % self._heartbeat_cycles == 0:
             self._master.send_heartbeat()
         return ZeroTorqueCycle(state, tick.lateness_ns, feedback_ns, command_ns, bus.take())
-
-    def _accept(self, frame: Frame) -> None:
-        if not self._arm.accept(frame):
-            self._master.accept(frame)

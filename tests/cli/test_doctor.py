@@ -10,7 +10,7 @@ from adacd_hil.cli.doctor import as_json, as_text
 from adacd_hil.control.arm_checks import ARM_CHECKS, ArmExamination, check_pdo_map
 from adacd_hil.control.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.object_dictionary import NmtState
+from firmware_sim.device import NmtState
 
 COMMAND = CODEC.message("Drive1Command")
 pytestmark = pytest.mark.slow
