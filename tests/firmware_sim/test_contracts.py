@@ -204,7 +204,7 @@ def test_a_stock_sensors_mapping_is_fixed(sub):
 
 @pytest.mark.skipif("arm_fd" not in BY_DEFAULT, reason="dbc/arm_fd.dbc is not in this tree")
 def test_fd_devices_exchange_one_protected_frame_each_way():
-    host = BenchHost(quiet_scenario(torque_offset_Nm=[1.0, 50.0]), contract="arm_fd")
+    host = BenchHost(quiet_scenario(torque_offset_Nm=[1.0, -50.0]), contract="arm_fd")
     host.start()
     codec = load_codec(CONTRACTS["arm_fd"].path)
     senders = {node: codec.message(f"Drive{node}Command").sender() for node in DRIVE_NODES}
@@ -224,5 +224,5 @@ def test_fd_devices_exchange_one_protected_frame_each_way():
     assert feedback[6:] == (0, 200, 4)
     assert len(frames[0x181]) == 24
     torque, gross, status, register, temperature = struct.unpack_from("<iiBBh", frames[0x184], 4)
-    assert (torque, gross, status, register, temperature) == (gross, torque, 3, 0, 2500)
-    assert frames[0x184][3] == 3
+    assert (torque, gross, status, register, temperature) == (gross, torque, 5, 0, 2500)
+    assert frames[0x184][3] == 5

@@ -64,8 +64,8 @@ class Watched:
             host.put(*HOST_BEAT)
         if self.watchdog in (HEARTBEAT, OPERATIONAL):
             host.nmt(START, 1)
-        host.step(ENABLE)  # out of sequence where the drive hasn't listened for a while
-        host.step(ENABLE)
+        for _ in range(8):  # the first are out of sequence where the drive hasn't listened for a while
+            host.step(ENABLE)
 
     def emergencies(self) -> list[tuple[int, int, int, int]]:
         """Take the EMCYs of drive 1: code, register, watchdog, ms."""
