@@ -76,7 +76,7 @@ class Session:
         """
         tap = Tap(self.bus, self.clock)
         arm = Arm(self.settings, self.codec, tap)
-        master = Master(self.settings, self.codec, tap)
+        master = Master(self.settings, self.codec, tap, watch_host=not self.is_lockstep)
         cycle = Cycle(self.settings, tap, arm, master, self._pacer(), self.operator, self.progress, self.is_lockstep)
         self._cycle = cycle
         if self._is_interrupted:

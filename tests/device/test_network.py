@@ -107,6 +107,13 @@ def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:
     assert watched == [127 << 16 | 100] * 4
 
 
+def test_devices_are_not_told_to_watch_a_host_in_lockstep() -> None:
+    rig = Rig()
+    rig.master = Master(load_settings("paper"), CODEC, rig.bus, watch_host=False)
+    rig.start()
+    assert read(rig, "Drive1", 0x1016, 1) == 0
+
+
 def test_the_same_boot_twice_is_the_same_frames() -> None:
     rigs = [Rig(), Rig()]
     for rig in rigs:
