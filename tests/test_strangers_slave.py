@@ -636,3 +636,39 @@ def test_wrong_units_of_a_sensor_are_one_line(tmp_path: Path, lies: dict[tuple[i
     with pytest.raises(DeviceError) as raised:
         rig.boot()
     assert str(raised.value) == line
+
+
+def rig_with_profile(folder: Path, line: str) -> Rig:
+    path = folder / "own.toml"
+    path.write_text(DIGITS_PROFILE.replace("[scale]", f"{line}\n[scale]"))
+    settings = load_settings("stock")
+    devices = dataclasses.replace(settings.devices, sensor=(str(path), str(path)))
+    return Rig(dataclasses.replace(settings, devices=devices), "torque_sensor.eds")
+
+
+def test_any_identity_is_taken_where_the_profile_says_so(tmp_path: Path) -> None:
+    rig = rig_with_profile(tmp_path, 'identity = "any"')
+    rig.sensors[0].lies.update({(0x1018, 1): 0xBAD, (0x1000, 0): 0})
+    rig.master.reset()
+    assert rig.master.identify()[2].vendor == 0xBAD
+
+
+def test_a_swapped_device_is_told_by_its_serial_number(tmp_path: Path) -> None:
+    rig = rig_with_profile(tmp_path, "serial = [4, 3]")
+    rig.master.reset()
+    with pytest.raises(DeviceError) as raised:
+        rig.master.identify()
+    assert str(raised.value) == "Sensor1 (node 3): serial number 0x1018:4 = 3, 4 expected"
+
+
+def test_extra_writes_of_a_profile_are_done_and_read_back(tmp_path: Path) -> None:
+    rig = rig_with_profile(tmp_path, 'setup = [{ object = "0x6131:1", value = 0xFD560100 }]')
+    rig.boot()
+    assert rig.sensors[1].node.data_store[0x6131][1] == bytes.fromhex("000156fd")
+
+
+def test_an_extra_write_of_an_object_that_the_eds_lacks_is_one_line(tmp_path: Path) -> None:
+    rig = rig_with_profile(tmp_path, 'setup = [{ object = "0x3002:1", value = 5 }]')
+    with pytest.raises(DeviceError) as raised:
+        rig.boot()
+    assert str(raised.value) == "Sensor1 (node 3): 0x3002:1 is not in the EDS"

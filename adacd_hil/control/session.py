@@ -133,7 +133,7 @@ class Session:
     def _prepare(self, tap: Tap, pacer: Pacer) -> Attempt:
         """Build and compile everything that must know nothing of an attempt before."""
         arm = Arm(self.settings, self.codec, tap)
-        master = Master(self.settings, self.codec, tap)
+        master = Master(self.settings, self.codec, tap, watch_host=not self.is_lockstep)
         cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.is_lockstep)
         cycle.compile()
         self._cycle = cycle

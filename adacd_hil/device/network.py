@@ -44,8 +44,13 @@ class Identity(NamedTuple):
 class Master:
     """The CANopen master of one arm."""
 
-    def __init__(self, settings: Settings, codec: Codec, bus: Bus) -> None:
-        """Load the profiles. Raises ConfigError when one can't be used."""
+    def __init__(self, settings: Settings, codec: Codec, bus: Bus, watch_host: bool = True) -> None:
+        """Load the profiles. Raises ConfigError when one can't be used.
+
+        `watch_host`: devices shall watch the host's heartbeat. Not in lockstep: there the host sends it by cycles,
+        which take as long as they take, and a device that waits goes by the wall clock.
+        """
+        self._watch_host = watch_host
         self._settings = settings
         self._codec = codec
         self._bus = bus
@@ -195,7 +200,8 @@ class Master:
             self._events.append(Event("warning", slave.name, "sends no heartbeat (0x1017 is not in its EDS)"))
         if slave.has(0x1016, 1) and slave.device.can("heartbeat_consumer"):
             host = self._heartbeat_id & 0x7F
-            slave.write_checked(0x1016, 1, host << 16 | round(PATIENCE_PERIODS * period_ms))
+            entry = host << 16 | round(PATIENCE_PERIODS * period_ms)
+            slave.write_checked(0x1016, 1, entry if self._watch_host else 0)
 
     def start(self) -> None:
         """Let all nodes exchange cyclic frames, the sensors first by default. Raises BusError."""

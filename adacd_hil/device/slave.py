@@ -61,7 +61,7 @@ class Slave:
     def _entry(self, index: int, sub: int) -> Any:
         entry = self._node.sdo.get_variable(index, sub)
         if entry is None:
-            raise KeyError("is not in the EDS")
+            self.fail(f"{ObjectName(index, sub)} is not in the EDS")
         return entry
 
 

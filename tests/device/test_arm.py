@@ -233,7 +233,7 @@ def test_a_cycle_without_a_frame_is_counted_once_as_no_new_data() -> None:
 def test_a_frame_that_fails_its_check_is_no_miss() -> None:
     devices = Devices()
     devices.arm.synchronise(0, 0, 1)
-    devices.answer(without=("Sensor2Torque",))
+    devices.answer(without=("Sensor2Torque", "Drive1Feedback"))
     devices.arm.accept(Frame(CODEC.message("Sensor2Torque").can_id, bytes(6), 0))
     devices.arm.synchronise(1, 0, 1)
     assert "1 WRONG_CRC, 0 NO_NEW_DATA" in devices.arm.describe_checks()[3]

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import Settings, load_settings, merge, parse
+from adacd_hil.config import Settings, load_settings, parse
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
-from adacd_hil.records import ArmCommand
+from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.wire.bus import EmbeddedBus, Frame
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.bench import Bench
 from firmware_sim.scenario import load_scenario
 
@@ -18,22 +19,30 @@ pytestmark = pytest.mark.slow
 
 CODEC = load_codec()
 PERIOD_NS = 1_000_000
+CONFIGURATIONS = [
+    name
+    for name in ("paper", "fd", "fd_500us", "stock")
+    if (contract_folder() / f"{load_settings(name).devices.contract}.dbc").is_file()
+]
 
 
 class Rig:
     """Host and emulator in one process; `passed` is every frame on the bus."""
 
-    def __init__(self, table: dict[str, object] | None = None) -> None:
+    def __init__(self, table: dict[str, object] | None = None, config: str = "paper") -> None:
+        base = load_settings(config)
+        codec = load_contract(base)
         self.clock = VirtualClock()
         self.passed: list[tuple[int, bytes]] = []
         bus = EmbeddedBus(self.clock)
-        self._bench = Bench(load_scenario("idle", "P"), CODEC, self._deliver)
+        self._bench = Bench(load_scenario("idle", "P"), codec, self._deliver)
         self.bus = bus
         bus.attach(self._on_frame)
         self._bench.boot()
-        settings = parse(Settings, merge({"name": "test"}, table or {}))
-        self.arm = Arm(settings, CODEC, bus)
-        self.master = Master(settings, CODEC, bus)
+        settings = parse(Settings, table) if table else base
+        self.period_ns = settings.bus.period_ns
+        self.arm = Arm(settings, codec, bus)
+        self.master = Master(settings, codec, bus)
         self.cycle = 0
 
     def _deliver(self, can_id: int, data: bytes) -> None:
@@ -54,12 +63,12 @@ class Rig:
         if not self.arm.accept(frame):
             self.master.accept(frame)
 
-    def step(self, enable: bool = False) -> None:
-        self.clock.sleep_until_ns(self.cycle * PERIOD_NS)
-        self.arm.synchronise(self.cycle, self.cycle * PERIOD_NS, 1)
+    def step(self, *tau: float, enable: bool = False) -> None:
+        self.clock.sleep_until_ns(self.cycle * self.period_ns)
+        self.arm.synchronise(self.cycle, self.cycle * self.period_ns, 1)
         while (frame := self.bus.receive(0.0)) is not None:
             self.accept(frame)
-        self.arm.write(ArmCommand(np.zeros(2), enable, False))
+        self.arm.write(ArmCommand(np.array(tau or (0.0, 0.0)), enable, False))
         if self.cycle % 100 == 0:
             self.master.send_heartbeat()
         self.cycle += 1
@@ -78,11 +87,31 @@ def test_the_emulated_arm_boots_runs_and_is_watched() -> None:
     assert rig.master.watch(rig.cycle * PERIOD_NS) == []
 
 
+@pytest.mark.parametrize("config", CONFIGURATIONS)
+def test_the_emulated_devices_of_every_contract_are_set_up_enabled_and_moved(config: str) -> None:
+    rig = Rig(config=config)
+    rig.start()
+    for _ in range(400):
+        rig.step(0.3, 0.1, enable=True)
+    state = rig.arm.state()
+    assert (state.is_enabled, state.is_complete, state.fault) == (True, True, FaultReason.NONE)
+    assert state.dq.min() > 0.1
+    np.testing.assert_allclose(state.tau_J, [0.3, 0.1], atol=0.1)
+    assert rig.arm.describe_faults() == rig.master.watch(rig.cycle * rig.period_ns) == []
+
+
 def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:
     rig = Rig({"bus": {"heartbeat_ms": 40}})
     rig.start()
     watched = [read(rig, name, 0x1016, 1) for name in ("Drive1", "Drive2", "Sensor1", "Sensor2")]
     assert watched == [127 << 16 | 100] * 4
+
+
+def test_devices_are_not_told_to_watch_a_host_in_lockstep() -> None:
+    rig = Rig()
+    rig.master = Master(load_settings("paper"), CODEC, rig.bus, watch_host=False)
+    rig.start()
+    assert read(rig, "Drive1", 0x1016, 1) == 0
 
 
 def test_the_same_boot_twice_is_the_same_frames() -> None:
