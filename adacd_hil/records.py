@@ -226,6 +226,17 @@ class CycleRecord(NamedTuple):
     frames_missing: int  # cyclic frames of this cycle that did not arrive or failed their checks
 
 
+class FrameChecks(NamedTuple):
+    """What the checks have said of the cyclic frames of drive 1, drive 2, sensor 1, sensor 2 since the attempt began.
+
+    counts: per device, by E2eStatus. implausible: per device.
+    """
+
+    cycle: int
+    counts: tuple[tuple[int, ...], ...]
+    implausible: tuple[int, ...]
+
+
 class Event(NamedTuple):
     """Something worth a line in the log."""
 

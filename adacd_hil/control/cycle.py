@@ -20,7 +20,7 @@ from adacd_hil.control.realtime import Pacer, Tick
 from adacd_hil.control.reference import Reference
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
-from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_scheme
+from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import (
     CONTROL_LAYOUT,
@@ -40,6 +40,8 @@ FAULT_LINGER_S = 0.5
 """How long a faulted run goes on, so that the drives' quick stop is in the log."""
 DISABLE_CYCLES = 20
 """Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
+FRAME_CHECKS_S = 1.0
+"""How often the log gets what the checks of frames have counted."""
 
 _POWERED = frozenset(
     (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
@@ -76,6 +78,7 @@ class Cycle:
         """Prepare. `stopwatch`: what durations within a cycle are measured by, default the host's clock."""
         self._period_s = settings.bus.period_s
         self._heartbeat_cycles = max(1, round(settings.bus.heartbeat_ms * 1e-3 / self._period_s))
+        self._checks_cycles = max(1, round(FRAME_CHECKS_S / self._period_s))
         self._watch_cycles = max(1, self._heartbeat_cycles // 10)
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
@@ -190,6 +193,8 @@ class Cycle:
             (ChannelId.CONTROL, pack_control(tick.cycle, self._block, flags, command.enable, command.quick_stop)),
             (ChannelId.CYCLE, pack_cycle(record)),
         ]
+        if tick.cycle % self._checks_cycles == 0:
+            messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
@@ -235,3 +240,5 @@ class Cycle:
             self._exchange.read(tick)
             self._arm.write(command)
             recorder.cycle(tick.t_ns, [], self._bus.take())
+        checks = pack_frame_checks(self._arm.frame_checks())
+        recorder.cycle(tick.t_ns, [(ChannelId.FRAME_CHECKS, checks)], self._bus.take())

@@ -15,7 +15,7 @@ from adacd_hil.device.emergency import name_error
 from adacd_hil.device.heartbeat import PATIENCE_PERIODS
 from adacd_hil.device.placement import Device, place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
-from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
+from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.e2e import E2eStatus
@@ -193,6 +193,14 @@ class Arm:
         for drive, tau_c, ratio in zip(self.drives, command.tau_c.tolist(), self._permille_per_Nm, strict=True):
             frame = drive.command(round(tau_c * ratio), command.enable, command.quick_stop)
             self._bus.send(drive.command_id, frame)
+
+    def frame_checks(self) -> FrameChecks:
+        """Return what the checks have said of all cyclic frames so far."""
+        return FrameChecks(
+            self._cycle,
+            tuple(tuple(device.end_to_end.counts) for device in self._devices),
+            tuple(device.implausible_frames for device in self._devices),
+        )
 
     def describe_checks(self) -> list[str]:
         """Say how many cyclic frames of each device passed and failed their checks, one line each."""

@@ -13,6 +13,7 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /contact | adacd_hil_msgs/msg/Contact | when a report begins and when it is final |
 | /control | adacd_hil_msgs/msg/Control | every cycle; records.CONTROL_LAYOUT |
 | /cycle | adacd_hil_msgs/msg/Cycle | every cycle; records.CycleRecord |
+| /frame_checks | adacd_hil_msgs/msg/FrameChecks | once a second: what the checks said of each device's cyclic frames |
 | /events | foxglove_msgs/msg/Log | when something happens |
 | /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; records.TRUTH_LAYOUT |
 """
@@ -30,6 +31,7 @@ from adacd_hil.records import (
     ContactReport,
     CycleRecord,
     FaultReason,
+    FrameChecks,
     Layout,
     Request,
     SchemeOutput,
@@ -37,6 +39,7 @@ from adacd_hil.records import (
     Vector,
     scheme_layout,
 )
+from adacd_hil.wire.e2e import E2eStatus
 
 PACKAGE = "adacd_hil_msgs/msg"
 DECODED = "/decoded/"
@@ -56,6 +59,7 @@ class ChannelId(IntEnum):
     TRUTH = 9
     TO_CAN_BUS_FD = 10
     FROM_CAN_BUS_FD = 11
+    FRAME_CHECKS = 12
     DECODED_FIRST = 16  # and up: the messages of the DBC, in its order
 
 
@@ -144,12 +148,22 @@ _CYCLE = (
     Member("overruns", "uint64", meaning="periods skipped since the run began"),
     Member("frames_missing", "uint64", meaning="cyclic frames that did not arrive or failed their checks"),
 )
+_DEVICES = ("drive1", "drive2", "sensor1", "sensor2")
+_FRAME_CHECKS = (
+    _CYCLE_NUMBER,
+    *(
+        Member(f"{device}_checks", "uint64", len(E2eStatus), meaning="frames so far, by E2eStatus", constants=constants)
+        for device, constants in zip(_DEVICES, (_constants("E2E", E2eStatus), (), (), ()), strict=True)
+    ),
+    Member("implausible", "uint64", len(_DEVICES), meaning="frames so far that failed their plausibility check"),
+)
 _TRUTH = (_CYCLE_NUMBER,)
 
 _SCHEME_HEAD = body_struct(_SCHEME, has_block=True)
 _CONTACT_BODY = body_struct(_CONTACT)
 _CONTROL_HEAD = body_struct(_CONTROL, has_block=True)
 _CYCLE_BODY = body_struct(_CYCLE)
+_FRAME_CHECKS_BODY = body_struct(_FRAME_CHECKS)
 _TRUTH_HEAD = body_struct(_TRUTH, has_block=True)
 SCHEME_BLOCK = _SCHEME_HEAD.size
 """Where the block begins in the body of /scheme, bytes."""
@@ -169,6 +183,7 @@ def run_channels(parameter_count: int, messages: "tuple[MessageLike, ...]" = ())
         Channel(ChannelId.CONTACT, "/contact", number_type(f"{PACKAGE}/Contact", _CONTACT)),
         Channel(ChannelId.CONTROL, "/control", number_type(f"{PACKAGE}/Control", control)),
         Channel(ChannelId.CYCLE, "/cycle", number_type(f"{PACKAGE}/Cycle", _CYCLE)),
+        Channel(ChannelId.FRAME_CHECKS, "/frame_checks", number_type(f"{PACKAGE}/FrameChecks", _FRAME_CHECKS)),
         Channel(ChannelId.EVENTS, "/events", LOG),
     )
     decoded = tuple(
@@ -229,6 +244,12 @@ def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick
 def pack_cycle(record: CycleRecord) -> bytes:
     """Pack the body of /cycle."""
     return _CYCLE_BODY.pack(*record)
+
+
+def pack_frame_checks(checks: FrameChecks) -> bytes:
+    """Pack the body of /frame_checks."""
+    counts = [count for device in checks.counts for count in device]
+    return _FRAME_CHECKS_BODY.pack(checks.cycle, *counts, *checks.implausible)
 
 
 def pack_truth(cycle: int, block: Vector) -> bytes:

@@ -19,6 +19,7 @@ from session_rig import (
 from adacd_hil.control.gate import GateFlag
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.e2e import E2eStatus
 
 pytestmark = pytest.mark.slow
 
@@ -88,6 +89,19 @@ def test_corrupted_torque_frames_count_as_lost_and_change_no_value(tmp_path: Pat
     assert "1 WRONG_CRC" in tally
     assert "1 OK_SOME_LOST" in tally
     assert log.scheme["tau_J"][TROUBLE_CYCLE][0] == log.scheme["tau_J"][TROUBLE_CYCLE - 1][0]
+
+
+def test_the_log_counts_what_the_checks_said_of_each_frame(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    lost = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 2)
+    rig.tamper = lambda cycle, i, data: None if i == 0x184 and cycle in lost else data
+    _, log = rig.run()
+    checks = log.topics["/frame_checks"]
+    is_missed = E2eStatus.NO_NEW_DATA
+    assert checks["sensor2_checks"][:, is_missed].tolist()[:3] == [0, 0, 2]
+    assert checks["sensor2_checks"][-1, is_missed] == 2
+    assert checks["sensor1_checks"][-1, is_missed] == 0
+    assert checks["sensor1_checks"][-1, E2eStatus.OK] == log.cycle["cycle"][-1] + 21  # the cycles of disabling, too
 
 
 def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from adacd_hil.control.tare import Pose, TareRefusedError, measure_pose, solve_t
 from adacd_hil.control.tare_session import TareInterruptedError
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import contract_folder
 
 OFFSET = (0.3, -0.2)
 NINE = {"gravity": True, "P0": (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5)}
@@ -238,27 +236,14 @@ def test_where_it_came_from_is_stored_with_it() -> None:
     )
     assert tare.layout_digest == f"0x{CODEC.layout_digest:08X}"
     np.testing.assert_allclose(np.degrees(tare.poses[0].q_rad), [-30.0, -60.0], atol=1e-3)
-    assert tare.sensor1.temperature_C is None
 
 
-def test_the_temperature_of_a_sensor_that_measures_it_is_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for path in contract_folder().iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    eds = tmp_path / "torque_sensor.eds"
-    text = eds.read_text()
-    section = text.index("[ManufacturerObjects]")
-    head, tail = text[:section], text[section:]
-    count = int(tail.split("SupportedObjects=")[1].split()[0])
-    tail = tail.replace(f"SupportedObjects={count}", f"SupportedObjects={count + 1}\n{count + 1}=0x2111", 1)
-    entry = (
-        "ParameterName=Temperature\nObjectType=0x7\nDataType=0x0003\nAccessType=ro\nDefaultValue=2345\nPDOMapping=0\n"
-    )
-    eds.write_text(f"{head}{tail}\n[2111]\n{entry}")
-    monkeypatch.setattr("firmware_sim.bench.contract_folder", lambda: tmp_path)
-    tare = TareRig().session.run()
-    assert (tare.sensor1.temperature_C, tare.sensor2.temperature_C) == (23.45, 23.45)
+def test_the_temperature_of_a_sensor_that_measures_it_is_stored() -> None:
+    rig = TareRig()
+    for sensor, temperature in zip(rig.bench.devices[2:], (2345, -150), strict=True):
+        sensor.serve(0x2111, 0, lambda value=temperature: value)
+    tare = rig.session.run()
+    assert (tare.sensor1.temperature_C, tare.sensor2.temperature_C) == (23.45, -1.5)
 
 
 def refusal_of(rig: TareRig) -> str:
