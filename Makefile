@@ -40,7 +40,7 @@ check: $(VENV)/.dev
 	$(BIN)/lint-imports --no-cache | tail -n 2
 
 test: check
-	$(BIN)/pytest -m "not vcan"
+	$(BIN)/pytest -m "not vcan" -n auto --dist loadfile
 	tools/test-on-vcan
 
 bench: $(VENV)/.run

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -83,3 +84,13 @@ def run_while_killing(folder: Path, victim: "subprocess.Popen[str]", *arguments:
                 victim.kill()
         stdout, _ = host.communicate(timeout=LIMIT_S)
     return Played(folder, host.returncode, stdout, "".join(lines))
+
+
+def other_contract(folder: Path) -> Path:
+    """Write a configuration whose sensors are ours but for their scale, so that its contract is another."""
+    ours = resources.files("adacd_hil") / "device_profiles" / "adacd-sensor.toml"
+    profile = folder / "other-sensor.toml"
+    profile.write_text(ours.read_text().replace("torque_Nm = 1e-6", "torque_Nm = 1e-5"))
+    config = folder / "other-contract.toml"
+    config.write_text(f'[devices]\nsensor = ["{profile}", "{profile}"]\ncontract = ""\n')
+    return config

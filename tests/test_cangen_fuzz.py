@@ -7,7 +7,7 @@ took is in a readable log, its bad frames counted; afterwards no drive is enable
 which, when the flood is over, succeeds as if nothing had been. An arm that nobody enables stays without torque. A flood
 on an identifier that isn't the arm's is filtered in the kernel and changes no decision, to the bit.
 
-By the environment variable ADACD_HIL_FUZZ_S the campaign takes longer: `tools/fuzz.py --cangen 60`.
+Flooded runs are a campaign, `tools/fuzz.py --cangen 60`; it sets the environment variable ADACD_HIL_FUZZ_S.
 """
 
 import contextlib
@@ -31,6 +31,7 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("cangen") is None, reason="cangen (Debian package can-utils) is not installed"),
 ]
 
+CAMPAIGN = pytest.mark.skipif("ADACD_HIL_FUZZ_S" not in os.environ, reason="a campaign: tools/fuzz.py --cangen 60")
 DURATION_S = float(os.environ.get("ADACD_HIL_FUZZ_S", "5"))
 RANDOM = ("-I", "r", "-L", "r", "-D", "r")
 FOREIGN = ("-I", "3FF", "-L", "r", "-D", "r")
@@ -105,6 +106,7 @@ def check_ending(played: Played) -> None:
     read_log(played.log)
 
 
+@CAMPAIGN
 def test_runs_through_a_flood_of_random_frames_end_safely_and_the_next_one_succeeds(tmp_path: Path) -> None:
     outcome: list[dict[str, object]] = []
     endings: list[int] = []
@@ -135,6 +137,7 @@ def test_a_flood_of_random_frames_moves_no_arm_that_nobody_enables(tmp_path: Pat
     assert float(abs(truth["tau_J"]).max()) == 0.0
 
 
+@CAMPAIGN
 def test_a_flood_that_is_not_the_arms_changes_no_decision(tmp_path: Path) -> None:
     outcome: list[dict[str, object]] = []
     with emulated_arm(tmp_path, outcome):

@@ -11,10 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from experiment_runs import BIN, Played, adacd_hil, emulator
+from experiment_runs import BIN, Played, adacd_hil, emulator, other_contract
 
 from adacd_hil.log.reader import read_log
-from adacd_hil.wire.codec import contract_folder
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
@@ -155,10 +154,7 @@ def test_doctor_stops_when_another_master_is_present(arm: Path, tmp_path: Path) 
 
 
 def test_doctor_tells_another_contract(arm: Path, tmp_path: Path) -> None:
-    text = (contract_folder() / "arm.dbc").read_text()
-    other = tmp_path / "other.dbc"
-    other.write_text(text.replace("SG_ torque : 16|32@1- (1e-06,0)", "SG_ torque : 16|32@1- (1e-05,0)"))
-    done = command(tmp_path, "doctor", "--dbc", str(other), "--json")
+    done = command(tmp_path, "doctor", "--config", str(other_contract(tmp_path)), "--json")
     found = {check["name"]: check for check in done.json["checks"]}
     assert (done.status, found["contract"]["status"]) == (1, "failed")
     assert found["contract"]["remedy"] == "give host and devices the same DBC file"

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from experiment_runs import adacd_hil, demo, emulator, run_on_vcan, run_while_killing
+from experiment_runs import adacd_hil, demo, emulator, other_contract, run_on_vcan, run_while_killing
 
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState
@@ -95,13 +95,22 @@ def test_a_run_that_never_started_leaves_a_readable_log_with_the_reason(tmp_path
     assert any("no boot-up" in entry.event.message for entry in log.events)
 
 
-@pytest.mark.vcan
-def test_another_dbc_than_the_devices_is_refused_before_the_arm_moves(tmp_path: Path) -> None:
+def test_a_dbc_that_says_otherwise_than_the_device_profiles_is_refused_before_the_bus_is_opened(tmp_path: Path) -> None:
     text = (contract_folder() / "arm.dbc").read_text()
     other = tmp_path / "other.dbc"
     other.write_text(text.replace("SG_ torque : 16|32@1- (1e-06,0)", "SG_ torque : 16|32@1- (1e-05,0)"))
+    played = run_on_vcan(tmp_path, "--dbc", str(other), "--clock", "lockstep")
+    (complaint,) = played.error_lines
+    assert played.status == USAGE
+    assert "Sensor1Torque: scales" in complaint
+    assert not played.log.exists()
+
+
+@pytest.mark.vcan
+def test_devices_with_another_contract_are_refused_before_the_arm_moves(tmp_path: Path) -> None:
+    config = other_contract(tmp_path)
     with emulator(tmp_path, "--scenario", "idle"):
-        played = run_on_vcan(tmp_path, "--dbc", str(other), "--clock", "lockstep")
+        played = run_on_vcan(tmp_path, "--config", str(config), "--clock", "lockstep")
     (complaint,) = played.error_lines
     assert played.status == BUS_MISSING
     assert re.search(r"layout digest 0x[0-9A-F]{8} is not the DBC's 0x[0-9A-F]{8}", complaint)
