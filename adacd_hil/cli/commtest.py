@@ -9,9 +9,9 @@ from adacd_hil.analysis.histogram import bar_chart, doubling_bins, percentiles
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
+from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.config import Settings, to_toml
-from adacd_hil.control.communication_test import CommunicationReport, CommunicationTest, Verdict
-from adacd_hil.control.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master

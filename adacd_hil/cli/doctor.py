@@ -7,9 +7,9 @@ from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.control.arm_checks import ARM_CHECKS, ArmExamination
-from adacd_hil.control.diagnosis import Finding, Status, diagnose, summarise
-from adacd_hil.control.host_checks import HOST_CHECKS, Host
+from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination
+from adacd_hil.commission.diagnosis import Finding, Status, diagnose, summarise
+from adacd_hil.commission.host_checks import HOST_CHECKS, Host
 from adacd_hil.scheduling import request_realtime
 from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import open_bus

@@ -8,11 +8,11 @@ from typing import Any
 from adacd_hil.cli.connection import check_clock, make_clock, on_interrupt, received_ids, with_dbc
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
+from adacd_hil.commission.tare import TareRefusedError
+from adacd_hil.commission.tare_session import TareInterruptedError, TareSession
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.exchange import SilenceError
-from adacd_hil.control.tare import TareRefusedError
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
-from adacd_hil.control.tare_session import TareInterruptedError, TareSession
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.wire.bus import open_bus

@@ -5,8 +5,8 @@ import json
 from bench_bus import BenchBus
 
 from adacd_hil.cli.commtest import as_text, describe
-from adacd_hil.control.communication_test import CommunicationTest
-from adacd_hil.control.zero_torque import ZeroTorqueLoop
+from adacd_hil.commission.communication_test import CommunicationTest
+from adacd_hil.commission.zero_torque import ZeroTorqueLoop
 
 
 def judged(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> dict:

@@ -7,8 +7,8 @@ import pytest
 from bench_bus import CODEC, BenchBus
 
 from adacd_hil.cli.doctor import as_json, as_text
-from adacd_hil.control.arm_checks import ARM_CHECKS, ArmExamination, check_pdo_map
-from adacd_hil.control.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
+from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_pdo_map
+from adacd_hil.commission.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.device import NmtState
 

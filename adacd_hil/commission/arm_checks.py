@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.clock import Clock
+from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
+from adacd_hil.commission.diagnosis import Check, Outcome, failed, ok, skipped, warning
+from adacd_hil.commission.hand_motion import HandMotion
+from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.config import Settings
-from adacd_hil.control.communication_test import CommunicationReport, CommunicationTest, Verdict
-from adacd_hil.control.diagnosis import Check, Outcome, failed, ok, skipped, warning
-from adacd_hil.control.hand_motion import HandMotion
-from adacd_hil.control.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.network import Master

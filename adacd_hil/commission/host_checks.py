@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from adacd_hil.control.diagnosis import Check, Outcome, failed, ok, skipped, warning
+from adacd_hil.commission.diagnosis import Check, Outcome, failed, ok, skipped, warning
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import can_interfaces
 from adacd_hil.wire.link import MTU_FD, Link

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from adacd_hil.control.diagnosis import Status
-from adacd_hil.control.host_checks import HOST_CHECKS, Host
+from adacd_hil.commission.diagnosis import Status
+from adacd_hil.commission.host_checks import HOST_CHECKS, Host
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.link import Link, parse_ip_link
 

@@ -12,8 +12,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.commission.zero_torque import ZeroTorqueCycle
 from adacd_hil.config import Settings
-from adacd_hil.control.zero_torque import ZeroTorqueCycle
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.load import LoadMeter

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from bench_bus import PERIOD_NS, BenchBus
 
-from adacd_hil.control.communication_test import CommunicationReport, CommunicationTest, Verdict, judge
-from adacd_hil.control.zero_torque import DISABLE_CYCLES, ZeroTorqueLoop
+from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict, judge
+from adacd_hil.commission.zero_torque import DISABLE_CYCLES, ZeroTorqueLoop
 from adacd_hil.records import FaultReason
 from adacd_hil.wire.codec import load_codec
 

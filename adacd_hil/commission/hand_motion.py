@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from adacd_hil.control.diagnosis import Outcome, failed, ok, warning
-from adacd_hil.control.zero_torque import ZeroTorqueCycle
+from adacd_hil.commission.diagnosis import Outcome, failed, ok, warning
+from adacd_hil.commission.zero_torque import ZeroTorqueCycle
 from adacd_hil.records import JOINTS, Vector
 
 WORK_FLOOR_J = 1e-3

@@ -12,10 +12,8 @@ import numpy as np
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, wall_ns
-from adacd_hil.config import ConfigError, Settings
-from adacd_hil.control.idle_cycle import IdleCycle
-from adacd_hil.control.session import git_commit
-from adacd_hil.control.tare import (
+from adacd_hil.commission.idle_cycle import IdleCycle
+from adacd_hil.commission.tare import (
     ArmMovedError,
     Pose,
     TareRefusedError,
@@ -25,6 +23,8 @@ from adacd_hil.control.tare import (
     measure_pose,
     solve_tare,
 )
+from adacd_hil.config import ConfigError, Settings
+from adacd_hil.control.session import git_commit
 from adacd_hil.control.tare_file import FORMAT, PoseRecord, SensorRecord, Tare, format_date, sensor_identities
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
