@@ -35,13 +35,6 @@ def received_ids(codec: Codec) -> list[int]:
     return [message.can_id for message in codec.messages.values() if "HOST" not in message.senders]
 
 
-def with_dbc(settings: Settings, dbc: Path | None) -> Settings:
-    """Let the option --dbc outweigh the configuration's contract."""
-    if dbc is None:
-        return settings
-    return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(dbc)))
-
-
 def contract_of(settings: Settings, out: Path) -> Codec:
     """Load the contract of the configured devices; one that is composed from their profiles is written to `out`.
 
@@ -64,9 +57,16 @@ class Connection:
     profile: str | None
     dbc: Path | None
 
+    def settings(self) -> Settings:
+        """Read the configuration, of which the option --dbc outweighs the contract. Raises ConfigError."""
+        settings = load_settings(self.config, self.profile)
+        if self.dbc is None:
+            return settings
+        return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(self.dbc)))
+
     def load(self) -> tuple[Settings, Codec]:
         """Read configuration and contract. Raises ConfigError, CodecError."""
-        settings = with_dbc(load_settings(self.config, self.profile), self.dbc)
+        settings = self.settings()
         return settings, load_contract(settings)
 
     @contextmanager

@@ -63,15 +63,21 @@ _config = click.option(
 _profile = click.option(
     "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
 )
-_interface = click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
-_channel = click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0.")
-_bitrate = click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
-_dbc = click.option(
-    "--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the package's."
-)
 _json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
 _clock = functools.partial(
     click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
+)
+
+
+_BUS_OPTIONS = (  # last first: click lists them the other way round
+    click.option(
+        "--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the configuration's."
+    ),
+    _profile,
+    _config,
+    click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."),
+    click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0."),
+    click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan."),
 )
 
 
@@ -93,7 +99,7 @@ def _on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
         return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
 
     explained: Callable[..., None] = _explained(connect)
-    for option in (_dbc, _profile, _config, _bitrate, _channel, _interface):
+    for option in _BUS_OPTIONS:
         explained = option(explained)
     return explained
 
@@ -122,29 +128,12 @@ def demo(config: str, out: Path, seed: int | None, clock: str, profile: str | No
 
 
 @cli.command(epilog=EPILOG)
-@_interface
-@_channel
-@_bitrate
-@_config
-@_dbc
+@_on_bus
 @click.option("--tare", type=click.Path(path_type=Path, dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/run"), show_default=True)
 @_clock(default="realtime")
-@_profile
 @_json
-@_explained
-def run(
-    interface: str,
-    channel: str,
-    bitrate: int | None,
-    config: str,
-    dbc: Path | None,
-    tare: Path | None,
-    out: Path,
-    clock: str,
-    profile: str | None,
-    as_json: bool,
-) -> ExitCode:
+def run(connection: "Connection", tare: Path | None, out: Path, clock: str, as_json: bool) -> ExitCode:
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
     On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, and
@@ -152,37 +141,26 @@ def run(
     """
     from adacd_hil.cli.run import run_on_bus
 
-    result, code = run_on_bus(interface, channel, bitrate, config, profile, dbc, clock, out, tare)
+    result, code = run_on_bus(connection, clock, out, tare)
     print(json.dumps(result, indent=2) if as_json else "\n".join(f"{key}: {value}" for key, value in result.items()))
     return code
 
 
 @cli.command(epilog=EPILOG)
-@_interface
-@_channel
-@_bitrate
-@_config
-@_dbc
+@_on_bus
 @click.option("--poses", type=click.IntRange(1, 50), help="Poses to measure in; default: tare.poses.")
 @click.option("--seconds", type=click.FloatRange(0.1, 600.0), help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default=Path("tare.toml"), show_default=True)
 @_clock(default="realtime")
-@_profile
 @_json
-@_explained
 def tare(
-    interface: str,
-    channel: str,
-    bitrate: int | None,
-    config: str,
-    dbc: Path | None,
+    connection: "Connection",
     poses: int | None,
     seconds: float | None,
     auto_zero: bool,
     out: Path,
     clock: str,
-    profile: str | None,
     as_json: bool,
 ) -> ExitCode:
     """Measure the offsets of the joint torque sensors at rest, with the drives disabled, and store them.
@@ -192,7 +170,7 @@ def tare(
     """
     from adacd_hil.cli.tare import tare_on_bus
 
-    result = tare_on_bus(interface, channel, bitrate, config, profile, dbc, clock, out, poses, seconds, auto_zero)
+    result = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
     print(json.dumps(result.as_json(), indent=2) if as_json else result.as_text())
     return ExitCode.OK
 

@@ -4,11 +4,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import check_clock, contract_of, make_clock, on_interrupt, received_ids, with_dbc
+from adacd_hil.cli.connection import Connection, check_clock, contract_of, make_clock, on_interrupt, received_ids
 from adacd_hil.cli.exit_codes import ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.clock import wall_ns
-from adacd_hil.config import ConfigError, Settings, load_settings
+from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
@@ -19,7 +19,12 @@ from adacd_hil.wire.codec import Codec
 
 
 def check_budget_of(codec: Codec, settings: Settings) -> None:
-    """Refuse a contract whose frames don't get through in the configured period. Raises ConfigError, CodecError."""
+    """Refuse a contract whose frames don't get through in the configured period. Raises ConfigError, CodecError.
+
+    A DBC that doesn't say when its messages are sent can't be judged and passes.
+    """
+    if b'"Trigger"' not in codec.text:
+        return
     budget = check_budget(codec, settings.bus.period_us)
     if not budget.is_fit:
         raise ConfigError(f"contract {codec.path.stem}: {budget.line}")
@@ -32,22 +37,15 @@ def drop_old_frames(bus: Bus, interface: str) -> None:
 
 
 def run_on_bus(
-    interface: str,
-    channel: str,
-    bitrate: int | None,
-    config: str,
-    profile: str | None,
-    dbc: Path | None,
-    clock_name: str,
-    out: Path,
-    tare_path: Path | None = None,
+    connection: Connection, clock_name: str, out: Path, tare_path: Path | None = None
 ) -> tuple[dict[str, Any], ExitCode]:
     """Run the scheme on a bus, with the offsets of a tare when one is given.
 
     Raises ConfigError, CodecError, BusMissingError, LogError, CommandError.
     """
+    interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
-    settings = with_dbc(load_settings(config, profile), dbc)
+    settings = connection.settings()
     tare = None
     if tare_path is not None:
         tare = use_tare(tare_path, settings, wall_ns())
@@ -56,7 +54,7 @@ def run_on_bus(
     if clock_name == "realtime":
         check_budget_of(codec, settings)
     clock = make_clock(clock_name)
-    bus = open_bus(interface, channel, clock, received_ids(codec), bitrate, codec.is_fd)
+    bus = open_bus(interface, channel, clock, received_ids(codec), connection.bitrate, codec.is_fd)
     drop_old_frames(bus, interface)
     operator: Operator = ScriptedOperator(settings.operator)
     if sys.stdin is not None and sys.stdin.isatty():

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import check_clock, make_clock, on_interrupt, received_ids, with_dbc
+from adacd_hil.cli.connection import Connection, check_clock, make_clock, on_interrupt, received_ids
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.commission.tare import TareRefusedError
 from adacd_hil.commission.tare_session import TareInterruptedError, TareSession
-from adacd_hil.config import Settings, load_settings
+from adacd_hil.config import Settings
 from adacd_hil.control.exchange import SilenceError
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
@@ -57,12 +57,7 @@ class StoredTare:
 
 
 def tare_on_bus(
-    interface: str,
-    channel: str,
-    bitrate: int | None,
-    config: str,
-    profile: str | None,
-    dbc: Path | None,
+    connection: Connection,
     clock_name: str,
     out: Path,
     poses: int | None,
@@ -70,13 +65,14 @@ def tare_on_bus(
     is_auto_zeroing: bool,
 ) -> StoredTare:
     """Tare the sensors of an arm on a bus. Raises ConfigError, CodecError, BusError, CommandError, OSError."""
+    interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
-    settings = with_dbc(_with_options(load_settings(config, profile), poses, seconds), dbc)
+    settings = _with_options(connection.settings(), poses, seconds)
     # A file that is no tare isn't overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
     codec = load_contract(settings)
     clock = make_clock(clock_name)
-    bus = open_bus(interface, channel, clock, received_ids(codec), bitrate, codec.is_fd)
+    bus = open_bus(interface, channel, clock, received_ids(codec), connection.bitrate, codec.is_fd)
     progress = Progress()
     try:
         session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)

@@ -129,7 +129,7 @@ def test_an_inhibit_time_counts_as_the_interval() -> None:
     contract = read_contract(edited(('BA_DEF_DEF_ "GenMsgDelayTime" 0;', 'BA_DEF_DEF_ "GenMsgDelayTime" 20;')), "x")
     budget = find_budget(contract)
     intervals = {entry.frame.name: entry.interval_ns for entry in budget.frames}
-    assert (intervals["Drive1Emcy"], intervals["Sync"]) == (20_000_000, 1_000_000)
+    assert (intervals["Drive1Status"], intervals["Sync"]) == (20_000_000, 1_000_000)
     assert not [note for note in budget.notes if "inhibit" in note]
     # four EMCY, four status; a heartbeat keeps its time
     (note,) = [note for note in check_budget(ARM).notes if "inhibit" in note]
