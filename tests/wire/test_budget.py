@@ -133,7 +133,7 @@ def test_an_inhibit_time_counts_as_the_interval() -> None:
     assert not [note for note in budget.notes if "inhibit" in note]
     # four EMCY, four status; a heartbeat keeps its time
     (note,) = [note for note in check_budget(ARM).notes if "inhibit" in note]
-    assert "event frames without inhibit time (GenMsgDelayTime): 8." in note
+    assert "event frames without inhibit time (GenMsgDelayTime): 4." in note
 
 
 def test_event_frames_that_come_too_often_miss_their_deadlines() -> None:
