@@ -21,7 +21,7 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
     settings, codec = connection.load()
     clock = MonotonicClock()
     with connection.bus(clock, codec.is_fd) as bus:
-        expected = expected_nodes(Master(settings, codec, bus).nodes)
+        expected = expected_nodes(Master(settings, codec, bus).slaves)
         found = survey(bus, clock, listen_s, lambda line: print(line, file=sys.stderr, flush=True))
     described = describe(found, compare(found, expected), codec)
     is_right = not any(row["verdict"] not in ("", "unexpected") for row in described["nodes"])

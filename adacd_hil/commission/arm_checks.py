@@ -134,7 +134,7 @@ def check_other_masters(patient: ArmExamination) -> Outcome:
 
 def check_nodes(patient: ArmExamination) -> Outcome:
     """Check that the expected nodes are there, with the expected identity."""
-    expected = expected_nodes(patient.master.nodes)
+    expected = expected_nodes(patient.master.slaves)
     found = survey(patient.tap, patient.clock, 0.0)
     verdicts = compare(found, expected)
     wrong = [f"node {node}: {text}" for node, text in verdicts.items() if text not in ("", "unexpected")]

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle
 from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.drive import Drive
+from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.load import LoadMeter
 
@@ -131,20 +133,17 @@ class CommunicationTest:
     def _device(self, ages: NDArray[np.int64], periods: int, place: int) -> DeviceReport:
         seen = ages[np.cumsum(ages == 0) > 0]
         counts = np.bincount(np.minimum(seen, OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
-        if place < JOINTS:
-            drive = self.arm.drives[place]
-            checks, is_protected = {"IMPLAUSIBLE": drive.implausible_frames}, drive.feedback_message.is_protected
-        else:
-            sensor = self.arm.sensors[place - JOINTS]
-            checks = {status.name: count for status, count in sensor.end_to_end.tally()}
-            is_protected = sensor.torque_message.is_protected
+        devices: tuple[Drive | TorqueSensor, ...] = (*self.arm.drives, *self.arm.sensors)
+        device = devices[place]
+        checks = {status.name: count for status, count in device.end_to_end.tally()} if device.is_protected else {}
+        checks["IMPLAUSIBLE"] = device.implausible_frames
         fresh = int(np.count_nonzero(ages == 0))
         return DeviceReport(
             share=fresh / periods if periods else 0.0,
             ages=counts.tolist(),
             never=len(ages) - len(seen),
             checks=checks,
-            is_protected=is_protected,
+            is_protected=device.is_protected,
         )
 
     def _load_percent(self) -> float:

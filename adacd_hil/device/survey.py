@@ -5,12 +5,12 @@ Sends SDO uploads only and changes no node's state, so it works beside a running
 """
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
+from adacd_hil.device.slave import Slave
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.tap import Tap
@@ -193,16 +193,15 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
     return others
 
 
-def expected_nodes(nodes: Mapping[str, Any]) -> list[Expected]:
-    """List what the master of an arm expects; `nodes`: its canopen nodes by name, each with its EDS."""
+def expected_nodes(slaves: Iterable[Slave]) -> list[Expected]:
+    """List what the master of an arm expects: vendor and product of the EDS, None where any will do."""
     expected = []
-    for name, node in nodes.items():
-        identity = node.object_dictionary.get(0x1018)
+    for slave in slaves:
+        is_checked = slave.device.settings.identity == "eds"
         vendor, product = (
-            None if identity is None or subindex not in identity.subindices else identity[subindex].default
-            for subindex in (1, 2)
+            slave.default(0x1018, sub) if is_checked and slave.has(0x1018, sub) else None for sub in (1, 2)
         )
-        expected.append(Expected(name, node.id, vendor, product))
+        expected.append(Expected(slave.name, slave.node_id, vendor, product))
     return expected
 
 

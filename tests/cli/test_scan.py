@@ -10,7 +10,7 @@ from adacd_hil.device.survey import compare, expected_nodes, survey
 
 def scanned(rig: BenchBus) -> dict:
     found = survey(rig.bus, rig.clock)
-    return describe(found, compare(found, expected_nodes(rig.master.nodes)), CODEC)
+    return describe(found, compare(found, expected_nodes(rig.master.slaves)), CODEC)
 
 
 def test_the_table_shows_nodes_what_they_send_and_whether_they_fit() -> None:

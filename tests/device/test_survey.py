@@ -13,7 +13,7 @@ def look(rig: BenchBus, duration_s: float = 1.5) -> Survey:
 
 
 def verdicts(rig: BenchBus, found: Survey) -> dict[int, str]:
-    return compare(found, expected_nodes(rig.master.nodes))
+    return compare(found, expected_nodes(rig.master.slaves))
 
 
 def test_every_node_is_found_with_its_identity() -> None:
@@ -79,21 +79,21 @@ def test_a_missing_node_is_named() -> None:
 def test_a_node_that_is_not_expected_is_said_to_be() -> None:
     rig = BenchBus()
     found = look(rig)
-    expected = [node for node in expected_nodes(rig.master.nodes) if node.node_id != 2]
+    expected = [node for node in expected_nodes(rig.master.slaves) if node.node_id != 2]
     assert compare(found, expected)[2] == "unexpected"
 
 
 def test_another_product_than_the_expected_one_is_a_difference() -> None:
     rig = BenchBus()
     found = look(rig)
-    expected = [dataclasses.replace(node, product=0x403) for node in expected_nodes(rig.master.nodes)]
+    expected = [dataclasses.replace(node, product=0x403) for node in expected_nodes(rig.master.slaves)]
     assert compare(found, expected)[1] == "Drive1 expected; product is not 0x403"
 
 
 def test_an_identity_that_is_not_expected_to_be_known_is_not_compared() -> None:
     rig = BenchBus()
     found = look(rig)
-    expected = [dataclasses.replace(node, vendor=None, product=None) for node in expected_nodes(rig.master.nodes)]
+    expected = [dataclasses.replace(node, vendor=None, product=None) for node in expected_nodes(rig.master.slaves)]
     assert set(compare(found, expected).values()) == {""}
 
 
