@@ -18,13 +18,16 @@ from adacd_hil.wire.codec import contract_folder
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 SEED = "7"
+UP_TO_THE_PAYLOAD = '[operator]\nscript = [{ at_s = 22.0, request = "finish" }]\n'
+"""One adaptation and four contacts: what comes after takes as long again and is the same code."""
 DECISIONS = ("/scheme", "/control", "/contact")
 
 
 @pytest.fixture(scope="module")
 def lockstep(tmp_path_factory: pytest.TempPathFactory) -> Played:
-    """Play the experiment in lockstep, with candump listening."""
+    """Play the experiment up to the change of payload in lockstep, with candump listening."""
     folder = tmp_path_factory.mktemp("lockstep")
+    (folder / "settings.toml").write_text(UP_TO_THE_PAYLOAD)
     dump = folder / "candump.log"
     with contextlib.ExitStack() as stack:
         if shutil.which("candump"):
@@ -33,11 +36,11 @@ def lockstep(tmp_path_factory: pytest.TempPathFactory) -> Played:
             stack.callback(listener.wait, 10)
             stack.callback(listener.terminate)
         stack.enter_context(emulator(folder, "--seed", SEED))
-        return run_on_vcan(folder, "--clock", "lockstep")
+        return run_on_vcan(folder, "--clock", "lockstep", "--config", str(folder / "settings.toml"))
 
 
 def test_lockstep_on_vcan_decides_the_same_as_the_embedded_bus_bit_for_bit(lockstep: Played, tmp_path: Path) -> None:
-    embedded = demo(tmp_path, "--seed", SEED)
+    embedded = demo(tmp_path, "--seed", SEED, "--config", str(lockstep.folder / "settings.toml"))
     for topic in DECISIONS:
         assert topic_bytes(lockstep.log, topic) == topic_bytes(embedded.log, topic)
 
