@@ -99,9 +99,9 @@ class EmbeddedBus:
         """Connect the device's receiver."""
         self._device = device
 
-    def deliver(self, can_id: int, data: bytes) -> None:
-        """Send from the device to the host."""
-        self._received.append(Frame(can_id, data, self._clock.now_ns()))
+    def deliver(self, can_id: int, data: bytes, is_error: bool = False) -> None:
+        """Send from the device to the host, or report an error as the host's controller does."""
+        self._received.append(Frame(can_id, data, self._clock.now_ns(), is_error))
 
     def send(self, can_id: int, data: bytes) -> None:
         """Hand a frame to the device; it has acted on it when this returns."""

@@ -49,6 +49,32 @@ def test_a_device_that_falls_silent_faults_the_run_after_its_age_budget(tmp_path
     assert first == TROUBLE_CYCLE + 3
 
 
+def test_a_device_whose_heartbeat_stops_faults_the_run_and_is_named(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.tamper = lambda cycle, i, data: None if i == 0x703 and cycle >= TROUBLE_CYCLE else data
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.HEARTBEAT
+    first = int(np.argmax(log.scheme["state"] == SchemeState.FAULT))
+    assert TROUBLE_CYCLE + 150 < first <= TROUBLE_CYCLE + 260  # 2.5 periods of 100 ms after the last one
+    (reason,) = [entry.event.message for entry in log.events if "-> FAULT" in entry.event.message]
+    assert "Sensor1 (node 3): no heartbeat for" in reason
+
+
+def test_error_frames_are_in_the_log_in_words(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    error_passive = bytes((0, 0x20, 0, 0, 0, 0, 130, 0))
+    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x204, error_passive, is_error=True)
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
+    (said,) = [entry.event for entry in log.events if entry.event.name == "bus"]
+    assert (said.level, said.message) == (
+        "warning",
+        "error passive (sending); error counters: sending 130, receiving 0",
+    )
+
+
 def test_after_a_fault_there_is_no_torque_on_the_wire_and_drives_are_stopped(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle >= TROUBLE_CYCLE else data
