@@ -280,7 +280,7 @@ class Drive:
         self.end_to_end.restart()
         self._received_position_rad = None
 
-    def accept_status(self, data: bytes, cycle: int = -1) -> None:
+    def accept_status(self, data: bytes, cycle: int) -> None:
         """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
         message, receiver = self.status_message, self._status_receiver
         if message is None or receiver is None or len(data) != message.length:

@@ -78,39 +78,39 @@ def test_the_way_up_has_the_standards_numbers() -> None:
 )
 def test_a_wanted_drive_is_led_up_state_by_state(statusword: int, controlword: int) -> None:
     arm = drive()
-    arm.accept_status(status_frame(statusword))
+    arm.accept_status(status_frame(statusword), 0)
     assert command_of(arm.command(0, enable=True, quick_stop=False))[0] == controlword
 
 
 @pytest.mark.parametrize("statusword", [0x0250, 0x0231, 0x0233, 0x0217, 0x0218])
 def test_torque_is_zero_on_the_wire_until_the_drive_is_enabled(statusword: int) -> None:
     arm = drive()
-    arm.accept_status(status_frame(statusword))
+    arm.accept_status(status_frame(statusword), 0)
     assert command_of(arm.command(500, enable=True, quick_stop=False))[1] == 0
 
 
 def test_an_enabled_drive_gets_its_torque() -> None:
     arm = drive()
-    arm.accept_status(status_frame(0x0237))
+    arm.accept_status(status_frame(0x0237), 0)
     assert command_of(arm.command(-500, enable=True, quick_stop=False)) == (0x000F, -500)
 
 
 def test_a_drive_in_another_mode_gets_no_torque() -> None:
     arm = drive()
-    arm.accept_status(status_frame(0x0237, mode=8))
+    arm.accept_status(status_frame(0x0237, mode=8), 0)
     assert command_of(arm.command(500, enable=True, quick_stop=False))[1] == 0
 
 
 @pytest.mark.parametrize(("quick_stop", "controlword"), [(True, 0x0002), (False, 0x0000)])
 def test_an_unwanted_drive_is_stopped_or_disabled_without_torque(quick_stop: bool, controlword: int) -> None:
     arm = drive()
-    arm.accept_status(status_frame(0x0237))
+    arm.accept_status(status_frame(0x0237), 0)
     assert command_of(arm.command(500, enable=False, quick_stop=quick_stop)) == (controlword, 0)
 
 
 def test_a_faulted_drive_gets_rising_edges_of_fault_reset() -> None:
     arm = drive()
-    arm.accept_status(status_frame(0x0218))
+    arm.accept_status(status_frame(0x0218), 0)
     words = [command_of(arm.command(0, enable=True, quick_stop=False))[0] for _ in range(4)]
     assert words == [0x0080, 0x0000, 0x0080, 0x0000]
 
@@ -144,7 +144,7 @@ def test_a_gap_of_cycles_is_no_jump() -> None:
 def test_a_frame_of_the_wrong_length_changes_nothing(length: int) -> None:
     arm = drive()
     arm.accept_feedback(feedback_frame(0.5, 1.0), 0)
-    arm.accept_status(bytes(length - 1) if length else b"")
+    arm.accept_status(bytes(length - 1) if length else b"", 0)
     assert arm.accept_feedback(bytes(length), 1) is False
 
 
@@ -208,7 +208,7 @@ def test_each_command_in_each_state_is_the_standards(state: Cia402State, command
 @pytest.mark.parametrize("state", list(Cia402State))
 def test_each_goal_in_each_state_has_its_command(goal: Goal, state: Cia402State) -> None:
     arm = drive()
-    arm.accept_status(status_frame(WORD_OF[state.name]))
+    arm.accept_status(status_frame(WORD_OF[state.name]), 0)
     assert command_of(arm.lead(goal))[0] == GOALS[goal][state]
 
 
@@ -216,7 +216,7 @@ def test_each_goal_in_each_state_has_its_command(goal: Goal, state: Cia402State)
 @pytest.mark.parametrize("state", list(Cia402State))
 def test_only_a_transition_of_the_standard_leads_on(goal: Goal, state: Cia402State) -> None:
     arm = drive()
-    arm.accept_status(status_frame(WORD_OF[state.name]))
+    arm.accept_status(status_frame(WORD_OF[state.name]), 0)
     word = command_of(arm.lead(goal))[0]
     target = TRANSITIONS.get((state, Controlword(word)))
     reached = state if target is None else target.target
@@ -230,7 +230,7 @@ def test_only_a_transition_of_the_standard_leads_on(goal: Goal, state: Cia402Sta
 @pytest.mark.parametrize("state", list(Cia402State))
 def test_no_other_goal_passes_torque(goal: Goal, state: Cia402State) -> None:
     arm = drive()
-    arm.accept_status(status_frame(WORD_OF[state.name]))
+    arm.accept_status(status_frame(WORD_OF[state.name]), 0)
     assert command_of(arm.lead(goal, 500))[1] == 0
 
 
@@ -238,7 +238,7 @@ def test_no_other_goal_passes_torque(goal: Goal, state: Cia402State) -> None:
 @pytest.mark.parametrize("mode", [-1, 0, 4, 8, 9, 10])
 def test_torque_passes_in_one_state_and_one_mode_only(state: Cia402State, mode: int) -> None:
     arm = drive()
-    arm.accept_status(status_frame(WORD_OF[state.name], mode))
+    arm.accept_status(status_frame(WORD_OF[state.name], mode), 0)
     is_allowed = state is Cia402State.OPERATION_ENABLED and mode == 10
     assert command_of(arm.command(500, enable=True, quick_stop=False))[1] == 500 * is_allowed
 
@@ -247,7 +247,7 @@ def test_fault_reset_rises_once_more_for_the_next_fault() -> None:
     arm = drive()
     words = []
     for statusword in (0x0218, 0x0218, 0x0250, 0x0218, 0x0218):
-        arm.accept_status(status_frame(statusword))
+        arm.accept_status(status_frame(statusword), 0)
         words.append(command_of(arm.command(0, enable=True, quick_stop=False))[0])
     assert words == [0x80, 0x00, 0x06, 0x80, 0x00]
 
@@ -256,7 +256,7 @@ def test_fault_reset_is_low_before_it_is_high_again_even_if_the_fault_is_a_new_o
     arm = drive()
     words = []
     for goal in (Goal.OPERATION_ENABLED, Goal.QUICK_STOP_ACTIVE, Goal.OPERATION_ENABLED, Goal.OPERATION_ENABLED):
-        arm.accept_status(status_frame(0x0218))
+        arm.accept_status(status_frame(0x0218), 0)
         words.append(command_of(arm.lead(goal))[0])
     assert words == [0x80, 0x02, 0x80, 0x00]
 
@@ -282,7 +282,7 @@ def test_quick_stop_is_left_as_its_option_code_demands(
 ) -> None:
     arm = Drive(CODEC, 1, PERIOD_S, option)
     arm.accept_feedback(feedback_frame(0.0, velocity), 0)
-    arm.accept_status(status_frame(statusword))
+    arm.accept_status(status_frame(statusword), 0)
     assert command_of(arm.command(500, enable=True, quick_stop=False)) == (controlword, 0)
 
 

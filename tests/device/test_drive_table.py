@@ -99,7 +99,7 @@ def test_a_drive_that_has_said_nothing_is_nowhere_and_not_ready(joint: int) -> N
 
 def test_a_status_frame_says_state_mode_torque_and_error() -> None:
     drive = Drive(CODEC, 1, PERIOD_S)
-    drive.accept_status(status(0x0218, 10, -123, 0x8250))
+    drive.accept_status(status(0x0218, 10, -123, 0x8250), 0)
     found = (drive.state, drive.mode, drive.torque_actual_permille, drive.error_code)
     assert found == (Cia402State.FAULT, 10, -123, 0x8250)
 
@@ -107,7 +107,7 @@ def test_a_status_frame_says_state_mode_torque_and_error() -> None:
 @pytest.mark.parametrize("length", [0, 6, 8])
 def test_a_status_frame_of_the_wrong_length_says_nothing(length: int) -> None:
     drive = Drive(CODEC, 1, PERIOD_S)
-    drive.accept_status((status(0x0237) + b"\x00")[:length])
+    drive.accept_status((status(0x0237) + b"\x00")[:length], 0)
     assert (drive.state, drive.mode) == (Cia402State.NOT_READY_TO_SWITCH_ON, 0)
 
 
