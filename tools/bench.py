@@ -39,7 +39,14 @@ ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 REPEATS = 20_000
 WARM_UP = 1_000
-SHORT_RUN = '[operator]\nscript = [{ at_s = 10.0, request = "finish" }]\n'
+SHORT_RUN = """
+[operator]
+script = [{ at_s = 10.0, request = "finish" }]
+
+[bus]  # a machine that stalls is to be measured, not to fault the arm
+command_patience_cycles = 250
+max_age_cycles = 100
+"""
 
 
 def main() -> int:
