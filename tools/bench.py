@@ -187,7 +187,7 @@ def bench_vcan() -> int:
             elapsed_s = time.perf_counter() - start_s
             emulator.terminate()
             emulator.communicate()
-            if host.returncode != 0:
+            if host.returncode not in (0, 3):  # 3: the log lacks what the machine had no time to write
                 print(host.stderr, file=sys.stderr)
                 return host.returncode
             show_log(f"vcan, {clock}", Path(folder) / "run.mcap", elapsed_s)
