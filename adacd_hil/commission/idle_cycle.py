@@ -5,7 +5,7 @@ import numpy as np
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.config import Settings
 from adacd_hil.control.exchange import Exchange
-from adacd_hil.control.realtime import make_pacer
+from adacd_hil.control.realtime import Recurrence, make_pacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import JOINTS, ArmCommand, ArmState
@@ -19,7 +19,7 @@ class IdleCycle:
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer = make_pacer(clock, settings.bus.period_ns)
         self._exchange = Exchange(settings, bus, arm, master, MonotonicClock(), isinstance(clock, VirtualClock))
-        self._heartbeat_cycles = max(1, round(settings.bus.heartbeat_ms * 1e-3 / settings.bus.period_s))
+        self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
         self._off = ArmCommand(np.zeros(JOINTS), enable=False, quick_stop=False)
 
     def step(self) -> ArmState:
@@ -27,7 +27,7 @@ class IdleCycle:
         tick = self._pacer.next()
         state = self._exchange.read(tick)
         self._arm.write(self._off)
-        if tick.cycle % self._heartbeat_cycles == 0:
+        if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()
         self._bus.take()  # nobody logs them
         return state

@@ -9,7 +9,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.realtime import GridPacer
+from adacd_hil.control.realtime import GridPacer, Recurrence
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
@@ -42,7 +42,7 @@ class ZeroTorqueLoop:
         self._is_enabling = is_enabling
         self._is_interrupted = False
         self._exchange = Exchange(settings, bus, arm, master, clock, is_lockstep=False)
-        self._heartbeat_cycles = max(1, settings.bus.heartbeat_ms * 1000 // settings.bus.period_us)
+        self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
         self._max_age_cycles = settings.bus.max_age_cycles
         self._gate = Gate(settings.arm, settings.bus.period_s)
         self._tau_d, self._tau_c = np.zeros(JOINTS), np.zeros(JOINTS)
@@ -94,6 +94,6 @@ class ZeroTorqueLoop:
         self._gate.limit(self._tau_d, is_enabling and state.is_enabled, self._tau_c)
         arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
         command_ns = clock.now_ns() - sync_ns
-        if tick.cycle % self._heartbeat_cycles == 0:
+        if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()
         return ZeroTorqueCycle(state, tick.lateness_ns, feedback_ns, command_ns, bus.take())

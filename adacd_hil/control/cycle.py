@@ -16,7 +16,7 @@ from adacd_hil.control.controller import Controller
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import Pacer, Tick
+from adacd_hil.control.realtime import Pacer, Recurrence, Tick
 from adacd_hil.control.reference import Reference
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
@@ -77,9 +77,10 @@ class Cycle:
     ) -> None:
         """Prepare. `stopwatch`: what durations within a cycle are measured by, default the host's clock."""
         self._period_s = settings.bus.period_s
-        self._heartbeat_cycles = max(1, round(settings.bus.heartbeat_ms * 1e-3 / self._period_s))
-        self._checks_cycles = max(1, round(FRAME_CHECKS_S / self._period_s))
-        self._watch_cycles = max(1, self._heartbeat_cycles // 10)
+        heartbeat_s = settings.bus.heartbeat_ms * 1e-3
+        self._heartbeats = Recurrence(heartbeat_s, self._period_s)
+        self._looks_at_nodes = Recurrence(0.1 * heartbeat_s, self._period_s)
+        self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
@@ -125,7 +126,7 @@ class Cycle:
             self._reference.step(arm, output)
             command, flags = self._control(arm, output)
             self._arm.write(command)
-            if tick.cycle % self._heartbeat_cycles == 0:
+            if self._heartbeats.is_due(tick.cycle):
                 self._master.send_heartbeat()
             self._record(recorder, tick, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
@@ -134,7 +135,7 @@ class Cycle:
 
     def _watch(self, arm: ArmState) -> ArmState:
         """Take a device that has fallen silent or left Operational for a fault of the arm."""
-        if arm.cycle % self._watch_cycles == 0:
+        if self._looks_at_nodes.is_due(arm.cycle):
             self._lost = self._master.watch(arm.t_ns)
         if self._lost and arm.fault is FaultReason.NONE:
             return arm._replace(fault=FaultReason.HEARTBEAT)
@@ -193,7 +194,7 @@ class Cycle:
             (ChannelId.CONTROL, pack_control(tick.cycle, self._block, flags, command.enable, command.quick_stop)),
             (ChannelId.CYCLE, pack_cycle(record)),
         ]
-        if tick.cycle % self._checks_cycles == 0:
+        if self._frame_checks.is_due(tick.cycle):
             messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))

@@ -1,7 +1,7 @@
 """When cycles begin."""
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.control.realtime import GridPacer, LockstepPacer, Tick
+from adacd_hil.control.realtime import GridPacer, LockstepPacer, Recurrence, Tick
 
 PERIOD_NS = 1_000_000
 
@@ -70,3 +70,19 @@ def test_lockstep_goes_on_where_its_clock_has_come_to() -> None:
     clock.sleep_until_ns(5_300_000)
     pacer.resume()
     assert pacer.next() == Tick(6, 6_000_000, 1, 0)
+
+
+def test_a_recurrence_is_due_every_so_many_cycles() -> None:
+    heartbeats = Recurrence(0.1, 0.001)
+    assert [cycle for cycle in range(350) if heartbeats.is_due(cycle)] == [0, 100, 200, 300]
+
+
+def test_a_recurrence_whose_cycle_is_skipped_is_due_in_the_next_one() -> None:
+    heartbeats = Recurrence(0.1, 0.001)
+    cycles = [0, 98, 99, 103, 104, 199, 402, 403, 499, 500]
+    assert [cycle for cycle in cycles if heartbeats.is_due(cycle)] == [0, 103, 402, 500]
+
+
+def test_an_interval_shorter_than_a_period_is_due_in_every_cycle() -> None:
+    often = Recurrence(0.0001, 0.001)
+    assert [cycle for cycle in range(3) if often.is_due(cycle)] == [0, 1, 2]
