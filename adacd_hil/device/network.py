@@ -47,8 +47,8 @@ class Master:
     def __init__(self, settings: Settings, codec: Codec, bus: Bus, watch_host: bool = True) -> None:
         """Load the profiles. Raises ConfigError when one can't be used.
 
-        `watch_host`: devices shall watch the host's heartbeat. Not in lockstep: there the host sends it by cycles,
-        which take as long as they take, and a device that waits goes by the wall clock.
+        `watch_host`: devices shall watch the host by time: its heartbeat, and its commands where they count ms. Not in
+        lockstep: there cycles take as long as they take, and a device that waits goes by the wall clock.
         """
         self._watch_host = watch_host
         self._settings = settings
@@ -163,7 +163,7 @@ class Master:
             self._set_up_sync(slave)
             self._set_up_heartbeats(slave)
             self._set_up_emergencies(slave)
-            set_up_pdos(slave, command_deadline_ms(self._settings))
+            set_up_pdos(slave, command_deadline_ms(self._settings) if self._watch_host else 0)
             if slave.device.settings.kind == "drive":
                 set_up_drive(slave, self._settings, self._codec)
             else:

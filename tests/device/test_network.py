@@ -114,6 +114,15 @@ def test_devices_are_not_told_to_watch_a_host_in_lockstep() -> None:
     assert read(rig, "Drive1", 0x1016, 1) == 0
 
 
+@pytest.mark.parametrize(("watch_host", "deadline_ms"), [(True, 10), (False, 0)])
+def test_a_drive_that_counts_ms_has_a_deadline_of_commands_but_in_lockstep(watch_host: bool, deadline_ms: int) -> None:
+    rig = Rig(config="stock")
+    settings = load_settings("stock")
+    rig.master = Master(settings, load_contract(settings), rig.bus, watch_host=watch_host)
+    rig.start()
+    assert read(rig, "Drive1", 0x1400, 5) == deadline_ms
+
+
 def test_the_same_boot_twice_is_the_same_frames() -> None:
     rigs = [Rig(), Rig()]
     for rig in rigs:
