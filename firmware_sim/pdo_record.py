@@ -4,6 +4,7 @@ A PDO is written while it is invalid (bit 31 of its COB-ID): number of entries t
 Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38, and table 34 (restricted identifiers).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Protocol
 
@@ -40,7 +41,7 @@ class PdoOwner(Protocol):
         """Take over a new configuration."""
 
 
-class PdoRecord:
+class PdoRecord(ABC):
     """Communication and mapping record of one PDO."""
 
     is_received: bool
@@ -80,13 +81,13 @@ class PdoRecord:
         """Whether it goes by SYNC."""
         return self.type not in EVENT_DRIVEN
 
+    @abstractmethod
     def bind(self) -> None:
         """Take over a new mapping."""
-        raise NotImplementedError
 
+    @abstractmethod
     def restart(self) -> None:
         """Begin anew after a reset."""
-        raise NotImplementedError
 
     def _check_cob_id(self, value: int) -> None:
         can_id = value & 0x7FF

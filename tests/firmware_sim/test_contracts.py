@@ -202,7 +202,6 @@ def test_a_stock_sensors_mapping_is_fixed(sub):
     assert host.abort_code(lambda: host.write(3, 0x1800, 1, 0x80000183)) == 0x06010002
 
 
-@pytest.mark.skipif("arm_fd" not in BY_DEFAULT, reason="dbc/arm_fd.dbc is not in this tree")
 def test_fd_devices_exchange_one_protected_frame_each_way():
     host = BenchHost(quiet_scenario(torque_offset_Nm=[1.0, -50.0]), contract="arm_fd")
     host.start()
