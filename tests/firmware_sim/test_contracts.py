@@ -12,7 +12,7 @@ from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.contracts import CONTRACTS, contract_of
 from firmware_sim.sensing import TORQUE_LSB_NM
 
-BY_DEFAULT = [name for name in ("arm", "arm_fd") if CONTRACTS[name].path.exists()]
+BY_DEFAULT = ("arm", "arm_fd")
 """Contracts whose drives need no mapping by a master."""
 PRESENT = [name for name, contract in CONTRACTS.items() if contract.path.exists()]
 SIZES = {2: (8, True), 3: (16, True), 4: (32, True), 5: (8, False), 6: (16, False), 7: (32, False)}
