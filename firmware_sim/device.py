@@ -93,11 +93,6 @@ class Device(ObjectDictionary):
         register = _GENERIC | _COMMUNICATION if self.watchdogs.tripped else 0
         return register | (_GENERIC if self.is_faulty else 0)
 
-    @property
-    def is_heartbeat_lost(self) -> bool:
-        """Whether the master's heartbeat is monitored and missing."""
-        return self._consumer.is_lost
-
     def attach(self, application: Application) -> None:
         """Connect what the device does."""
         self._application = application

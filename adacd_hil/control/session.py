@@ -155,7 +155,7 @@ class Session:
             recorder.cycle(self.clock.now_ns(), [], tap.take())
             recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))
             self.progress(ending.error)
-        for line in arm.describe_checks():
+        for line in (*arm.describe_checks(), *master.describe_checks()):
             recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
         return ending
 

@@ -167,15 +167,6 @@ class Arm:
             return FaultReason.DATA_AGE
         return FaultReason.NONE
 
-    def restart(self) -> None:
-        """Forget that the drives were enabled, and the sequence of every device's frames: for a recovery, or new run.
-
-        Values and ages stay: what is old is old until fresh frames are in.
-        """
-        self._was_enabled = False
-        for device in self._devices:
-            device.restart()
-
     def ages(self) -> list[SignalAge]:
         """Return the age of every signal that the arm is run by, against its limit."""
         cycle = self._cycle

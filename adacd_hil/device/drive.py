@@ -275,11 +275,6 @@ class Drive:
         """Note a cycle in which no feedback came."""
         self.end_to_end.miss()
 
-    def restart(self) -> None:
-        """Forget the sequence of the feedback: the next valid frame is the first."""
-        self.end_to_end.restart()
-        self._received_position_rad = None
-
     def accept_status(self, data: bytes, cycle: int) -> None:
         """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
         message, receiver = self.status_message, self._status_receiver

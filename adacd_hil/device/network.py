@@ -27,7 +27,6 @@ _SYNC_ID = 0x080
 _IDENTIFIER_MASK = 0x7FF
 _PROFILE_NUMBER_MASK = 0xFFFF  # of 0x1000
 _MOST_OLD_FRAMES = 10_000  # more than any queue holds; a bus that somebody floods is never empty
-_AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
 
 
 class Identity(NamedTuple):
@@ -90,6 +89,11 @@ class Master:
         events = self._events.copy()
         self._events.clear()
         return events
+
+    def describe_checks(self) -> list[str]:
+        """Say how many frames fitted no CANopen service and were dropped; empty when none."""
+        count = self._canopen.malformed_frames
+        return [f"{count} frames dropped that are not what their identifier says"] if count else []
 
     def describe_emergencies(self) -> list[str]:
         """Return the last error that each device reported and has not reset since, one line each."""
@@ -228,27 +232,3 @@ class Master:
     def send_heartbeat(self) -> None:
         """Say that the host lives, 0x700 + 127. Raises BusError."""
         self._bus.send(self._heartbeat_id, bytes((OPERATIONAL,)))
-
-    def begin_autozero(self, joint: int, on_frame: Callable[[Frame], object] = lambda _: None) -> int:
-        """Tell the sensor of joint 0 or 1 to take its present torque for zero; return how many samples that takes.
-
-        `on_frame` gets the frames that arrive meanwhile, so that a running cycle misses none. Completion is seen by
-        `TorqueSensor.begin_zero`. Raises DeviceError when the sensor can't or refuses.
-        """
-        slave = next(s for s in self.slaves if s.device.settings.kind == "sensor" and s.device.joint == joint)
-        torque = slave.device.pdo("Torque")
-        signals = () if torque is None else torque.signals
-        channel = next((signal.name.sub for signal in signals if signal.signal == "torque"), 1)
-        if not slave.has(0x6125, channel) or not slave.device.can("autozero"):
-            slave.fail("has no auto-zero, 0x6125")
-
-        def on_both(frame: Frame) -> None:
-            self._heartbeats.accept(frame)
-            on_frame(frame)
-
-        self._canopen.bystander = on_both
-        try:
-            slave.write(0x6125, channel, _AUTOZERO_SIGNATURE)
-        finally:
-            self._canopen.bystander = self._heartbeats.accept
-        return slave.device.settings.autozero_samples

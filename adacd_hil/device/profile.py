@@ -21,13 +21,12 @@ FEATURES = (
     "option_codes",
     "torque_limits",
     "sync_tolerance",
-    "autozero",
     "watchdog_in_emcy",
 )
 """What a profile may name: the host uses an object of these kinds only where the EDS lists it too.
 
 heartbeat_consumer 0x1016; sync_counter 0x1019; option_codes 0x605A, 0x605E; torque_limits 0x6072, 0x60E0, 0x60E1;
-sync_tolerance 0x2201; autozero 0x6125; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the
+sync_tolerance 0x2201; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the
 device's time in ms.
 """
 EMCY_INHIBIT_100US = 100
@@ -178,7 +177,6 @@ class ProfileSettings:
     features: tuple[str, ...] = setting((), choices=FEATURES, meaning="what the device can do besides")
     quick_stop_option: int | None = setting(None, low=0, high=8, meaning="0x605A that is written, or fixed")
     fault_reaction_option: int | None = setting(None, low=0, high=4, meaning="0x605E that is written, or fixed")
-    autozero_samples: int = setting(64, low=1, high=100_000, meaning="samples that the device takes for its zero")
     scale: ScaleSettings = setting(ScaleSettings, meaning="worth of a count")
     plausibility: PlausibilitySettings = setting(PlausibilitySettings, meaning="bounds for unprotected frames")
     setup: tuple[WriteSettings, ...] = setting((), meaning="extra SDO writes, last")

@@ -52,7 +52,6 @@ class TorqueSensor:
         self._torque_range_Nm = torque_range_Nm
         names = [signal.name for signal in self.torque_message.values]
         self._torque_at = find_signal(self.torque_message, "torque")
-        self._gross_at = names.index("gross_torque") if "gross_torque" in names else None
         self._status_at = names.index("status") if "status" in names else None
         self._status_in_header = _STATUS_IN_HEADER[self.torque_message.header_bytes]
         self._slow_status_at = None if self.status_message is None else find_signal(self.status_message, "status")
@@ -61,11 +60,8 @@ class TorqueSensor:
         """Whether the torque carries an end-to-end header; else it is checked by plausibility."""
         self._received_torque_Nm: float | None = None
         self._received_cycle = 0
-        self._zero_left = 0
         self.torque_Nm = 0.0
         """As the device gives it: its sign, its own auto-zero, not tared."""
-        self.gross_torque_Nm: float | None = None
-        """Before the device's auto-zero; None where the contract doesn't carry it."""
         self.sample_cycle = -1
         """Cycle of the torque in use; -1 before the first."""
         self.implausible_frames = 0
@@ -88,11 +84,7 @@ class TorqueSensor:
                 return False
         self.torque_Nm = torque
         self.sample_cycle = cycle
-        if self._gross_at is not None:
-            self.gross_torque_Nm = values[self._gross_at]
         self._take_status(data, values, torque)
-        if self._zero_left:
-            self._zero_left -= 1
         return True
 
     def _is_plausible(self, torque: float, cycle: int) -> bool:
@@ -118,12 +110,6 @@ class TorqueSensor:
         """Note a cycle in which no torque came."""
         self.end_to_end.miss()
 
-    def restart(self) -> None:
-        """Forget the sequence of the torque frames: the next valid one is the first."""
-        self.end_to_end.restart()
-        self._received_torque_Nm = None
-        self._zero_left = 0
-
     def accept_status(self, data: bytes) -> None:
         """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
         message, receiver, at = self.status_message, self._status_receiver, self._slow_status_at
@@ -136,15 +122,6 @@ class TorqueSensor:
     def is_overloaded(self) -> bool:
         """Whether the torque is beyond the sensor's range: fresh, but not the torque that acts."""
         return bool(self.status & _OVERLOAD)
-
-    def begin_zero(self, samples: int) -> None:
-        """Begin to count the samples of an auto-zero that the device has been told to take, 0x6125."""
-        self._zero_left = samples + 1  # the value after the last sample is the first with the new zero
-
-    @property
-    def is_zeroing(self) -> bool:
-        """Whether an auto-zero is still under way: silence doesn't end it, valid frames do."""
-        return self._zero_left > 0
 
 
 def _judge_range(torque: float, range_Nm: float) -> SensorStatus:

@@ -75,6 +75,16 @@ def test_error_frames_are_in_the_log_in_words(tmp_path: Path) -> None:
     )
 
 
+def test_a_frame_that_is_not_what_its_identifier_says_is_dropped_and_counted(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x081, b"\x01\x02\x03")
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
+    said = [entry.event.message for entry in log.events if entry.event.name == "frame checks"]
+    assert said[-1] == "1 frames dropped that are not what their identifier says"
+
+
 def test_after_a_fault_there_is_no_torque_on_the_wire_and_drives_are_stopped(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle >= TROUBLE_CYCLE else data

@@ -122,20 +122,6 @@ def test_a_drive_that_drops_out_is_a_fault() -> None:
     assert devices.arm.state().fault is FaultReason.DRIVE
 
 
-def test_after_a_restart_a_drive_has_not_dropped_out_and_any_position_is_taken() -> None:
-    devices = Devices()
-    devices.enable()
-    devices.arm.synchronise(0, 0, 1)
-    devices.answer()
-    devices.arm.state()
-    devices.arm.restart()
-    devices.send("Drive2Status", 0x0250, 10, 0, 0)
-    devices.arm.synchronise(1, 0, 1)
-    devices.send("Drive1Feedback", 1.0, 0.0)  # pushed by hand meanwhile
-    state = devices.arm.state()
-    assert (state.fault, round(float(state.q[0]), 4), state.age_q) == (FaultReason.NONE, 1.0, (0, 1))
-
-
 def test_a_drive_that_was_never_enabled_has_not_dropped_out() -> None:
     devices = Devices()
     devices.send("Drive2Status", 0x0218, 10, 0, 0x8250)

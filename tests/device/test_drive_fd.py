@@ -75,23 +75,6 @@ def test_a_cycle_without_feedback_is_counted() -> None:
     assert dict(seen.end_to_end.tally())[E2eStatus.NO_NEW_DATA] == 1
 
 
-def test_a_restart_takes_any_counter_for_the_first() -> None:
-    seen, sender = drive(), Sender()
-    frames = [sender.frame() for _ in range(100)]
-    seen.accept_feedback(frames[0], 0)
-    assert seen.accept_feedback(frames[50], 1) is False
-    seen.restart()
-    assert seen.accept_feedback(frames[99], 2) is True
-
-
-def test_a_restart_of_unprotected_feedback_takes_any_place_for_the_first() -> None:
-    seen = drive(CLASSIC)
-    message = CLASSIC.message("Drive1Feedback")
-    seen.accept_feedback(bytes(message.encode(0.0, 0.0)), 0)
-    seen.restart()
-    assert seen.accept_feedback(bytes(message.encode(1.0, 0.0)), 1) is True
-
-
 def test_an_implausible_frame_is_refused_by_a_plain_no() -> None:
     seen = drive(CLASSIC)
     message = CLASSIC.message("Drive1Feedback")

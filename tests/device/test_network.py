@@ -163,37 +163,3 @@ def test_an_emergency_is_an_event_with_name_watchdog_and_time_and_stays_until_re
     rig.accept(Frame(0x081, bytes(8), 0))
     assert [event.message for event in rig.master.take_events()] == ["EMCY 0x0000: error reset"]
     assert rig.master.describe_emergencies() == []
-
-
-def test_an_auto_zero_takes_the_offset_away_and_says_when_it_is_done() -> None:
-    rig = Rig()
-    rig.start()
-    for _ in range(50):
-        rig.step()
-    sensor = rig.arm.sensors[0]
-    sensor.begin_zero(rig.master.begin_autozero(0, rig.accept))
-    steps = 0
-    while sensor.is_zeroing:
-        rig.step()
-        steps += 1
-    after = []
-    for _ in range(200):
-        rig.step()
-        after.append(sensor.torque_Nm)
-    assert steps == 65
-    assert abs(np.mean(after)) < 0.02
-
-
-def test_no_cyclic_frame_is_lost_to_an_sdo_in_between() -> None:
-    rig = Rig()
-    rig.start()
-    rig.arm.synchronise(0, 0, 1)  # its answers wait in the queue while the SDO is spoken
-    rig.master.begin_autozero(1, rig.accept)
-    assert rig.arm.is_complete
-
-
-def test_a_sensor_without_auto_zero_says_so() -> None:
-    settings = load_settings("stock")
-    bus = EmbeddedBus(VirtualClock())
-    with pytest.raises(DeviceError, match=r"Sensor2 \(node 4\): has no auto-zero, 0x6125"):
-        Master(settings, CODEC, bus).begin_autozero(1)

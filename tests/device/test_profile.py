@@ -74,7 +74,7 @@ def test_an_object_is_index_and_sub_index(text: str, name: tuple[int, int]) -> N
         (("torque_Nm = 1e-6", ""), "a sensor needs torque_Nm"),
         (("[scale]", 'protection = "P02"\n[scale]'), "header has 0 objects, P02 takes 2"),
         (("cob_id", 'data_ids = ["00", "11"]\ncob_id'), "data_ids need protection P02 or P05"),
-        (("[scale]", "features = ['autozerro']\n[scale]"), "did you mean 'autozero'?"),
+        (("[scale]", "features = ['sync_conter']\n[scale]"), "did you mean 'sync_counter'?"),
         (("[scale]", "serial = [1]\n[scale]"), "serial has 1 numbers, 2 expected"),
     ],
 )

@@ -104,24 +104,6 @@ def test_the_end_of_its_range_is_the_overload_of_a_sensor_without_status() -> No
     assert states == [0, OVERLOADED, 0, 0, 0, 0, negative]
 
 
-def test_an_auto_zero_ends_with_the_first_value_that_has_the_new_zero() -> None:
-    rig = Protected()
-    rig.sensor.begin_zero(samples=3)
-    seen = []
-    for cycle in range(4):
-        rig.sensor.accept_torque(rig.frame(0.0), cycle)
-        seen.append(rig.sensor.is_zeroing)
-    assert seen == [True, True, True, False]
-
-
-def test_silence_does_not_end_an_auto_zero() -> None:
-    rig = Protected()
-    rig.sensor.begin_zero(samples=1)
-    for _ in range(10):
-        rig.sensor.miss()
-    assert rig.sensor.is_zeroing
-
-
 def test_a_frame_of_the_wrong_length_changes_nothing() -> None:
     sensor = unprotected()
     assert not sensor.accept_torque(bytes(3), 0)
