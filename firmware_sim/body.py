@@ -90,6 +90,8 @@ _SLOW_SHARE: Final = 0.5
 _HARD_SHARE: Final = 1.5
 """Of BRAKE_DAMPING. The shortest time constant, 10 ms / 1.5, is four lags of the drive's velocity: no overshoot."""
 
+_ROOM_TEMPERATURE_C: Final = 25.0
+
 _PLACE: Final = {name: place.start for name, place in TRUTH_LAYOUT.slices.items()}
 _TRUE_Q: Final = _PLACE["q"]
 _TRUE_DQ: Final = _PLACE["dq"]
@@ -101,6 +103,9 @@ _TRUE_LINK: Final = _PLACE["contact_link"]
 _TRUE_INDEX: Final = _PLACE["contact_index"]
 _TRUE_PAYLOAD: Final = _PLACE["payload"]
 _TRUE_THETA: Final = _PLACE["theta"]
+_TRUE_Q_M: Final = _PLACE["q_m"]
+_TRUE_TAU_M: Final = _PLACE["tau_m"]
+_TRUE_TEMPERATURE: Final = _PLACE["joint_temperature"]
 
 
 @compiled
@@ -200,6 +205,7 @@ def _fill_truth(
     state: Vector, arm: Vector, contacts: NDArray[np.float64], payloads: NDArray[np.float64], out: Vector
 ) -> None:
     """Fill a block laid out by TRUTH_LAYOUT with what is true at this instant."""
+    out[:] = 0.0
     _change_payload(state, arm, payloads)
     contact = _contact_in_force(state, contacts)
     elapsed_s = 0.0
@@ -233,6 +239,9 @@ def _fill_truth(
     for joint in range(2):
         out[_TRUE_THETA + 3 + joint] = arm[VISCOUS + joint]
         out[_TRUE_THETA + 5 + joint] = arm[COULOMB + joint]
+        out[_TRUE_Q_M + joint] = state[Q + joint]
+        out[_TRUE_TAU_M + joint] = state[TAU + joint]
+        out[_TRUE_TEMPERATURE + joint] = _ROOM_TEMPERATURE_C
 
 
 class Measurement(NamedTuple):
@@ -324,8 +333,13 @@ class Body:
         """Velocity that the drives know, not quantised; by this they see standstill."""
         return float(self._state[_VELOCITY]), float(self._state[_VELOCITY + 1])
 
-    def advance(self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int]) -> None:
-        """Advance by one period. Set-points (2,) and `DriveMode` (2,) hold for the whole of it."""
+    def advance(
+        self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int | None = None
+    ) -> None:
+        """Advance by one period, or by `tick_count` ticks of 100 µs.
+
+        Set-points (2,) and `DriveMode` (2,) hold for the whole of it.
+        """
         _advance(
             self._state,
             self._arm,
@@ -335,7 +349,7 @@ class Body:
             float(torque_setpoint_Nm[1]),
             int(drive_mode[0]),
             int(drive_mode[1]),
-            self._ticks_per_period,
+            self._ticks_per_period if tick_count is None else tick_count,
             SUBSTEPS,
         )
 
