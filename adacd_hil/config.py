@@ -351,6 +351,40 @@ class OperatorSettings:
 
 
 @dataclass(frozen=True)
+class LockstepSettings:
+    """What stands for the time that passes by itself on an arm; lockstep only."""
+
+    latency: str = setting(
+        "constant",
+        choices=("constant", "uniform", "lognormal"),
+        meaning="distribution of the host's time between the last feedback and its commands",
+    )
+    latency_us: float = setting(
+        60.0, unit="us", low=0.0, high=1e6, meaning="constant: it; uniform: the lowest; lognormal: the median"
+    )
+    latency_high_us: float = setting(
+        200.0, unit="us", low=0.0, high=1e6, meaning="uniform: the highest; lognormal: exceeded by 1 in 1000"
+    )
+    stall_us: float = setting(0.0, unit="us", low=0.0, high=1e7, meaning="how much longer a stalled cycle takes")
+    stall_every_s: float = setting(0.0, unit="s", low=0.0, high=1e6, meaning="mean time between stalls; 0: none")
+    seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the latency")
+    stuffing: str = setting(
+        "exact", choices=("exact", "worst"), meaning="length of frames: by their bits, or the longest that can be"
+    )
+
+    def __post_init__(self) -> None:
+        if self.latency != "constant" and self.latency_high_us < self.latency_us:
+            raise ConfigError(
+                f"`lockstep.latency_high_us` = {self.latency_high_us:g} us is below `lockstep.latency_us` = "
+                f"{self.latency_us:g} us"
+            )
+        if self.latency == "lognormal" and self.latency_us <= 0.0:
+            raise ConfigError(
+                "`lockstep.latency_us` = 0 us can't be the median of a lognormal distribution; above 0 us"
+            )
+
+
+@dataclass(frozen=True)
 class SafetySettings:
     """Checks before torque."""
 
@@ -423,6 +457,7 @@ class Settings:
     trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
     operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
+    lockstep: LockstepSettings = setting(LockstepSettings, meaning="modelled time of the host")
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
 

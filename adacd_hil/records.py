@@ -231,6 +231,7 @@ class CycleRecord(NamedTuple):
     command_ns: int  # SYNC sent to last command handed to the bus
     overruns: int  # periods skipped since the run began
     frames_missing: int  # cyclic frames of this cycle that did not arrive or failed their checks
+    commands_late: int  # commands of the cycle before that were not on the bus at this SYNC: they act at the next one
 
 
 class FrameChecks(NamedTuple):

@@ -11,7 +11,9 @@ Two clocks:
     wall   the body moves by the given clock on a 100 µs grid and a SYNC samples it where it is. The drives watch that
            SYNC keeps coming.
 
-By SYNC, heartbeats and deadlines go by the given clock while no SYNC comes, and so does the braking that they cause.
+By SYNC, heartbeats and deadlines go by the given clock while no SYNC comes, and so does the braking that they cause. A
+host in lockstep says itself how much time passes (`firmware_sim.time_marks`), and hears from the bench what doesn't
+come at once.
 
 The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
 0 for a master that begins at 1; from there the counter 1…240 is unwrapped.
@@ -27,12 +29,13 @@ from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec, contract_folder
 from firmware_sim.body import Body
 from firmware_sim.contact import TICK_S
-from firmware_sim.contracts import Contract, contract_of, longest_pdo
+from firmware_sim.contracts import Contract, answers_to_sync, contract_of, longest_pdo
 from firmware_sim.device import RESET_COMMUNICATION, RESET_NODE, Device
 from firmware_sim.drive_node import DriveNode, Motor
 from firmware_sim.object_dictionary import NEVER_NS, Abort, refuse
 from firmware_sim.scenario import Scenario
 from firmware_sim.sensor_node import SensorNode
+from firmware_sim.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 
 ClockMode = Literal["sync", "wall"]
 SYNC_COUNTERS = 240
@@ -69,10 +72,19 @@ class Bench:
         """The bench's time: of `boot` plus, by SYNC, the periods since then; by wall, the clock's."""
         self.cycle = -1
         """Number of the last SYNC, -1 before the first."""
+        self.is_paced = False
+        """Whether a host in lockstep says how much time passes."""
+        self._send = send
+        self._sent = 0  # frames so far
+        self._granted = 0  # of them, when time was last granted
+        self._granted_ns = 0  # on the host's clock
+        self._ahead_ns = 0  # of the bench's time over the host's
+        self._answers = answers_to_sync(codec)
+        self._has_all_answers = False
         self._scenario = scenario
         self._seed = seed
         self._is_wall = clock_mode == "wall"
-        self._on_truth = on_truth
+        self.on_truth = on_truth
         self._truth = np.zeros(TRUTH_LAYOUT.size)
         self._counter = 0  # of the last SYNC, 0: none since boot-up
         self._has_moved = False
@@ -85,7 +97,8 @@ class Bench:
         ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
         longest = longest_pdo(codec)
         self.devices = tuple(
-            Device(node_id, folder / file, send, codec.by_id, longest) for node_id, file in zip(ids, files, strict=True)
+            Device(node_id, folder / file, self._transmit, codec.by_id, longest)
+            for node_id, file in zip(ids, files, strict=True)
         )
         rated_Nm = scenario.arm.rated_torque_Nm
         self.drives = tuple(
@@ -106,6 +119,7 @@ class Bench:
         self._services: dict[int, Handler] = {
             codec.message("Nmt").can_id: self._on_nmt,
             codec.message("HostHeartbeat").can_id: self._on_host_heartbeat,
+            **({} if self._is_wall else {HOST_MARK: self._on_mark}),
             **{0x600 + device.node_id: device.on_sdo for device in self.devices},
         }
 
@@ -154,6 +168,41 @@ class Bench:
             self._poll(self.now_ns)
         self._move_to(t_ns)
 
+    def release(self) -> None:
+        """Let time go by the given clock again: the host in lockstep has gone."""
+        self.is_paced = False
+
+    @property
+    def host_ns(self) -> int:
+        """The bench's time on the clock of a host in lockstep."""
+        return self.now_ns - self._ahead_ns
+
+    def _transmit(self, can_id: int, data: bytes) -> None:
+        self._sent += 1
+        self._send(can_id, data)
+
+    def _mark(self, kind: MarkKind, t_ns: int = 0) -> None:
+        self._send(DEVICE_MARK, pack_mark(kind, t_ns))
+
+    def _on_mark(self, data: bytes, _t_ns: int) -> None:
+        """Let time pass until the host's next frame, or until something is sent."""
+        mark = unpack_mark(data)
+        if mark is None or mark[0] is not MarkKind.ADVANCE:
+            return
+        host_ns = mark[1]
+        if not self.is_paced or host_ns < self._granted_ns:
+            self.is_paced = True
+            self._ahead_ns = self.now_ns - host_ns
+        target_ns = host_ns + self._ahead_ns
+        while self._sent == self._granted and self._due_ns <= target_ns:
+            self._move_to(max(self._due_ns, self.now_ns))
+            self._poll(self.now_ns)
+        if self._sent == self._granted:
+            self._move_to(target_ns)
+        self._granted = self._sent
+        self._granted_ns = self.host_ns
+        self._mark(MarkKind.GRANT, self._granted_ns)
+
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
         for device in self.devices:
             device.on_nmt(data, t_ns)
@@ -194,9 +243,12 @@ class Bench:
             body.start_scenario()
         for send in self._senders:
             send()
-        if self._on_truth is not None:
+        if self.is_paced and not self._has_all_answers:
+            self._mark(MarkKind.END)
+        self._granted = self._sent
+        if self.on_truth is not None:
             body.truth(self._truth)
-            self._on_truth(self.cycle, t_ns, self._truth)
+            self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
         if not self._is_wall:
             self._has_moved = True
             body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode))
@@ -247,6 +299,7 @@ class Bench:
     def _listen(self) -> None:
         """Take over which PDOs the devices exchange."""
         self._senders = tuple(send for device in self.devices for send in device.pdos.on_sync)
+        self._has_all_answers = self._answers == frozenset().union(*(device.pdos.answers for device in self.devices))
         commands: dict[int, tuple[Handler, ...]] = {}
         for device in self.devices:
             for can_id, take in device.pdos.handlers():

@@ -30,9 +30,9 @@ class QueuedBus:
         self._is_dead = False  # the interface has been down since the last recovery
 
     @property
-    def waiting_frames(self) -> int:
-        """Count of frames in the transmit queue."""
-        return len(self._waiting)
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Identifiers of the frames in the transmit queue, oldest first."""
+        return tuple(can_id for can_id, _ in self._waiting)
 
     @property
     def is_acknowledged(self) -> bool:

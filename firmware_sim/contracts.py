@@ -43,3 +43,9 @@ def is_fd(codec: Codec) -> bool:
 def longest_pdo(codec: Codec) -> int:
     """Return how many bytes a PDO may have on this contract's bus."""
     return FD_BYTES if is_fd(codec) else CLASSIC_BYTES
+
+
+def answers_to_sync(codec: Codec) -> frozenset[int]:
+    """Name the identifiers that the devices of a contract send on every SYNC. Raises CodecError."""
+    names = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
+    return frozenset(codec.message(name).can_id for name in names)

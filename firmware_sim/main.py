@@ -4,7 +4,7 @@ import json
 import logging
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from enum import IntEnum
 from pathlib import Path
@@ -15,6 +15,7 @@ import click
 from adacd_hil.clock import Clock, MonotonicClock, wall_ns
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
+from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
@@ -23,6 +24,7 @@ from firmware_sim.bench import Bench, ClockMode
 from firmware_sim.contracts import CONTRACTS, is_fd
 from firmware_sim.pdo_record import LISTENED_IDS
 from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
+from firmware_sim.time_marks import HOST_MARK
 from firmware_sim.truth import TRUTH_NAME, TruthLog
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
@@ -133,7 +135,15 @@ class Service:
         return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
 
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when none has come for a while."""
+        """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when none has come for a while.
+
+        A host in lockstep says the time itself, until it has gone.
+        """
+        if self._bench.is_paced:
+            self._time_ns = now_ns
+            if now_ns - self._heard_ns > _SILENCE_NS:
+                self._bench.release()
+            return
         if self._is_wall:
             if is_idle:
                 self._bench.advance_to(now_ns)
@@ -211,13 +221,12 @@ def run(
         truth = None
         if out is not None:
             metadata = {"scenario": resolved.name, "profile": resolved.profile, "seed": str(resolved.seed)}
-            epoch_ns = wall_ns() - clock.now_ns()
             # By SYNC, time waits for the log; by wall clock nothing may.
-            is_waiting = clock_mode == "sync"
-            truth = TruthLog(out / TRUTH_NAME, blocking=is_waiting, epoch_ns=epoch_ns, metadata=metadata)
+            truth = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata)
             stack.enter_context(truth)
-        on_truth = None if truth is None else truth.write
-        bench = Bench(resolved, codec, bus.send, clock_mode=clock_mode, on_truth=on_truth)
+        bench = Bench(resolved, codec, bus.send, clock_mode=clock_mode)
+        if truth is not None:
+            bench.on_truth = _stamp_truth(truth, bench, wall_ns() - clock.now_ns())
         service = Service(bench, bus, clock, clock_mode, stop, is_once)
         for line in request_realtime().missing:
             _complain(f"not granted: {line}")
@@ -228,9 +237,19 @@ def run(
         return _report(bench, resolved, clock_mode, truth, as_json)
 
 
+def _stamp_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> Callable[[int, int, Vector], None]:
+    """Stamp the truth by the host's clock in lockstep, else by the wall clock."""
+
+    def write(cycle: int, t_ns: int, block: Vector) -> None:
+        truth.write(cycle, t_ns if bench.is_paced else t_ns + epoch_ns, block)
+
+    return write
+
+
 def _open_bus(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
     """Open the devices' end; CAN FD only where the contract has such frames."""
     heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
+    heard.add(HOST_MARK)
     options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}
     return open_bus(interface, channel, clock, sorted(heard), **options)
 

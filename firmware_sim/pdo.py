@@ -229,6 +229,8 @@ class Pdos:
         self._now_ns = 0
         self.on_sync: tuple[Callable[[], None], ...] = ()
         """What sends the frames that belong to a SYNC."""
+        self.answers: frozenset[int] = frozenset()
+        """Identifiers of the frames that follow every SYNC."""
         self._asynchronous: tuple[TransmitPdo, ...] = ()
         self._compared: tuple[TransmitPdo, ...] = ()
         self.has_compared = False
@@ -280,6 +282,7 @@ class Pdos:
             if begun not in self._sending:
                 begun.begin(self._now_ns)
         self._sending = frozenset(sending)
+        self.answers = frozenset(pdo.can_id for pdo in sending if pdo.type == 1)
         self.on_sync = tuple(pdo.send if pdo.type == 1 else pdo.on_sync for pdo in sending if pdo.is_synchronous)
         self._asynchronous = tuple(pdo for pdo in sending if not pdo.is_synchronous)
         self._compared = tuple(pdo for pdo in self._asynchronous if pdo.is_compared)

@@ -42,9 +42,7 @@ class CycleRig:
         self.master = Master(settings, CODEC, self.tap)
         pacer = GridPacer(self.clock, settings.bus.period_ns)
         operator = ScriptedOperator(settings.operator)
-        self.cycle = Cycle(
-            settings, self.tap, self.arm, self.master, pacer, operator, lambda _: None, False, stopwatch=self.clock
-        )
+        self.cycle = Cycle(settings, self.tap, self.arm, self.master, pacer, operator, lambda _: None, self.clock)
         self.cycle.compile()
         self._path = folder / "run.mcap"
         self.recorder = Recorder(self._path, blocking=True)

@@ -61,6 +61,7 @@ class Timing:
     command_ns: Cycles
     overruns: Cycles
     frames_missing: Cycles
+    commands_late: Cycles
 
 
 @dataclass(frozen=True)
@@ -187,6 +188,7 @@ class CycleStatistics:
     duration_s: float
     overruns: int
     frames_missing: int
+    commands_late: int
     feedback_us: Percentiles | None
     command_us: Percentiles | None
     lateness_us: Percentiles | None
@@ -636,6 +638,7 @@ def cycle_statistics(run: Run) -> CycleStatistics:
         duration_s=float((run.t_ns[-1] - run.t_ns[0]) * 1e-9) if run.t_ns.size else 0.0,
         overruns=int(timing.overruns.max(initial=0)),
         frames_missing=int(timing.frames_missing.sum()),
+        commands_late=int(timing.commands_late.sum()),
         feedback_us=percentiles(timing.feedback_ns),
         command_us=percentiles(timing.command_ns),
         lateness_us=percentiles(timing.lateness_ns) if is_realtime(run) else None,

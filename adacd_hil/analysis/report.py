@@ -137,6 +137,7 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
             command_ns=cycle["command_ns"],
             overruns=cycle["overruns"].astype(np.int64),
             frames_missing=cycle["frames_missing"].astype(np.int64),
+            commands_late=cycle["commands_late"].astype(np.int64),
         ),
         finish_cycle=_finish_cycle(scheme),
         truth=_truth(truth_log),
@@ -512,6 +513,7 @@ def _cycle_table(metrics: Metrics) -> str:
         f"{cycle.count} cycles in {_number(cycle.duration_s, 1)} s",
         f"{cycle.overruns} overruns",
         f"{cycle.frames_missing} frames missing",
+        f"{cycle.commands_late} commands late",
         f"clock {cycle.clock or _NONE}",
         f"scheduler {cycle.scheduler or _NONE}",
     ]

@@ -103,6 +103,7 @@ def _record(cycle: ZeroTorqueCycle, loop: ZeroTorqueLoop) -> CycleRecord:
         command_ns=cycle.command_ns,
         overruns=loop.pacer.overruns,
         frames_missing=sum(age != 0 for age in (*state.age_q, *state.age_tau_J)),
+        commands_late=cycle.late_commands,
     )
 
 

@@ -30,6 +30,16 @@ def check_clock(name: str, interface: str, channel: str) -> None:
         )
 
 
+def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
+    """Give a bus without time of its own the modelled one of lockstep. Raises CodecError."""
+    # The emulator's part of the host; real time does without.
+    from firmware_sim.lockstep_bus import make_lockstep_bus
+
+    lockstep, period_us = settings.lockstep, settings.bus.period_us
+    patience_s = settings.bus.feedback_timeout_ms * 1e-3
+    return make_lockstep_bus(bus, clock, codec, period_us, lockstep.stuffing == "worst", patience_s)
+
+
 def received_ids(codec: Codec) -> list[int]:
     """List the identifiers that the host receives."""
     return [message.can_id for message in codec.messages.values() if "HOST" not in message.senders]
@@ -68,6 +78,15 @@ class Connection:
         """Read configuration and contract. Raises ConfigError, CodecError."""
         settings = self.settings()
         return settings, load_contract(settings)
+
+    def open(self, clock: Clock, codec: Codec, settings: Settings) -> Bus:
+        """Open the bus for a run: what the host receives in real time; all of it, with modelled time, in lockstep.
+
+        Raises BusMissingError, CodecError.
+        """
+        can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec)
+        bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd)
+        return model_time(bus, clock, codec, settings) if isinstance(clock, VirtualClock) else bus
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:

@@ -3,14 +3,15 @@
 from pathlib import Path
 
 from adacd_hil.analysis.report import Report, write_report
-from adacd_hil.cli.connection import contract_of, make_clock, on_interrupt
+from adacd_hil.cli.connection import contract_of, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.report import TRUTH_NAME
+from adacd_hil.clock import VirtualClock
 from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
-from adacd_hil.wire.bus import EmbeddedBus
+from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench import Bench
 from firmware_sim.scenario import load_scenario
 from firmware_sim.truth import TruthLog
@@ -24,13 +25,14 @@ def play(config: str, profile: str | None, seed: int | None, clock_name: str, ou
     scenario = load_scenario(SCENARIO, settings.arm.profile, seed)
     codec = contract_of(settings, out)
     clock = make_clock(clock_name)
-    bus = EmbeddedBus(clock)
+    embedded = EmbeddedBus(clock)
+    bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
     out.mkdir(parents=True, exist_ok=True)
     progress = Progress()
     progress(f"experiment of configuration {settings.name}, profile {settings.arm.profile}, in {out}")
     with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep") as truth:
-        bench = Bench(scenario, codec, bus.deliver, on_truth=truth.write)
-        bus.attach(bench.on_frame)
+        bench = Bench(scenario, codec, embedded.deliver, on_truth=truth.write)
+        embedded.attach(bench.on_frame)
         bench.boot()
         session = Session(
             settings,

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, check_clock, contract_of, make_clock, on_interrupt, received_ids
+from adacd_hil.cli.connection import Connection, check_clock, contract_of, make_clock, on_interrupt
 from adacd_hil.cli.exit_codes import ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.clock import wall_ns
@@ -13,7 +13,7 @@ from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperat
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
 from adacd_hil.wire.budget import check_budget
-from adacd_hil.wire.bus import Bus, open_bus
+from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.can_interface import CanInterface
 from adacd_hil.wire.codec import Codec
 
@@ -54,7 +54,7 @@ def run_on_bus(
     if clock_name == "realtime":
         check_budget_of(codec, settings)
     clock = make_clock(clock_name)
-    bus = open_bus(interface, channel, clock, received_ids(codec), connection.bitrate, codec.is_fd)
+    bus = connection.open(clock, codec, settings)
     drop_old_frames(bus, interface)
     operator: Operator = ScriptedOperator(settings.operator)
     if sys.stdin is not None and sys.stdin.isatty():

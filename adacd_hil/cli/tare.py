@@ -5,17 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, check_clock, make_clock, on_interrupt, received_ids
+from adacd_hil.cli.connection import Connection, check_clock, make_clock, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.commission.tare import TareRefusedError
 from adacd_hil.commission.tare_session import TareInterruptedError, TareSession
 from adacd_hil.config import Settings
-from adacd_hil.control.exchange import SilenceError
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
-from adacd_hil.wire.bus import open_bus
+from adacd_hil.wire.bus import SilenceError
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def tare_on_bus(
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
     codec = load_contract(settings)
     clock = make_clock(clock_name)
-    bus = open_bus(interface, channel, clock, received_ids(codec), connection.bitrate, codec.is_fd)
+    bus = connection.open(clock, codec, settings)
     progress = Progress()
     try:
         session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
+from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.realtime import Recurrence, make_pacer
@@ -17,15 +17,16 @@ class IdleCycle:
 
     def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, clock: Clock) -> None:
         self._bus, self._arm, self._master = bus, arm, master
-        self._pacer = make_pacer(clock, settings.bus.period_ns)
-        self._exchange = Exchange(settings, bus, arm, master, MonotonicClock(), isinstance(clock, VirtualClock))
+        self._pacer = make_pacer(settings, clock)
+        self._exchange = Exchange(settings, bus, arm, master, clock)
         self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
         self._off = ArmCommand(np.zeros(JOINTS), enable=False, quick_stop=False)
 
     def step(self) -> ArmState:
-        """Do one cycle and return what the arm reported. Raises BusError, and SilenceError in lockstep."""
+        """Do one cycle and return what the arm reported. Raises BusError, of it SilenceError in lockstep."""
         tick = self._pacer.next()
         state = self._exchange.read(tick)
+        self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
         self._arm.write(self._off)
         if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()

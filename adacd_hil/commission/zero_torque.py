@@ -28,6 +28,7 @@ class ZeroTorqueCycle(NamedTuple):
     feedback_ns: int
     command_ns: int
     frames: list[tuple[bool, Frame]]
+    late_commands: int
 
 
 class ZeroTorqueLoop:
@@ -37,11 +38,12 @@ class ZeroTorqueLoop:
         self, settings: Settings, bus: Tap, clock: Clock, arm: Arm, master: Master, is_enabling: bool = False
     ) -> None:
         self.pacer = GridPacer(clock, settings.bus.period_ns)
+        self._period_ns = settings.bus.period_ns
         self._clock = clock
         self._bus, self._arm, self._master = bus, arm, master
         self._is_enabling = is_enabling
         self._is_interrupted = False
-        self._exchange = Exchange(settings, bus, arm, master, clock, is_lockstep=False)
+        self._exchange = Exchange(settings, bus, arm, master, clock)
         self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
         self._max_age_cycles = settings.bus.max_age_cycles
         self._gate = Gate(settings.arm, settings.bus.period_s)
@@ -63,9 +65,9 @@ class ZeroTorqueLoop:
         is_over: Callable[[], bool] = lambda: False,
     ) -> FaultReason:
         """Cycle for a while, then disable the drives; returns what a device faulted with. Raises BusError."""
-        end_ns = self._clock.now_ns() + round(duration_s * 1e9)
+        last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE
-        while self._clock.now_ns() < end_ns and not (self._is_interrupted or is_over() or fault):
+        while self._clock.now_ns() < last_ns and not (self._is_interrupted or is_over() or fault):
             cycle = self._cycle(self._is_enabling, quick_stop=False)
             fault = self._fault(cycle.state)
             observe(cycle)
@@ -96,4 +98,6 @@ class ZeroTorqueLoop:
         command_ns = clock.now_ns() - sync_ns
         if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()
-        return ZeroTorqueCycle(state, tick.lateness_ns, feedback_ns, command_ns, bus.take())
+        return ZeroTorqueCycle(
+            state, tick.lateness_ns, feedback_ns, command_ns, bus.take(), self._exchange.late_commands.count
+        )

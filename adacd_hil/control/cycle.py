@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.exchange import Exchange
@@ -72,10 +72,9 @@ class Cycle:
         pacer: Pacer,
         operator: Operator,
         progress: Callable[[str], None],
-        is_lockstep: bool,
-        stopwatch: Clock | None = None,
+        clock: Clock,
     ) -> None:
-        """Prepare. `stopwatch`: what durations within a cycle are measured by, default the host's clock."""
+        """Prepare. `clock`: what durations within a cycle are measured by."""
         self._period_s = settings.bus.period_s
         heartbeat_s = settings.bus.heartbeat_ms * 1e-3
         self._heartbeats = Recurrence(heartbeat_s, self._period_s)
@@ -84,9 +83,9 @@ class Cycle:
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
-        self._stopwatch: Clock = stopwatch or MonotonicClock()
-        self._exchange = Exchange(settings, bus, arm, master, self._stopwatch, is_lockstep)
-        self._stale_ns = None if is_lockstep else settings.bus.max_age_cycles * settings.bus.period_ns
+        self._clock = clock
+        self._exchange = Exchange(settings, bus, arm, master, clock)
+        self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
         self._controller = Controller(settings)
         self._gate = Gate(settings.arm, self._period_s)
@@ -115,7 +114,7 @@ class Cycle:
     def run(self, recorder: Recorder) -> RunResult:
         """Run cycles until the run is finished, faulted or interrupted, then disable the drives.
 
-        Raises BusError, and SilenceError in lockstep.
+        Raises BusError, of it SilenceError in lockstep.
         """
         output = None
         while not self._is_over(output):
@@ -124,6 +123,7 @@ class Cycle:
             request = self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
+            self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
             command, flags = self._control(arm, output)
             self._arm.write(command)
             if self._heartbeats.is_due(tick.cycle):
@@ -167,7 +167,7 @@ class Cycle:
 
     def _is_stale(self) -> bool:
         """Whether this cycle took so long, as when the process was stopped, that its torque belongs to the past."""
-        return self._stale_ns is not None and self._stopwatch.now_ns() - self._exchange.sync_ns > self._stale_ns
+        return self._clock.now_ns() - self._exchange.sync_ns > self._stale_ns
 
     def _record(
         self,
@@ -185,9 +185,10 @@ class Cycle:
             cycle=tick.cycle,
             lateness_ns=tick.lateness_ns,
             feedback_ns=self._exchange.feedback_ns - self._exchange.sync_ns,
-            command_ns=self._stopwatch.now_ns() - self._exchange.sync_ns,
+            command_ns=self._clock.now_ns() - self._exchange.sync_ns,
             overruns=self._pacer.overruns,
             frames_missing=self._arm.missing_frames,
+            commands_late=self._exchange.late_commands.count,
         )
         messages = [
             (ChannelId.SCHEME, pack_scheme(output, request)),
@@ -199,8 +200,10 @@ class Cycle:
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
-        for event in (*self._master.take_events(), *self._exchange.troubles.take_events()):
-            recorder.event(t_ns, event)
+        exchange = self._exchange
+        for source in (self._master, exchange.troubles, exchange.late_commands):
+            for event in source.take_events():
+                recorder.event(t_ns, event)
         if output.state is not self._state:
             event = self._transition(output)
             recorder.event(t_ns, event)
@@ -221,7 +224,6 @@ class Cycle:
             self._enabled_cycle = cycle
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle
-            self._exchange.expect_little()
 
     def _is_over(self, output: SchemeOutput | None) -> bool:
         if output is None:

@@ -2,6 +2,7 @@
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
+from adacd_hil.control.late_commands import LateCommands
 from adacd_hil.control.realtime import Tick
 from adacd_hil.control.trouble_report import TroubleReport
 from adacd_hil.device.arm import Arm
@@ -15,56 +16,40 @@ FEEDBACK_SHARE = 0.7
 the worst, and two commands need 230 µs before the next SYNC."""
 _MOST_FRAMES = 1000
 """Frames taken at once, so that a bus that somebody floods can't hold up the cycle: a classic one carries 21 per ms."""
-_LITTLE_PATIENCE_S = 0.02
-"""Lockstep after a fault: a device that is there answers within 1 ms, and half a second of cycles is still to come."""
-
-
-class SilenceError(RuntimeError):
-    """No device answered a SYNC in lockstep; one line."""
 
 
 class Exchange:
-    """Reads the arm once per cycle. `sync_ns`, `feedback_ns`: when SYNC went out, when the last frame was decoded."""
+    """Reads the arm once per cycle.
 
-    def __init__(
-        self, settings: Settings, bus: Tap, arm: Arm, master: Master, stopwatch: Clock, is_lockstep: bool
-    ) -> None:
+    `sync_ns`, `feedback_ns`: when SYNC went out, when the last frame was decoded.
+    """
+
+    def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, clock: Clock) -> None:
         self.sync_ns = 0
         self.feedback_ns = 0
+        self.late_commands = LateCommands()
         self.troubles = TroubleReport()
         self._bus, self._arm, self._master = bus, arm, master
-        self._stopwatch = stopwatch
-        self._is_lockstep = is_lockstep
-        self._patience_s = (
-            settings.bus.feedback_timeout_ms * 1e-3 if is_lockstep else FEEDBACK_SHARE * settings.bus.period_s
-        )
-
-    def expect_little(self) -> None:
-        """Wait for less from now on in lockstep: after a fault a device may be gone for good."""
-        self._patience_s = min(self._patience_s, _LITTLE_PATIENCE_S)
+        self._clock = clock
+        self._command_ids = tuple(drive.command_id for drive in arm.drives)
+        self._patience_s = FEEDBACK_SHARE * settings.bus.period_s
 
     def read(self, tick: Tick) -> ArmState:
-        """Send SYNC and take in what the devices sampled on it. Raises BusError, and SilenceError in lockstep."""
-        bus, arm = self._bus, self._arm
+        """Send SYNC and take in what the devices sampled on it. Raises BusError, of it SilenceError in lockstep."""
+        bus, arm, clock = self._bus, self._arm, self._clock
         self._take_late_frames()
-        self.sync_ns = self._stopwatch.now_ns()
-        bus.held_ns = tick.t_ns if self._is_lockstep else self.sync_ns
+        waiting = bus.waiting_frames
+        self.sync_ns = bus.held_ns = clock.now_ns()
+        late = sum(waiting.count(can_id) for can_id in self._command_ids) if waiting else 0
+        self.late_commands.note(tick.cycle, late, self.sync_ns)
         arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
         patience_s = self._patience_s
         for _ in range(_MOST_FRAMES):
             if arm.has_all_frames or (frame := bus.receive(patience_s)) is None:
                 break
             self._accept(frame)
-            if not self._is_lockstep:
-                patience_s = self._patience_s - (frame.t_ns - self.sync_ns) * 1e-9
-        self.feedback_ns = self._stopwatch.now_ns()
-        if not self._is_lockstep:
-            bus.held_ns = self.feedback_ns
-        if self._is_lockstep and arm.missing_frames == len(arm.drives) + len(arm.sensors):
-            raise SilenceError(
-                f"no answer from {', '.join(arm.missing_names())} to SYNC of cycle {tick.cycle} on {bus.channel} "
-                f"within {self._patience_s:g} s"
-            )
+            patience_s = self._patience_s - (frame.t_ns - self.sync_ns) * 1e-9
+        self.feedback_ns = bus.held_ns = clock.now_ns()
         return arm.state()
 
     def _take_late_frames(self) -> None:

@@ -1,8 +1,10 @@
-"""When a cycle begins: at once in lockstep, on a fixed grid in real time."""
+"""When a cycle begins: on a fixed grid, of the host's clock in real time, of a virtual one in lockstep."""
 
 from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock, VirtualClock
+from adacd_hil.config import Settings
+from adacd_hil.control.host_latency import HostLatency
 
 
 class Tick(NamedTuple):
@@ -21,6 +23,9 @@ class Pacer(Protocol):
 
     def next(self) -> Tick:
         """Wait for the next cycle and return its beginning."""
+
+    def spend(self, feedback_ns: int) -> int:
+        """Let the host's work after the feedback take its time; return when its commands leave."""
 
     def resume(self) -> None:
         """Go on after a pause that was meant: its periods are passed over and not counted as overruns."""
@@ -41,32 +46,16 @@ class Recurrence:
         return True
 
 
-class LockstepPacer:
-    """Begins a cycle as soon as it is asked, and moves the virtual clock by one period each time."""
-
-    def __init__(self, clock: VirtualClock, period_ns: int) -> None:
-        self.overruns = 0
-        self._clock = clock
-        self._period_ns = period_ns
-        self._cycle = -1
-
-    def next(self) -> Tick:
-        """Return the next cycle's beginning, at once."""
-        self._cycle += 1
-        t_ns = self._cycle * self._period_ns
-        self._clock.sleep_until_ns(t_ns)
-        return Tick(self._cycle, t_ns, 1, 0)
-
-    def resume(self) -> None:
-        """Let the next cycle begin at the first multiple of the period that the clock has not passed."""
-        self._cycle = max(self._cycle, -(-self._clock.now_ns() // self._period_ns) - 1)
-
-
 class GridPacer:
-    """Begins cycles on a fixed grid; a late one doesn't move the grid, a very late one skips whole periods."""
+    """Begins cycles on a fixed grid; a late one doesn't move the grid, a very late one skips whole periods.
 
-    def __init__(self, clock: Clock, period_ns: int) -> None:
+    The grid is that of the clock's whole periods.
+    """
+
+    def __init__(self, clock: Clock, period_ns: int, latency: HostLatency | None = None) -> None:
+        """`latency`: how long the host's work takes by a clock that doesn't go on while it works."""
         self.overruns = 0
+        self._latency = latency
         self._clock = clock
         self._period_ns = period_ns
         self._start_ns: int | None = None
@@ -75,7 +64,7 @@ class GridPacer:
     def next(self) -> Tick:
         """Sleep until the next grid point that is still ahead; the first call sets the grid."""
         if self._start_ns is None:
-            self._start_ns = self._clock.now_ns() + self._period_ns
+            self._start_ns = -(-self._clock.now_ns() // self._period_ns) * self._period_ns
         previous = self._cycle
         self._cycle += 1
         due_ns = self._start_ns + self._cycle * self._period_ns
@@ -88,12 +77,21 @@ class GridPacer:
             due_ns += skipped * self._period_ns
         return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)
 
+    def spend(self, feedback_ns: int) -> int:
+        """Move a virtual clock by the modelled latency; in real time the commands carry the feedback's stamp."""
+        if self._latency is not None:
+            feedback_ns += self._latency.draw_ns()
+            self._clock.sleep_until_ns(feedback_ns)
+        return feedback_ns
+
     def resume(self) -> None:
         """Let the next cycle begin on the next grid point that is ahead."""
         if self._start_ns is not None:
             self._cycle = max(self._cycle, (self._clock.now_ns() - self._start_ns) // self._period_ns)
 
 
-def make_pacer(clock: Clock, period_ns: int) -> Pacer:
-    """Make the pacer that goes with a clock: lockstep with a VirtualClock, else the grid."""
-    return LockstepPacer(clock, period_ns) if isinstance(clock, VirtualClock) else GridPacer(clock, period_ns)
+def make_pacer(settings: Settings, clock: Clock) -> Pacer:
+    """Make the pacer that goes with a clock: with a VirtualClock the host's work takes a modelled time."""
+    bus = settings.bus
+    is_virtual = isinstance(clock, VirtualClock)
+    return GridPacer(clock, bus.period_ns, HostLatency(settings.lockstep, bus.period_s) if is_virtual else None)

@@ -11,7 +11,6 @@ from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult
-from adacd_hil.control.exchange import SilenceError
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import Pacer, make_pacer
 from adacd_hil.control.recovery import Recovery
@@ -103,7 +102,7 @@ class Session:
         Raises LogError when the log can't be created.
         """
         tap = Tap(self.bus, self.clock)
-        pacer = make_pacer(self.clock, self.settings.bus.period_ns)
+        pacer = make_pacer(self.settings, self.clock)
         self.progress("compiling")
         attempt = self._prepare(tap, pacer)
         # After compiling: a second of work at real-time priority would be paid back by 50 ms of throttling later.
@@ -134,7 +133,7 @@ class Session:
         """Build and compile everything that must know nothing of an attempt before."""
         arm = Arm(self.settings, self.codec, tap)
         master = Master(self.settings, self.codec, tap, watch_host=not self.is_lockstep)
-        cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.is_lockstep)
+        cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.clock)
         cycle.compile()
         self._cycle = cycle
         if self._is_interrupted:
@@ -150,7 +149,7 @@ class Session:
             self._boot(master, recorder, tap)
             self.progress("running")
             ending = Ending(self._run(cycle, master, recorder, tap), "", is_bus_failed=False)
-        except (BusError, DeviceError, SilenceError) as reason:
+        except (BusError, DeviceError) as reason:
             ending = Ending(None, str(reason), isinstance(reason, BusError))
             recorder.cycle(self.clock.now_ns(), [], tap.take())
             recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))

@@ -147,6 +147,7 @@ _CYCLE = (
     Member("command_ns", "int64", unit="ns", meaning="SYNC sent to last command handed to the bus"),
     Member("overruns", "uint64", meaning="periods skipped since the run began"),
     Member("frames_missing", "uint64", meaning="cyclic frames that did not arrive or failed their checks"),
+    Member("commands_late", "uint64", meaning="commands of the cycle before that missed this SYNC and act at the next"),
 )
 _DEVICES = ("drive1", "drive2", "sensor1", "sensor2")
 _FRAME_CHECKS = (

@@ -28,6 +28,10 @@ class TransmitQueueError(BusError):
     """The transmit queue stays full: nobody acknowledges, or it is too short. What waits in it is old by then."""
 
 
+class SilenceError(BusError):
+    """No device answered a SYNC in lockstep, where nothing goes on without an answer."""
+
+
 class InterfaceDownError(BusError):
     """The interface was taken down or has vanished. The bus end stays dead until `recover`."""
 
@@ -63,6 +67,10 @@ class Bus(Protocol):
 
     channel: str
 
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Identifiers of what was sent and is not on the bus yet, as far as this end can know."""
+
     def send(self, can_id: int, data: bytes) -> None:
         """Hand a frame to the bus. Raises BusError, of it TransmitQueueError and InterfaceDownError."""
 
@@ -94,6 +102,11 @@ class EmbeddedBus:
         self._clock = clock
         self._received: deque[Frame] = deque()
         self._device: Callable[[Frame], None] | None = None
+
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Nothing: what is sent has arrived."""
+        return ()
 
     def attach(self, device: Callable[[Frame], None]) -> None:
         """Connect the device's receiver."""
@@ -133,7 +146,8 @@ def open_bus(
 
     `can_ids` are filtered in the kernel on SocketCAN; elsewhere everything is received. `bitrate` in bit/s is for the
     interfaces that python-can configures; a SocketCAN interface has its own from `ip link`. Frames of more than 8 bytes
-    need `is_fd`. Remote frames, and 29-bit identifiers that would read as 11-bit ones, are never received.
+    need `is_fd`. Identifiers beyond 0x7FF are 29-bit ones. Remote frames, and 29-bit identifiers that would read as
+    11-bit ones, are never received.
     """
     # Both build on this module; and who only knows frames, such as the log's writer, does without python-can (0.1 s).
     from adacd_hil.wire.python_can import PythonCanBus

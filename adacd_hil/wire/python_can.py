@@ -42,6 +42,11 @@ class PythonCanBus:
         except (OSError, can.CanError, ValueError) as error:
             raise BusMissingError(f"interface {self._interface}, channel {self.channel}: {error}") from None
 
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Nothing: python-can doesn't say which frames wait."""
+        return ()
+
     def send(self, can_id: int, data: bytes) -> None:
         """Send a frame. Raises BusError."""
         is_long = len(data) > MAX_CLASSIC_BYTES
@@ -50,7 +55,11 @@ class PythonCanBus:
         try:
             self._bus.send(
                 can.Message(
-                    arbitration_id=can_id, data=data, is_extended_id=False, is_fd=is_long, bitrate_switch=is_long
+                    arbitration_id=can_id,
+                    data=data,
+                    is_extended_id=can_id > _MAX_STANDARD_ID,
+                    is_fd=is_long,
+                    bitrate_switch=is_long,
                 )
             )
         except (OSError, can.CanError, ValueError) as error:

@@ -88,12 +88,19 @@ class SocketCanBus:
         self._is_drained = True  # the last look found nothing, so waiting comes before looking
         self._stamp_ns: int | None = None
 
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Nothing: the kernel doesn't say which frames wait."""
+        return ()
+
     def send(self, can_id: int, data: bytes) -> None:
-        """Queue a frame for transmission.
+        """Queue a frame for transmission; identifiers beyond 0x7FF are 29-bit ones.
 
         Raises TransmitQueueError, InterfaceDownError, and BusError for data that the bus can't carry.
         """
         length = len(data)
+        if can_id > _MAX_STANDARD_ID:
+            can_id |= CAN_EFF_FLAG
         packed = _FRAME.pack(can_id, length, data) if length <= MAX_CLASSIC_BYTES else self._pack_fd(can_id, data)
         try:
             self._socket.send(packed)
@@ -232,7 +239,12 @@ def _pack_filters(can_ids: Iterable[int] | None) -> bytes:
     """
     flags = CAN_EFF_FLAG | CAN_RTR_FLAG
     if can_ids is not None:
-        return b"".join(_FILTER.pack(can_id, _MAX_STANDARD_ID | flags) for can_id in can_ids)
+        return b"".join(
+            _FILTER.pack(can_id, _MAX_STANDARD_ID | flags)
+            if can_id <= _MAX_STANDARD_ID
+            else _FILTER.pack(can_id | CAN_EFF_FLAG, CAN_ID_MASK | flags)
+            for can_id in can_ids
+        )
     extended = (_FILTER.pack(CAN_EFF_FLAG | 1 << bit, flags | 1 << bit) for bit in range(11, 29))
     return b"".join((_FILTER.pack(0, flags), *extended))
 

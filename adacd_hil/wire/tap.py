@@ -17,6 +17,11 @@ class Tap:
         self._passed: list[tuple[bool, Frame]] = []
         self.held_ns: int | None = None
 
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Identifiers of what was sent and is not on the bus yet, as far as the bus behind it knows."""
+        return self._bus.waiting_frames
+
     def send(self, can_id: int, data: bytes) -> None:
         """Send and remember a frame. Raises BusError."""
         # Remembered first: on the embedded bus the answers come while `send` runs.

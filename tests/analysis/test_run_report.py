@@ -57,7 +57,7 @@ KEYS = {
     "contacts.0": "number section link onset_s end_s is_armed detected_s delay_ms law_ms ideal_ms link_at_alarm "
     "link_detected direction direction_ok tau_ext_Nm tau_ext_peak_hat_Nm torque_error_ratio",
     "parameters.A": "a1 a2 a3 F_v1 F_v2 F_c1 F_c2",
-    "cycle": "count duration_s overruns frames_missing latency_us lateness_us clock scheduler",
+    "cycle": "count duration_s overruns frames_missing commands_late latency_us lateness_us clock scheduler",
     "cycle.latency_us": "feedback command",
     "cycle.latency_us.feedback": "p50 p99 p999 max",
     "cycle.lateness_us": "p50 p99 p999 max",

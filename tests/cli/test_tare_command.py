@@ -38,8 +38,7 @@ class Lab:
         self.tare_file = folder / "tare.toml"
         self.settings_file = folder / "settings.toml"
         self.settings_file.write_text(SHORT_RUN)
-        monkeypatch.setattr("adacd_hil.cli.tare.open_bus", self._open_bus)
-        monkeypatch.setattr("adacd_hil.cli.run.open_bus", self._open_bus)
+        monkeypatch.setattr("adacd_hil.cli.connection.open_bus", self._open_bus)
         monkeypatch.setattr("adacd_hil.cli.run.drop_old_frames", lambda bus, interface: None)
         monkeypatch.setattr("adacd_hil.cli.connection.is_hardware", lambda interface, channel: False)
 

@@ -1,7 +1,11 @@
 """When cycles begin."""
 
-from adacd_hil.clock import VirtualClock
-from adacd_hil.control.realtime import GridPacer, LockstepPacer, Recurrence, Tick
+import dataclasses
+from typing import Any
+
+from adacd_hil.clock import MonotonicClock, VirtualClock
+from adacd_hil.config import LockstepSettings, load_settings
+from adacd_hil.control.realtime import GridPacer, Pacer, Recurrence, Tick, make_pacer
 
 PERIOD_NS = 1_000_000
 
@@ -18,7 +22,7 @@ class LateClock(VirtualClock):
 
 
 def test_lockstep_cycles_are_one_period_apart_in_virtual_time() -> None:
-    pacer = LockstepPacer(VirtualClock(), PERIOD_NS)
+    pacer = GridPacer(VirtualClock(), PERIOD_NS)
     assert [pacer.next() for _ in range(3)] == [Tick(k, k * PERIOD_NS, 1, 0) for k in range(3)]
 
 
@@ -63,13 +67,33 @@ def test_a_pause_that_is_meant_is_no_overrun_and_keeps_the_grid() -> None:
     assert pacer.overruns == 0
 
 
-def test_lockstep_goes_on_where_its_clock_has_come_to() -> None:
+def test_the_grid_is_that_of_the_clocks_whole_periods() -> None:
     clock = VirtualClock()
-    pacer = LockstepPacer(clock, PERIOD_NS)
-    pacer.next()
     clock.sleep_until_ns(5_300_000)
-    pacer.resume()
-    assert pacer.next() == Tick(6, 6_000_000, 1, 0)
+    assert GridPacer(clock, PERIOD_NS).next() == Tick(0, 6_000_000, 1, 0)
+
+
+def paced(**lockstep: Any) -> tuple[VirtualClock, Pacer]:
+    clock = VirtualClock()
+    settings = dataclasses.replace(load_settings(), lockstep=LockstepSettings(**lockstep))
+    return clock, make_pacer(settings, clock)
+
+
+def test_in_lockstep_the_hosts_work_takes_its_modelled_time() -> None:
+    clock, pacer = paced(latency_us=80.0)
+    clock.sleep_until_ns(500_000)
+    assert (pacer.spend(500_000), clock.now_ns()) == (580_000, 580_000)
+
+
+def test_in_real_time_nothing_is_added_to_the_time_that_the_work_takes() -> None:
+    assert make_pacer(load_settings(), MonotonicClock()).spend(500_000) == 500_000
+
+
+def test_a_modelled_host_that_is_slower_than_a_period_skips_periods() -> None:
+    _, pacer = paced(latency_us=1_700.0)
+    pacer.next()
+    pacer.spend(500_000)
+    assert (pacer.next(), pacer.overruns) == (Tick(2, 2_200_000, 2, 200_000), 1)
 
 
 def test_a_recurrence_is_due_every_so_many_cycles() -> None:

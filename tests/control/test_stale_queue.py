@@ -24,7 +24,7 @@ def stopped_rig(folder: Path, queue_length: int) -> CycleRig:
     rig.in_cycle[STOP_CYCLE] = stop
     with pytest.raises(TransmitQueueError):
         rig.run()
-    assert rig.queue.waiting_frames == queue_length
+    assert len(rig.queue.waiting_frames) == queue_length
     rig.arrived.clear()
     return rig
 

@@ -20,7 +20,7 @@ class Rig:
 def test_an_acknowledged_frame_goes_out_at_once() -> None:
     rig = Rig()
     rig.bus.send(0x201, b"a")
-    assert (rig.arrived, rig.bus.waiting_frames) == ([(0x201, b"a")], 0)
+    assert (rig.arrived, len(rig.bus.waiting_frames)) == ([(0x201, b"a")], 0)
 
 
 def test_frames_that_nobody_acknowledges_wait_and_go_out_in_order() -> None:
@@ -28,10 +28,10 @@ def test_frames_that_nobody_acknowledges_wait_and_go_out_in_order() -> None:
     rig.bus.is_acknowledged = False
     for number in range(4):
         rig.bus.send(0x200 + number, bytes((number,)))
-    assert (rig.arrived, rig.bus.waiting_frames) == ([], 4)
+    assert (rig.arrived, len(rig.bus.waiting_frames)) == ([], 4)
     rig.bus.is_acknowledged = True
     assert rig.arrived == [(0x200, b"\0"), (0x201, b"\1"), (0x202, b"\2"), (0x203, b"\3")]
-    assert rig.bus.waiting_frames == 0
+    assert rig.bus.waiting_frames == ()
 
 
 @pytest.mark.parametrize("length", [1, 10, 512])
@@ -71,7 +71,7 @@ def test_a_recovery_does_not_bring_acknowledgement_back() -> None:
     rig.bus.is_acknowledged = False
     rig.bus.recover()
     rig.bus.send(0x201, b"")
-    assert (rig.arrived, rig.bus.waiting_frames) == ([], 1)
+    assert (rig.arrived, len(rig.bus.waiting_frames)) == ([], 1)
 
 
 def test_a_later_change_of_the_data_does_not_change_what_waits() -> None:
@@ -113,7 +113,7 @@ def test_a_device_that_takes_the_acknowledgement_away_while_the_queue_drains_sto
     for number in range(3):
         rig.bus.send(number, b"")
     rig.bus.is_acknowledged = True
-    assert (rig.arrived, rig.bus.waiting_frames) == ([(0, b"")], 2)
+    assert (rig.arrived, len(rig.bus.waiting_frames)) == ([(0, b"")], 2)
 
 
 def test_closing_closes_the_bus_behind_it() -> None:

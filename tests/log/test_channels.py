@@ -162,10 +162,10 @@ def test_contact_is_laid_out_as_its_type_says():
 
 
 def test_cycle_is_laid_out_as_its_type_says():
-    message = decode(ChannelId.CYCLE, pack_cycle(CycleRecord(1, -2, 3, 4, 5, 6)))
+    message = decode(ChannelId.CYCLE, pack_cycle(CycleRecord(1, -2, 3, 4, 5, 6, 7)))
     values = (message.cycle, message.lateness_ns, message.feedback_ns, message.command_ns)
     assert values == (1, -2, 3, 4)
-    assert (message.overruns, message.frames_missing) == (5, 6)
+    assert (message.overruns, message.frames_missing, message.commands_late) == (5, 6, 7)
 
 
 def test_states_are_named_before_the_field_that_holds_them():

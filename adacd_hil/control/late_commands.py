@@ -1,0 +1,44 @@
+"""Commands that missed their SYNC, as events: the first at once, then at most one a second.
+
+The commands of cycle k act at SYNC k + 1. Those that are not on the bus when SYNC k + 1 goes out act at k + 2.
+"""
+
+from adacd_hil.records import Event
+
+_REPEAT_NS = 1_000_000_000
+
+
+class LateCommands:
+    """Counts them and makes events of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Of the present cycle."""
+        self._unsaid = 0
+        self._said_ns: int | None = None
+        self._events: list[Event] = []
+
+    def note(self, cycle: int, count: int, t_ns: int) -> None:
+        """Take note of the commands of `cycle` - 1 that still wait as SYNC of `cycle` goes out, at `t_ns`."""
+        self.count = count
+        if count == 0:
+            return
+        if self._said_ns is not None and t_ns - self._said_ns < _REPEAT_NS:
+            self._unsaid += count
+            return
+        more = f", as {self._unsaid} before" if self._unsaid else ""
+        commands = "1 command" if count == 1 else f"{count} commands"
+        self._events.append(
+            Event(
+                "warning",
+                "late commands",
+                f"{commands} of cycle {cycle - 1} missed SYNC {cycle} and act one later{more}",
+            )
+        )
+        self._unsaid = 0
+        self._said_ns = t_ns
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
+        events, self._events = self._events, []
+        return events

@@ -1,0 +1,53 @@
+"""The frames by which a host in lockstep and the emulated devices keep one time.
+
+A bus without time of its own, such as vcan, carries them like any other frame, so order tells what belongs together.
+Both have 29-bit identifiers that no CANopen service has; on an arm they never appear. Data: 1 byte kind, 7 bytes time
+in ns, little-endian.
+
+| kind | from | means |
+|---|---|---|
+| ADVANCE | host | "I send nothing before this time": let time pass until then, or until you have sent something |
+| GRANT | devices | "it is this time": the answer to ADVANCE, after what was sent on the way |
+| RELEASE | devices | what follows is handed to the bus so long after SYNC; wait for END |
+| END | devices | that is all that belongs to this SYNC |
+| DARK | devices | nobody is powered, so nobody acknowledges; time: 0 |
+| LIT | devices | somebody is |
+
+Every SYNC lets one period pass. Only when not all cyclic frames follow a SYNC at once, or others too, it takes RELEASE
+and END; an undisturbed arm sends none. The first ADVANCE of a host says what its clock reads and lets no time pass.
+"""
+
+import struct
+from enum import IntEnum
+from typing import Final
+
+HOST_MARK: Final = 0x1ADACD00
+DEVICE_MARK: Final = 0x1ADACD01
+_PACKING: Final = struct.Struct("<Q")
+
+
+class MarkKind(IntEnum):
+    """What a mark says."""
+
+    ADVANCE = 1
+    GRANT = 2
+    RELEASE = 3
+    END = 4
+    DARK = 5
+    LIT = 6
+
+
+def pack_mark(kind: MarkKind, t_ns: int = 0) -> bytes:
+    """Pack the data of a mark; the time wraps at 2.3 years."""
+    return _PACKING.pack((t_ns << 8 | kind) & 0xFFFFFFFFFFFFFFFF)
+
+
+def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
+    """Unpack the data of a mark; None when it is none."""
+    if len(data) != _PACKING.size:
+        return None
+    (packed,) = _PACKING.unpack(data)
+    try:
+        return MarkKind(packed & 0xFF), packed >> 8
+    except ValueError:
+        return None

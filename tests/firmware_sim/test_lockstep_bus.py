@@ -1,0 +1,319 @@
+"""Modelled time on the bus: arbitration, queues, and devices that live with the host's clock."""
+
+from collections import deque
+from collections.abc import Callable
+
+import pytest
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.wire.bus import Frame, SilenceError, TransmitQueueError
+from firmware_sim.lockstep_bus import LockstepBus
+from firmware_sim.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+
+SYNC, PERIOD_NS = 0x080, 1_000_000
+FRAME_NS = 100_000  # every frame of these tests takes so long
+
+
+class Devices:
+    """The devices' end, without time of its own: `on_frame` says what they send when they get something."""
+
+    channel = "devices"
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[int, bytes]] = []
+        self.asked_ns: list[int] = []
+        self.queue: deque[Frame] = deque()
+        self.on_frame: Callable[[int, bytes], None] = lambda can_id, data: None
+        self.events: list[tuple[int, int, bytes]] = []  # when, identifier, data
+        self.is_marking = True
+        self._is_new = True
+        self._has_sent = False
+        self._now_ns = 0
+
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        return ()
+
+    def say(self, can_id: int, data: bytes = b"") -> None:
+        self._has_sent = self._has_sent or can_id != DEVICE_MARK
+        self.queue.append(Frame(can_id, data, 0))
+
+    def mark(self, kind: MarkKind, t_ns: int = 0) -> None:
+        self.say(DEVICE_MARK, pack_mark(kind, t_ns))
+
+    def send(self, can_id: int, data: bytes) -> None:
+        if can_id != HOST_MARK:
+            self.heard.append((can_id, data))
+            self.on_frame(can_id, data)
+            return
+        mark = unpack_mark(data)
+        assert mark is not None
+        if not self.is_marking:
+            return
+        self.asked_ns.append(mark[1])
+        if self._is_new:
+            self._is_new = False
+            self._now_ns = mark[1]
+        elif not self._has_sent:
+            self._live_until(mark[1])
+        self._has_sent = False
+        self.mark(MarkKind.GRANT, self._now_ns)
+
+    def _live_until(self, t_ns: int) -> None:
+        if self.events and self.events[0][0] <= t_ns:
+            t_ns, can_id, data = self.events.pop(0)
+            self.say(can_id, data)
+        self._now_ns = max(self._now_ns, t_ns)
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        return self.queue.popleft() if self.queue else None
+
+    def recover(self) -> None:
+        self.queue.clear()
+
+    def close(self) -> None:
+        self.queue.clear()
+
+
+class Rig:
+    def __init__(self, answers: tuple[int, ...] = (), queue_length: int = 10) -> None:
+        self.devices = Devices()
+        self.clock = VirtualClock()
+        self.bus = LockstepBus(
+            self.devices,
+            self.clock,
+            lambda can_id, data: FRAME_NS,
+            period_ns=PERIOD_NS,
+            answers=answers,
+            patience_s=0.0,
+            queue_length=queue_length,
+        )
+        self.devices.on_frame = self._answer
+        self.answers = answers
+
+    def _answer(self, can_id: int, data: bytes) -> None:
+        if can_id == SYNC:
+            for answer in self.answers:
+                self.devices.say(answer)
+
+    def receive_all(self, timeout_s: float) -> list[tuple[int, int]]:
+        received = []
+        end_ns = self.clock.now_ns() + round(timeout_s * 1e9)
+        while frame := self.bus.receive((end_ns - self.clock.now_ns()) * 1e-9):
+            received.append((frame.can_id, frame.t_ns))
+        return received
+
+    def at(self, t_ns: int) -> "Rig":
+        self.clock.sleep_until_ns(t_ns)
+        return self
+
+
+def test_answers_follow_sync_one_after_the_other_by_identifier() -> None:
+    rig = Rig((0x184, 0x181, 0x183))
+    rig.bus.send(SYNC, b"\x01")
+    assert rig.receive_all(0.0009) == [(0x181, 200_000), (0x183, 300_000), (0x184, 400_000)]
+
+
+def test_waiting_for_a_frame_moves_the_clock_to_its_end() -> None:
+    rig = Rig((0x181,))
+    rig.bus.send(SYNC, b"\x01")
+    rig.bus.receive(0.0007)
+    assert rig.clock.now_ns() == 200_000
+
+
+def test_waiting_in_vain_takes_the_whole_time() -> None:
+    rig = Rig((0x181,))
+    rig.bus.send(SYNC, b"\x01")
+    rig.receive_all(0.0007)
+    assert rig.clock.now_ns() == 700_000
+
+
+def test_a_frame_that_ends_after_the_wait_is_there_next_time() -> None:
+    rig = Rig((0x181, 0x182))
+    rig.bus.send(SYNC, b"\x01")
+    assert rig.receive_all(0.00025) == [(0x181, 200_000)]
+    assert rig.receive_all(0.0005) == [(0x182, 300_000)]
+
+
+def test_what_the_host_sends_leaves_in_the_order_in_which_it_was_sent() -> None:
+    rig = Rig()
+    rig.bus.send(0x77F, b"")
+    rig.bus.send(0x201, b"")
+    rig.receive_all(0.001)
+    assert [can_id for can_id, _ in rig.devices.heard] == [0x77F, 0x201]
+
+
+def test_commands_in_time_reach_the_devices_before_the_next_sync() -> None:
+    rig = Rig((0x181,))
+    rig.bus.send(SYNC, b"\x01")
+    rig.receive_all(0.0007)
+    rig.at(790_000).bus.send(0x201, b"")
+    rig.bus.send(0x202, b"")
+    rig.at(PERIOD_NS)
+    assert rig.bus.waiting_frames == ()
+    rig.bus.send(SYNC, b"\x02")
+    rig.receive_all(0.0007)
+    assert [can_id for can_id, _ in rig.devices.heard] == [SYNC, 0x201, 0x202, SYNC]
+
+
+def test_a_command_that_has_not_begun_when_sync_is_due_waits_for_the_answers() -> None:
+    rig = Rig((0x181, 0x182))
+    rig.bus.send(SYNC, b"\x01")
+    rig.receive_all(0.0007)
+    rig.at(920_000).bus.send(0x201, b"")
+    rig.bus.send(0x202, b"")
+    rig.at(PERIOD_NS)
+    assert rig.bus.waiting_frames == (0x202,)
+
+
+def test_sync_goes_behind_a_command_in_the_hosts_queue() -> None:
+    rig = Rig((0x181,))
+    rig.at(950_000).bus.send(0x201, b"")
+    rig.bus.send(0x202, b"")
+    rig.at(PERIOD_NS).bus.send(SYNC, b"\x01")
+    assert rig.receive_all(0.0007) == [(0x181, 1_350_000)]
+    assert [can_id for can_id, _ in rig.devices.heard] == [0x201, 0x202, SYNC]
+
+
+def test_a_low_frame_at_the_head_of_the_queue_loses_to_the_devices_and_holds_sync_up() -> None:
+    rig = Rig((0x181,))
+    rig.devices.on_frame = lambda can_id, data: (
+        [rig.devices.say(one) for one in (0x181, 0x281, 0x282)] if can_id == SYNC and data == b"\x01" else None
+    )
+    rig.bus.send(SYNC, b"\x01")
+    rig.bus.receive(0.0007)
+    rig.at(200_000).bus.send(0x77F, b"")
+    rig.bus.send(0x000, b"")
+    rig.receive_all(0.0008)
+    assert [can_id for can_id, _ in rig.devices.heard] == [SYNC, 0x77F, 0x000]
+
+
+def test_released_frames_come_when_they_are_released() -> None:
+    rig = Rig((0x181, 0x182))
+
+    def answer_late(can_id: int, data: bytes) -> None:
+        rig.devices.mark(MarkKind.RELEASE, 0)
+        rig.devices.say(0x181)
+        rig.devices.mark(MarkKind.RELEASE, 350_000)
+        rig.devices.say(0x182)
+        rig.devices.mark(MarkKind.END)
+
+    rig.devices.on_frame = answer_late
+    rig.bus.send(SYNC, b"\x01")
+    assert rig.receive_all(0.0009) == [(0x181, 200_000), (0x182, 550_000)]
+
+
+def test_after_release_frames_beyond_the_expected_ones_are_awaited() -> None:
+    rig = Rig((0x181,))
+
+    def answer_twice(can_id: int, data: bytes) -> None:
+        rig.devices.mark(MarkKind.RELEASE, 0)
+        rig.devices.say(0x181, b"a")
+        rig.devices.say(0x181, b"b")
+        rig.devices.mark(MarkKind.END)
+
+    rig.devices.on_frame = answer_twice
+    rig.bus.send(SYNC, b"\x01")
+    assert rig.receive_all(0.0009) == [(0x181, 200_000), (0x181, 300_000)]
+
+
+def test_end_says_that_what_is_missing_does_not_come() -> None:
+    rig = Rig((0x181, 0x182))
+    rig.devices.on_frame = lambda can_id, data: rig.devices.mark(MarkKind.END)
+    rig.bus.send(SYNC, b"\x01")
+    assert rig.bus.receive(0.0007) is None
+
+
+def test_devices_that_say_nothing_to_sync_have_gone() -> None:
+    rig = Rig((0x181,))
+    rig.devices.on_frame = lambda can_id, data: None
+    rig.bus.send(SYNC, b"\x01")
+    with pytest.raises(SilenceError, match="no answer to SYNC on devices"):
+        rig.bus.receive(0.0007)
+
+
+def test_without_sync_devices_live_with_the_hosts_clock() -> None:
+    rig = Rig()
+    rig.devices.events = [(300_000_000, 0x701, b"\x7f"), (600_000_000, 0x701, b"\x05")]
+    assert rig.receive_all(0.5) == [(0x701, 300_100_000)]
+    assert rig.receive_all(0.5) == [(0x701, 600_100_000)]
+
+
+def test_a_frame_of_the_host_waits_for_what_the_devices_have_before_it() -> None:
+    rig = Rig()
+    rig.bus.receive(0.0)
+    rig.devices.events = [(4_950_000, 0x701, b"\x05")]
+    rig.at(5_000_000).bus.send(0x601, b"")
+    assert rig.receive_all(0.001) == [(0x701, 5_050_000)]
+
+
+def test_an_answer_is_handed_over_when_its_request_is_through() -> None:
+    rig = Rig()
+    rig.devices.on_frame = lambda can_id, data: rig.devices.say(0x581)
+    rig.bus.send(0x601, b"")
+    assert rig.receive_all(0.5) == [(0x581, 200_000)]
+
+
+def test_a_wait_passes_at_once_by_the_wall_clock() -> None:
+    rig = Rig()
+    rig.receive_all(3600.0)
+    assert (rig.clock.now_ns(), rig.devices.asked_ns[-1]) == (3_600_000_000_000, 3_600_000_000_000)
+
+
+def test_while_nobody_is_powered_frames_stay_in_the_queue_until_it_is_full() -> None:
+    rig = Rig(queue_length=3)
+    rig.devices.mark(MarkKind.DARK)
+    rig.bus.receive(0.0)
+    rig.devices.mark(MarkKind.DARK)
+    rig.bus.receive(0.001)
+    for _ in range(3):
+        rig.bus.send(0x201, b"")
+    with pytest.raises(TransmitQueueError, match="full with 3 frames: nobody acknowledges"):
+        rig.bus.send(0x201, b"")
+    assert rig.devices.heard == []
+
+
+def test_when_somebody_is_powered_again_the_stale_queue_goes_out() -> None:
+    rig = Rig(queue_length=3)
+    rig.bus.receive(0.0)
+    rig.devices.mark(MarkKind.DARK)
+    rig.bus.receive(0.001)
+    rig.bus.send(0x201, b"old")
+    rig.bus.receive(0.5)
+    rig.devices.mark(MarkKind.LIT)
+    rig.bus.receive(0.5)
+    rig.bus.receive(0.001)
+    assert rig.devices.heard == [(0x201, b"old")]
+
+
+def test_recovery_empties_the_queue() -> None:
+    rig = Rig((0x181,))
+    rig.bus.receive(0.0)
+    rig.bus.send(0x201, b"old")
+    rig.bus.recover()
+    rig.receive_all(0.01)
+    assert rig.devices.heard == []
+
+
+def test_closing_lets_what_waits_go_out() -> None:
+    rig = Rig()
+    rig.bus.send(0x000, b"\x80\x00")
+    rig.bus.close()
+    assert rig.devices.heard == [(0x000, b"\x80\x00")]
+
+
+def test_devices_without_marks_are_waited_for() -> None:
+    rig = Rig((0x181,))
+    rig.devices.is_marking = False
+    rig.bus.send(SYNC, b"\x01")
+    assert rig.receive_all(0.0009) == [(0x181, 200_000)]
+
+
+@pytest.mark.parametrize("kind", list(MarkKind))
+def test_a_mark_survives_the_bus(kind: MarkKind) -> None:
+    assert unpack_mark(pack_mark(kind, 123_456_789_012_345)) == (kind, 123_456_789_012_345)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00" * 8, b"\x07" + bytes(7), bytes(7)])
+def test_what_is_no_mark_is_none(data: bytes) -> None:
+    assert unpack_mark(data) is None
