@@ -371,6 +371,9 @@ class LockstepSettings:
     stuffing: str = setting(
         "exact", choices=("exact", "worst"), meaning="length of frames: by their bits, or the longest that can be"
     )
+    queue: str = setting(
+        "identifier", choices=("identifier", "fifo"), meaning="which of the host's waiting frames is sent first"
+    )
 
     def __post_init__(self) -> None:
         if self.latency != "constant" and self.latency_high_us < self.latency_us:

@@ -1,19 +1,26 @@
 """The bus in lockstep: frames take their time, win arbitration by identifier, and carry modelled stamps.
 
 It stands between the host and a bus that has no time of its own (the embedded bus, vcan) and moves the host's virtual
-clock. The host's frames wait in a queue, first in, first out, as in an interface's transmit queue; the devices hand
-theirs over when SYNC is through, or later, and send them by identifier. Whenever the bus is free the lowest identifier
-of those that wait is sent, and is through after its exact number of bits; then it is received. What the host sends
-reaches the devices in this order, so a command that comes too late for SYNC k + 1 acts at k + 2, as on an arm.
+clock. The devices hand their frames over when SYNC is through, or later. Whenever the bus is free the lowest identifier
+of those that wait is sent, and is through after its number of bits; then it is received. The host's own frames wait in
+its transmit queue:
+
+    identifier  the lowest is sent first, as by a controller with a mailbox for each. SYNC goes out when it is due, or
+                one frame later; a command that has not begun by then acts one SYNC later.
+    fifo        in the order in which they were handed over, as in Linux's default queue. SYNC waits behind a late
+                command, and every frame behind one that loses to the devices'.
+
+What the host sends reaches the devices in the order in which it is through.
 
 How devices let time pass: `firmware_sim.time_marks`. Devices that send no marks are waited for, by the wall clock.
 """
 
 from collections import deque
 from collections.abc import Iterable
-from typing import Final
+from typing import Final, NamedTuple
 
 from adacd_hil.clock import VirtualClock
+from adacd_hil.config import Settings
 from adacd_hil.wire.budget import read_contract
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
 from adacd_hil.wire.codec import Codec
@@ -27,6 +34,15 @@ DEFAULT_BITRATE: Final = 1_000_000
 DEFAULT_DATA_BITRATE: Final = 5_000_000
 _CYCLIC_PERIODS: Final = 2
 """For so many periods after a SYNC devices live by SYNC; after that the host lets time pass by ADVANCE."""
+
+
+class Offer(NamedTuple):
+    """A frame that waits for the bus; the smaller one wins."""
+
+    can_id: int
+    order: int  # among all, for equal identifiers
+    t_ns: int  # when it was handed over
+    data: bytes
 
 
 class LockstepBus:
@@ -43,11 +59,13 @@ class LockstepBus:
         answers: Iterable[int] = (),
         patience_s: float = 2.0,
         queue_length: int = DEFAULT_LENGTH,
+        is_fifo: bool = False,
     ) -> None:
         """Take over a bus.
 
         answers: identifiers that devices send on every SYNC. patience_s: by the wall clock, how long devices that send
-        no marks are waited for. queue_length: frames that wait at most while nobody acknowledges.
+        no marks are waited for. queue_length: frames that wait at most while nobody acknowledges. is_fifo: the host's
+        frames leave in the order in which they were handed over.
         """
         self.channel = bus.channel
         self._bus = bus
@@ -58,12 +76,14 @@ class LockstepBus:
         self._answers = frozenset(answers)
         self._patience_s = patience_s
         self._queue_length = queue_length
-        self._queue: deque[tuple[int, int, bytes]] = deque()  # the host's: when it was handed over, identifier, data
-        self._offered: list[tuple[int, int, int, bytes]] = []  # the devices': identifier, count, when, data
+        self._is_fifo = is_fifo
+        self._queue: list[Offer] = []  # the host's
+        self._offered: list[Offer] = []  # the devices'
         self._received: deque[Frame] = deque()
         self._free_ns = 0
         """When the last frame was through."""
-        self._sync_ns = -NEVER_NS
+        self.sync_ns = -NEVER_NS
+        """When the last SYNC was through."""
         self._count = 0
         self._granted_ns = 0
         """Up to here the devices have lived, as long as no SYNC comes."""
@@ -77,7 +97,7 @@ class LockstepBus:
         """Identifiers of the host's frames that are not on the bus yet, oldest first."""
         if self._queue:
             self._transmit_before(self._clock.now_ns())
-        return tuple(can_id for _, can_id, _ in self._queue)
+        return tuple(offer.can_id for offer in self._queue)
 
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame at the clock's present time. Raises TransmitQueueError while nobody acknowledges."""
@@ -90,7 +110,8 @@ class LockstepBus:
                 raise TransmitQueueError(
                     f"transmit queue of {self.channel} is full with {self._queue_length} frames: nobody acknowledges"
                 )
-        self._queue.append((now_ns, can_id, bytes(data)))
+        self._count += 1
+        self._queue.append(Offer(can_id, self._count, now_ns, bytes(data)))
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
@@ -130,39 +151,34 @@ class LockstepBus:
 
     def _transmit_next(self, limit_ns: int) -> bool:
         """Let the next frame win the bus, if one starts before `limit_ns`."""
-        queue, offered = self._queue, self._offered
         while True:
-            first_ns = queue[0][0] if queue and self._is_acknowledged else NEVER_NS
-            for offer in offered:
-                first_ns = min(first_ns, offer[2])
-            start_ns = max(first_ns, self._free_ns)
+            waiting = self._offered
+            if self._queue and self._is_acknowledged:
+                waiting = [*waiting, *(self._queue[:1] if self._is_fifo else self._queue)]
+            if not waiting:
+                return False
+            start_ns = max(min([offer.t_ns for offer in waiting]), self._free_ns)
             if start_ns >= limit_ns:
                 return False
             if start_ns <= self._granted_ns or not self._is_marked or self._is_cyclic(start_ns):
                 break
             self._ask(start_ns)  # the devices may have something that comes first
-        winner = None
-        for offer in offered:
-            if offer[2] <= start_ns and (winner is None or offer < winner):
-                winner = offer
-        if queue and self._is_acknowledged and queue[0][0] <= start_ns and (winner is None or queue[0][1] < winner[0]):
-            _, can_id, data = queue.popleft()
-            self._free_ns = start_ns + self._frame_time(can_id, data)
-            self._forward(can_id, data)
-            return True
-        if winner is None:
-            return False
-        offered.remove(winner)
+        winner = min([offer for offer in waiting if offer.t_ns <= start_ns])
         can_id, _, _, data = winner
         self._free_ns = start_ns + self._frame_time(can_id, data)
-        self._received.append(Frame(can_id, data, self._free_ns))
+        if winner in self._offered:
+            self._offered.remove(winner)
+            self._received.append(Frame(can_id, data, self._free_ns))
+        else:
+            self._queue.remove(winner)
+            self._forward(can_id, data)
         return True
 
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame of the host's, which is through, to the devices; after SYNC take their answers."""
         if can_id == self._sync_id:
             self._bus.send(can_id, data)
-            self._sync_ns = self._free_ns
+            self.sync_ns = self._free_ns
             self._take_answers()
         else:
             self._bus.send(can_id, data)
@@ -190,7 +206,7 @@ class LockstepBus:
                 continue
             if frame.can_id in self._answers:
                 missing -= 1
-            self._offer(frame, self._sync_ns + offset_ns)
+            self._offer(frame, self.sync_ns + offset_ns)
         if is_silent and self._answers:
             raise SilenceError(f"no answer to SYNC on {self.channel} within {self._patience_s:g} s")
 
@@ -200,11 +216,11 @@ class LockstepBus:
             self._received.append(frame._replace(t_ns=t_ns))
             return
         self._count += 1
-        self._offered.append((frame.can_id, self._count, t_ns, frame.data))
+        self._offered.append(Offer(frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
         """Whether the devices live by SYNC at a time."""
-        return t_ns - self._sync_ns < _CYCLIC_PERIODS * self._period_ns
+        return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
         """Ask the devices to let time pass; tell whether that may have brought something."""
@@ -265,23 +281,20 @@ class LockstepBus:
             self._is_acknowledged = kind is MarkKind.LIT
 
 
-def make_lockstep_bus(
-    bus: Bus, clock: VirtualClock, codec: Codec, period_us: int, is_worst: bool, patience_s: float
-) -> LockstepBus:
-    """Model the bus of a contract at the rates that its DBC gives. Raises CodecError.
-
-    is_worst: every frame takes as long as one of its length can. patience_s: see `LockstepBus`.
-    """
+def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> LockstepBus:
+    """Model the bus of a contract at the rates that its DBC gives, as `settings.lockstep` says. Raises CodecError."""
     bitrate, data_bitrate = bit_rates(codec)
-    frame_time = worst_time(bitrate, data_bitrate) if is_worst else exact_time(bitrate, data_bitrate)
+    make = worst_time if settings.lockstep.stuffing == "worst" else exact_time
+    frame_time = make(bitrate, data_bitrate)
     return LockstepBus(
         bus,
         clock,
         frame_time,
-        period_ns=period_us * 1000,
+        period_ns=settings.bus.period_ns,
         sync_id=codec.message("Sync").can_id,
         answers=answers_to_sync(codec),
-        patience_s=patience_s,
+        patience_s=settings.bus.feedback_timeout_ms * 1e-3,
+        is_fifo=settings.lockstep.queue == "fifo",
     )
 
 

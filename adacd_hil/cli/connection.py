@@ -35,9 +35,7 @@ def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) 
     # The emulator's part of the host; real time does without.
     from firmware_sim.lockstep_bus import make_lockstep_bus
 
-    lockstep, period_us = settings.lockstep, settings.bus.period_us
-    patience_s = settings.bus.feedback_timeout_ms * 1e-3
-    return make_lockstep_bus(bus, clock, codec, period_us, lockstep.stuffing == "worst", patience_s)
+    return make_lockstep_bus(bus, clock, codec, settings)
 
 
 def received_ids(codec: Codec) -> list[int]:

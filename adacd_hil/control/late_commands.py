@@ -27,14 +27,8 @@ class LateCommands:
             self._unsaid += count
             return
         more = f", as {self._unsaid} before" if self._unsaid else ""
-        commands = "1 command" if count == 1 else f"{count} commands"
-        self._events.append(
-            Event(
-                "warning",
-                "late commands",
-                f"{commands} of cycle {cycle - 1} missed SYNC {cycle} and act one later{more}",
-            )
-        )
+        what = f"1 command of cycle {cycle - 1}" if count == 1 else f"{count} commands of cycle {cycle - 1}"
+        self._events.append(Event("warning", "late commands", f"{what} missed SYNC {cycle}, so acting one later{more}"))
         self._unsaid = 0
         self._said_ns = t_ns
 

@@ -76,7 +76,7 @@ class Devices:
 
 
 class Rig:
-    def __init__(self, answers: tuple[int, ...] = (), queue_length: int = 10) -> None:
+    def __init__(self, answers: tuple[int, ...] = (), queue_length: int = 10, is_fifo: bool = False) -> None:
         self.devices = Devices()
         self.clock = VirtualClock()
         self.bus = LockstepBus(
@@ -87,6 +87,7 @@ class Rig:
             answers=answers,
             patience_s=0.0,
             queue_length=queue_length,
+            is_fifo=is_fifo,
         )
         self.devices.on_frame = self._answer
         self.answers = answers
@@ -135,12 +136,13 @@ def test_a_frame_that_ends_after_the_wait_is_there_next_time() -> None:
     assert rig.receive_all(0.0005) == [(0x182, 300_000)]
 
 
-def test_what_the_host_sends_leaves_in_the_order_in_which_it_was_sent() -> None:
-    rig = Rig()
-    rig.bus.send(0x77F, b"")
-    rig.bus.send(0x201, b"")
+@pytest.mark.parametrize(("is_fifo", "order"), [(False, [0x000, 0x201, 0x77F]), (True, [0x201, 0x77F, 0x000])])
+def test_what_the_host_sends_leaves_by_identifier_or_in_the_order_of_sending(is_fifo: bool, order: list[int]) -> None:
+    rig = Rig(is_fifo=is_fifo)
+    for can_id in (0x201, 0x77F, 0x000):
+        rig.bus.send(can_id, b"")
     rig.receive_all(0.001)
-    assert [can_id for can_id, _ in rig.devices.heard] == [0x77F, 0x201]
+    assert [can_id for can_id, _ in rig.devices.heard] == order
 
 
 def test_commands_in_time_reach_the_devices_before_the_next_sync() -> None:
@@ -166,26 +168,35 @@ def test_a_command_that_has_not_begun_when_sync_is_due_waits_for_the_answers() -
     assert rig.bus.waiting_frames == (0x202,)
 
 
-def test_sync_goes_behind_a_command_in_the_hosts_queue() -> None:
-    rig = Rig((0x181,))
+@pytest.mark.parametrize(
+    ("is_fifo", "order", "answer_ns"),
+    [(False, [0x201, SYNC, 0x202], 1_250_000), (True, [0x201, 0x202, SYNC], 1_350_000)],
+)
+def test_a_late_command_acts_one_sync_later_or_holds_sync_up(is_fifo: bool, order: list[int], answer_ns: int) -> None:
+    rig = Rig((0x181,), is_fifo=is_fifo)
     rig.at(950_000).bus.send(0x201, b"")
     rig.bus.send(0x202, b"")
     rig.at(PERIOD_NS).bus.send(SYNC, b"\x01")
-    assert rig.receive_all(0.0007) == [(0x181, 1_350_000)]
-    assert [can_id for can_id, _ in rig.devices.heard] == [0x201, 0x202, SYNC]
+    assert rig.receive_all(0.0007) == [(0x181, answer_ns)]
+    assert [can_id for can_id, _ in rig.devices.heard] == order
 
 
-def test_a_low_frame_at_the_head_of_the_queue_loses_to_the_devices_and_holds_sync_up() -> None:
-    rig = Rig((0x181,))
+@pytest.mark.parametrize(("is_fifo", "sync_ns"), [(False, 1_100_000), (True, 1_400_000)])
+def test_in_a_fifo_sync_waits_behind_a_frame_that_loses_to_the_devices(is_fifo: bool, sync_ns: int) -> None:
+    rig = Rig((0x181,), is_fifo=is_fifo)
     rig.devices.on_frame = lambda can_id, data: (
-        [rig.devices.say(one) for one in (0x181, 0x281, 0x282)] if can_id == SYNC and data == b"\x01" else None
+        [rig.devices.say(one) for one in (*([0x281] * 10 if data == b"\x01" else []), 0x181)]
+        if can_id == SYNC
+        else None
     )
     rig.bus.send(SYNC, b"\x01")
-    rig.bus.receive(0.0007)
-    rig.at(200_000).bus.send(0x77F, b"")
-    rig.bus.send(0x000, b"")
-    rig.receive_all(0.0008)
-    assert [can_id for can_id, _ in rig.devices.heard] == [SYNC, 0x77F, 0x000]
+    rig.receive_all(0.0007)
+    rig.bus.send(0x77F, b"")
+    rig.at(PERIOD_NS).bus.send(SYNC, b"\x02")
+    rig.receive_all(0.0007)
+    assert rig.clock.now_ns() >= PERIOD_NS
+    assert [can_id for can_id, _ in rig.devices.heard] == ([SYNC, 0x77F, SYNC] if is_fifo else [SYNC, SYNC, 0x77F])
+    assert rig.bus.sync_ns == sync_ns
 
 
 def test_released_frames_come_when_they_are_released() -> None:
