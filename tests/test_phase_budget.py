@@ -25,7 +25,7 @@ CODEC = load_codec()
 
 
 def play(folder: Path, **lockstep: Any) -> tuple[RunLog, list[int]]:
-    """Run an idle arm for half a second with frames as long as they can be; give log, and identifiers as they arrive."""
+    """Run an idle arm for half a second with frames as long as can be; give log, and identifiers as they arrive."""
     operator = OperatorSettings(script=(RequestSettings(at_s=0.5, request="finish"),))
     settings = dataclasses.replace(
         load_settings(), operator=operator, lockstep=LockstepSettings(**({"stuffing": "worst"} | lockstep))
