@@ -80,6 +80,7 @@ class LockstepBus:
         self._queue: list[Offer] = []  # the host's
         self._offered: list[Offer] = []  # the devices'
         self._received: deque[Frame] = deque()
+        """What is through, or surely will be unless the host sends before; see `_withdraw`."""
         self._free_ns = 0
         """When the last frame was through."""
         self.sync_ns = -NEVER_NS
@@ -110,6 +111,8 @@ class LockstepBus:
                 raise TransmitQueueError(
                     f"transmit queue of {self.channel} is full with {self._queue_length} frames: nobody acknowledges"
                 )
+        if self._received:
+            self._withdraw(now_ns)
         self._count += 1
         self._queue.append(Offer(can_id, self._count, now_ns, bytes(data)))
 
@@ -146,11 +149,14 @@ class LockstepBus:
         self._bus.close()
 
     def _transmit_before(self, limit_ns: int) -> None:
+        """Let everything win the bus, in its turn, that starts before `limit_ns`."""
         while self._transmit_next(limit_ns):
             pass
 
     def _transmit_next(self, limit_ns: int) -> bool:
         """Let the next frame win the bus, if one starts before `limit_ns`."""
+        if not (self._offered or self._queue):
+            return False
         while True:
             waiting = self._offered
             if self._queue and self._is_acknowledged:
@@ -185,30 +191,66 @@ class LockstepBus:
 
     def _take_answers(self) -> None:
         """Take what belongs to this SYNC. Raises SilenceError when nobody says anything."""
+        came: list[Frame] = []
         missing = len(self._answers)
-        offset_ns = 0
-        is_ending = False
-        is_silent = True
-        while missing or is_ending:
+        while missing:
             frame = self._bus.receive(self._patience_s)
             if frame is None:
                 break
-            is_silent = False
             if frame.can_id == DEVICE_MARK:
+                self._take_marked(frame)
+                missing = 0
+            else:
+                came.append(frame)
+                if frame.can_id in self._answers:
+                    missing -= 1
+        if missing == len(self._answers) != 0 and not came:
+            raise SilenceError(f"no answer to SYNC on {self.channel} within {self._patience_s:g} s")
+        if len(came) == len(self._answers) and not (self._queue or self._offered):
+            self._line_up(came)
+        else:
+            for frame in came:
+                self._offer(frame, self.sync_ns)
+
+    def _take_marked(self, mark: Frame) -> None:
+        """Take frames by their release, from a mark up to the one that says that this was all."""
+        offset_ns = 0
+        frame: Frame | None = mark
+        while frame is not None:
+            if frame.can_id != DEVICE_MARK:
+                self._offer(frame, self.sync_ns + offset_ns)
+            else:
                 kind, time_ns = unpack_mark(frame.data) or (MarkKind.END, 0)
                 if kind is MarkKind.END:
                     return
                 if kind is MarkKind.RELEASE:
                     offset_ns = time_ns
-                    is_ending = True
                 else:
                     self._note(kind)
+            frame = self._bus.receive(self._patience_s)
+
+    def _line_up(self, came: list[Frame]) -> None:
+        """Let answers that nothing competes with go one after the other, by identifier."""
+        came.sort()
+        through_ns = self._free_ns
+        for can_id, data, _, is_error in came:
+            if is_error:
+                self._received.append(Frame(can_id, data, through_ns, True))
                 continue
-            if frame.can_id in self._answers:
-                missing -= 1
-            self._offer(frame, self.sync_ns + offset_ns)
-        if is_silent and self._answers:
-            raise SilenceError(f"no answer to SYNC on {self.channel} within {self._patience_s:g} s")
+            through_ns += self._frame_time(can_id, data)
+            self._received.append(Frame(can_id, data, through_ns))
+        self._free_ns = through_ns
+
+    def _withdraw(self, now_ns: int) -> None:
+        """Take back what was lined up and has not begun: the host sends something that may come first."""
+        while self._received:
+            last = self._received[-1]
+            start_ns = last.t_ns - (0 if last.is_error else self._frame_time(last.can_id, last.data))
+            if start_ns < now_ns or last.is_error:
+                return
+            self._received.pop()
+            self._free_ns = start_ns
+            self._offer(last, self.sync_ns)
 
     def _offer(self, frame: Frame, t_ns: int) -> None:
         """Let a device hand over a frame."""
