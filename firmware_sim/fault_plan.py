@@ -258,7 +258,7 @@ class FaultPlan:
         """Let a row begin or end if it is time."""
         edges: list[FaultEdge] = []
         now_ns = self._now_ns(row)
-        if not row.is_active and not row.is_over and 0 <= row.begin_ns <= now_ns:
+        if not row.is_active and not row.is_over and row.begin_ns <= now_ns:
             row.is_active = True
             self._begin(row)
             edges.append(FaultEdge(row.index, True, f"begins: {row.settings.text}"))

@@ -207,6 +207,13 @@ class FaultSettings:
         subject = f"{self.kind} {what} of {whom}" if what else f"{self.kind} of {whom}"
         return ", ".join((subject, *details))
 
+    @property
+    def timed_text(self) -> str:
+        """The same with its onset."""
+        if not KINDS[self.kind].is_timed:
+            return f"{self.text}, from power on"
+        return f"{self.text}, at {self.at_s:g} s since {(self.since or SINCE[0]).replace('_', ' ')}"
+
 
 _IN_TEXT = ("kind", "node", "frame", "signal", "at_s", "since")
 
