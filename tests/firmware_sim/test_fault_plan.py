@@ -263,7 +263,8 @@ def test_frames_of_two_nodes_do_not_swap_with_each_other():
     plan = active({"kind": "reorder", "node": "all", "frame": "torque"})
     assert plan.transmit(SENSOR1, 0x183, b"a") == []
     assert plan.transmit(SENSOR2, 0x184, b"b") == []
-    assert plan.transmit(SENSOR1, 0x183, b"c") == [(0, 0x183, b"c"), (0, 0x183, b"a")]
+    assert plan.transmit(SENSOR2, 0x184, b"c") == [(0, 0x184, b"c"), (0, 0x184, b"b")]
+    assert plan.transmit(SENSOR1, 0x183, b"d") == [(0, 0x183, b"d"), (0, 0x183, b"a")]
 
 
 def flipped(before: bytes, after: bytes) -> list[int]:
@@ -352,6 +353,9 @@ def test_a_frame_that_the_contract_has_not_is_refused(row, contract, message):
 def test_rows_about_one_frame_act_in_their_order():
     mask = frame_row("corrupt", mask="ff")
     assert active(frame_row("duplicate"), mask).transmit(SENSOR1, 0x183, b"\0") == [(0, 0x183, b"\xff")] * 2
+    flip = frame_row("corrupt", bits=1)
+    assert len(set(active(frame_row("duplicate"), flip).transmit(SENSOR1, 0x183, bytes(64)))) == 2
+    assert len(set(active(flip, frame_row("duplicate")).transmit(SENSOR1, 0x183, bytes(64)))) == 1
     late = frame_row("delay", delay_us=1.0)
     assert active(late, late, mask).transmit(SENSOR1, 0x183, b"\0") == [(2000, 0x183, b"\xff")]
     assert active(frame_row("lose"), mask).transmit(SENSOR1, 0x183, b"\0") == []
@@ -413,10 +417,20 @@ def test_a_row_draws_for_each_frame_though_another_row_has_lost_it():
     together = [both.transmit(SENSOR1, 0x183, TORQUE) for _ in range(200)]
     kept = [(a, frames[0][2] != TORQUE) for a, frames in zip(alone, together, strict=True) if frames]
     assert 60 < len(kept) < 140
+    assert 0.3 < sum(a for a, _ in kept) / len(kept) < 0.7  # the two rows don't hit the same frames
     assert [a for a, _ in kept] == [b for _, b in kept]
 
 
 HALF_CORRUPT = frame_row("corrupt", mask="ff", probability=0.5)
+
+
+def test_a_row_that_reorders_draws_for_a_frame_though_another_row_has_lost_it():
+    plan = active(frame_row("lose", probability=0.5), frame_row("reorder", count=100))
+    lost = lost_frames(active(HALF))
+    came = [len(plan.transmit(SENSOR1, 0x183, TORQUE)) for _ in range(200)]
+    assert sum(lost) > 60
+    assert plan.advance(PERIOD_NS)[0].row == 1
+    assert sum(came) == 200 - sum(lost)
 
 
 def test_two_rows_that_are_alike_draw_on_their_own():

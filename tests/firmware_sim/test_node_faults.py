@@ -163,6 +163,15 @@ def test_a_device_off_the_bus_does_not_hear_the_masters_heartbeat():
     assert [int(watchdog) for watchdog in device.watchdogs.tripped] == [3]
 
 
+@pytest.mark.parametrize("node", [1, 3])
+def test_what_is_written_to_a_device_off_the_bus_does_not_arrive(node):
+    host = enabled_host()
+    device = host.bench.devices[node - 1]
+    device.leave_bus(host.bench.now_ns)
+    host.put(0x600 + node, bytes([0x2B, 0x17, 0x10, 0, 77, 0, 0, 0]))
+    assert device.value(0x1017) == 10
+
+
 def test_power_that_comes_while_the_controller_is_off_the_bus_is_not_heard():
     host = enabled_host()
     device = host.bench.devices[0]
@@ -274,12 +283,12 @@ def test_a_device_with_a_fast_clock_loses_the_masters_heartbeat_sooner(ppm, lost
     device = host.bench.devices[2]
     device.clock.set_drift(ppm, 0)
     host.write(3, 0x1016, 1, 127 << 16 | 50)
+    pass_ms(host, 400)
     host.put(0x77F, b"\x05")
     pass_ms(host, lost_ms - 1)
     assert device.watchdogs.tripped == set()
     pass_ms(host, 1)
     assert [int(watchdog) for watchdog in device.watchdogs.tripped] == [3]
-    assert host.read(3, 0x2210, 2) in (50, 49)
 
 
 @pytest.mark.parametrize(("ppm", "patience_ns"), [(0.0, 1_500_000), (200_000.0, 1_250_000), (-250_000.0, 2_000_000)])
