@@ -573,7 +573,8 @@ def _write_section(section: Any, prefix: str, lines: list[str]) -> None:
 
 
 def _inline(section: Any) -> str:
-    return ", ".join(f"{f.name} = {_toml_value(getattr(section, f.name))}" for f in dataclasses.fields(section))
+    values = ((field.name, getattr(section, field.name)) for field in dataclasses.fields(section))
+    return ", ".join(f"{name} = {_toml_value(value)}" for name, value in values if value is not None)
 
 
 def _toml_value(value: Any) -> str:

@@ -1,7 +1,8 @@
 """One emulated CANopen device: NMT slave with object dictionary, PDOs, heartbeats, EMCY and watchdogs.
 
-It starts no thread: heartbeats and every other timer run on the bench's time, which comes in as `t_ns`.
-Source: CiA 301, 7.2 (services), 7.3 (NMT).
+It starts no thread: heartbeats and every other timer run on the time that comes in as `t_ns`. What a bench calls takes
+the bench's time; what a device and its application tell each other is in the time of its own clock.
+Source: CiA 301, 7.2 (services), 7.3 (NMT), 7.5.2.32 (0x1029, error behaviour).
 """
 
 from collections.abc import Callable, Mapping
@@ -12,12 +13,14 @@ from typing import Protocol
 from adacd_hil.wire.codec import MessageCodec
 from firmware_sim.emergency import ErrorReporter
 from firmware_sim.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from firmware_sim.node_clock import NodeClock
 from firmware_sim.object_dictionary import ObjectDictionary, Send
 from firmware_sim.pdo import Pdos, PdoUser
 from firmware_sim.pdo_mapping import CLASSIC_BYTES
 from firmware_sim.watchdogs import Watchdog, Watchdogs
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
+_RECOVERED_FROM_BUS_OFF = 0x8140
 
 
 class NmtState(IntEnum):
@@ -68,7 +71,12 @@ class Device(ObjectDictionary):
 
         `messages`: the contract's, by identifier. `longest_pdo` in bytes.
         """
-        super().__init__(node_id, eds_path, send)
+        super().__init__(node_id, eds_path, self._send)
+        self.clock = NodeClock()
+        self.is_powered = True
+        self.is_on_bus = True
+        """Whether it has power and its controller takes part in the bus."""
+        self._is_bus_off = False
         self.state = NmtState.INITIALISING
         self.is_operational = False
         self.is_faulty = False
@@ -76,16 +84,17 @@ class Device(ObjectDictionary):
         self.now_ns = 0
         """Time of the last request, for what it starts."""
         self.power_on_ns = 0
-        """Where the device's own clock begins."""
+        """When the device got its power, by its own clock."""
         self.on_pdo_change: Callable[[], None] = lambda: None
         """Called when other PDOs are exchanged than before."""
-        self._send = send
+        self._put_on_bus = send
         self._application: Application | None = None
-        self._producer = HeartbeatProducer(self, send, lambda: self.state, lambda: self.now_ns)
+        self._producer = HeartbeatProducer(self, self._send, lambda: self.state, lambda: self.now_ns)
         self._consumer = HeartbeatConsumer(self, self)
-        self._errors = ErrorReporter(self, send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
+        self._errors = ErrorReporter(self, self._send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
         self.watchdogs = Watchdogs(self)
         self.pdos = Pdos(self, send, messages or {}, longest_pdo, self._announce_pdos)
+        self.pdos.own_ns = self.clock.own_ns
 
     @property
     def error_register(self) -> int:
@@ -99,11 +108,40 @@ class Device(ObjectDictionary):
         self.pdos.user = application
 
     def power_on(self, t_ns: int) -> None:
-        """Let the device's own clock begin, then boot."""
-        self.power_on_ns = t_ns
-        self.boot(t_ns)
+        """Give the device power: its time begins, then it boots, with its defaults if it was off."""
+        self.is_powered = True
+        self.is_on_bus = not self._is_bus_off
+        self.power_on_ns = self.clock.own_ns(t_ns)
+        self._boot(self.power_on_ns)
 
-    def boot(self, t_ns: int) -> None:
+    def power_off(self, _t_ns: int) -> None:
+        """Take the power away: nothing is said or heard, and all that was written is forgotten."""
+        self.is_powered = self.is_on_bus = False
+        self._errors.reset()
+        self.is_operational = False
+        self.state = NmtState.INITIALISING
+        self.pdos.set_operational(False, self.now_ns)
+        self._reset(is_node_reset=True)
+
+    def leave_bus(self, t_ns: int) -> None:
+        """Take the controller off the bus; an operational device goes to Pre-operational, the default of 0x1029."""
+        self._is_bus_off = True
+        self.is_on_bus = False
+        if self.is_operational:
+            self._enter(NmtState.PRE_OPERATIONAL, self.clock.own_ns(t_ns))
+
+    def return_to_bus(self, t_ns: int) -> None:
+        """Let the controller take part again; the device says so."""
+        self._is_bus_off = False
+        self.is_on_bus = self.is_powered
+        if self.is_on_bus:
+            self._errors.report(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
+
+    def cry(self, code: int, t_ns: int) -> None:
+        """Send an EMCY at once, whatever its inhibit time, as a device out of control does."""
+        self._errors.report_at_once(code, self.clock.own_ns(t_ns))
+
+    def _boot(self, t_ns: int) -> None:
         """Announce the device and enter Pre-operational."""
         self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
         self._producer.restart(t_ns)
@@ -111,26 +149,29 @@ class Device(ObjectDictionary):
 
     def on_nmt(self, data: bytes, t_ns: int) -> None:
         """Obey an NMT command, if it is for this device."""
-        if len(data) != 2 or data[1] not in (0, self.node_id):
+        if len(data) != 2 or data[1] not in (0, self.node_id) or not self.is_on_bus:
             return
-        self.now_ns = t_ns
+        self.now_ns = t_ns = self.clock.own_ns(t_ns)
         command = data[0]
         if command in _COMMANDED_STATES:
             self._enter(_COMMANDED_STATES[command], t_ns)
         elif command in (RESET_NODE, RESET_COMMUNICATION):
             self._enter(NmtState.INITIALISING, t_ns)
             self._reset(command == RESET_NODE)
-            self.boot(t_ns)
+            self._boot(t_ns)
 
     def on_sdo(self, data: bytes, t_ns: int) -> None:
         """Answer an SDO request."""
-        self.now_ns = t_ns
+        if not self.is_on_bus:
+            return
+        self.now_ns = t_ns = self.clock.own_ns(t_ns)
         if len(data) == 8 and self.state != NmtState.STOPPED:
             self.on_request(data, t_ns)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
         """Take note of another node's heartbeat."""
-        self._consumer.on_heartbeat(node_id, t_ns)
+        if self.is_on_bus:
+            self._consumer.on_heartbeat(node_id, self.clock.own_ns(t_ns))
 
     def lose_heartbeat(self, t_ns: int) -> None:
         """React to the master's silence: the application, then Pre-operational (CiA 301, default of 0x1029)."""
@@ -156,12 +197,21 @@ class Device(ObjectDictionary):
         """Say by an EMCY with code 0 that a fault was reset."""
         self._errors.report(0, t_ns)
 
+    def report_error(self, code: int, t_ns: int) -> None:
+        """Report by an EMCY an error that no watchdog has found."""
+        self._errors.report(code, t_ns)
+
     def poll(self, t_ns: int) -> int:
-        """Do what is due; return when something is due next."""
+        """Do what is due by its own clock; return when something is due next."""
         return min(self._producer.poll(t_ns), self._consumer.poll(t_ns), self._errors.poll(t_ns))
 
     def _announce_pdos(self) -> None:
         self.on_pdo_change()
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        """Send what isn't a PDO; PDOs are exchanged in Operational only, and there a device is on the bus."""
+        if self.is_on_bus:
+            self._put_on_bus(can_id, data)
 
     def _time_ms(self, t_ns: int) -> int:
         return (t_ns - self.power_on_ns) // 1_000_000

@@ -59,6 +59,7 @@ class DriveNode:
         self.has_news = False
         """Whether something has changed that the bus hasn't been told."""
         self._pdos = device.pdos
+        self._clock = device.clock
         self._tripped = device.watchdogs.tripped
         self._motor = motor
         self._is_free_running = is_free_running
@@ -71,6 +72,7 @@ class DriveNode:
         self._controlword = 0
         self._error_code = 0
         self._cause: Watchdog | None = None
+        self._failure = 0
         self._is_found_by_time = False
         self._stop = DISABLE
         self._ramp_end: DriveEvent | None = None
@@ -150,12 +152,20 @@ class DriveNode:
         """0x603F: the fault that is latched, 0 for none."""
         return self._error_code
 
-    def on_sync(self, position: int, velocity: int, t_ns: int) -> None:
-        """Let the pending command act. `position`, `velocity`: sampled at this SYNC, in the body's LSBs."""
+    def on_sync(self, position: int, velocity: int, t_ns: int, *, is_distorted: bool = False) -> None:
+        """Let the pending command act. `position`, `velocity`: sampled at this SYNC, in the body's LSBs.
+
+        `is_distorted`: the velocity isn't the motor's, so it counts where the contract has an LSB of its own, too.
+        """
+        t_ns = self._clock.own_ns(t_ns)
         self._sync_ns = t_ns
         self._position = position
         lsb_rad_s = self._velocity_lsb_rad_s
-        self._velocity = velocity if lsb_rad_s is None else round(self._motor.velocity_rad_s() / lsb_rad_s)
+        if lsb_rad_s is None:
+            self._velocity = velocity
+        else:
+            speed_rad_s = velocity * VELOCITY_LSB_RAD_S if is_distorted else self._motor.velocity_rad_s()
+            self._velocity = round(speed_rad_s / lsb_rad_s)
         if self._pdos.act_on_sync(t_ns):
             self._silent_syncs = 0
             self._acted_commands += 1
@@ -188,6 +198,7 @@ class DriveNode:
 
     def on_lost_sync(self, t_ns: int) -> None:
         """Live through a period whose SYNC never came, in a bench that counts periods by SYNC counters."""
+        t_ns = self._clock.own_ns(t_ns)
         self._miss_command(t_ns)
         if self._is_braking:
             self._watch_standstill(t_ns)
@@ -195,7 +206,9 @@ class DriveNode:
 
     def poll(self, t_ns: int) -> int:
         """Do what is due by time; return when something is due next."""
+        t_ns = self._clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
+        self._feel_failure(t_ns)
         if self.is_enabled:
             due_ns = min(due_ns, self._watch_bus(t_ns))
         if self._is_braking and (self._is_free_running or self.is_left_alone):
@@ -206,7 +219,21 @@ class DriveNode:
             self._pdos.notify()
         due_ns = min(due_ns, self._pdos.poll(t_ns))
         self._drive_motor()
-        return due_ns
+        return self._clock.bench_ns(due_ns)
+
+    def fail(self, code: int, t_ns: int) -> None:
+        """Fault by itself, with an error code of 0x603F; what causes it stays until `mend`."""
+        self._failure = code
+        self._feel_failure(self._clock.own_ns(t_ns))
+
+    def mend(self) -> None:
+        """Let the cause of a failure be gone; the fault stays latched."""
+        self._failure = 0
+
+    def _feel_failure(self, t_ns: int) -> None:
+        """Fault for a failure that lasts, after a reset again."""
+        if self._failure and self.device.is_powered:
+            self._latch(self._failure, None, t_ns)
 
     def leave_operational(self, t_ns: int) -> None:
         """Fault: without PDOs there is no command."""
@@ -330,20 +357,26 @@ class DriveNode:
 
     def _fault(self, cause: Watchdog, t_ns: int, is_found_by_time: bool = False) -> None:
         """Latch a fault; the first one counts."""
+        self._latch(ERROR_CODES[cause], cause, t_ns, is_found_by_time)
+
+    def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
         if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
             return
-        self._error_code = ERROR_CODES[cause]
+        self._error_code = code
         self._cause = cause
         self._is_found_by_time = is_found_by_time
         self.device.is_faulty = True
         self._limits.target = 0
         self._apply(DriveEvent.FAULT_DETECTED, t_ns)
         self._drive_motor()
-        self.device.trip(cause, t_ns)
+        if cause is None:
+            self.device.report_error(code, t_ns)
+        else:
+            self.device.trip(cause, t_ns)
 
     def _is_cause_present(self, t_ns: int) -> bool:
-        """Whether a watchdog that stops the drive is tripped, or would be at once."""
-        if self._tripped - {Watchdog.LENGTH}:
+        """Whether the drive fails, or a watchdog that stops it is tripped, or would be at once."""
+        if self._failure or self._tripped - {Watchdog.LENGTH}:
             return True
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
 

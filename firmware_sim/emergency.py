@@ -47,6 +47,19 @@ class ErrorReporter:
             self._waiting.append(_EMERGENCY.pack(code, self._register(), number, time_ms & 0xFFFFFFFF))
             self.poll(t_ns)
 
+    def report_at_once(self, code: int, t_ns: int) -> None:
+        """Send an EMCY without regard to the inhibit time and to those that wait."""
+        self._history.appendleft(code)
+        if self._is_valid and self._is_allowed():
+            self._allowed_ns = t_ns + self._inhibit_ns
+            self._send(self._cob_id, _EMERGENCY.pack(code, self._register(), 0, 0))
+
+    def reset(self) -> None:
+        """Forget everything, as at power-on."""
+        self._waiting.clear()
+        self._history.clear()
+        self._allowed_ns = 0
+
     def poll(self, t_ns: int) -> int:
         """Send what the inhibit time held back; return when to look again."""
         while self._waiting and t_ns >= self._allowed_ns:

@@ -178,11 +178,11 @@ class ReceivePdo(PdoRecord):
         self.pending = None
 
     def on_frame(self, data: bytes, t_ns: int) -> None:
-        """Take a frame in; one that fails a check changes nothing."""
+        """Take a frame in at the bench's time; one that fails a check changes nothing."""
         layout = self.layout
         if len(data) != layout.length:
             self._is_length_wrong = True
-            self._pdos.user.mind_length(False, t_ns)
+            self._pdos.user.mind_length(False, self._pdos.own_ns(t_ns))
             return
         if layout.header_bytes and self.receiver is not None:
             if self.receiver.check(data) > E2eStatus.OK_SOME_LOST:
@@ -190,10 +190,10 @@ class ReceivePdo(PdoRecord):
             self._pdos.header = data
         if self._is_length_wrong:
             self._is_length_wrong = False
-            self._pdos.user.mind_length(True, t_ns)
+            self._pdos.user.mind_length(True, self._pdos.own_ns(t_ns))
         self.pending = layout.packing.unpack_from(data, layout.header_bytes)
         if self.type in EVENT_DRIVEN:
-            self._pdos.act_at_once(self, t_ns)
+            self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
         """Whether its deadline is over."""
@@ -227,6 +227,8 @@ class Pdos:
         self._on_refresh = on_refresh
         self._is_operational = False
         self._now_ns = 0
+        self.own_ns: Callable[[int], int] = lambda t_ns: t_ns
+        """Turns the bench's time, with which frames come, into the device's."""
         self.on_sync: tuple[Callable[[], None], ...] = ()
         """What sends the frames that belong to a SYNC."""
         self.answers: frozenset[int] = frozenset()

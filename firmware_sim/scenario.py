@@ -1,4 +1,4 @@
-"""A scenario: which arm, where it starts, who touches it when, and when the payload changes.
+"""A scenario: which arm, where it starts, who touches it when, when the payload changes, and what goes wrong.
 
 Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
 package are in the folder `scenarios`.
@@ -15,6 +15,7 @@ from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, 
 from adacd_hil.records import Vector
 from firmware_sim.arms import ARMS, Arm
 from firmware_sim.contact import ContactSettings, ticks
+from firmware_sim.faults import FaultSettings, check_rows
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Scenario:
     )
     payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
     contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
+    faults: tuple[FaultSettings, ...] = setting((), meaning="what goes wrong, each row by its own time")
 
     def __post_init__(self) -> None:
         for index, contact in enumerate(self.contacts):
@@ -67,6 +69,7 @@ class Scenario:
                 raise ConfigError(
                     f"`payloads[{index}].at_s` = {after.at_s} s is not after the change before it at {before.at_s} s"
                 )
+        check_rows(self.faults)
 
     @property
     def arm(self) -> Arm:

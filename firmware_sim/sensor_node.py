@@ -42,6 +42,7 @@ class SensorNode:
         self._torque = self._counts = 0
         self._zero_counts = 0.0
         self._autozero_left = self._autozero_sum = 0
+        self._error_bits = 0
         device.serve(0x2000, 1, lambda: codec.wire_version)
         device.serve(0x2000, 2, lambda: codec.layout_digest)
         device.serve(0x2110, 1, lambda: round(self._counts * self._lsbs_per_count))
@@ -57,11 +58,11 @@ class SensorNode:
 
     def on_sync(self, counts: int) -> None:
         """Take the torque that was sampled at this SYNC, in the converter's counts."""
-        status = 0
+        status = self._error_bits
         if counts >= _HIGHEST_COUNT:
-            status = STATUS_POSITIVE_OVERLOAD | STATUS_NOT_VALID
+            status |= STATUS_POSITIVE_OVERLOAD | STATUS_NOT_VALID
         elif counts <= _LOWEST_COUNT:
-            status = STATUS_NEGATIVE_OVERLOAD | STATUS_NOT_VALID
+            status |= STATUS_NEGATIVE_OVERLOAD | STATUS_NOT_VALID
         if status != self._status:
             self._status = status
             self.has_news = True
@@ -72,13 +73,19 @@ class SensorNode:
         if self._pdos.has_compared and self._pdos.compare():
             self.has_news = True
 
+    def set_error(self, bits: int) -> None:
+        """Let the sensor find fault with itself, from its next sample on: bits of 0x6150, 0 for none."""
+        self._error_bits = bits
+
     def poll(self, t_ns: int) -> int:
         """Do what is due by time; return when something is due next."""
+        clock = self.device.clock
+        t_ns = clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
         if self.has_news:
             self.has_news = False
             self._pdos.notify()
-        return min(due_ns, self._pdos.poll(t_ns))
+        return clock.bench_ns(min(due_ns, self._pdos.poll(t_ns)))
 
     def act(self, t_ns: int) -> None:
         """Do nothing: a sensor takes no commands."""

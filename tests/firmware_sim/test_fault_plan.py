@@ -1,0 +1,700 @@
+"""The plan of faults: when rows act, what they do to frames, values and nodes, and that their draws are their own."""
+
+import collections
+import statistics
+
+import pytest
+from bench_host import CODEC
+from test_faults import EXAMPLES, UNTIMED, example
+
+from adacd_hil.config import ConfigError, parse
+from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.e2e import E2eStatus
+from firmware_sim.contracts import CONTRACTS
+from firmware_sim.fault_plan import EVERYBODY, ActionKind, FaultPlan, NodeAction
+from firmware_sim.faults import FaultSettings
+from firmware_sim.object_dictionary import NEVER_NS
+from firmware_sim.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+
+MS = 1_000_000
+PERIOD_NS = MS
+S = 1_000 * MS
+DRIVE1, DRIVE2, SENSOR1, SENSOR2 = range(4)
+TORQUE = bytes(range(6))
+FEEDBACK = bytes(range(8))
+
+
+def plan_of(*rows: dict[str, object], seed: int = 1, contract: str = "arm") -> FaultPlan:
+    codec = CODEC if contract == "arm" else load_codec(CONTRACTS[contract].path)
+    return FaultPlan([parse(FaultSettings, row) for row in rows], seed, PERIOD_NS, codec)
+
+
+def active(*rows: dict[str, object], seed: int = 1) -> FaultPlan:
+    """A plan at the onset of its rows, all at 0 s."""
+    plan = plan_of(*[row | ({} if row["kind"] in UNTIMED else {"at_s": 0.0}) for row in rows], seed=seed)
+    plan.advance(0)
+    return plan
+
+
+def frame_row(kind: str, **keys: object) -> dict[str, object]:
+    return {"kind": kind, "node": "sensor1", "frame": "torque", **keys}
+
+
+# When
+
+
+def test_a_row_begins_and_ends_at_its_times_and_says_so():
+    plan = plan_of(example("silence", node="sensor2", at_s=1.0, duration_s=0.5))
+    edges = {ms: plan.advance(ms * MS) for ms in (-1, 0, 999, 1000, 1001, 1499, 1500, 1501)}
+    said = {ms: [(edge.row, edge.begins, edge.text) for edge in found] for ms, found in edges.items() if found}
+    text = "silence of sensor2, duration_s 0.5"
+    assert said == {1000: [(0, True, f"begins: {text}")], 1500: [(0, False, f"ends: {text}")]}
+
+
+def test_the_mask_has_a_bit_for_each_row_that_is_active():
+    plan = plan_of(
+        example("silence", at_s=1.0, duration_s=2.0),
+        example("lose", at_s=2.0, duration_s=3.0),
+        example("clock_drift", at_s=2.5),
+    )
+    masks = []
+    for second in (0.0, 1.0, 2.0, 2.5, 3.0, 5.0, 9.0):
+        plan.advance(round(second * 1e9))
+        masks.append(plan.mask)
+    assert masks == [0b000, 0b001, 0b011, 0b111, 0b110, 0b100, 0b100]
+
+
+def test_before_the_drives_are_enabled_nothing_begins():
+    plan = plan_of(example("silence", at_s=0.0))
+    assert plan.advance(-1) == []
+    assert (plan.mask, plan.is_quiet) == (0, True)
+    assert [edge.begins for edge in plan.advance(0)] == [True]
+
+
+def test_a_row_can_count_from_power_on():
+    plan = plan_of(example("silence", since="power_on", at_s=1.0))
+    assert plan.advance(5 * S, 999 * MS) == []
+    assert plan.advance(-1, 1000 * MS)[0].begins
+
+
+def test_a_row_whose_whole_time_was_missed_begins_and_ends_at_once():
+    plan = plan_of(example("silence", at_s=1.0, duration_s=0.5))
+    plan.advance(0)
+    assert [edge.begins for edge in plan.advance(10 * S)] == [True, False]
+    assert plan.mask == 0
+
+
+@pytest.mark.parametrize("kind", ["reboot", "drive_fault"])
+def test_a_row_without_length_is_active_for_one_period(kind):
+    plan = plan_of(example(kind))
+    masks = []
+    for step in range(4):
+        plan.advance(S + (step - 1) * PERIOD_NS)
+        masks.append(plan.mask)
+    assert masks == [0, 1, 0, 0]
+
+
+@pytest.mark.parametrize("kind", ["wrong_node_id", "duplicate_node_id"])
+def test_a_wrong_id_is_there_from_power_on_and_disturbs_nothing_else(kind):
+    plan = plan_of(example(kind))
+    assert plan.advance(-1, 0)[0].begins
+    assert (plan.mask, plan.is_quiet, plan.wait_ns) == (1, True, NEVER_NS)
+
+
+def test_a_row_with_a_count_ends_when_it_has_acted_so_often():
+    plan = active(frame_row("lose", count=3))
+    left = [len(plan.transmit(SENSOR1, 0x183, TORQUE)) for _ in range(6)]
+    assert left == [0, 0, 0, 1, 1, 1]
+    assert [edge.begins for edge in plan.advance(PERIOD_NS)] == [False]
+    assert plan.is_quiet
+
+
+def test_it_says_how_long_nothing_will_change():
+    plan = plan_of(
+        example("silence", at_s=1.0, duration_s=0.25), example("emcy_storm", at_s=2.0, rate_Hz=4.0, duration_s=1.0)
+    )
+    waits = {}
+    for ms in (0, 400, 1000, 1250, 2000, 2250, 3000):
+        plan.advance(ms * MS)
+        waits[ms] = plan.wait_ns // MS
+    assert waits == {0: 1000, 400: 600, 1000: 250, 1250: 750, 2000: 250, 2250: 250, 3000: NEVER_NS // MS}
+
+
+def test_before_the_drives_are_enabled_there_is_nothing_to_wait_for():
+    plan = plan_of(example("silence", at_s=1.0))
+    plan.advance(-1, 5 * S)
+    assert plan.wait_ns == NEVER_NS
+
+
+@pytest.mark.parametrize("kind", EXAMPLES)
+def test_a_plan_is_quiet_before_its_rows_and_without_any(kind):
+    plan = plan_of(example(kind))
+    plan.advance(-1)
+    assert plan.is_quiet
+    assert plan_of().is_quiet
+
+
+def test_a_plan_is_not_quiet_while_a_row_acts_and_is_again_after_it():
+    plan = plan_of(example("lose", at_s=1.0, duration_s=1.0))
+    quiet = []
+    for second in (0, 1, 2):
+        plan.advance(second * S)
+        quiet.append(plan.is_quiet)
+    assert quiet == [True, False, True]
+
+
+def test_a_plan_is_not_quiet_until_its_actions_are_taken():
+    plan = active(example("drive_fault"))
+    assert not plan.is_quiet
+    plan.actions()
+    assert plan.is_quiet
+
+
+# Frames
+
+
+def test_a_frame_that_no_row_is_about_passes_as_it_is():
+    plan = active(frame_row("lose"))
+    assert plan.transmit(SENSOR2, 0x184, TORQUE) == [(0, 0x184, TORQUE)]
+    assert plan.transmit(SENSOR1, 0x283, b"\0\0") == [(0, 0x283, b"\0\0")]
+    assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
+
+
+SENT = [
+    ("feedback", "drive1", DRIVE1, 0x181),
+    ("feedback", "drive2", DRIVE2, 0x182),
+    ("torque", "sensor2", SENSOR2, 0x184),
+    ("status", "drive2", DRIVE2, 0x282),
+    ("status", "sensor1", SENSOR1, 0x283),
+    ("heartbeat", "sensor2", SENSOR2, 0x704),
+    ("emcy", "drive1", DRIVE1, 0x081),
+    ("sdo_response", "drive2", DRIVE2, 0x582),
+]
+
+
+@pytest.mark.parametrize(("frame", "node", "place", "can_id"), SENT)
+def test_what_a_node_sends_is_lost_if_the_row_says_so_and_nothing_else(frame, node, place, can_id):
+    plan = active({"kind": "lose", "node": node, "frame": frame})
+    sent = {(other, identifier): plan.transmit(other, identifier, b"\0") for _, _, other, identifier in SENT}
+    assert [key for key, left in sent.items() if not left] == [(place, can_id)]
+
+
+@pytest.mark.parametrize(
+    ("frame", "node", "place", "can_id"),
+    [
+        ("command", "drive1", DRIVE1, 0x201),
+        ("sdo_request", "sensor2", SENSOR2, 0x604),
+        ("sync", "drive2", DRIVE2, 0x080),
+        ("nmt", "sensor1", SENSOR1, 0x000),
+        ("sync", "all", EVERYBODY, 0x080),
+        ("sync", None, EVERYBODY, 0x080),
+        ("nmt", None, EVERYBODY, 0x000),
+        ("heartbeat", "host", EVERYBODY, 0x77F),
+    ],
+)
+def test_what_the_host_sends_is_lost_on_its_way_to_whom_the_row_says(frame, node, place, can_id):
+    row = {"kind": "lose", "frame": frame} | ({} if node is None else {"node": node})
+    plan = active(row)
+    left = {other: plan.receive(other, can_id, b"\0") for other in (EVERYBODY, DRIVE1, DRIVE2, SENSOR1, SENSOR2)}
+    assert [other for other, frames in left.items() if not frames] == [place]
+
+
+@pytest.mark.parametrize(
+    ("frame", "keys"), [("torque", [2, 3]), ("feedback", [0, 1]), ("heartbeat", [0, 1, 2, 3]), ("any", [0, 1, 2, 3])]
+)
+def test_all_is_every_node_with_such_a_frame(frame, keys):
+    plan = active({"kind": "lose", "node": "all", "frame": frame})
+    ids = {"torque": 0x181, "feedback": 0x181, "heartbeat": 0x701, "any": 0x581}
+    lost = [node for node in range(4) if not plan.transmit(node, ids[frame] + node, b"\0")]
+    assert lost == keys
+
+
+def test_the_commands_of_both_drives_can_be_lost():
+    plan = active({"kind": "lose", "node": "all", "frame": "command"})
+    assert [plan.receive(node, 0x201 + node, b"\0") for node in (DRIVE1, DRIVE2)] == [[], []]
+
+
+def test_any_frame_of_a_node_is_lost_whatever_else_is_said_of_one_of_them():
+    plan = active({"kind": "lose", "node": "drive1", "frame": "any"}, example("duplicate"))
+    assert plan.transmit(DRIVE1, 0x181, FEEDBACK) == []
+    assert plan.transmit(DRIVE1, 0x7A1, b"") == []
+    assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
+
+
+def test_a_duplicated_frame_comes_twice():
+    plan = active(frame_row("duplicate"))
+    assert plan.transmit(SENSOR1, 0x183, TORQUE) == [(0, 0x183, TORQUE)] * 2
+
+
+def test_a_delayed_frame_says_how_late_it_is():
+    plan = active(frame_row("delay", delay_us=2500.0))
+    assert plan.transmit(SENSOR1, 0x183, TORQUE) == [(2_500_000, 0x183, TORQUE)]
+
+
+def test_jitter_delays_up_to_its_size_and_evenly():
+    plan = active(frame_row("delay", delay_us=100.0, jitter_us=400.0))
+    late_us = [plan.transmit(SENSOR1, 0x183, TORQUE)[0][0] / 1e3 for _ in range(2000)]
+    assert min(late_us) >= 100.0
+    assert max(late_us) <= 500.0
+    assert statistics.fmean(late_us) == pytest.approx(300.0, abs=10.0)
+    assert statistics.stdev(late_us) == pytest.approx(400.0 / 12**0.5, abs=5.0)
+
+
+def test_a_reordered_frame_comes_after_the_next():
+    plan = active(frame_row("reorder", count=1))
+    first, second, third = (bytes([n] * 6) for n in (1, 2, 3))
+    assert plan.transmit(SENSOR1, 0x183, first) == []
+    assert plan.transmit(SENSOR1, 0x183, second) == [(0, 0x183, second), (0, 0x183, first)]
+    assert plan.transmit(SENSOR1, 0x183, third) == [(0, 0x183, third)]
+
+
+def test_a_frame_that_is_held_back_at_the_end_of_its_row_still_comes():
+    plan = active(frame_row("reorder", duration_s=0.001))
+    first, second = bytes(6), bytes([1] * 6)
+    assert plan.transmit(SENSOR1, 0x183, first) == []
+    plan.advance(2 * PERIOD_NS)
+    assert (plan.mask, plan.is_quiet) == (0, False)
+    assert plan.transmit(SENSOR1, 0x183, second) == [(0, 0x183, second), (0, 0x183, first)]
+    assert plan.is_quiet
+    assert plan.transmit(SENSOR1, 0x183, first) == [(0, 0x183, first)]
+
+
+def test_frames_of_two_nodes_do_not_swap_with_each_other():
+    plan = active({"kind": "reorder", "node": "all", "frame": "torque"})
+    assert plan.transmit(SENSOR1, 0x183, b"a") == []
+    assert plan.transmit(SENSOR2, 0x184, b"b") == []
+    assert plan.transmit(SENSOR2, 0x184, b"c") == [(0, 0x184, b"c"), (0, 0x184, b"b")]
+    assert plan.transmit(SENSOR1, 0x183, b"d") == [(0, 0x183, b"d"), (0, 0x183, b"a")]
+
+
+def flipped(before: bytes, after: bytes) -> list[int]:
+    bits = int.from_bytes(before, "little") ^ int.from_bytes(after, "little")
+    return [bit for bit in range(8 * len(before)) if bits >> bit & 1]
+
+
+@pytest.mark.parametrize("bits", [1, 2, 5, 48])
+def test_so_many_bits_flip_as_the_row_says(bits):
+    plan = active(frame_row("corrupt", bits=bits))
+    for _ in range(50):
+        ((_, _, data),) = plan.transmit(SENSOR1, 0x183, TORQUE)
+        assert len(flipped(TORQUE, data)) == bits
+
+
+def test_every_bit_flips_as_often_as_any_other():
+    plan = active(frame_row("corrupt"))
+    counts = collections.Counter(
+        flipped(TORQUE, plan.transmit(SENSOR1, 0x183, TORQUE)[0][2])[0] for _ in range(100 * 48)
+    )
+    assert sorted(counts) == list(range(48))
+    assert sum((count - 100) ** 2 / 100 for count in counts.values()) < 85  # chi-square, 47 degrees: 0.05 %
+
+
+def test_no_more_bits_flip_than_a_frame_has():
+    plan = active(frame_row("corrupt", bits=500))
+    assert plan.transmit(SENSOR1, 0x183, b"\x0f") == [(0, 0x183, b"\xf0")]
+
+
+@pytest.mark.parametrize(("mask", "data"), [("ff", "ff0203"), ("0080", "008203"), ("00000001", "000203")])
+def test_a_mask_says_which_bits_flip(mask, data):
+    plan = active(frame_row("corrupt", mask=mask))
+    assert plan.transmit(SENSOR1, 0x183, bytes.fromhex("000203"))[0][2] == bytes.fromhex(data)
+
+
+@pytest.mark.parametrize(
+    ("contract", "name", "frame", "node"),
+    [
+        ("arm", "Sensor1Torque", "torque", "sensor1"),
+        ("arm", "Drive2Command", "command", "drive2"),
+        ("arm_fd", "Drive1Feedback", "feedback", "drive1"),
+        ("arm_fd", "Sensor2Torque", "torque", "sensor2"),
+    ],
+)
+def test_a_frozen_counter_stands_still_under_a_right_crc(contract, name, frame, node):
+    codec = CODEC if contract == "arm" else load_codec(CONTRACTS[contract].path)
+    message = codec.message(name)
+    plan = plan_of({"kind": "freeze_counter", "node": node, "frame": frame, "at_s": 0.0}, contract=contract)
+    sender, receiver = message.sender(), message.receiver()
+    statuses = []
+    for k in range(6):
+        if k == 2:
+            plan.advance(0)
+        data = sender.protect(bytearray([0] * (message.length - 1) + [k]))
+        place = ["drive1", "drive2", "sensor1", "sensor2"].index(node)
+        if frame == "command":
+            ((_, data),) = plan.receive(place, message.can_id, data)
+        else:
+            ((_, _, data),) = plan.transmit(place, message.can_id, data)
+        assert data[-1] == k
+        statuses.append(receiver.check(data))
+    assert statuses == [E2eStatus.OK] * 3 + [E2eStatus.REPEATED] * 3
+
+
+@pytest.mark.parametrize(
+    ("row", "contract", "message"),
+    [
+        (
+            {"kind": "freeze_counter", "node": "drive1", "frame": "feedback"},
+            "arm",
+            "Drive1Feedback has no counter to freeze in arm.dbc",
+        ),
+        (
+            {"kind": "lose", "node": "drive1", "frame": "status"},
+            "arm_fd",
+            "frame 'status' is not in arm_fd.dbc: ",
+        ),
+    ],
+)
+def test_a_frame_that_the_contract_has_not_is_refused(row, contract, message):
+    with pytest.raises(ConfigError) as refusal:
+        plan_of(row | {"at_s": 0.0}, contract=contract)
+    assert str(refusal.value).startswith(f"faults[0]: {message}")
+
+
+def test_rows_about_one_frame_act_in_their_order():
+    mask = frame_row("corrupt", mask="ff")
+    assert active(frame_row("duplicate"), mask).transmit(SENSOR1, 0x183, b"\0") == [(0, 0x183, b"\xff")] * 2
+    flip = frame_row("corrupt", bits=1)
+    assert len(set(active(frame_row("duplicate"), flip).transmit(SENSOR1, 0x183, bytes(64)))) == 2
+    assert len(set(active(flip, frame_row("duplicate")).transmit(SENSOR1, 0x183, bytes(64)))) == 1
+    late = frame_row("delay", delay_us=1.0)
+    assert active(late, late, mask).transmit(SENSOR1, 0x183, b"\0") == [(2000, 0x183, b"\xff")]
+    assert active(frame_row("lose"), mask).transmit(SENSOR1, 0x183, b"\0") == []
+
+
+def test_a_silent_node_sends_nothing_and_still_hears():
+    plan = active(example("silence", node="drive1"))
+    assert plan.transmit(DRIVE1, 0x7A1, b"") == []
+    assert plan.transmit(DRIVE2, 0x182, FEEDBACK) == [(0, 0x182, FEEDBACK)]
+    assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
+
+
+def test_all_nodes_can_be_silent():
+    plan = active(example("silence", node="all"))
+    assert [plan.transmit(node, 0x181 + node, b"") for node in range(4)] == [[]] * 4
+
+
+# Chance
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.01, 0.3, 0.9, 1.0])
+def test_as_many_frames_are_lost_as_their_probability_says(probability):
+    plan = active(frame_row("lose", probability=probability))
+    count = 20_000
+    lost = sum(not plan.transmit(SENSOR1, 0x183, TORQUE) for _ in range(count))
+    sigma = (count * probability * (1 - probability)) ** 0.5
+    assert abs(lost - count * probability) <= 3.5 * sigma
+
+
+def lost_frames(plan: FaultPlan, node: int = SENSOR1, can_id: int = 0x183) -> list[bool]:
+    return [not plan.transmit(node, can_id, TORQUE) for _ in range(200)]
+
+
+HALF = frame_row("lose", probability=0.5)
+
+
+def test_the_same_seed_hits_the_same_frames_and_another_hits_others():
+    assert lost_frames(active(HALF)) == lost_frames(active(HALF))
+    assert lost_frames(active(HALF)) != lost_frames(active(HALF, seed=2))
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        [example("lose", node="sensor2")],
+        [example("corrupt", node="sensor1", probability=0.5)],
+        [frame_row("duplicate", probability=0.5), frame_row("delay", delay_us=1.0, jitter_us=1.0)],
+        [frame_row("lose", frame="status"), {"kind": "jump", "node": "sensor1", "signal": "torque", "step": 1.0}],
+    ],
+)
+def test_other_rows_before_and_after_a_row_leave_its_draws_alone(others):
+    alone = lost_frames(active(HALF))
+    assert lost_frames(active(*others, HALF, *others)) == alone
+
+
+def test_a_row_draws_for_each_frame_though_another_row_has_lost_it():
+    plan, both = active(HALF_CORRUPT), active(HALF, HALF_CORRUPT)
+    alone = [plan.transmit(SENSOR1, 0x183, TORQUE)[0][2] != TORQUE for _ in range(200)]
+    together = [both.transmit(SENSOR1, 0x183, TORQUE) for _ in range(200)]
+    kept = [(a, frames[0][2] != TORQUE) for a, frames in zip(alone, together, strict=True) if frames]
+    assert 60 < len(kept) < 140
+    assert 0.3 < sum(a for a, _ in kept) / len(kept) < 0.7  # the two rows don't hit the same frames
+    assert [a for a, _ in kept] == [b for _, b in kept]
+
+
+HALF_CORRUPT = frame_row("corrupt", mask="ff", probability=0.5)
+
+
+def test_a_row_that_reorders_draws_for_a_frame_though_another_row_has_lost_it():
+    plan = active(frame_row("lose", probability=0.5), frame_row("reorder", count=100))
+    lost = lost_frames(active(HALF))
+    came = [len(plan.transmit(SENSOR1, 0x183, TORQUE)) for _ in range(200)]
+    assert sum(lost) > 60
+    assert plan.advance(PERIOD_NS)[0].row == 1
+    assert sum(came) == 200 - sum(lost)
+
+
+def test_two_rows_that_are_alike_draw_on_their_own():
+    one, both = active(HALF), active(HALF, HALF)
+    assert sum(lost_frames(one)) < 120
+    assert sum(lost_frames(both)) > 120
+
+
+def test_the_numbers_of_a_row_do_not_choose_its_stream():
+    rare = lost_frames(active(frame_row("lose", probability=0.2)))
+    often = lost_frames(active(HALF))
+    assert 20 < sum(rare) < 60
+    assert all(is_lost for is_lost, was_lost in zip(often, rare, strict=True) if was_lost)
+
+
+# Values
+
+ZERO = (0, 0)
+
+
+def test_values_that_no_row_is_about_pass_as_they_are():
+    plan = active({"kind": "stick", "node": "drive1", "signal": "position"})
+    plan.distort((5, 6), (7, 8), (9, 10))
+    assert plan.distort((1, 2), (3, 4), (11, 12)) == ((5, 2), (3, 4), (11, 12))
+
+
+@pytest.mark.parametrize(
+    ("node", "signal", "expected"),
+    [
+        ("drive2", "position", ((1, 6), (3, 4), (11, 12))),
+        ("drive1", "velocity", ((1, 2), (7, 4), (11, 12))),
+        ("drive2", "velocity", ((1, 2), (3, 8), (11, 12))),
+        ("sensor1", "torque", ((1, 2), (3, 4), (9, 12))),
+        ("sensor2", "torque", ((1, 2), (3, 4), (11, 10))),
+    ],
+)
+def test_a_value_that_sticks_repeats_the_one_of_the_onset(node, signal, expected):
+    plan = active({"kind": "stick", "node": node, "signal": signal})
+    plan.distort((5, 6), (7, 8), (9, 10))
+    plan.distort((0, 0), (0, 0), (0, 0))
+    assert plan.distort((1, 2), (3, 4), (11, 12)) == expected
+
+
+@pytest.mark.parametrize(
+    ("node", "signal", "which", "joint", "lsb"),
+    [
+        ("drive1", "position", 0, 0, POSITION_LSB_RAD),
+        ("drive2", "velocity", 1, 1, VELOCITY_LSB_RAD_S),
+        ("sensor2", "torque", 2, 1, TORQUE_LSB_NM),
+    ],
+)
+def test_a_jump_adds_its_step_in_the_values_unit(node, signal, which, joint, lsb):
+    plan = active({"kind": "jump", "node": node, "signal": signal, "step": -1.5})
+    values = plan.distort((100, 100), (100, 100), (100, 100))
+    assert values[which][joint] == 100 + round(-1.5 / lsb)
+    assert sum(abs(value - 100) for pair in values for value in pair) == round(1.5 / lsb)
+
+
+@pytest.mark.parametrize(("step", "end"), [(200.0, TORQUE_COUNTS[1]), (-200.0, TORQUE_COUNTS[0])])
+def test_a_jump_of_torque_ends_at_the_converters_range(step, end):
+    plan = active({"kind": "jump", "node": "sensor1", "signal": "torque", "step": step})
+    assert plan.distort(ZERO, ZERO, ZERO)[2] == (end, 0)
+
+
+@pytest.mark.parametrize(("counts", "end"), [(5, TORQUE_COUNTS[1]), (0, TORQUE_COUNTS[1]), (-5, TORQUE_COUNTS[0])])
+def test_a_saturated_sensor_reads_the_end_of_its_range(counts, end):
+    plan = active({"kind": "saturate", "node": "sensor2", "signal": "torque"})
+    assert plan.distort(ZERO, ZERO, (0, counts))[2] == (0, end)
+
+
+@pytest.mark.parametrize(("counts", "seen"), [(-2000, -1000), (-1000, -1000), (3, 3), (1001, 1000)])
+def test_a_saturated_value_goes_no_further_than_the_row_says(counts, seen):
+    plan = active({"kind": "saturate", "node": "drive1", "signal": "velocity", "value": 0.5})
+    assert plan.distort(ZERO, (counts, 0), ZERO)[1] == (seen, 0)
+
+
+def test_spikes_hit_as_many_samples_as_their_probability_says():
+    plan = active({"kind": "jump", "node": "sensor1", "signal": "torque", "step": 1.0, "probability": 0.1})
+    hits = sum(plan.distort(ZERO, ZERO, ZERO)[2][0] != 0 for _ in range(10_000))
+    assert abs(hits - 1000) < 3.5 * 30
+
+
+def test_a_jump_with_a_count_hits_so_many_samples():
+    plan = active({"kind": "jump", "node": "sensor1", "signal": "torque", "step": 1.0, "count": 2})
+    assert [plan.distort(ZERO, ZERO, ZERO)[2][0] != 0 for _ in range(4)] == [True, True, False, False]
+
+
+# SYNC
+
+
+def test_sync_is_late_while_the_row_is_active():
+    plan = plan_of(example("late_sync", delay_us=200.0, duration_s=1.0))
+    late = []
+    for second in (0, 1, 2):
+        plan.advance(second * S)
+        late.append(plan.sync_delay_ns())
+    assert late == [0, 200_000, 0]
+
+
+def test_some_syncs_are_late_by_chance():
+    plan = active({"kind": "late_sync", "delay_us": 100.0, "jitter_us": 100.0, "probability": 0.25})
+    late = [plan.sync_delay_ns() for _ in range(4000)]
+    hits = [delay_ns for delay_ns in late if delay_ns]
+    assert abs(len(hits) - 1000) < 3.5 * 27.4
+    assert min(hits) >= 100_000
+    assert max(hits) <= 200_000
+
+
+# Floods
+
+
+def flood(plan: FaultPlan, periods: int) -> list[tuple[int, int, bytes]]:
+    """Return the frames with their times since the onset, in µs."""
+    frames = []
+    for k in range(periods):
+        plan.advance(k * PERIOD_NS)
+        frames += [(k * 1000 + offset // 1000, can_id, data) for offset, can_id, data in plan.babble(PERIOD_NS)]
+    return frames
+
+
+def test_a_babbling_node_floods_the_bus_at_its_rate():
+    plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 2500.0, "data": "0102", "at_s": 0.0})
+    frames = flood(plan, 4)
+    assert [t_us for t_us, _, _ in frames] == [0, 400, 800, 1200, 1600, 2000, 2400, 2800, 3200, 3600]
+    assert {(can_id, data) for _, can_id, data in frames} == {(0x10, b"\x01\x02")}
+
+
+def test_a_slow_flood_keeps_its_grid_between_periods():
+    plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 400.0, "at_s": 0.0})
+    assert [(t_us, data) for t_us, _, data in flood(plan, 8)] == [(k * 2500, bytes(8)) for k in range(4)]
+
+
+@pytest.mark.parametrize(("end", "count"), [({"count": 7}, 7), ({"duration_s": 0.0025}, 13)])
+def test_a_flood_ends_by_count_or_time(end, count):
+    plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 5000.0, "at_s": 0.0, **end})
+    assert len(flood(plan, 10)) == count
+
+
+def test_a_node_without_power_does_not_babble():
+    row = {"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 1000.0, "at_s": 0.0}
+    plan = plan_of(row, {"kind": "power_loss", "node": "drive1", "at_s": 0.002, "duration_s": 0.003})
+    assert [t_us for t_us, _, _ in flood(plan, 8)] == [0, 1000, 5000, 6000, 7000]
+
+
+def test_frames_of_a_flood_that_nobody_asked_for_in_time_are_not_made_up_for():
+    plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 1000.0, "at_s": 0.0})
+    plan.advance(0)
+    plan.advance(50 * PERIOD_NS)
+    assert [offset for offset, _, _ in plan.babble(PERIOD_NS)] == [0]
+
+
+# Nodes
+
+A = ActionKind
+
+
+def happens(plan: FaultPlan, end_ms: int) -> list[tuple[int, str, int, float]]:
+    """Return what happens to nodes, with the ms since the onset."""
+    found = []
+    for ms in range(end_ms + 1):
+        plan.advance(ms * MS)
+        found += [(ms, action.kind.value, action.node, action.value) for action in plan.actions()]
+    return found
+
+
+ACTIONS = [
+    ({"kind": "reboot", "node": "drive2"}, [(2, A.POWER_OFF, 1, 0), (2, A.POWER_ON, 1, 0)]),
+    ({"kind": "reboot", "node": "sensor1", "duration_s": 0.003}, [(2, A.POWER_OFF, 2, 0), (5, A.POWER_ON, 2, 0)]),
+    ({"kind": "bus_off", "node": "drive1"}, [(2, A.LEAVE_BUS, 0, 0)]),
+    ({"kind": "bus_off", "node": "drive1", "duration_s": 0.003}, [(2, A.LEAVE_BUS, 0, 0), (5, A.RETURN_TO_BUS, 0, 0)]),
+    ({"kind": "power_loss"}, [(2, A.POWER_OFF, node, 0) for node in range(4)]),
+    (
+        {"kind": "power_loss", "node": "sensor2", "duration_s": 0.004},
+        [(2, A.POWER_OFF, 3, 0), (6, A.POWER_ON, 3, 0)],
+    ),
+    ({"kind": "drive_fault", "node": "drive1", "code": 0x2310}, [(2, A.FAIL, 0, 0x2310), (2, A.MEND, 0, 0)]),
+    (
+        {"kind": "drive_fault", "node": "drive2", "code": 0x2310, "duration_s": 0.003},
+        [(2, A.FAIL, 1, 0x2310), (5, A.MEND, 1, 0)],
+    ),
+    ({"kind": "sensor_error", "node": "sensor1"}, [(2, A.SENSOR_STATUS, 2, 1)]),
+    (
+        {"kind": "sensor_error", "node": "sensor2", "status": 5, "duration_s": 0.003},
+        [(2, A.SENSOR_STATUS, 3, 5), (5, A.SENSOR_STATUS, 3, 0)],
+    ),
+    (
+        {"kind": "clock_drift", "node": "drive1", "drift_ppm": -80.0, "duration_s": 0.003},
+        [(2, A.DRIFT, 0, -80.0), (5, A.DRIFT, 0, 0)],
+    ),
+    (
+        {"kind": "emcy_storm", "node": "sensor1", "code": 0x1000, "rate_Hz": 500.0, "count": 3},
+        [(ms, A.EMERGENCY, 2, 0x1000) for ms in (2, 4, 6)],
+    ),
+    (
+        {"kind": "emcy_storm", "node": "drive2", "code": 0x8110, "rate_Hz": 2000.0, "duration_s": 0.002},
+        [(ms, A.EMERGENCY, 1, 0x8110) for ms in (2, 3, 3, 4)],
+    ),
+]
+
+
+@pytest.mark.parametrize(("row", "actions"), ACTIONS)
+def test_what_happens_to_nodes_happens_when_it_should(row, actions):
+    assert happens(plan_of(row | {"at_s": 0.002}), 10) == [(ms, kind.value, node, v) for ms, kind, node, v in actions]
+
+
+def test_every_kind_that_happens_to_a_node_is_in_the_table():
+    kinds = {row["kind"] for row, _ in ACTIONS}
+    assert kinds == {"reboot", "bus_off", "power_loss", "drive_fault", "sensor_error", "clock_drift", "emcy_storm"}
+
+
+def test_actions_are_taken_once():
+    plan = active(example("drive_fault"))
+    assert plan.actions() == [NodeAction(A.FAIL, 0, 0x2310), NodeAction(A.MEND, 0)]
+    assert plan.actions() == []
+
+
+def test_a_node_has_power_again_when_the_last_row_gives_it_back():
+    plan = plan_of(
+        {"kind": "power_loss", "at_s": 0.002, "duration_s": 0.005},
+        {"kind": "reboot", "node": "drive1", "at_s": 0.003, "duration_s": 0.002},
+        {"kind": "power_loss", "node": "drive1", "at_s": 0.004, "duration_s": 0.005},
+    )
+    power = [(ms, kind) for ms, kind, node, _ in happens(plan, 12) if node == 0]
+    assert power == [(2, "power off"), (9, "power on")]
+
+
+def test_errors_of_one_sensor_add_up():
+    plan = plan_of(
+        {"kind": "sensor_error", "node": "sensor1", "status": 1, "at_s": 0.001, "duration_s": 0.005},
+        {"kind": "sensor_error", "node": "sensor1", "status": 4, "at_s": 0.002, "duration_s": 0.002},
+    )
+    assert [(ms, value) for ms, _, _, value in happens(plan, 9)] == [(1, 1), (2, 5), (4, 1), (6, 0)]
+
+
+def test_drifts_of_one_clock_add_up():
+    row = {"kind": "clock_drift", "node": "drive1", "drift_ppm": 50.0}
+    plan = plan_of(row | {"at_s": 0.001}, row | {"at_s": 0.002, "duration_s": 0.001})
+    assert [(ms, value) for ms, _, _, value in happens(plan, 5)] == [(1, 50.0), (2, 100.0), (3, 50.0)]
+
+
+def test_a_drive_is_mended_when_its_last_failure_ends():
+    row = {"kind": "drive_fault", "node": "drive1", "code": 0x2310}
+    plan = plan_of(row | {"at_s": 0.001, "duration_s": 0.002}, row | {"at_s": 0.002, "duration_s": 0.004})
+    assert [(ms, kind) for ms, kind, _, _ in happens(plan, 9)] == [(1, "fail"), (2, "fail"), (6, "mend")]
+
+
+@pytest.mark.parametrize(
+    ("rows", "is_acknowledged"),
+    [
+        ([], True),
+        ([{"kind": "power_loss"}], False),
+        ([{"kind": "power_loss", "node": "drive1"}], True),
+        ([{"kind": "bus_off", "node": node} for node in ("drive1", "drive2", "sensor1", "sensor2")], False),
+        ([{"kind": "silence", "node": "all"}], True),
+    ],
+)
+def test_what_the_host_sends_is_acknowledged_as_long_as_anybody_is_there(rows, is_acknowledged):
+    assert active(*rows).is_acknowledged is is_acknowledged
+
+
+def test_the_bus_is_acknowledged_again_when_power_is_back():
+    plan = plan_of({"kind": "power_loss", "at_s": 0.001, "duration_s": 0.002})
+    seen = []
+    for ms in range(5):
+        plan.advance(ms * MS)
+        seen.append(plan.is_acknowledged)
+    assert seen == [True, False, False, True, True]

@@ -1,0 +1,336 @@
+"""What a device does when it loses power or the bus, fails by itself, or has a clock that drifts."""
+
+import struct
+
+import pytest
+from bench_host import ENABLE, FAULT_RESET, PERIOD_NS, RESET_NODE, START, BenchHost
+
+from firmware_sim.body import DriveMode
+from firmware_sim.device import NmtState
+from firmware_sim.node_clock import NodeClock
+from firmware_sim.object_dictionary import NEVER_NS
+
+MS = 1_000_000
+FAULT_BITS, DISABLED_BITS, REACTION_BITS, ENABLED_BITS = 0x08, 0x40, 0x0F, 0x27
+ERROR = 0x2310
+
+
+def enabled_host() -> BenchHost:
+    host = BenchHost()
+    for node in (1, 2, 3, 4):
+        host.write(node, 0x1017, 0, 10)
+    host.enable()
+    for _ in range(5):
+        host.step(ENABLE, 100)
+    host.take()
+    return host
+
+
+def poll(host: BenchHost) -> None:
+    """Let the bench look again after something was done to a device."""
+    host.bench._poll(host.bench.now_ns)
+
+
+def pass_ms(host: BenchHost, count: int) -> None:
+    for _ in range(count):
+        host.t_ns += MS
+        host.bench.advance_to(host.t_ns)
+
+
+def errors(host: BenchHost, node: int) -> list[int]:
+    return [struct.unpack_from("<H", data)[0] for data in host.taken(0x080 + node)]
+
+
+@pytest.mark.parametrize("node", [1, 2, 3, 4])
+def test_a_device_without_power_says_and_hears_nothing(node):
+    host = enabled_host()
+    device = host.bench.devices[node - 1]
+    device.power_off(host.bench.now_ns)
+    poll(host)
+    host.put(0x600 + node, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]))
+    host.nmt(START, node)
+    pass_ms(host, 50)
+    assert [can_id for can_id, _ in host.take() if can_id & 0x7F == node] == []
+    assert device.state is NmtState.INITIALISING
+
+
+def test_a_drive_without_power_has_no_torque_and_does_not_brake():
+    host = enabled_host()
+    assert host.bench.drives[0].torque_Nm != 0.0
+    host.bench.devices[0].power_off(host.bench.now_ns)
+    drive = host.bench.drives[0]
+    assert (drive.torque_Nm, drive.motor_mode) == (0.0, DriveMode.OFF)
+
+
+@pytest.mark.parametrize("node", [1, 3])
+def test_power_brings_a_device_back_as_it_was_delivered(node):
+    host = enabled_host()
+    host.write(node, 0x1016, 1, 127 << 16 | 50)
+    device = host.bench.devices[node - 1]
+    device.power_off(host.bench.now_ns)
+    device.power_on(host.bench.now_ns)
+    poll(host)
+    assert host.taken(0x700 + node) == [b"\0"]
+    assert device.state is NmtState.PRE_OPERATIONAL
+    assert [host.read(node, 0x1017), host.read(node, 0x1016, 1), host.read(node, 0x1003)] == [0, 0, 0]
+    host.nmt(START, node)
+    host.take()
+    host.sync()
+    assert len(host.taken(0x180 + node)) == 1
+
+
+def test_a_drives_state_machine_begins_anew_with_power():
+    host = enabled_host()
+    host.bench.devices[0].power_off(host.bench.now_ns)
+    host.bench.devices[0].power_on(host.bench.now_ns)
+    assert host.state_bits(1) == DISABLED_BITS
+    assert host.state_bits(2) == ENABLED_BITS
+
+
+def test_emergencies_that_waited_are_gone_with_the_power():
+    host = enabled_host()
+    host.write(1, 0x1015, 0, 1000)
+    host.put(0x201, b"\0")  # wrong length, right length: two messages, of which the second must wait
+    host.command(ENABLE)
+    assert errors(host, 1) == [0x8210]
+    host.bench.devices[0].power_off(host.bench.now_ns)
+    host.bench.devices[0].power_on(host.bench.now_ns)
+    poll(host)
+    pass_ms(host, 200)
+    assert errors(host, 1) == []
+
+
+def test_a_reset_of_power_restarts_the_time_in_emergencies():
+    host = enabled_host()
+    pass_ms(host, 500)
+    host.bench.devices[0].power_off(host.bench.now_ns)
+    host.bench.devices[0].power_on(host.bench.now_ns)
+    pass_ms(host, 30)
+    host.nmt(START, 1)
+    host.take()
+    host.put(0x201, b"\0")
+    ((_, _, _, time_ms),) = [struct.unpack("<HBBI", data) for data in host.taken(0x081)]
+    assert time_ms == 30
+
+
+@pytest.mark.parametrize("node", [1, 3])
+def test_a_device_off_the_bus_goes_pre_operational_and_says_nothing(node):
+    host = enabled_host()
+    device = host.bench.devices[node - 1]
+    device.leave_bus(host.bench.now_ns)
+    poll(host)
+    host.put(0x600 + node, bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0]))
+    host.nmt(START, node)
+    pass_ms(host, 50)
+    assert [can_id for can_id, _ in host.take() if can_id & 0x7F == node] == []
+    assert device.state is NmtState.PRE_OPERATIONAL
+
+
+def test_a_powered_drive_off_the_bus_faults_and_brakes():
+    host = enabled_host()
+    host.bench.devices[0].leave_bus(host.bench.now_ns)
+    drive = host.bench.drives[0]
+    assert drive.state.value == "fault reaction active"
+    assert drive.error_code == 0x8100
+    assert drive.torque_Nm == 0.0
+
+
+@pytest.mark.parametrize("node", [1, 3])
+def test_a_device_that_returns_to_the_bus_says_so_and_stays_pre_operational(node):
+    host = enabled_host()
+    device = host.bench.devices[node - 1]
+    device.leave_bus(host.bench.now_ns)
+    pass_ms(host, 50)
+    host.take()
+    device.return_to_bus(host.bench.now_ns)
+    assert errors(host, node) == [0x8140]
+    poll(host)
+    pass_ms(host, 20)
+    assert set(host.taken(0x700 + node)) == {b"\x7f"}
+    assert host.read(node, 0x1000) & 0xFFFF == (402 if node == 1 else 404)
+
+
+def test_a_device_off_the_bus_does_not_hear_the_masters_heartbeat():
+    host = BenchHost()
+    host.write(3, 0x1016, 1, 127 << 16 | 50)
+    host.nmt(START)
+    host.put(0x77F, b"\x05")
+    device = host.bench.devices[2]
+    device.leave_bus(host.bench.now_ns)
+    for _ in range(60):
+        host.put(0x77F, b"\x05")
+        pass_ms(host, 1)
+    assert [int(watchdog) for watchdog in device.watchdogs.tripped] == [3]
+
+
+@pytest.mark.parametrize("node", [1, 3])
+def test_what_is_written_to_a_device_off_the_bus_does_not_arrive(node):
+    host = enabled_host()
+    device = host.bench.devices[node - 1]
+    device.leave_bus(host.bench.now_ns)
+    host.put(0x600 + node, bytes([0x2B, 0x17, 0x10, 0, 77, 0, 0, 0]))
+    assert device.value(0x1017) == 10
+
+
+def test_power_that_comes_while_the_controller_is_off_the_bus_is_not_heard():
+    host = enabled_host()
+    device = host.bench.devices[0]
+    device.leave_bus(host.bench.now_ns)
+    device.power_off(host.bench.now_ns)
+    device.power_on(host.bench.now_ns)
+    assert host.taken(0x701) == []
+    device.return_to_bus(host.bench.now_ns)
+    assert errors(host, 1) == [0x8140]
+
+
+def test_a_drive_that_fails_faults_with_its_code_and_says_so():
+    host = enabled_host()
+    drive = host.bench.drives[0]
+    drive.fail(ERROR, host.bench.now_ns)
+    assert host.state_bits(1) == REACTION_BITS
+    assert struct.unpack_from("<HBB", host.taken(0x081)[0]) == (ERROR, 0x01, 0)
+    assert host.read(1, 0x603F) == ERROR
+    assert host.read(1, 0x1003, 1) == ERROR
+    assert drive.torque_Nm == 0.0
+
+
+def test_fault_reset_is_refused_until_the_failure_is_mended():
+    host = enabled_host()
+    drive = host.bench.drives[0]
+    drive.fail(ERROR, host.bench.now_ns)
+    host.wait_until_at_rest()
+    host.step(0)
+    host.step(FAULT_RESET)
+    assert host.state_bits(1) == FAULT_BITS
+    drive.mend()
+    host.step(0)
+    assert host.state_bits(1) == FAULT_BITS
+    host.step(FAULT_RESET)
+    assert host.state_bits(1) == DISABLED_BITS
+    assert host.read(1, 0x603F) == 0
+
+
+def test_a_failure_that_lasts_is_back_after_a_reset_of_the_node():
+    host = enabled_host()
+    host.bench.drives[0].fail(ERROR, host.bench.now_ns)
+    host.wait_until_at_rest()
+    host.take()
+    host.nmt(RESET_NODE, 1)
+    assert host.read(1, 0x603F) == ERROR
+    assert errors(host, 1) == [ERROR]
+
+
+def test_a_drive_without_power_does_not_fail_before_it_has_some():
+    host = enabled_host()
+    host.bench.devices[0].power_off(host.bench.now_ns)
+    host.bench.drives[0].fail(ERROR, host.bench.now_ns)
+    assert host.bench.drives[0].error_code == 0
+    host.bench.devices[0].power_on(host.bench.now_ns)
+    poll(host)
+    assert host.bench.drives[0].error_code == ERROR
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 7])
+def test_a_sensor_that_finds_fault_with_itself_says_so_in_frame_and_status(bits):
+    host = enabled_host()
+    host.bench.sensors[0].set_error(bits)
+    host.sync()
+    frames = dict(host.take())
+    assert frames[0x183][1] >> 4 == bits
+    assert frames[0x283][0] == bits
+    host.bench.sensors[0].set_error(0)
+    host.sync()
+    assert host.taken(0x283)[0][0] == 0
+
+
+def test_an_overload_is_added_to_the_error_of_a_sensor():
+    host = enabled_host()
+    sensor = host.bench.sensors[0]
+    sensor.set_error(4)
+    sensor.on_sync(32767)
+    assert host.read(3, 0x6150, 1) == 7
+
+
+def test_a_device_out_of_control_sends_emergencies_whatever_their_inhibit_time():
+    host = enabled_host()
+    host.write(1, 0x1015, 0, 10_000)
+    for _ in range(5):
+        host.bench.devices[0].cry(0x1000, host.bench.now_ns)
+    assert errors(host, 1) == [0x1000] * 5
+
+
+def test_a_device_off_the_bus_cries_in_vain():
+    host = enabled_host()
+    host.bench.devices[0].leave_bus(host.bench.now_ns)
+    host.bench.devices[0].cry(0x1000, host.bench.now_ns)
+    assert errors(host, 1) == []
+
+
+@pytest.mark.parametrize(("ppm", "count"), [(0.0, 100), (100_000.0, 110), (-100_000.0, 90), (400_000.0, 140)])
+@pytest.mark.parametrize("node", [1, 3])
+def test_heartbeats_go_by_the_devices_own_clock(ppm, count, node):
+    host = BenchHost()
+    host.bench.devices[node - 1].clock.set_drift(ppm, 0)
+    host.write(node, 0x1017, 0, 10)
+    host.take()
+    host.bench.advance_to(1_000 * MS)
+    assert abs(len(host.taken(0x700 + node)) - count) <= 1
+
+
+@pytest.mark.parametrize(("ppm", "lost_ms"), [(0.0, 50), (250_000.0, 40), (-200_000.0, 63)])
+def test_a_device_with_a_fast_clock_loses_the_masters_heartbeat_sooner(ppm, lost_ms):
+    host = BenchHost()
+    device = host.bench.devices[2]
+    device.clock.set_drift(ppm, 0)
+    host.write(3, 0x1016, 1, 127 << 16 | 50)
+    pass_ms(host, 400)
+    host.put(0x77F, b"\x05")
+    pass_ms(host, lost_ms - 1)
+    assert device.watchdogs.tripped == set()
+    pass_ms(host, 1)
+    assert [int(watchdog) for watchdog in device.watchdogs.tripped] == [3]
+
+
+@pytest.mark.parametrize(("ppm", "patience_ns"), [(0.0, 1_500_000), (200_000.0, 1_250_000), (-250_000.0, 2_000_000)])
+def test_a_drive_with_a_fast_clock_misses_sync_sooner(ppm, patience_ns):
+    host = BenchHost(clock_mode="wall")
+    host.bench.devices[0].clock.set_drift(ppm, 0)
+    host.enable()
+    host.bench.advance_to(host.t_ns + patience_ns - 1)
+    assert host.bench.drives[0].error_code == 0
+    host.bench.advance_to(host.t_ns + patience_ns)
+    assert host.bench.drives[0].error_code == 0x8700
+
+
+@pytest.mark.parametrize("ppm", [0.0, 1.0, -1.0, 33.3, 500_000.0, -500_000.0])
+def test_a_time_of_the_device_is_reached_at_the_first_time_of_the_bench_that_shows_it(ppm):
+    clock = NodeClock()
+    clock.set_drift(ppm, 7_000_001)
+    for own_ns in (7_000_001, 7_000_002, 8_123_457, 1_000_000_007, 3_600_000_000_001):
+        t_ns = clock.bench_ns(own_ns)
+        assert clock.own_ns(t_ns) >= own_ns
+        assert clock.own_ns(t_ns - 1) < own_ns
+
+
+def test_a_clock_that_drifts_no_more_keeps_its_lead():
+    clock = NodeClock()
+    clock.set_drift(100_000.0, 1_000)
+    clock.set_drift(0.0, 2_000)
+    assert clock.own_ns(2_000) == 2_100
+    assert clock.own_ns(5_000) == 5_100
+    assert clock.bench_ns(5_100) == 5_000
+    assert not clock.is_true
+
+
+def test_what_is_never_due_is_never_due_by_any_clock():
+    clock = NodeClock()
+    clock.set_drift(100.0, 0)
+    assert clock.bench_ns(NEVER_NS) == NEVER_NS
+
+
+@pytest.mark.parametrize(("is_distorted", "velocity_rad_s"), [(True, 0.5), (False, 0.0)])
+def test_a_distorted_velocity_counts_where_the_contract_has_an_lsb_of_its_own(is_distorted, velocity_rad_s):
+    host = BenchHost(contract="arm_stock")
+    host.bench.drives[0].on_sync(0, 1000, PERIOD_NS, is_distorted=is_distorted)
+    raw = host.bench.devices[0].reader(0x606C, 0)()
+    assert raw * 5.992112452678286e-06 == pytest.approx(velocity_rad_s, abs=1e-5)
