@@ -32,10 +32,13 @@ from firmware_sim.contact import TICK_S
 from firmware_sim.contracts import Contract, answers_to_sync, contract_of, longest_pdo
 from firmware_sim.device import RESET_COMMUNICATION, RESET_NODE, Device
 from firmware_sim.drive_node import DriveNode, Motor
+from firmware_sim.faults import device_ids, own_messages
+from firmware_sim.injector import Handler, Injector, OnEvent
 from firmware_sim.object_dictionary import NEVER_NS, Abort, refuse
+from firmware_sim.outbox import Outbox
 from firmware_sim.scenario import Scenario
 from firmware_sim.sensor_node import SensorNode
-from firmware_sim.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from firmware_sim.time_marks import HOST_MARK, MarkKind, unpack_mark
 
 ClockMode = Literal["sync", "wall"]
 SYNC_COUNTERS = 240
@@ -43,8 +46,11 @@ SYNC_COUNTERS = 240
 _TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
+_PLANNED_PERIOD_NS = 1_000_000
+"""How long a fault without length, such as a reboot, is active."""
+_ALL = (True,) * len(_NODES)
 
-Handler = Callable[[bytes, int], None]
+_FAULTS = TRUTH_LAYOUT.slices["faults"]
 
 
 class Bench:
@@ -60,23 +66,23 @@ class Bench:
         seed: int | None = None,
         on_truth: Callable[[int, int, Vector], None] | None = None,
         contract: Contract | None = None,
+        on_event: OnEvent | None = None,
     ) -> None:
         """Build and compile everything; nothing is sent before `boot`.
 
         send: called with (identifier, data). seed: outweighs the scenario's. on_truth: called each cycle with (cycle,
         t_ns of the SYNC frame, block by TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS
-        files the devices have; default: those that go with the codec's DBC.
-        Raises CodecError when the DBC lacks a message, OSError when an EDS can't be read.
+        files the devices have; default: those that go with the codec's DBC. on_event: called with t_ns, level, name and
+        text when a fault begins or ends.
+        Raises ConfigError when a fault is about a frame that the contract hasn't, CodecError when the DBC lacks a
+        message, OSError when an EDS can't be read.
         """
         self.now_ns = 0
         """The bench's time: of `boot` plus, by SYNC, the periods since then; by wall, the clock's."""
         self.cycle = -1
         """Number of the last SYNC, -1 before the first."""
-        self.is_paced = False
-        """Whether a host in lockstep says how much time passes."""
-        self._send = send
-        self._sent = 0  # frames so far
-        self._granted = 0  # of them, when time was last granted
+        self._outbox = Outbox(send)
+        self._granted = 0  # frames that had gone out when time was last granted
         self._granted_ns = 0  # on the host's clock
         self._ahead_ns = 0  # of the bench's time over the host's
         self._answers = answers_to_sync(codec)
@@ -94,17 +100,27 @@ class Bench:
         self.contract = contract or contract_of(codec)
         folder = contract_folder()
         files = [self.contract.drive_eds if n.startswith("Drive") else self.contract.sensor_eds for n in _NODES]
-        ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
+        right_ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
+        ids = device_ids(scenario.faults, right_ids)
         longest = longest_pdo(codec)
+        plan_seed = scenario.seed if seed is None else seed
+        self._injector = Injector(scenario, plan_seed, _PLANNED_PERIOD_NS, codec, self._outbox, on_event)
         self.devices = tuple(
-            Device(node_id, folder / file, self._transmit, codec.by_id, longest)
-            for node_id, file in zip(ids, files, strict=True)
+            Device(
+                ids[i],
+                folder / files[i],
+                self._injector.sender(i),
+                own_messages(codec.by_id, right_ids[i], ids[i]),
+                longest,
+            )
+            for i in range(len(_NODES))
         )
         rated_Nm = scenario.arm.rated_torque_Nm
         self.drives = tuple(
             DriveNode(self.devices[i], codec, i + 1, self._motor(i), rated_Nm[i], self._is_wall) for i in range(JOINTS)
         )
         self.sensors = tuple(SensorNode(self.devices[JOINTS + i], codec, i + 1) for i in range(JOINTS))
+        self._injector.attach(self.devices, self.drives, self.sensors)
         self._period_ns = self.devices[0].value(0x1006) * 1000
         for device in self.devices:
             device.watch(0x1006, 0, check=self._check_period)
@@ -112,16 +128,21 @@ class Bench:
         self._body = self._make_body()
         self._sync_id = codec.message("Sync").can_id
         self._host_id = codec.node_id("HostHeartbeat")
-        self._commands: dict[int, tuple[Handler, ...]] = {}
-        self._senders: tuple[Callable[[], None], ...] = ()
+        self._commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
+        self._senders: tuple[tuple[int, Callable[[], None]], ...] = ()
         for device in self.devices:
             device.on_pdo_change = self._listen
         self._services: dict[int, Handler] = {
             codec.message("Nmt").can_id: self._on_nmt,
             codec.message("HostHeartbeat").can_id: self._on_host_heartbeat,
             **({} if self._is_wall else {HOST_MARK: self._on_mark}),
-            **{0x600 + device.node_id: device.on_sdo for device in self.devices},
+            **{0x600 + device.node_id: self._sdo_handler(0x600 + device.node_id) for device in self.devices},
         }
+
+    @property
+    def is_paced(self) -> bool:
+        """Whether a host in lockstep says how much time passes."""
+        return self._outbox.is_paced
 
     @property
     def is_operational(self) -> bool:
@@ -141,8 +162,10 @@ class Bench:
     def boot(self, t_ns: int = 0) -> None:
         """Power on at `t_ns`: every node announces itself."""
         self.now_ns = self._body_ns = t_ns
+        self._injector.power_on(t_ns)
         for device in self.devices:
             device.power_on(t_ns)
+        self._advance_faults(t_ns)
         self._poll(t_ns)
 
     def on_frame(self, frame: Frame) -> None:
@@ -153,10 +176,12 @@ class Bench:
         if self._is_wall and t_ns > self.now_ns:
             self.now_ns = t_ns
         if can_id == self._sync_id:
-            self._on_sync(data, t_ns)
+            if self._injector.has_faults:
+                self._advance_faults(t_ns, self._time_to_sync_ns(data))
+            self._injector.receive_by_all(can_id, data, self._on_sync, t_ns)
         elif can_id in self._commands:
-            for take in self._commands[can_id]:
-                take(data, self.now_ns)
+            for place, take in self._commands[can_id]:
+                self._injector.receive(place, can_id, data, take, self.now_ns)
         elif can_id in self._services:
             self._services[can_id](data, self.now_ns)
             self._poll(self.now_ns)
@@ -164,25 +189,37 @@ class Bench:
     def advance_to(self, t_ns: int) -> None:
         """Let time pass without frames: heartbeats, event timers, watchdogs; by wall clock the body moves too."""
         while self._due_ns <= t_ns:
-            self._move_to(max(self._due_ns, self.now_ns))
-            self._poll(self.now_ns)
+            self._live(max(self._due_ns, self.now_ns))
         self._move_to(t_ns)
+
+    def _live(self, t_ns: int) -> None:
+        """Reach `t_ns` and do what is due then."""
+        self._move_to(t_ns)
+        self._advance_faults(t_ns)
+        self._outbox.release(self.now_ns)
+        self._poll(self.now_ns)
+
+    def _advance_faults(self, stamp_ns: int, ahead_ns: int = 0) -> None:
+        """Let faults begin and end by now, or by what is `ahead_ns` of it."""
+        if self._injector.has_faults:
+            self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if self.is_paced else stamp_ns)
+
+    def _time_to_sync_ns(self, data: bytes) -> int:
+        """Say by how much this SYNC moves the bench's time, if it is heard."""
+        if self._is_wall or not self._has_moved:
+            return 0
+        counter = data[0] if data else 0
+        periods = (counter - self._counter) % SYNC_COUNTERS if counter and self._counter else 1
+        return periods * self._period_ns
 
     def release(self) -> None:
         """Let time go by the given clock again: the host in lockstep has gone."""
-        self.is_paced = False
+        self._outbox.is_paced = False
 
     @property
     def host_ns(self) -> int:
         """The bench's time on the clock of a host in lockstep."""
         return self.now_ns - self._ahead_ns
-
-    def _transmit(self, can_id: int, data: bytes) -> None:
-        self._sent += 1
-        self._send(can_id, data)
-
-    def _mark(self, kind: MarkKind, t_ns: int = 0) -> None:
-        self._send(DEVICE_MARK, pack_mark(kind, t_ns))
 
     def _on_mark(self, data: bytes, _t_ns: int) -> None:
         """Let time pass until the host's next frame, or until something is sent."""
@@ -191,28 +228,41 @@ class Bench:
             return
         host_ns = mark[1]
         if not self.is_paced or host_ns < self._granted_ns:
-            self.is_paced = True
+            self._outbox.is_paced = True
             self._ahead_ns = self.now_ns - host_ns
         target_ns = host_ns + self._ahead_ns
-        while self._sent == self._granted and self._due_ns <= target_ns:
-            self._move_to(max(self._due_ns, self.now_ns))
-            self._poll(self.now_ns)
-        if self._sent == self._granted:
+        outbox = self._outbox
+        while outbox.sent == self._granted and self._due_ns <= target_ns:
+            self._live(max(self._due_ns, self.now_ns))
+        if outbox.sent == self._granted:
             self._move_to(target_ns)
-        self._granted = self._sent
+        self._granted = outbox.sent
         self._granted_ns = self.host_ns
-        self._mark(MarkKind.GRANT, self._granted_ns)
+        outbox.mark(MarkKind.GRANT, self._granted_ns)
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
-        for device in self.devices:
-            device.on_nmt(data, t_ns)
+        for place, device in enumerate(self.devices):
+            self._injector.receive(place, 0x000, data, device.on_nmt, t_ns)
         is_reset = len(data) == 2 and data[0] in (RESET_NODE, RESET_COMMUNICATION)
         if is_reset and data[1] in (0, self.devices[0].node_id):
             self._counter = 0
 
-    def _on_host_heartbeat(self, _data: bytes, t_ns: int) -> None:
-        for device in self.devices:
-            device.on_heartbeat(self._host_id, t_ns)
+    def _on_host_heartbeat(self, data: bytes, t_ns: int) -> None:
+        def take(_data: bytes, t_ns: int) -> None:
+            for device in self.devices:
+                device.on_heartbeat(self._host_id, t_ns)
+
+        self._injector.receive_by_all(0x700 + self._host_id, data, take, t_ns)
+
+    def _sdo_handler(self, can_id: int) -> Handler:
+        """Let every device with this node id answer."""
+
+        def answer(data: bytes, t_ns: int) -> None:
+            for place, device in enumerate(self.devices):
+                if 0x600 + device.node_id == can_id:
+                    self._injector.receive(place, can_id, data, device.on_sdo, t_ns)
+
+        return answer
 
     def _on_sync(self, data: bytes, t_ns: int) -> None:
         """Run one cycle."""
@@ -220,8 +270,6 @@ class Bench:
         periods = self._count_periods(counter) if counter <= SYNC_COUNTERS else 0
         if periods == 0:
             return
-        drive1, drive2 = self.drives
-        sensor1, sensor2 = self.sensors
         if self._is_wall:
             self._move_to(self.now_ns)
         elif self._period_ns != self._body_period_ns:
@@ -229,29 +277,73 @@ class Bench:
         elif self._has_moved:
             self._live_through_lost_syncs(periods - 1)
             self.now_ns += self._period_ns
+        late_ns = self._injector.late_ns(self._period_ns)
+        if late_ns and self._is_wall:
+            self._outbox.hold(self.now_ns + late_ns, lambda: self._answer(data, t_ns, 0))
+            self._due_ns = min(self._due_ns, self._outbox.due_ns)
+        else:
+            self._answer(data, t_ns, late_ns)
+
+    def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
+        """Sample and answer a SYNC that reaches the devices now, or by SYNC `late_ns` after its time."""
+        sync_ns = self.now_ns
+        late_ticks = late_ns // _TICK_NS
+        torque_Nm = self.drives[0].torque_Nm, self.drives[1].torque_Nm
+        if late_ticks:
+            self._body.advance(torque_Nm, (self.drives[0].motor_mode, self.drives[1].motor_mode), late_ticks)
+        is_plain = (
+            self._injector.is_quiet and self._has_all_answers and self._outbox.due_ns >= sync_ns + self._period_ns
+        )
+        if self._is_wall or is_plain:
+            self._sample_and_send(data)
+            if self._is_wall:
+                self._outbox.release(self.now_ns)
+        else:
+            self._outbox.collect(sync_ns + late_ns)
+            self._sample_and_send(data)
+            self._injector.flood(self._period_ns)
+            self._outbox.close(sync_ns, sync_ns + self._period_ns)
+        self._granted = self._outbox.sent
+        if self.on_truth is not None:
+            self._body.truth(self._truth)
+            self._truth[_FAULTS] = self._injector.plan.mask
+            self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
+        if not self._is_wall:
+            self._has_moved = True
+            drive1, drive2 = self.drives
+            ticks = self._period_ns // _TICK_NS - late_ticks
+            self._body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode), ticks)
+
+    @property
+    def _is_plain(self) -> bool:
+        """Whether all cyclic frames, undisturbed and without company, answer this SYNC."""
+        is_undisturbed = self._injector.is_quiet and self._outbox.due_ns >= self.now_ns + self._period_ns
+        return is_undisturbed and self._has_all_answers
+
+    def _sample_and_send(self, data: bytes) -> None:
+        """Give the nodes their samples, and let them send."""
         now_ns = self.now_ns
-        body = self._body
-        (position1, position2), (velocity1, velocity2), (torque1, torque2) = body.sample()
-        drive1.on_sync(position1, velocity1, now_ns)
-        drive2.on_sync(position2, velocity2, now_ns)
-        sensor1.on_sync(torque1)
-        sensor2.on_sync(torque2)
+        drive1, drive2 = self.drives
+        sensor1, sensor2 = self.sensors
+        measured = self._body.sample()
+        heard = _ALL
+        if self._injector.is_quiet:
+            (position1, position2), (velocity1, velocity2), (torque1, torque2) = measured
+            drive1.on_sync(position1, velocity1, now_ns)
+            drive2.on_sync(position2, velocity2, now_ns)
+            sensor1.on_sync(torque1)
+            sensor2.on_sync(torque2)
+        else:
+            heard = self._injector.sync(self._sync_id, data, measured, now_ns)
         if now_ns >= self._due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
             self._poll(now_ns)
         if not self._is_started and drive1.is_enabled and drive2.is_enabled:
             self._is_started = True
-            body.start_scenario()
-        for send in self._senders:
-            send()
-        if self.is_paced and not self._has_all_answers:
-            self._mark(MarkKind.END)
-        self._granted = self._sent
-        if self.on_truth is not None:
-            body.truth(self._truth)
-            self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
-        if not self._is_wall:
-            self._has_moved = True
-            body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode))
+            self._injector.start(now_ns)
+            self._body.start_scenario()
+        for place, send in self._senders:
+            if heard[place]:
+                send()
 
     def _count_periods(self, counter: int) -> int:
         """Unwrap the SYNC counter; return the periods since the SYNC before, 0 for a repeated one.
@@ -298,12 +390,12 @@ class Bench:
 
     def _listen(self) -> None:
         """Take over which PDOs the devices exchange."""
-        self._senders = tuple(send for device in self.devices for send in device.pdos.on_sync)
+        self._senders = tuple((i, send) for i, device in enumerate(self.devices) for send in device.pdos.on_sync)
         self._has_all_answers = self._answers == frozenset().union(*(device.pdos.answers for device in self.devices))
-        commands: dict[int, tuple[Handler, ...]] = {}
-        for device in self.devices:
+        commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
+        for place, device in enumerate(self.devices):
             for can_id, take in device.pdos.handlers():
-                commands[can_id] = (*commands.get(can_id, ()), take)
+                commands[can_id] = (*commands.get(can_id, ()), (place, take))
         self._commands = commands
 
     def _poll(self, t_ns: int) -> None:
@@ -311,6 +403,8 @@ class Bench:
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
         self._due_ns = min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
+        if self._injector.has_faults:
+            self._due_ns = min(self._due_ns, self._injector.due_ns, self._outbox.due_ns)
 
     def _motor(self, joint: int) -> Motor:
         return Motor(
