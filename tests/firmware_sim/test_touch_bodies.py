@@ -8,7 +8,16 @@ from touched_arm import TouchedArm
 
 from firmware_sim.body_regions import BODY_REGIONS
 from firmware_sim.contact import TICK_S, ContactSettings, contact_torque
-from firmware_sim.touch import ENERGY, SHIFT, SHIFT_RATE, initial_touch_state, largest_rate_rad_s, touch, touch_table
+from firmware_sim.touch import (
+    ENERGY,
+    SHIFT,
+    SHIFT_RATE,
+    initial_touch_state,
+    largest_rate_rad_s,
+    touch,
+    touch_substeps,
+    touch_table,
+)
 from firmware_sim.touch_settings import BodySettings, HandSettings, WallSettings
 
 POSE = (0.3, 0.7)
@@ -370,6 +379,15 @@ def test_things_that_are_never_there_together_do_not_add_up():
     alone = largest_rate_rad_s(TouchedArm(bodies=(one,)).things)
     assert largest_rate_rad_s(TouchedArm(bodies=(one, later)).things) == pytest.approx(alone)
     assert largest_rate_rad_s(TouchedArm(bodies=(one, also)).things) == pytest.approx(math.sqrt(2.0) * alone)
+
+
+@pytest.mark.parametrize(("stiffness_N_m", "substeps"), [(150_000.0, 1), (400_000.0, 2), (1e6, 3)])
+def test_a_stiffer_body_is_stepped_more_finely(stiffness_N_m, substeps):
+    body = BodySettings(at_s=1.0, link=2, x_m=9.0, y_m=9.0, mass_kg=4.4, stiffness_N_m=stiffness_N_m)
+    things = TouchedArm(bodies=(body,)).things
+    assert touch_substeps(things) == substeps
+    assert largest_rate_rad_s(things) * TICK_S / substeps <= 0.1
+    assert touch_substeps(things[:0]) == 1
 
 
 # ISO/TS 15066:2016: m_H kg and K N/mm of table A.3; F N and the lowest p N/cm² of table A.2, quasi-static.
