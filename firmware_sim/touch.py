@@ -268,7 +268,10 @@ def _meet(thing: Vector, own: Vector, pose: Pose) -> tuple[float, float, float, 
 
 @compiled
 def _recede_rate(thing: Vector, own: Vector) -> float:
-    """Give the velocity of a body along its free direction, m/s: none into the wall behind it."""
+    """Give the velocity of a body along its free direction, m/s: none into the wall behind it.
+
+    What its speed ṡ gathers against the wall within a tick is taken away between ticks.
+    """
     if own[SHIFT] >= thing[ROOM_M] and own[SHIFT_RATE] > 0.0:
         return 0.0
     return float(own[SHIFT_RATE])
@@ -351,9 +354,8 @@ def touch(
         if thing[KIND] == BODY:
             force_x, force_y, point_m, _ = _body_force(thing, own, pose, dq1, dq2)
             gain1, gain2 = _joint_torque(thing[LINK], point_m, force_x, force_y, length1_m, pose)
-            push = -(force_x * own[FREE_X] + force_y * own[FREE_Y]) / thing[MASS]
             rates_out[place + SHIFT] = _recede_rate(thing, own)
-            rates_out[place + SHIFT_RATE] = min(push, 0.0) if own[SHIFT] >= thing[ROOM_M] else push
+            rates_out[place + SHIFT_RATE] = -(force_x * own[FREE_X] + force_y * own[FREE_Y]) / thing[MASS]
         elif thing[KIND] == HAND:
             force_x, force_y = _hand_force(thing, own, time_s, pose, dq1, dq2)
             gain1, gain2 = _joint_torque(thing[LINK], thing[POINT_M], force_x, force_y, length1_m, pose)

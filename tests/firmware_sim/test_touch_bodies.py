@@ -10,8 +10,10 @@ from firmware_sim.body_regions import BODY_REGIONS
 from firmware_sim.contact import TICK_S, ContactSettings, contact_torque
 from firmware_sim.touch import (
     ENERGY,
+    PRESENCE,
     SHIFT,
     SHIFT_RATE,
+    SIDE,
     initial_touch_state,
     largest_rate_rad_s,
     touch,
@@ -167,9 +169,9 @@ def test_a_body_pushes_the_arm_off_and_never_pulls_it(side, damping_N_s_m):
     body = beside(1, 0.25, side, **SOFT, damping_N_s_m=damping_N_s_m)
     arm = strike(body, 0.25, side, speed_m_s=0.5, motor=(side * 0.5, 0.0), substeps=2)
     seen = arm.play(0.3)
-    assert side * seen["tau1"].max() <= 0.0 if side > 0 else seen["tau1"].min() >= 0.0
-    assert abs(seen["tau1"]).max() > 1.0
-    assert side * arm.own(0, SHIFT)[-1] * side > 0.0
+    assert (side * seen["tau1"]).max() <= 0.0
+    assert (side * seen["tau1"]).min() < -1.0
+    assert arm.own(0, SHIFT)[-1] > 0.0
 
 
 @pytest.mark.parametrize("link", [1, 2])
@@ -212,14 +214,14 @@ def test_a_clamped_body_is_pressed_with_the_force_that_the_motor_gives(region):
 
 def test_a_body_with_a_wall_behind_it_is_pushed_up_to_the_wall_and_clamped_there():
     body = beside(1, 0.25, region="hand_finger", gap_m=0.02)
-    arm = TouchedArm(q=POSE, motor=(5.0, 0.0), damping=0.6, bodies=(body,))
+    arm = TouchedArm(q=POSE, motor=(5.0, 0.0), damping=0.6, substeps=8, bodies=(body,))
     seen = arm.play(3.0)
     shift_m = arm.own(0, SHIFT)
     fastest_m_s = arm.own(0, SHIFT_RATE).max()
     assert fastest_m_s > 0.1
-    assert 0.02 <= shift_m.max() <= 0.02 + fastest_m_s * TICK_S
-    assert shift_m[-1] == pytest.approx(0.02, abs=fastest_m_s * TICK_S)
-    assert arm.own(0, SHIFT_RATE)[-1] == 0.0
+    # No further than one integration step beyond the wall, and no creeping into it.
+    assert 0.02 <= shift_m.max() <= 0.02 + fastest_m_s * TICK_S / 8
+    assert shift_m[-1] == shift_m.max()
     assert seen["force"][-1] == pytest.approx(5.0 / math.hypot(0.25, 0.02), rel=1e-3)
 
 
@@ -249,8 +251,8 @@ def test_a_body_in_the_arms_place_waits_until_the_arm_has_gone():
     seen = arm.play(0.3)
     assert seen["force"].max() == 0.0
     assert (seen["index"] == -1.0).all()
-    assert arm.own(0, 0)[150] == 0.0
-    assert arm.own(0, 0)[-1] == 1.0
+    assert arm.own(0, PRESENCE)[150] == 0.0
+    assert arm.own(0, PRESENCE)[-1] == 1.0
 
 
 def test_a_body_that_leaves_takes_its_force_with_it():
@@ -289,11 +291,11 @@ def test_a_link_that_came_round_the_body_touches_it_from_its_new_side():
     body = BodySettings(at_s=0.0, link=2, x_m=0.66, y_m=0.05, region="chest", radius_m=0.005)
     arm = TouchedArm(q=(0.0, 0.0), bodies=(body,))
     arm.play(TICK_S)
-    side_before = arm.own(0, 5)[-1]
+    side_before = arm.own(0, SIDE)[-1]
     arm.y[:2] = (0.2, 0.0)
     arm.play(TICK_S)
     arm.play(TICK_S)
-    assert (side_before, arm.own(0, 5)[-1]) == (1.0, -1.0)
+    assert (side_before, arm.own(0, SIDE)[-1]) == (1.0, -1.0)
 
 
 def test_a_deep_push_does_not_throw_the_body_through_the_link():

@@ -14,6 +14,7 @@ from firmware_sim.plant import DQ, MECHANICAL_STATE, Q, fit_payload, integrate, 
 from firmware_sim.scenario import load_scenario
 from firmware_sim.touch import (
     ENERGY,
+    PRESENCE,
     TOUCH_TRUTH,
     add_prescribed_work,
     change_touch,
@@ -114,6 +115,10 @@ def test_a_wall_holds_the_end_of_a_link_against_the_motor(end):
     seen = arm.play(2.0)
     force_N = 1.5 / 0.30 if end == 2 else 4.0 / 0.35
     assert seen["force"][-1] == pytest.approx(force_N, rel=5e-3)
+    normal = np.array([math.cos(math.radians(wall.normal_deg)), math.sin(math.radians(wall.normal_deg))])
+    q1, q2 = arm.y[:2]
+    reached = arm.tip(q1, q2) if end == 2 else 0.35 * np.array([math.cos(q1), math.sin(q1)])
+    assert normal @ (np.array([wall.x_m, wall.y_m]) - reached) == pytest.approx(force_N / 2e4, rel=5e-3)
     assert set(seen["link"][10:]) <= {0.0, float(end)}
     assert seen["link"][-1] == end
     assert np.hypot(arm.y[0] - q[0], arm.y[1] - q[1]) < 0.02
@@ -165,8 +170,8 @@ def test_a_wall_in_the_arms_place_waits_until_the_arm_has_gone():
     arm = TouchedArm(q=(0.3, 0.2), dq=(-1.0, 0.0), walls=(wall,))
     seen = arm.play(0.6)
     assert seen["force"].max() == 0.0
-    assert arm.own(0, 0)[600] == 0.0
-    assert arm.own(0, 0)[-1] == 1.0
+    assert arm.own(0, PRESENCE)[600] == 0.0
+    assert arm.own(0, PRESENCE)[-1] == 1.0
 
 
 def test_the_largest_rate_of_wall_and_hand_is_that_of_their_points():

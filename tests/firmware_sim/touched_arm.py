@@ -10,6 +10,7 @@ from firmware_sim.contact import TICK_S
 from firmware_sim.plant import COULOMB, DQ, MECHANICAL_STATE, VISCOUS, Q, accelerate, fit_payload, mass_matrix
 from firmware_sim.scenario import Scenario
 from firmware_sim.touch import (
+    THING_STATE,
     TOUCH_HEADER,
     TOUCH_TRUTH,
     change_touch,
@@ -89,7 +90,7 @@ class TouchedArm:
 
     def own(self, thing: int, place: int) -> np.ndarray:
         """History of one place of one thing's state."""
-        return self.states[:, TOUCH_HEADER + thing * 6 + place]
+        return self.states[:, TOUCH_HEADER + thing * THING_STATE + place]
 
     def kinetic_J(self, history: dict[str, np.ndarray]) -> np.ndarray:
         """Kinetic energy of the arm over time."""
