@@ -91,6 +91,21 @@ def test_what_a_hand_gives_the_arm_is_its_motion():
     assert seen["energy"].min() < -1e-3
 
 
+def test_changes_that_are_asked_for_twice_at_an_instant_are_done_once():
+    body = BodySettings(at_s=0.05, link=2, x_m=0.5, y_m=0.45, region="hand_finger", gap_m=0.01)
+    wall = WallSettings(x_m=0.0, y_m=0.5, normal_deg=-90.0, at_s=0.02)
+    arm = TouchedArm(q=POSE, dq=(1.0, 1.5), hands=(hand(duration_s=0.05),), bodies=(body,), walls=(wall,))
+    states = set()
+    for _ in range(250):
+        arm.play(TICK_S * 8)
+        change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
+        once = arm.y.copy()
+        change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
+        assert arm.y.tobytes() == once.tobytes()
+        states.add(tuple(arm.own(thing, PRESENCE)[-1] for thing in range(3)))
+    assert len(states) >= 4
+
+
 def wall_before(end: int, q, direction_deg: float, away_m: float = 1e-9, **changes) -> WallSettings:
     """Put a wall in front of a link's end, seen along a direction."""
     rig = TouchedArm(q=q)
