@@ -15,6 +15,9 @@ from firmware_sim.scenario import load_scenario
 from firmware_sim.touch import (
     ENERGY,
     PRESENCE,
+    SHIFT,
+    SHIFT_RATE,
+    TOUCH_HEADER,
     TOUCH_TRUTH,
     add_prescribed_work,
     change_touch,
@@ -32,7 +35,6 @@ def hand(**changes) -> HandSettings:
     return HandSettings(**values)
 
 
-@pytest.mark.slow
 def test_a_hand_guides_the_tip_along_a_line_and_stops_at_its_end():
     start = TouchedArm(q=POSE).tip(*POSE)
     end = start + np.array([-0.12, 0.05])
@@ -92,18 +94,22 @@ def test_what_a_hand_gives_the_arm_is_its_motion():
 
 
 def test_changes_that_are_asked_for_twice_at_an_instant_are_done_once():
-    body = BodySettings(at_s=0.05, link=2, x_m=0.5, y_m=0.45, region="hand_finger", gap_m=0.01)
+    body = BodySettings(at_s=0.05, link=1, x_m=0.224, y_m=0.122, region="hand_finger", gap_m=0.005)
     wall = WallSettings(x_m=0.0, y_m=0.5, normal_deg=-90.0, at_s=0.02)
-    arm = TouchedArm(q=POSE, dq=(1.0, 1.5), hands=(hand(duration_s=0.05),), bodies=(body,), walls=(wall,))
-    states = set()
-    for _ in range(250):
+    arm = TouchedArm(
+        q=POSE, dq=(1.0, 1.5), motor=(3.0, 0.0), hands=(hand(duration_s=0.05),), bodies=(body,), walls=(wall,)
+    )
+    presences, pressed = set(), 0
+    for _ in range(400):
         arm.play(TICK_S * 8)
+        pressed += arm.own(0, SHIFT)[-1] >= 0.005 and arm.y[4 + TOUCH_HEADER + SHIFT_RATE] > 0.0
         change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
         once = arm.y.copy()
         change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
         assert arm.y.tobytes() == once.tobytes()
-        states.add(tuple(arm.own(thing, PRESENCE)[-1] for thing in range(3)))
-    assert len(states) >= 4
+        presences.add(tuple(arm.own(thing, PRESENCE)[-1] for thing in range(3)))
+    assert len(presences) >= 4
+    assert pressed > 10
 
 
 def wall_before(end: int, q, direction_deg: float, away_m: float = 1e-9, **changes) -> WallSettings:
@@ -191,7 +197,7 @@ def test_a_wall_in_the_arms_place_waits_until_the_arm_has_gone():
 
 def test_the_largest_rate_of_wall_and_hand_is_that_of_their_points():
     rig = TouchedArm()
-    bends = np.linspace(0.0, math.pi, 400)
+    bends = np.linspace(0.0, math.pi, 101)
     turns = np.linspace(0.0, math.pi, 181)
     tip = max(rig.mobility(2, 0.3, (0.0, bend), (math.cos(a), math.sin(a))) for bend in bends for a in turns[::4])
     elbow = max(rig.mobility(1, 0.35, (0.0, bend), (0.0, 1.0)) for bend in bends)
