@@ -5,6 +5,7 @@ package are in the folder `scenarios`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -16,6 +17,7 @@ from adacd_hil.records import Vector
 from firmware_sim.arms import ARMS, Arm
 from firmware_sim.contact import ContactSettings, ticks
 from firmware_sim.faults import FaultSettings, check_rows
+from firmware_sim.touch_settings import BodySettings, HandSettings, WallSettings
 
 
 @dataclass(frozen=True)
@@ -49,15 +51,15 @@ class Scenario:
     payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
     contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
     faults: tuple[FaultSettings, ...] = setting((), meaning="what goes wrong, each row by its own time")
+    bodies: tuple[BodySettings, ...] = setting((), meaning="bodies in the arm's way")
+    hands: tuple[HandSettings, ...] = setting((), meaning="hands that grasp and guide")
+    walls: tuple[WallSettings, ...] = setting((), meaning="walls")
 
     def __post_init__(self) -> None:
-        for index, contact in enumerate(self.contacts):
-            length_m = self.arm.link_length_m[contact.link - 1]
-            if contact.point_m > length_m:
-                raise ConfigError(
-                    f"`contacts[{index}].point_m` = {contact.point_m} m is beyond the end of link {contact.link} "
-                    f"at {length_m} m"
-                )
+        self._check_points("contacts", self.contacts)
+        self._check_points("hands", self.hands)
+        self._check_room("bodies", self.bodies)
+        self._check_room("walls", self.walls)
         for index, (first, second) in enumerate(zip(self.contacts, self.contacts[1:], strict=False), start=1):
             if second.onset_tick < first.end_tick:
                 raise ConfigError(
@@ -70,6 +72,24 @@ class Scenario:
                     f"`payloads[{index}].at_s` = {after.at_s} s is not after the change before it at {before.at_s} s"
                 )
         check_rows(self.faults)
+
+    def _check_points(self, key: str, touches: Sequence[ContactSettings | HandSettings]) -> None:
+        for index, one in enumerate(touches):
+            length_m = self.arm.link_length_m[one.link - 1]
+            if one.point_m > length_m:
+                raise ConfigError(
+                    f"`{key}[{index}].point_m` = {one.point_m} m is beyond the end of link {one.link} at {length_m} m"
+                )
+
+    def _check_room(self, key: str, things: Sequence[BodySettings | WallSettings]) -> None:
+        pose_rad = math.radians(self.start_deg[0]), math.radians(self.start_deg[1])
+        for index, thing in enumerate(things):
+            overlap_m = thing.overlap_m(self.arm.link_length_m, pose_rad)
+            if thing.onset_tick == 0 and overlap_m > 0.0:
+                raise ConfigError(
+                    f"`{key}[{index}]`: at at_s = 0 s the arm in its start pose {self.start_deg} deg "
+                    f"is {overlap_m:.4g} m inside it"
+                )
 
     @property
     def arm(self) -> Arm:

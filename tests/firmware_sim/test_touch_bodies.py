@@ -1,0 +1,429 @@
+"""Bodies in the arm's way: blows against closed forms, balances of energy and momentum, clamping, coming and going."""
+
+import math
+
+import numpy as np
+import pytest
+from touched_arm import TouchedArm
+
+from firmware_sim.body_regions import BODY_REGIONS
+from firmware_sim.contact import TICK_S, ContactSettings, contact_torque
+from firmware_sim.touch import (
+    ENERGY,
+    PRESENCE,
+    SHIFT,
+    SHIFT_RATE,
+    SIDE,
+    initial_touch_state,
+    largest_rate_rad_s,
+    touch,
+    touch_substeps,
+    touch_table,
+)
+from firmware_sim.touch_settings import BodySettings, HandSettings, WallSettings
+
+POSE = (0.3, 0.7)
+SOFT = {"mass_kg": 1.5, "stiffness_N_m": 2000.0}
+
+
+def normal_of(link: int, q) -> np.ndarray:
+    """Normal of a link on the side of +q."""
+    angle = q[0] if link == 1 else q[0] + q[1]
+    return np.array([-math.sin(angle), math.cos(angle)])
+
+
+def point_of(link: int, point_m: float, q) -> np.ndarray:
+    reach_m = point_m if link == 1 else 0.35
+    elbow = reach_m * np.array([math.cos(q[0]), math.sin(q[0])])
+    if link == 1:
+        return elbow
+    return elbow + point_m * np.array([math.cos(q[0] + q[1]), math.sin(q[0] + q[1])])
+
+
+def beside(
+    link: int = 2, point_m: float = 0.2, side: int = 1, away_m: float = 1e-9, q=POSE, **settings
+) -> BodySettings:
+    """Put a body beside a point of a link, its surface `away_m` off."""
+    reach_m = away_m + settings.get("radius_m", 0.0)
+    center = point_of(link, point_m, q) + side * reach_m * normal_of(link, q)
+    values = {"at_s": 0.0, "link": link, "x_m": float(center[0]), "y_m": float(center[1])} | settings
+    return BodySettings(**values)
+
+
+def toward(link: int, point_m: float, velocity_m_s, q=POSE) -> np.ndarray:
+    """Joint velocities that give a link's point this velocity, the other link still if link 1 is meant."""
+    jacobian = TouchedArm(q=q).jacobian(link, point_m, q)
+    if link == 1:
+        return np.array([float(np.linalg.lstsq(jacobian[:, :1], velocity_m_s, rcond=None)[0][0]), 0.0])
+    return np.linalg.solve(jacobian, velocity_m_s)
+
+
+def strike(body: BodySettings, point_m: float, side: int = 1, speed_m_s: float = 0.01, **arm) -> TouchedArm:
+    dq = toward(body.link, point_m, side * speed_m_s * normal_of(body.link, POSE))
+    return TouchedArm(q=POSE, dq=dq, bodies=(body,), **arm)
+
+
+def reduced_mass(arm: TouchedArm, body: BodySettings, point_m: float) -> float:
+    return 1.0 / (1.0 / body.mass + arm.mobility(body.link, point_m, POSE, normal_of(body.link, POSE)))
+
+
+# Blows of 10 mm/s move the arm so little that its effective mass is constant; the model is linear in the speed.
+BLOWS = [
+    ("P", 2, 0.2, 1, {"region": "skull_forehead"}),
+    ("P", 2, 0.3, -1, {"region": "hand_finger", "radius_m": 0.03}),
+    ("P", 1, 0.25, 1, {"region": "chest"}),
+    ("S", 2, 0.15, -1, {"region": "lower_leg", "radius_m": 0.05}),
+    ("M", 1, 0.30, -1, {"mass_kg": 0.3, "stiffness_N_m": 5e4}),
+]
+
+
+@pytest.mark.parametrize(("profile", "link", "point_m", "side", "kind"), BLOWS)
+def test_an_elastic_blow_has_the_force_time_and_speeds_of_two_masses(profile, link, point_m, side, kind):
+    body = beside(link, point_m, side, **kind)
+    arm = strike(body, point_m, side, profile=profile, substeps=2)
+    mass_kg = reduced_mass(arm, body, point_m)
+    rate_rad_s = math.sqrt(body.stiffness / mass_kg)
+    seen = arm.play(2.0 * math.pi / rate_rad_s)
+    touched = seen["force"] > 0.0
+    assert seen["force"].max() == pytest.approx(0.01 * math.sqrt(body.stiffness * mass_kg), rel=2e-3)
+    assert np.count_nonzero(touched) * TICK_S == pytest.approx(math.pi / rate_rad_s, abs=1.5 * TICK_S)
+    assert arm.own(0, SHIFT_RATE)[-1] == pytest.approx(0.01 * 2.0 * mass_kg / body.mass, rel=1e-3)
+    q, dq = arm.y[:2], arm.y[2:4]
+    after_m_s = side * normal_of(link, POSE) @ arm.jacobian(link, point_m, q) @ dq
+    mobility = mass_kg * arm.mobility(link, point_m, POSE, normal_of(link, POSE))
+    assert after_m_s == pytest.approx(0.01 * (1.0 - 2.0 * mobility), rel=5e-3)
+    assert set(seen["link"][touched]) == {link}
+
+
+@pytest.mark.parametrize("damping_ratio", [0.05, 0.2, 0.5])
+def test_a_damped_blow_has_the_restitution_of_spring_and_damper_that_part_without_pull(damping_ratio):
+    """δ = (v/ω_d) e^(−ζωt) sin ω_d t; they part where K δ + c δ̇ = 0."""
+    bare = beside(**SOFT)
+    mass_kg = reduced_mass(TouchedArm(q=POSE), bare, 0.2)
+    rate = math.sqrt(2000.0 / mass_kg)
+    body = beside(**SOFT, damping_N_s_m=2.0 * damping_ratio * mass_kg * rate)
+    arm = strike(body, 0.2, substeps=4, speed_m_s=0.001)
+    arm.play(1.2 * math.pi / rate)
+    damped = math.sqrt(1.0 - damping_ratio**2)
+    parting = math.pi - math.atan2(2.0 * damping_ratio * damped, 1.0 - 2.0 * damping_ratio**2)
+    restitution = math.exp(-damping_ratio / damped * parting)
+    assert arm.own(0, SHIFT_RATE)[-1] == pytest.approx(0.001 * (1.0 + restitution) * mass_kg / 1.5, rel=2e-3)
+
+
+def depth_of(body: BodySettings, arm: TouchedArm, seen) -> np.ndarray:
+    """Penetration over time, by the foot of the perpendicular."""
+    free = normal_of(body.link, POSE)
+    depths = []
+    for q1, q2, shift in zip(seen["q1"], seen["q2"], arm.own(0, SHIFT), strict=True):
+        center = np.array([body.x_m, body.y_m]) + shift * free
+        off = center - point_of(2, 0.0, (q1, q2))
+        depths.append(body.radius_m - off @ normal_of(2, (q1, q2)))
+    return np.maximum(np.array(depths), 0.0)
+
+
+@pytest.mark.parametrize("damping_N_s_m", [0.0, 12.0, 60.0])
+def test_what_the_arm_gives_is_the_bodys_motion_its_spring_and_its_heat(damping_N_s_m):
+    body = beside(**SOFT, damping_N_s_m=damping_N_s_m, radius_m=0.05)
+    # The damper's force jumps at the first touch: a step that holds it is wrong by up to its own share of the impulse.
+    arm = strike(body, 0.2, speed_m_s=0.6, substeps=16)
+    seen = arm.play(0.12)
+    touched = depth_of(body, arm, seen) > 0.0
+    depth_m, force_N = depth_of(body, arm, seen), seen["force"]
+    spring_J = 0.5 * 2000.0 * depth_m**2
+    # The interval of the first touch has the force of its end.
+    mean_N = np.where(touched[:-1], 0.5 * (force_N[1:] + force_N[:-1]), force_N[1:])
+    heat_J = np.cumsum((mean_N - 1000.0 * (depth_m[1:] + depth_m[:-1])) * np.diff(depth_m))
+    heat_J = np.concatenate([[0.0], heat_J])
+    motion_J = 0.5 * 1.5 * arm.own(0, SHIFT_RATE) ** 2
+    assert 100 < np.count_nonzero(touched) < len(touched)
+    assert np.diff(heat_J).min() > -1e-9
+    assert (motion_J + spring_J + heat_J)[touched] == pytest.approx(seen["energy"][touched], abs=2e-3 * motion_J.max())
+    lost_J = arm.kinetic_J(seen)[0] - arm.kinetic_J(seen)
+    assert lost_J[touched] == pytest.approx(seen["energy"][touched], abs=2e-4 * motion_J.max())
+
+
+def test_the_impulse_on_the_joints_is_the_bodys_momentum():
+    body = beside(**SOFT, damping_N_s_m=5.0)
+    arm = strike(body, 0.2, speed_m_s=0.005, substeps=2)
+    seen = arm.play(0.12)
+    torque = np.array([seen["tau1"], seen["tau2"]])
+    impulse_Nm_s = torque.sum(axis=1) * TICK_S
+    momentum = 1.5 * arm.own(0, SHIFT_RATE)[-1] * normal_of(2, POSE)
+    assert impulse_Nm_s == pytest.approx(-arm.jacobian(2, 0.2, POSE).T @ momentum, rel=5e-3)
+
+
+def test_power_integrates_to_the_energy():
+    arm = strike(beside(**SOFT, damping_N_s_m=20.0), 0.2, speed_m_s=0.5)
+    seen = arm.play(0.1)
+    touched = seen["index"] >= 0.0
+    power_W = seen["power"][touched]
+    integral_J = np.concatenate([[0.0], np.cumsum(0.5 * (power_W[1:] + power_W[:-1]) * TICK_S)])
+    start_J = seen["energy"][touched][0]
+    assert integral_J[-1] > 0.01
+    assert start_J + integral_J == pytest.approx(seen["energy"][touched], abs=1e-5)
+
+
+@pytest.mark.parametrize("damping_N_s_m", [0.0, 30.0, 3000.0])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_body_pushes_the_arm_off_and_never_pulls_it(side, damping_N_s_m):
+    body = beside(1, 0.25, side, **SOFT, damping_N_s_m=damping_N_s_m)
+    arm = strike(body, 0.25, side, speed_m_s=0.5, motor=(side * 0.5, 0.0), substeps=2)
+    seen = arm.play(0.3)
+    assert (side * seen["tau1"]).max() <= 0.0
+    assert (side * seen["tau1"]).min() < -1.0
+    assert arm.own(0, SHIFT)[-1] > 0.0
+
+
+@pytest.mark.parametrize("link", [1, 2])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_bodys_torque_is_that_of_a_prescribed_force_of_its_size(link, side):
+    generator = np.random.default_rng(5)
+    for _ in range(30):
+        q = generator.uniform(-2.5, 2.5, 2)
+        point_m, depth_m = generator.uniform(0.02, 0.28), generator.uniform(0.0005, 0.01)
+        body = beside(link, point_m, side, 1e-6, q, region="chest", radius_m=0.02)
+        arm = TouchedArm(q=q, bodies=(body,))
+        arm.play(TICK_S)
+        # The link turns into the body until its surface is `depth_m` in.
+        turn = 2.0 * side * depth_m / point_m
+        bent = (q[0] + turn, q[1]) if link == 1 else (q[0], q[1] + turn)
+        found = touch(arm.things, 0.0, *bent, 0.0, 0.0, arm.y[4:], np.zeros(arm.y.size - 4))
+        off = np.array([body.x_m, body.y_m]) - point_of(link, 0.0, bent)
+        along = np.array([normal_of(link, bent)[1], -normal_of(link, bent)[0]])
+        deep_m = 0.02 - side * off @ normal_of(link, bent)
+        row = np.array(
+            ContactSettings(
+                at_s=0.0, link=link, point_m=float(off @ along), force_N=10.0, duration_s=1.0, angle_deg=-90.0 * side
+            ).row()
+        )
+        assert deep_m > 0.0
+        assert found == pytest.approx(contact_torque(row, 25_000.0 * deep_m, 0.35, *bent), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("region", ["hand_finger", "chest", "skull_forehead"])
+def test_a_clamped_body_is_pressed_with_the_force_that_the_motor_gives(region):
+    body = beside(1, 0.25, region=region, clamped=True)
+    arm = TouchedArm(q=POSE, motor=(8.0, 0.0), damping=0.6, bodies=(body,))
+    seen = arm.play(3.0)
+    assert seen["force"][-1] == pytest.approx(8.0 / 0.25, rel=1e-3)
+    deep_m = float((point_of(1, 0.25, arm.y[:2]) - np.array([body.x_m, body.y_m])) @ normal_of(1, arm.y[:2]))
+    assert deep_m == pytest.approx(32.0 / body.stiffness, rel=5e-3)
+    assert abs(arm.own(0, SHIFT)).max() == 0.0
+    assert seen["energy"][-1] == pytest.approx(0.5 * 32.0**2 / body.stiffness, rel=5e-3)
+
+
+def test_a_body_with_a_wall_behind_it_is_pushed_up_to_the_wall_and_clamped_there():
+    body = beside(1, 0.25, region="hand_finger", gap_m=0.02)
+    arm = TouchedArm(q=POSE, motor=(5.0, 0.0), damping=0.6, substeps=8, bodies=(body,))
+    seen = arm.play(3.0)
+    shift_m = arm.own(0, SHIFT)
+    fastest_m_s = arm.own(0, SHIFT_RATE).max()
+    assert fastest_m_s > 0.1
+    # No further than one integration step beyond the wall, and no creeping into it.
+    assert 0.02 <= shift_m.max() <= 0.02 + fastest_m_s * TICK_S / 8
+    assert shift_m[-1] == shift_m.max()
+    assert seen["force"][-1] == pytest.approx(5.0 / math.hypot(0.25, 0.02), rel=1e-3)
+
+
+def test_a_free_body_flies_on_where_a_body_with_a_wall_stops():
+    ends_m = []
+    for gap_m in (None, 0.02):
+        arm = strike(beside(1, 0.25, region="hand_finger", gap_m=gap_m), 0.25, speed_m_s=0.4, damping=0.6)
+        arm.play(0.5)
+        ends_m.append(arm.own(0, SHIFT)[-1])
+    assert ends_m[0] > 0.1
+    assert ends_m[1] == pytest.approx(0.02, abs=1e-4)
+
+
+def test_a_body_moves_only_in_its_free_direction():
+    """60° beside the normal a blow pushes the body with a cosine of ½: its mass seems 4 times as large."""
+    angle_deg = math.degrees(sum(POSE)) + 90.0 + 60.0
+    body = beside(2, 0.2, mass_kg=0.5, stiffness_N_m=1e5, free_deg=angle_deg)
+    arm = strike(body, 0.2, substeps=2)
+    arm.play(0.03)
+    mass_kg = 1.0 / (0.25 / 0.5 + arm.mobility(2, 0.2, POSE, normal_of(2, POSE)))
+    assert arm.own(0, SHIFT_RATE)[-1] == pytest.approx(0.5 * 2.0 * 0.01 * mass_kg / 0.5, rel=2e-3)
+
+
+def test_a_body_in_the_arms_place_waits_until_the_arm_has_gone():
+    body = beside(2, 0.2, 1, -0.02, region="chest", at_s=0.01, radius_m=0.05)
+    arm = strike(body, 0.2, -1, speed_m_s=0.5)
+    seen = arm.play(0.3)
+    assert seen["force"].max() == 0.0
+    assert (seen["index"] == -1.0).all()
+    assert arm.own(0, PRESENCE)[150] == 0.0
+    assert arm.own(0, PRESENCE)[-1] == 1.0
+
+
+def test_a_body_that_leaves_takes_its_force_with_it():
+    body = beside(1, 0.25, region="chest", clamped=True, duration_s=0.5)
+    arm = TouchedArm(q=POSE, motor=(5.0, 0.0), damping=0.6, bodies=(body,))
+    seen = arm.play(0.6)
+    assert seen["force"][4999] > 10.0
+    assert abs(seen["force"][5000:]).max() == 0.0
+    assert abs(seen["energy"][5000:]).max() == 0.0
+    assert (seen["index"][5000:] == -1.0).all()
+
+
+def test_nothing_touches_before_the_scenario_begins():
+    body = beside(1, 0.25, region="chest")
+    arm = strike(body, 0.25, speed_m_s=0.5)
+    arm.time_s = -0.1
+    seen = arm.play(0.1)
+    assert seen["force"].max() == 0.0
+
+
+def test_the_energy_of_a_second_touch_counts_from_its_own_beginning():
+    first = beside(1, 0.25, 1, 0.01, region="chest", duration_s=0.2)
+    second = beside(1, 0.25, -1, 0.01, region="chest", at_s=0.0)
+    arm = strike(first, 0.25, speed_m_s=0.3, damping=0.02)
+    arm = TouchedArm(q=POSE, dq=arm.y[2:4], damping=0.02, bodies=(first, second))
+    seen = arm.play(0.6)
+    one, two = seen["index"] == 0.0, seen["index"] == 1.0
+    assert (np.count_nonzero(one) > 20, np.count_nonzero(two) > 20) == (True, True)
+    between = (np.arange(one.size) > np.flatnonzero(one)[-1]) & (np.arange(one.size) < np.flatnonzero(two)[0])
+    assert abs(seen["energy"][between]).max() == 0.0
+    assert abs(seen["energy"][two][0]) < 0.1 * seen["energy"][two].max()
+
+
+def test_a_link_that_came_round_the_body_touches_it_from_its_new_side():
+    """Link 2 is drawn back past a body beyond its tip; what counts is where the body is when it is alongside again."""
+    body = BodySettings(at_s=0.0, link=2, x_m=0.66, y_m=0.05, region="chest", radius_m=0.005)
+    arm = TouchedArm(q=(0.0, 0.0), bodies=(body,))
+    arm.play(TICK_S)
+    side_before = arm.own(0, SIDE)[-1]
+    arm.y[:2] = (0.2, 0.0)
+    arm.play(TICK_S)
+    arm.play(TICK_S)
+    assert (side_before, arm.own(0, SIDE)[-1]) == (1.0, -1.0)
+
+
+def test_a_deep_push_does_not_throw_the_body_through_the_link():
+    body = beside(1, 0.25, mass_kg=500.0, stiffness_N_m=300.0, radius_m=0.01)
+    arm = strike(body, 0.25, speed_m_s=0.5)
+    seen = arm.play(0.3)
+    assert seen["force"].max() > 2.0 * 300.0 * 0.01
+    assert seen["tau1"].max() <= 0.0
+    assert seen["dq1"][-1] < 0.0
+
+
+def test_the_strongest_of_several_is_reported_with_its_place_in_the_scenario():
+    bodies = (beside(1, 0.2, stiffness_N_m=1000.0, mass_kg=10.0), beside(1, 0.2, stiffness_N_m=3000.0, mass_kg=10.0))
+    contact = ContactSettings(at_s=99.0, link=1, point_m=0.1, force_N=1.0, duration_s=1.0)
+    arm = strike(bodies[0], 0.2, speed_m_s=0.2)
+    arm = TouchedArm(q=POSE, dq=arm.y[2:4], bodies=bodies, contacts=(contact,))
+    seen = arm.play(0.02)
+    assert set(seen["index"][2:]) == {2.0}
+    assert seen["tau1"][100] == pytest.approx(-0.2 * seen["force"][100] * 4.0 / 3.0, rel=1e-3)
+
+
+def test_an_empty_table_touches_nothing_and_writes_nothing():
+    things = touch_table(TouchedArm().scenario)
+    rates = np.full(1, 7.0)
+    assert (things.size, initial_touch_state(things).size, largest_rate_rad_s(things)) == (0, 1, 0.0)
+    assert touch(things, 1.0, 0.1, 0.2, 3.0, 4.0, np.zeros(1), rates) == (0.0, 0.0)
+    assert rates.tolist() == [7.0]
+
+
+def test_touch_changes_no_state():
+    arm = strike(beside(**SOFT), 0.2, speed_m_s=0.5)
+    arm.play(0.02)
+    before = arm.y.copy()
+    rates = np.zeros(arm.y.size - 4)
+    first = touch(arm.things, 0.02, *arm.y[:4], arm.y[4:], rates)
+    second = touch(arm.things, 0.02, *arm.y[:4], arm.y[4:], rates)
+    assert first == second
+    assert arm.y.tolist() == before.tolist()
+    assert rates[ENERGY] == -first[0] * arm.y[2] - first[1] * arm.y[3]
+
+
+def test_the_same_scenario_gives_the_same_bits():
+    things = {
+        "bodies": (beside(**SOFT, damping_N_s_m=3.0), beside(1, 0.3, -1, 0.02, region="face")),
+        "walls": (WallSettings(x_m=0.2, y_m=0.6, normal_deg=-90.0),),
+        "hands": (HandSettings(at_s=0.05, duration_s=0.1, link=2, point_m=0.3, direction_deg=30.0),),
+    }
+    runs = [TouchedArm(q=POSE, dq=(1.0, 2.0), **things).play(0.3) for _ in range(2)]
+    assert runs[0]["force"].max() > 1.0
+    for name, values in runs[0].items():
+        assert values.tobytes() == runs[1][name].tobytes(), name
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+@pytest.mark.parametrize("region", ["skull_forehead", "abdomen"])
+def test_the_largest_rate_bounds_every_pose_and_is_reached_in_one(profile, region):
+    rig = TouchedArm(profile=profile)
+    for link in (1, 2):
+        body = BodySettings(at_s=1.0, link=link, x_m=9.0, y_m=9.0, region=region, damping_N_s_m=1.0)
+        bound = largest_rate_rad_s(touch_table(TouchedArm(profile=profile, bodies=(body,)).scenario))
+        generator = np.random.default_rng(2)
+        rates = []
+        for _ in range(1000):
+            q = generator.uniform(-3.1, 3.1, 2)
+            turn = generator.uniform(-3.1, 3.1)
+            point_m = generator.uniform(0.0, (0.35, 0.30)[link - 1])
+            mobility = rig.mobility(link, point_m, q, (math.cos(turn), math.sin(turn)))
+            rates.append(math.sqrt(body.stiffness * (mobility + 1.0 / body.mass)))
+        assert 0.85 * bound < max(rates) < 1.0001 * bound
+
+
+def test_a_damper_faster_than_its_spring_sets_the_largest_rate():
+    body = BodySettings(at_s=1.0, link=1, x_m=9.0, y_m=9.0, mass_kg=1e3, stiffness_N_m=1.0, damping_N_s_m=500.0)
+    rig = TouchedArm(bodies=(body,))
+    mobility = max(rig.mobility(1, 0.35, (0.0, bend), (0.0, 1.0)) for bend in np.linspace(0.0, 3.1, 200))
+    assert largest_rate_rad_s(rig.things) == pytest.approx(500.0 * mobility, rel=2e-3)
+
+
+def test_things_that_are_never_there_together_do_not_add_up():
+    body = {"link": 1, "x_m": 9.0, "y_m": 9.0, "region": "face"}
+    one = BodySettings(at_s=0.0, duration_s=1.0, **body)
+    later, also = BodySettings(at_s=1.0, **body), BodySettings(at_s=0.5, **body)
+    alone = largest_rate_rad_s(TouchedArm(bodies=(one,)).things)
+    assert largest_rate_rad_s(TouchedArm(bodies=(one, later)).things) == pytest.approx(alone)
+    assert largest_rate_rad_s(TouchedArm(bodies=(one, also)).things) == pytest.approx(math.sqrt(2.0) * alone)
+
+
+@pytest.mark.parametrize(("stiffness_N_m", "substeps"), [(150_000.0, 1), (400_000.0, 2), (1e6, 3)])
+def test_a_stiffer_body_is_stepped_more_finely(stiffness_N_m, substeps):
+    body = BodySettings(at_s=1.0, link=2, x_m=9.0, y_m=9.0, mass_kg=4.4, stiffness_N_m=stiffness_N_m)
+    things = TouchedArm(bodies=(body,)).things
+    assert touch_substeps(things) == substeps
+    assert largest_rate_rad_s(things) * TICK_S / substeps <= 0.1
+    assert touch_substeps(things[:0]) == 1
+
+
+# ISO/TS 15066:2016: m_H kg and K N/mm of table A.3; F N and the lowest p N/cm² of table A.2, quasi-static.
+STANDARD = {
+    "skull_forehead": (4.4, 150, 130, 110),
+    "face": (4.4, 75, 65, 110),
+    "neck": (1.2, 50, 150, 140),
+    "back_shoulder": (40, 35, 210, 160),
+    "chest": (40, 25, 140, 120),
+    "abdomen": (40, 10, 110, 140),
+    "pelvis": (40, 25, 180, 210),
+    "upper_arm_elbow": (3, 30, 150, 190),
+    "lower_arm_wrist": (2, 40, 160, 180),
+    "hand_finger": (0.6, 75, 140, 190),
+    "thigh_knee": (75, 50, 220, 220),
+    "lower_leg": (75, 60, 130, 210),
+}
+
+
+@pytest.mark.parametrize("name", STANDARD)
+def test_a_body_region_has_the_numbers_of_the_standard(name):
+    region = BODY_REGIONS[name]
+    assert (region.mass_kg, region.spring_N_mm, region.force_N, region.pressure_N_cm2) == STANDARD[name]
+    assert region.stiffness_N_m == 1000.0 * STANDARD[name][1]
+
+
+def test_the_standard_has_12_regions_and_29_areas():
+    assert list(BODY_REGIONS) == list(STANDARD)
+    assert sum(len(region.areas) for region in BODY_REGIONS.values()) == 29
+
+
+def test_a_blow_may_be_twice_as_strong_as_clamping_but_not_on_the_head():
+    assert BODY_REGIONS["chest"].transient_force_N == 280.0
+    assert BODY_REGIONS["hand_finger"].transient_pressure_N_cm2 == 380.0
+    without = [name for name, region in BODY_REGIONS.items() if region.transient_force_N is None]
+    assert without == ["skull_forehead", "face"]
+    assert BODY_REGIONS["face"].transient_pressure_N_cm2 is None

@@ -1,0 +1,333 @@
+"""Hands that guide the arm, walls that stop it, what a prescribed force takes, and what a scenario may say of all."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from touched_arm import TouchedArm
+
+from adacd_hil.config import ConfigError
+from firmware_sim.arms import ARMS
+from firmware_sim.contact import TICK_S, ContactSettings, contact_torque
+from firmware_sim.plant import DQ, MECHANICAL_STATE, Q, fit_payload, integrate, mass_matrix
+from firmware_sim.scenario import load_scenario
+from firmware_sim.touch import (
+    ENERGY,
+    PRESENCE,
+    SHIFT,
+    SHIFT_RATE,
+    TOUCH_HEADER,
+    TOUCH_TRUTH,
+    add_prescribed_work,
+    change_touch,
+    describe_touch,
+    largest_rate_rad_s,
+    touch,
+)
+from firmware_sim.touch_settings import BodySettings, HandSettings, WallSettings
+
+POSE = (0.3, 0.7)
+
+
+def hand(**changes) -> HandSettings:
+    values = {"at_s": 0.1, "duration_s": 3.0, "link": 2, "point_m": 0.30} | changes
+    return HandSettings(**values)
+
+
+def test_a_hand_guides_the_tip_along_a_line_and_stops_at_its_end():
+    start = TouchedArm(q=POSE).tip(*POSE)
+    end = start + np.array([-0.12, 0.05])
+    arm = TouchedArm(q=POSE, damping=0.02, hands=(hand(move_to_m=tuple(end.tolist()), speed_m_s=0.1),))
+    seen = arm.play(3.0)
+    tips = arm.tip(seen["q1"], seen["q2"]).T
+    assert tips[:1000] == pytest.approx(np.tile(start, (1000, 1)), abs=1e-12)
+    way = (end - start) / 0.13
+    # Half-way through its 1.3 s the tip follows the point that moves at 0.1 m/s, by what its friction takes to pull.
+    behind = start + way * 0.1 * 0.65 - tips[7500]
+    assert abs(behind @ np.array([-way[1], way[0]])) < 2e-3
+    assert abs(behind @ way) < 5e-3
+    assert tips[-1] == pytest.approx(end, abs=1e-4)
+    assert np.hypot(*(tips[7500] - tips[7000])) == pytest.approx(0.1 * 0.05, rel=0.1)
+
+
+def test_a_hand_lets_go_at_its_time():
+    arm = TouchedArm(q=POSE, hands=(hand(duration_s=0.4, direction_deg=90.0, speed_m_s=0.2),))
+    seen = arm.play(0.8)
+    assert seen["index"].tolist() == [-1.0] * 1000 + [0.0] * 4000 + [-1.0] * 3000
+    assert seen["force"][1000:5000].max() > 1.0
+    assert abs(seen["tau1"][5000:]).max() == 0.0
+    assert seen["energy"][4999] == pytest.approx(-arm.kinetic_J(seen)[5000], rel=1e-3)
+
+
+def test_a_hand_that_holds_takes_spring_force_both_ways_with_spring_and_damper():
+    arm = TouchedArm(q=POSE, dq=(0.4, -0.2), hands=(hand(at_s=0.0, force_limit_N=1000.0),))
+    start = arm.tip(*POSE)
+    seen = arm.play(0.5)
+    for tick in (1, 300, 1500, 4000):
+        q, dq = (seen["q1"][tick], seen["q2"][tick]), np.array([seen["dq1"][tick], seen["dq2"][tick]])
+        jacobian = arm.jacobian(2, 0.3, q)
+        force = 400.0 * (start - arm.tip(*q)) - 40.0 * jacobian @ dq
+        assert seen["force"][tick] == pytest.approx(np.hypot(*force), rel=1e-9)
+        assert (seen["tau1"][tick], seen["tau2"][tick]) == pytest.approx(tuple(jacobian.T @ force), rel=1e-9)
+    assert min(seen["tau1"]) < 0.0 < max(seen["tau1"])
+
+
+def test_a_hand_is_never_stronger_than_its_limit():
+    arm = TouchedArm(q=POSE, motor=(6.0, 2.0), hands=(hand(at_s=0.0, force_limit_N=12.0),))
+    seen = arm.play(0.3)
+    assert seen["force"].max() == pytest.approx(12.0, rel=1e-12)
+    assert seen["force"][-1] == pytest.approx(12.0, rel=1e-12)
+    start = arm.tip(*POSE)
+    q, dq = arm.y[:2], arm.y[2:4]
+    pull = 400.0 * (start - arm.tip(*q)) - 40.0 * arm.jacobian(2, 0.3, q) @ dq
+    change_touch(arm.things, 0.3, *q, arm.y[4:], False)
+    found = touch(arm.things, 0.3, *arm.y[:4], arm.y[4:], np.zeros(arm.y.size - 4))
+    assert found == pytest.approx(tuple(arm.jacobian(2, 0.3, q).T @ (12.0 * pull / np.hypot(*pull))), rel=1e-9)
+
+
+def test_what_a_hand_gives_the_arm_is_its_motion():
+    arm = TouchedArm(q=POSE, hands=(hand(at_s=0.0, direction_deg=200.0, speed_m_s=0.2),))
+    seen = arm.play(0.5)
+    assert seen["energy"] == pytest.approx(-arm.kinetic_J(seen), abs=1e-9)
+    assert seen["energy"].min() < -1e-3
+
+
+def test_changes_that_are_asked_for_twice_at_an_instant_are_done_once():
+    body = BodySettings(at_s=0.05, link=1, x_m=0.224, y_m=0.122, region="hand_finger", gap_m=0.005)
+    wall = WallSettings(x_m=0.0, y_m=0.5, normal_deg=-90.0, at_s=0.02)
+    arm = TouchedArm(
+        q=POSE, dq=(1.0, 1.5), motor=(3.0, 0.0), hands=(hand(duration_s=0.05),), bodies=(body,), walls=(wall,)
+    )
+    presences, pressed = set(), 0
+    for _ in range(400):
+        arm.play(TICK_S * 8)
+        pressed += arm.own(0, SHIFT)[-1] >= 0.005 and arm.y[4 + TOUCH_HEADER + SHIFT_RATE] > 0.0
+        change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
+        once = arm.y.copy()
+        change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
+        assert arm.y.tobytes() == once.tobytes()
+        presences.add(tuple(arm.own(thing, PRESENCE)[-1] for thing in range(3)))
+    assert len(presences) >= 4
+    assert pressed > 10
+
+
+def wall_before(end: int, q, direction_deg: float, away_m: float = 1e-9, **changes) -> WallSettings:
+    """Put a wall in front of a link's end, seen along a direction."""
+    rig = TouchedArm(q=q)
+    place = rig.tip(*q) if end == 2 else 0.35 * np.array([math.cos(q[0]), math.sin(q[0])])
+    angle = math.radians(direction_deg)
+    place = place + away_m * np.array([math.cos(angle), math.sin(angle)])
+    return WallSettings(x_m=float(place[0]), y_m=float(place[1]), normal_deg=direction_deg + 180.0, **changes)
+
+
+@pytest.mark.parametrize("end", [1, 2])
+def test_a_wall_holds_the_end_of_a_link_against_the_motor(end):
+    q = (0.2, 0.4) if end == 2 else (0.2, -2.0)
+    direction_deg = math.degrees(q[0] + (q[1] if end == 2 else 0.0)) + 90.0
+    wall = wall_before(end, q, direction_deg, stiffness_N_m=2e4)
+    motor = (0.0, 1.5) if end == 2 else (4.0, 0.0)
+    arm = TouchedArm(q=q, motor=motor, damping=0.3, walls=(wall,))
+    jacobian = arm.jacobian(end, (0.35, 0.30)[end - 1], q)
+    if end == 2:
+        # Joint 1 is held by the motor as the wall's force asks.
+        normal = np.array([math.cos(math.radians(direction_deg)), math.sin(math.radians(direction_deg))])
+        arm.motor[0] = (jacobian.T @ normal)[0] * 1.5 / 0.30
+    seen = arm.play(2.0)
+    force_N = 1.5 / 0.30 if end == 2 else 4.0 / 0.35
+    assert seen["force"][-1] == pytest.approx(force_N, rel=5e-3)
+    normal = np.array([math.cos(math.radians(wall.normal_deg)), math.sin(math.radians(wall.normal_deg))])
+    q1, q2 = arm.y[:2]
+    reached = arm.tip(q1, q2) if end == 2 else 0.35 * np.array([math.cos(q1), math.sin(q1)])
+    assert normal @ (np.array([wall.x_m, wall.y_m]) - reached) == pytest.approx(force_N / 2e4, rel=5e-3)
+    assert set(seen["link"][10:]) <= {0.0, float(end)}
+    assert seen["link"][-1] == end
+    assert np.hypot(arm.y[0] - q[0], arm.y[1] - q[1]) < 0.02
+
+
+@pytest.mark.parametrize(("damping_s_m", "speed_m_s"), [(0.0, 0.05), (2.0, 0.05), (10.0, 0.05), (60.0, 0.02)])
+def test_a_wall_gives_back_the_speed_that_hunt_and_crossley_say(damping_s_m, speed_m_s):
+    """v/χ − ln(1 + χ v)/χ² before is −v'/χ − ln(1 − χ v')/χ² after, whatever the mass is."""
+    q = (0.2, -2.0)
+    wall = wall_before(1, q, math.degrees(0.2) + 90.0, 1e-7, stiffness_N_m=1e6, damping_s_m=damping_s_m)
+    arm = TouchedArm(q=q, dq=(speed_m_s / 0.35, -speed_m_s / 0.35), substeps=8, walls=(wall,))
+    seen = arm.play(0.02)
+    gone_m_s = -0.35 * seen["dq1"][-1]
+    before = 0.5 * speed_m_s**2
+    after = 0.5 * gone_m_s**2
+    if damping_s_m > 0.0:
+        before = speed_m_s / damping_s_m - math.log1p(damping_s_m * speed_m_s) / damping_s_m**2
+        after = -gone_m_s / damping_s_m - math.log1p(-damping_s_m * gone_m_s) / damping_s_m**2
+    assert np.count_nonzero(seen["force"]) > 5
+    assert gone_m_s < speed_m_s * (1.001 if damping_s_m == 0.0 else 0.95)
+    assert after == pytest.approx(before, rel=5e-3)
+
+
+def test_a_wall_never_pulls():
+    wall = wall_before(2, POSE, 120.0, damping_s_m=50.0, stiffness_N_m=5e3)
+    velocity = np.linalg.solve(TouchedArm(q=POSE).jacobian(2, 0.3, POSE), [-0.3, 0.6])
+    arm = TouchedArm(q=POSE, dq=velocity, substeps=2, walls=(wall,))
+    seen = arm.play(0.1)
+    touched = seen["force"] > 0.0
+    away = np.array([math.cos(math.radians(300.0)), math.sin(math.radians(300.0))])
+    assert np.count_nonzero(touched) > 20
+    for tick in np.flatnonzero(touched):
+        torque = arm.jacobian(2, 0.3, (seen["q1"][tick], seen["q2"][tick])).T @ away
+        found = np.array([seen["tau1"][tick], seen["tau2"][tick]])
+        assert found == pytest.approx(seen["force"][tick] * torque, rel=1e-9, abs=1e-12)
+
+
+def test_a_wall_stops_the_ends_of_links_and_lets_their_middles_through():
+    between = WallSettings(x_m=0.0, y_m=0.1, normal_deg=-90.0)
+    arm = TouchedArm(q=(0.0, 0.0), dq=(1.0, 0.0), walls=(between,))
+    seen = arm.play(0.25)
+    tip_y = arm.tip(seen["q1"], seen["q2"])[1]
+    assert tip_y.max() < 0.105
+    assert set(seen["link"]) == {0.0, 2.0}
+
+
+def test_a_wall_in_the_arms_place_waits_until_the_arm_has_gone():
+    wall = WallSettings(x_m=0.0, y_m=0.1, normal_deg=-90.0, at_s=0.05)
+    arm = TouchedArm(q=(0.3, 0.2), dq=(-1.0, 0.0), walls=(wall,))
+    seen = arm.play(0.6)
+    assert seen["force"].max() == 0.0
+    assert arm.own(0, PRESENCE)[600] == 0.0
+    assert arm.own(0, PRESENCE)[-1] == 1.0
+
+
+def test_the_largest_rate_of_wall_and_hand_is_that_of_their_points():
+    rig = TouchedArm()
+    bends = np.linspace(0.0, math.pi, 101)
+    turns = np.linspace(0.0, math.pi, 181)
+    tip = max(rig.mobility(2, 0.3, (0.0, bend), (math.cos(a), math.sin(a))) for bend in bends for a in turns[::4])
+    elbow = max(rig.mobility(1, 0.35, (0.0, bend), (0.0, 1.0)) for bend in bends)
+    wall = WallSettings(x_m=9.0, y_m=9.0, normal_deg=180.0, stiffness_N_m=2e4, damping_s_m=0.4)
+    found = largest_rate_rad_s(TouchedArm(walls=(dataclasses.replace(wall, at_s=1.0),)).things)
+    assert found == pytest.approx(math.sqrt(2e4 * max(tip, elbow)), rel=2e-3)
+    stiff = largest_rate_rad_s(TouchedArm(hands=(hand(damping_N_s_m=0.0),)).things)
+    assert stiff == pytest.approx(math.sqrt(400.0 * tip), rel=2e-3)
+    assert largest_rate_rad_s(TouchedArm(hands=(hand(),)).things) == pytest.approx(40.0 * tip, rel=2e-3)
+
+
+def test_a_hard_blow_on_a_wall_with_much_damping_sets_the_largest_rate():
+    wall = WallSettings(x_m=9.0, y_m=9.0, normal_deg=180.0, at_s=1.0)
+    rates = [
+        largest_rate_rad_s(TouchedArm(walls=(dataclasses.replace(wall, damping_s_m=chi),)).things) for chi in (0.5, 5.0)
+    ]
+    assert rates[1] == pytest.approx(10.0 * rates[0], rel=1e-12)
+
+
+PRESCRIBED = [
+    {"link": 2, "point_m": 0.2, "force_N": 20.0, "duration_s": 0.05, "shape": "step"},
+    {"link": 1, "point_m": 0.3, "force_N": 30.0, "duration_s": 0.05, "shape": "half_sine", "angle_deg": -60.0},
+    {"link": 2, "point_m": 0.3, "force_N": 15.0, "duration_s": 0.05, "shape": "push", "frame": "world"},
+]
+
+
+@pytest.mark.parametrize("changes", PRESCRIBED)
+def test_a_prescribed_force_gives_the_arm_the_energy_that_is_logged(changes):
+    arm = dataclasses.replace(ARMS["P"], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0))
+    numbers = arm.numbers()
+    state = np.zeros(MECHANICAL_STATE)
+    fit_payload(state, numbers, 0.0)
+    state[Q : Q + 2] = POSE
+    row = np.array(ContactSettings(at_s=0.0, **changes).row())
+    things = TouchedArm().things
+    touched, out = np.zeros(1), np.zeros(TOUCH_TRUTH)
+    powers = []
+    for tick in range(500):
+        elapsed_s = tick * TICK_S
+        change_touch(things, elapsed_s, state[0], state[1], touched, True)
+        external = describe_touch(things, elapsed_s, *state[:4], touched, row, 4.0, elapsed_s, 0.35, out)
+        powers.append(out[3])
+        assert external == contact_torque(row, out[0], 0.35, state[0], state[1])
+        assert out[1:3].tolist() == [changes["link"], 4.0]
+        before = state[0], state[1]
+        integrate(state, numbers, row, elapsed_s, 0.0, 0.0, TICK_S)
+        add_prescribed_work(row, elapsed_s, TICK_S, 0.35, *before, state[0], state[1], touched)
+    m11, m12, m22 = mass_matrix(state, state[Q + 1])
+    dq1, dq2 = state[DQ], state[DQ + 1]
+    kinetic_J = 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
+    assert kinetic_J > 0.01
+    assert touched[ENERGY] == pytest.approx(-kinetic_J, rel=2e-5)
+    assert TICK_S * sum(powers) == pytest.approx(-kinetic_J, rel=0.02)
+    change_touch(things, 0.06, state[0], state[1], touched, False)
+    assert touched[ENERGY] == 0.0
+
+
+BODY = "at_s = 1.0, link = 2, x_m = 0.5, y_m = 0.3"
+INSIDE = "at_s = 0.0, link = 2, x_m = 0.5, y_m = 0.01, radius_m = 0.03"
+HAND = "at_s = 1.0, link = 2, point_m = 0.2, duration_s = 1.0"
+WALL = "x_m = 0.5, y_m = 0.3, normal_deg = 0.0"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            f"bodies = [{{ {BODY.replace('link = 2', 'link = 3')}, region = 'chest' }}]",
+            "`bodies[0].link` = 3 is above 2",
+        ),
+        (f"bodies = [{{ {BODY}, region = 'hand_fingr' }}]", "did you mean 'hand_finger'?"),
+        (f"bodies = [{{ {BODY} }}]", "a body needs a region, or mass_kg and stiffness_N_m"),
+        (f"bodies = [{{ {BODY}, mass_kg = 1.0 }}]", "a body needs a region, or mass_kg and stiffness_N_m"),
+        (f"bodies = [{{ {BODY}, region = 'face', mass_kg = 1.0 }}]", "mass_kg = 1.0 is given by region 'face'"),
+        (f"bodies = [{{ {BODY}, region = 'face', stiffness_N_m = 5.0 }}]", "stiffness_N_m = 5.0 is given by region"),
+        (f"bodies = [{{ {BODY}, region = 'face', clamped = true, gap_m = 0.1 }}]", "gap_m = 0.1 m: a clamped body"),
+        (f"bodies = [{{ {BODY}, region = 'face', stifness = 5.0 }}]", "did you mean `bodies[0].stiffness_N_m`?"),
+        (
+            f"bodies = [{{ {BODY}, mass_kg = 0.0, stiffness_N_m = 9.0 }}]",
+            "`bodies[0].mass_kg` = 0.0 kg is below 0.01 kg",
+        ),
+        (f"bodies = [{{ {INSIDE}, region = 'face' }}]", "`bodies[0]`: at at_s = 0 s the arm in its start pose"),
+        (f"bodies = [{{ {INSIDE}, region = 'face' }}]", "is 0.02 m inside it"),
+        (f"hands = [{{ {HAND.replace('0.2', '0.31')} }}]", "`hands[0].point_m` = 0.31 m is beyond the end of link 2"),
+        (f"hands = [{{ {HAND}, move_to_m = [0.1] }}]", "`hands[0].move_to_m` has 1 values, 2 expected"),
+        (
+            f"hands = [{{ {HAND}, move_to_m = [0.1, 0.2], direction_deg = 3.0 }}]",
+            "direction_deg = 3.0 deg beside move_to_m",
+        ),
+        (f"hands = [{{ {HAND}, speed_m_s = 5 }}]", "`hands[0].speed_m_s` = 5.0 m/s is above 2 m/s"),
+        (f"walls = [{{ {WALL}, stiffness_N_m = 1.0 }}]", "`walls[0].stiffness_N_m` = 1.0 N/m is below 100 N/m"),
+        (
+            f"walls = [{{ {WALL} }}]",
+            "`walls[0]`: at at_s = 0 s the arm in its start pose (0.0, 0.0) deg is 0.15 m inside it",
+        ),
+        (f"walls = [{{ {WALL.replace('normal_deg', 'normal')} }}]", "did you mean `walls[0].normal_deg`?"),
+    ],
+)
+def test_a_thing_that_cannot_be_is_refused_in_one_line(tmp_path, text, message):
+    path = tmp_path / "scenario.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as refusal:
+        load_scenario(str(path))
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_scenario_with_all_kinds_of_things_is_read(tmp_path):
+    path = tmp_path / "crowd.toml"
+    path.write_text(
+        f"""
+        [[bodies]]
+        {BODY.replace(", ", chr(10))}
+        region = "hand_finger"
+        gap_m = 0.05
+        [[hands]]
+        {HAND.replace(", ", chr(10))}
+        move_to_m = [0.4, 0.3]
+        [[walls]]
+        {WALL.replace(", ", chr(10)).replace("0.0", "180.0").replace("0.5", "0.7")}
+        """,
+        encoding="utf-8",
+    )
+    scenario = load_scenario(str(path))
+    assert scenario.bodies == (BodySettings(at_s=1.0, link=2, x_m=0.5, y_m=0.3, region="hand_finger", gap_m=0.05),)
+    assert scenario.hands == (hand(at_s=1.0, point_m=0.2, duration_s=1.0, move_to_m=(0.4, 0.3)),)
+    assert scenario.walls == (WallSettings(x_m=0.7, y_m=0.3, normal_deg=180.0),)
+
+
+def test_a_body_that_comes_later_may_stand_where_the_arm_starts(tmp_path):
+    path = tmp_path / "later.toml"
+    path.write_text(f"bodies = [{{ {INSIDE.replace('0.0,', '0.1,', 1)}, region = 'face' }}]", encoding="utf-8")
+    assert load_scenario(str(path)).bodies[0].overlap_m((0.35, 0.30), (0.0, 0.0)) == pytest.approx(0.02)
