@@ -15,6 +15,7 @@ from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, 
 from adacd_hil.records import Vector
 from firmware_sim.arms import ARMS, Arm
 from firmware_sim.contact import ContactSettings, ticks
+from firmware_sim.mechanics_settings import MechanicsSettings, PayloadBody
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,10 @@ class PayloadSettings:
 
     at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="since the drives were enabled")
     mass_kg: float = setting(unit="kg", low=0.0, high=20.0, meaning="payload from then on, at the tip; 0: none")
+    center_m: tuple[float, float] = setting(
+        (0.0, 0.0), unit="m", low=-2.0, high=2.0, meaning="its centre of mass from the tip, along and beside link 2"
+    )
+    inertia_kg_m2: float = setting(0.0, unit="kg m²", low=0.0, high=10.0, meaning="its inertia about that point")
 
     @property
     def tick(self) -> int:
@@ -48,7 +53,10 @@ class Scenario:
     payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
     contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
 
+    mechanics: MechanicsSettings = setting(MechanicsSettings, meaning="the arm beyond rigid links")
+
     def __post_init__(self) -> None:
+        self.mechanics.check(self.arm, self.start_deg, self.payload_bodies)
         for index, contact in enumerate(self.contacts):
             length_m = self.arm.link_length_m[contact.link - 1]
             if contact.point_m > length_m:
@@ -62,6 +70,9 @@ class Scenario:
                     f"`contacts[{index}].at_s` = {second.at_s} s is before the end of the contact before it at "
                     f"{first.at_s + first.duration_s} s"
                 )
+        for index, change in enumerate(self.payloads):
+            if change.mass_kg == 0.0 and (change.center_m != (0.0, 0.0) or change.inertia_kg_m2 != 0.0):
+                raise ConfigError(f"`payloads[{index}].mass_kg` = 0 kg has neither `center_m` nor `inertia_kg_m2`")
         for index, (before, after) in enumerate(zip(self.payloads, self.payloads[1:], strict=False), start=1):
             if after.tick <= before.tick:
                 raise ConfigError(
@@ -72,6 +83,12 @@ class Scenario:
     def arm(self) -> Arm:
         """The arm of this profile."""
         return ARMS[self.profile]
+
+    @property
+    def payload_bodies(self) -> tuple[PayloadBody, ...]:
+        """Every payload of this scenario, and none."""
+        changes = ((change.mass_kg, change.center_m, change.inertia_kg_m2) for change in self.payloads)
+        return (0.0, (0.0, 0.0), 0.0), (self.payload_kg, (0.0, 0.0), 0.0), *changes
 
     @property
     def start_rad(self) -> Vector:
