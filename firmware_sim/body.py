@@ -179,7 +179,7 @@ def _read_encoder(state: Vector, joint: int) -> None:
 def _advance(
     state: Vector,
     arm: Vector,
-    mechanics: Vector,
+    mechanics: Vector | None,
     contacts: NDArray[np.float64],
     touch_numbers: NDArray[np.float64],
     touch_state: Vector,
@@ -192,7 +192,7 @@ def _advance(
     substeps: int,
     work: Vector,
 ) -> None:
-    """Advance the body by `tick_count` ticks; empty mechanics: of the rigid arm."""
+    """Advance the body by `tick_count` ticks; without mechanics the rigid arm, and numba then compiles nothing else."""
     step_s = TICK_S / substeps
     for _ in range(tick_count):
         _change_payload(state, arm, payloads)
@@ -202,7 +202,7 @@ def _advance(
             elapsed_s = (state[_TICK] - state[_START_TICK] - contact[ONSET_TICK]) * TICK_S
         target1 = _torque_target(arm, 0, mode1, setpoint1_Nm, state[_VELOCITY])
         target2 = _torque_target(arm, 1, mode2, setpoint2_Nm, state[_VELOCITY + 1])
-        if mechanics.size == 0:
+        if mechanics is None:
             for substep in range(substeps):
                 integrate(state, arm, contact, elapsed_s + substep * step_s, target1, target2, step_s)
             mirror_stiff_joints(state)
@@ -231,7 +231,7 @@ def _sample(state: Vector, noise: Vector, offset: Vector, out: NDArray[np.int64]
 def _fill_truth(
     state: Vector,
     arm: Vector,
-    mechanics: Vector,
+    mechanics: Vector | None,
     contacts: NDArray[np.float64],
     touch_numbers: NDArray[np.float64],
     touch_state: Vector,
@@ -253,7 +253,7 @@ def _fill_truth(
         link = contact[LINK]
         index = state[_CONTACT]
     q1, q2, dq1, dq2 = state[Q], state[Q + 1], state[DQ], state[DQ + 1]
-    if mechanics.size == 0:
+    if mechanics is None:
         ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
         torque1 = state[TAU] + ext1
         torque2 = state[TAU + 1] + ext2
@@ -340,7 +340,7 @@ class Body:
         self._touch_numbers = np.zeros((0, 0))
         self._touch_state = np.zeros(0)
         is_rigid = scenario.mechanics.is_rigid and self._touch_numbers.size == 0
-        self._mechanics = np.zeros(0) if is_rigid else scenario.mechanics.numbers(scenario.arm)
+        self._mechanics = None if is_rigid else scenario.mechanics.numbers(scenario.arm)
         self._substeps = SUBSTEPS if is_rigid else scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies)
         self._work = work_space(self._touch_state.size)
         self._offset = np.array(scenario.torque_offset_Nm, dtype=np.float64)
