@@ -1,11 +1,16 @@
 """The arms that the emulator can play: two rigid links in the horizontal plane, with friction in both joints.
 
 Profiles P, S and M are given by the masses that a lab could weigh, not by the host's lumped parameters. Link i
-has its mass m_i at the distance c_i from joint i and the inertia I_i about that point; a payload m sits at the tip.
-With the absolute link angles φ₁ = q₁, φ₂ = q₁ + q₂ the kinetic energy is
+has its mass m_i at the distance c_i from joint i and the inertia I_i about that point. A payload m has its centre of
+mass at (x, y) from the tip, in the frame of link 2, and the inertia I about it; a point mass at the tip has neither.
 
-    T = ½ α φ̇₁² + β cos(φ₂ − φ₁) φ̇₁ φ̇₂ + ½ γ φ̇₂²
-    α = I₁ + m₁ c₁² + (m₂ + m) l₁²      β = l₁ (m₂ c₂ + m l₂)      γ = I₂ + m₂ c₂² + m l₂²      kg m²
+With the absolute link angles φ₁ = q₁, φ₂ = q₁ + q₂ and the unit vectors e(φ), n(φ) along and across a link, the
+payload moves with ṙ = l₁ φ̇₁ n(φ₁) + φ̇₂ ((l₂ + x) n(φ₂) − y e(φ₂)). With n(φ₁)·n(φ₂) = cos q₂ and
+n(φ₁)·e(φ₂) = sin q₂ the kinetic energy of the arm is
+
+    T = ½ α φ̇₁² + (β cos q₂ − σ sin q₂) φ̇₁ φ̇₂ + ½ γ φ̇₂²                            kg m²
+    α = I₁ + m₁ c₁² + (m₂ + m) l₁²          β = l₁ (m₂ c₂ + m (l₂ + x))
+    γ = I₂ + m₂ c₂² + m ((l₂ + x)² + y²) + I     σ = l₁ m y
 
 The host's a₁ = α + γ, a₂ = β, a₃ = γ appear in the truth record only.
 """
@@ -22,8 +27,11 @@ from firmware_sim.plant import (
     BETA,
     BRAKE_DAMPING,
     COULOMB,
+    CURRENT_LOOP,
+    CURRENT_LOOP_RAD_S,
     GAMMA,
     LENGTH,
+    MOMENT,
     TORQUE_LIMIT,
     VISCOUS,
 )
@@ -78,6 +86,9 @@ class Arm:
         numbers[COULOMB : COULOMB + 2] = self.coulomb_Nm
         numbers[TORQUE_LIMIT : TORQUE_LIMIT + 2] = self.rated_torque_Nm
         numbers[BRAKE_DAMPING : BRAKE_DAMPING + 2] = self.brake_damping_Nm_s
+        numbers[CURRENT_LOOP : CURRENT_LOOP + 2] = CURRENT_LOOP_RAD_S
+        first, second = self.links
+        numbers[MOMENT] = first.mass_kg * first.center_m + second.mass_kg * first.length_m
         return numbers
 
 

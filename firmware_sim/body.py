@@ -20,31 +20,38 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import TRUTH_LAYOUT, Vector
 from firmware_sim.contact import (
     END_TICK,
-    LINK,
     ONSET_TICK,
     TICK_S,
-    contact_force,
     contact_table,
     ticks,
 )
+from firmware_sim.friction import REFERENCE_C
+from firmware_sim.mechanics import HOLDING_BRAKE, integrate_mechanics, observe, work_space
 from firmware_sim.plant import (
+    BRAKE,
     BRAKE_DAMPING,
     COULOMB,
     DQ,
+    ENCODED,
     INERTIA,
+    JOINT_TORQUE,
+    LENGTH,
     MECHANICAL_STATE,
     PAYLOAD,
+    SHAFT,
     TAU,
     TORQUE_LIMIT,
     VISCOUS,
+    WARMTH,
     Q,
     accelerate,
     decide_slips,
     external_torque,
     fit_payload,
     integrate,
+    mirror_stiff_joints,
 )
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario import PayloadSettings, Scenario
 from firmware_sim.sensing import (
     POSITION_LSB_RAD,
     TORQUE_COUNTS,
@@ -55,6 +62,20 @@ from firmware_sim.sensing import (
     to_counts,
     torque_counts,
     track,
+)
+from firmware_sim.touch import (
+    FORCE,
+    POWER,
+    STRONGEST_INDEX,
+    STRONGEST_LINK,
+    TOUCH_TRUTH,
+    TRUE_ENERGY,
+    add_prescribed_work,
+    change_touch,
+    describe_touch,
+    initial_touch_state,
+    largest_rate_rad_s,
+    touch_table,
 )
 
 
@@ -82,6 +103,7 @@ _ESTIMATE: Final = _TICK + 6  # 2: position of the tracking loop, rad
 _VELOCITY: Final = _TICK + 8  # 2: velocity of the tracking loop, rad/s
 _STATE: Final = _TICK + 10
 
+_OFF: Final = int(DriveMode.OFF)
 _TORQUE: Final = int(DriveMode.TORQUE)
 _BRAKE: Final = int(DriveMode.BRAKE)
 _BRAKE_SLOWLY: Final = int(DriveMode.BRAKE_SLOWLY)
@@ -89,8 +111,6 @@ _BRAKE_HARD: Final = int(DriveMode.BRAKE_HARD)
 _SLOW_SHARE: Final = 0.5
 _HARD_SHARE: Final = 1.5
 """Of BRAKE_DAMPING. The shortest time constant, 10 ms / 1.5, is four lags of the drive's velocity: no overshoot."""
-
-_ROOM_TEMPERATURE_C: Final = 25.0
 
 _PLACE: Final = {name: place.start for name, place in TRUTH_LAYOUT.slices.items()}
 _TRUE_Q: Final = _PLACE["q"]
@@ -101,10 +121,13 @@ _TRUE_FRICTION: Final = _PLACE["tau_friction"]
 _TRUE_FORCE: Final = _PLACE["contact_force"]
 _TRUE_LINK: Final = _PLACE["contact_link"]
 _TRUE_INDEX: Final = _PLACE["contact_index"]
+_TRUE_POWER: Final = _PLACE["contact_power"]
+_TRUE_ENERGY: Final = _PLACE["contact_energy"]
 _TRUE_PAYLOAD: Final = _PLACE["payload"]
 _TRUE_THETA: Final = _PLACE["theta"]
 _TRUE_Q_M: Final = _PLACE["q_m"]
 _TRUE_TAU_M: Final = _PLACE["tau_m"]
+_TRUE_GRAVITY: Final = _PLACE["tau_gravity"]
 _TRUE_TEMPERATURE: Final = _PLACE["joint_temperature"]
 
 
@@ -124,15 +147,21 @@ def _contact_in_force(state: Vector, contacts: NDArray[np.float64]) -> NDArray[n
 
 @compiled
 def _change_payload(state: Vector, arm: Vector, payloads: NDArray[np.float64]) -> None:
-    """Fit or take off what the scenario says for this tick; payloads (n, 2): tick, kg."""
+    """Fit or take off what the scenario says for this tick; payloads (n, 5): see `payload_table`."""
     if state[_START_TICK] < 0.0:
         return
     tick = state[_TICK] - state[_START_TICK]
     index = int(state[_CHANGE])
     while index < payloads.shape[0] and payloads[index, 0] <= tick:
-        fit_payload(state, arm, payloads[index, 1])
+        fit_payload(state, arm, payloads[index, 1], payloads[index, 2], payloads[index, 3], payloads[index, 4])
         index += 1
     state[_CHANGE] = index
+
+
+@compiled
+def _scenario_s(state: Vector) -> float:
+    """Give the scenario time of this tick in s, -1 before the scenario starts."""
+    return float((state[_TICK] - state[_START_TICK]) * TICK_S) if state[_START_TICK] >= 0.0 else -1.0
 
 
 @compiled
@@ -154,7 +183,7 @@ def _torque_target(arm: Vector, joint: int, mode: int, setpoint_Nm: float, veloc
 @compiled
 def _read_encoder(state: Vector, joint: int) -> None:
     """Take the encoder's position at the end of a tick and advance the drive's velocity."""
-    now_rad = to_counts(state[Q + joint], POSITION_LSB_RAD) * POSITION_LSB_RAD
+    now_rad = to_counts(state[ENCODED + joint], POSITION_LSB_RAD) * POSITION_LSB_RAD
     state[_ESTIMATE + joint], state[_VELOCITY + joint] = track(
         state[_ENCODER + joint], now_rad, state[_ESTIMATE + joint], state[_VELOCITY + joint], TICK_S
     )
@@ -165,7 +194,10 @@ def _read_encoder(state: Vector, joint: int) -> None:
 def _advance(
     state: Vector,
     arm: Vector,
+    mechanics: Vector | None,
     contacts: NDArray[np.float64],
+    touch_numbers: NDArray[np.float64],
+    touch_state: Vector,
     payloads: NDArray[np.float64],
     setpoint1_Nm: float,
     setpoint2_Nm: float,
@@ -173,8 +205,9 @@ def _advance(
     mode2: int,
     tick_count: int,
     substeps: int,
+    work: Vector,
 ) -> None:
-    """Advance the body by `tick_count` ticks."""
+    """Advance the body by `tick_count` ticks; without mechanics the rigid arm, and numba then compiles nothing else."""
     step_s = TICK_S / substeps
     for _ in range(tick_count):
         _change_payload(state, arm, payloads)
@@ -182,10 +215,24 @@ def _advance(
         elapsed_s = 0.0
         if contact.size != 0:
             elapsed_s = (state[_TICK] - state[_START_TICK] - contact[ONSET_TICK]) * TICK_S
+        before1, before2 = state[Q], state[Q + 1]
+        change_touch(touch_numbers, _scenario_s(state), before1, before2, touch_state, contact.size != 0)
         target1 = _torque_target(arm, 0, mode1, setpoint1_Nm, state[_VELOCITY])
         target2 = _torque_target(arm, 1, mode2, setpoint2_Nm, state[_VELOCITY + 1])
-        for substep in range(substeps):
-            integrate(state, arm, contact, elapsed_s + substep * step_s, target1, target2, step_s)
+        if mechanics is None:
+            for substep in range(substeps):
+                integrate(state, arm, contact, elapsed_s + substep * step_s, target1, target2, step_s)
+            mirror_stiff_joints(state)
+        else:
+            state[BRAKE] = mechanics[HOLDING_BRAKE] if mode1 == _OFF else 0.0
+            state[BRAKE + 1] = mechanics[HOLDING_BRAKE + 1] if mode2 == _OFF else 0.0
+            integrate_mechanics(
+                state, arm, mechanics, contact, touch_numbers, touch_state,
+                _scenario_s(state), elapsed_s, target1, target2, TICK_S, substeps, work,
+            )  # fmt: skip
+        add_prescribed_work(
+            contact, elapsed_s, TICK_S, arm[LENGTH], before1, before2, state[Q], state[Q + 1], touch_state
+        )
         _read_encoder(state, 0)
         _read_encoder(state, 1)
         state[_TICK] += 1.0
@@ -195,43 +242,62 @@ def _advance(
 def _sample(state: Vector, noise: Vector, offset: Vector, out: NDArray[np.int64]) -> None:
     """Quantise what the devices measure now: position, velocity, torque counts, two each (6,)."""
     for joint in range(2):
-        out[joint] = to_counts(state[Q + joint], POSITION_LSB_RAD)
+        out[joint] = to_counts(state[ENCODED + joint], POSITION_LSB_RAD)
         out[2 + joint] = to_counts(state[_VELOCITY + joint], VELOCITY_LSB_RAD_S)
-        out[4 + joint] = torque_counts(state[TAU + joint] + offset[joint] + noise[joint])
+        out[4 + joint] = torque_counts(state[JOINT_TORQUE + joint] + offset[joint] + noise[joint])
 
 
 @compiled
 def _fill_truth(
-    state: Vector, arm: Vector, contacts: NDArray[np.float64], payloads: NDArray[np.float64], out: Vector
+    state: Vector,
+    arm: Vector,
+    mechanics: Vector | None,
+    contacts: NDArray[np.float64],
+    touch_numbers: NDArray[np.float64],
+    touch_state: Vector,
+    payloads: NDArray[np.float64],
+    work: Vector,
+    touched: Vector,
+    out: Vector,
 ) -> None:
     """Fill a block laid out by TRUTH_LAYOUT with what is true at this instant."""
     out[:] = 0.0
     _change_payload(state, arm, payloads)
     contact = _contact_in_force(state, contacts)
     elapsed_s = 0.0
-    force_N = 0.0
-    link = 0.0
-    index = -1.0
     if contact.size != 0:
         elapsed_s = (state[_TICK] - state[_START_TICK] - contact[ONSET_TICK]) * TICK_S
-        force_N = contact_force(contact, elapsed_s)
-        link = contact[LINK]
-        index = state[_CONTACT]
     q1, q2, dq1, dq2 = state[Q], state[Q + 1], state[DQ], state[DQ + 1]
-    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
-    torque1 = state[TAU] + ext1
-    torque2 = state[TAU + 1] + ext2
-    slip1, slip2 = decide_slips(state, arm, torque1, torque2, q2, dq1, dq2)
-    _, _, friction1, friction2 = accelerate(state, arm, slip1, slip2, torque1, torque2, q2, dq1, dq2)
+    time_s = _scenario_s(state)
+    change_touch(touch_numbers, time_s, q1, q2, touch_state, contact.size != 0)
+    describe_touch(
+        touch_numbers, time_s, q1, q2, dq1, dq2, touch_state,
+        contact, state[_CONTACT], elapsed_s, arm[LENGTH], touched,
+    )  # fmt: skip
+    if mechanics is None:
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
+        torque1 = state[TAU] + ext1
+        torque2 = state[TAU + 1] + ext2
+        slip1, slip2 = decide_slips(state, arm, torque1, torque2, q2, dq1, dq2)
+        _, _, friction1, friction2 = accelerate(state, arm, slip1, slip2, torque1, torque2, q2, dq1, dq2)
+        friction1 += arm[VISCOUS] * dq1
+        friction2 += arm[VISCOUS + 1] * dq2
+        held1, held2 = 0.0, 0.0
+    else:
+        ext1, ext2, friction1, friction2, held1, held2 = observe(
+            state, arm, mechanics, contact, touch_numbers, touch_state, _scenario_s(state), elapsed_s, work
+        )
     out[_TRUE_Q], out[_TRUE_Q + 1] = q1, q2
     out[_TRUE_DQ], out[_TRUE_DQ + 1] = dq1, dq2
-    out[_TRUE_TAU_J], out[_TRUE_TAU_J + 1] = state[TAU], state[TAU + 1]
+    out[_TRUE_TAU_J], out[_TRUE_TAU_J + 1] = state[JOINT_TORQUE], state[JOINT_TORQUE + 1]
     out[_TRUE_TAU_EXT], out[_TRUE_TAU_EXT + 1] = ext1, ext2
-    out[_TRUE_FRICTION] = friction1 + arm[VISCOUS] * dq1
-    out[_TRUE_FRICTION + 1] = friction2 + arm[VISCOUS + 1] * dq2
-    out[_TRUE_FORCE] = force_N
-    out[_TRUE_LINK] = link
-    out[_TRUE_INDEX] = index
+    out[_TRUE_FRICTION], out[_TRUE_FRICTION + 1] = friction1, friction2
+    out[_TRUE_GRAVITY], out[_TRUE_GRAVITY + 1] = held1, held2
+    out[_TRUE_FORCE] = touched[FORCE]
+    out[_TRUE_LINK] = touched[STRONGEST_LINK]
+    out[_TRUE_INDEX] = touched[STRONGEST_INDEX]
+    out[_TRUE_POWER] = touched[POWER]
+    out[_TRUE_ENERGY] = touched[TRUE_ENERGY]
     out[_TRUE_PAYLOAD] = state[PAYLOAD]
     out[_TRUE_THETA] = state[INERTIA] + state[INERTIA + 2]
     out[_TRUE_THETA + 1] = state[INERTIA + 1]
@@ -239,9 +305,15 @@ def _fill_truth(
     for joint in range(2):
         out[_TRUE_THETA + 3 + joint] = arm[VISCOUS + joint]
         out[_TRUE_THETA + 5 + joint] = arm[COULOMB + joint]
-        out[_TRUE_Q_M + joint] = state[Q + joint]
+        out[_TRUE_Q_M + joint] = state[SHAFT + joint]
         out[_TRUE_TAU_M + joint] = state[TAU + joint]
-        out[_TRUE_TEMPERATURE + joint] = _ROOM_TEMPERATURE_C
+        out[_TRUE_TEMPERATURE + joint] = state[WARMTH + joint]
+
+
+def payload_table(payloads: tuple[PayloadSettings, ...]) -> NDArray[np.float64]:
+    """Pack payload changes (n, 5): tick, kg, centre of mass along and beside link 2 from the tip m, inertia kg m²."""
+    rows = [(change.tick, change.mass_kg, *change.center_m, change.inertia_kg_m2) for change in payloads]
+    return np.array(rows, dtype=np.float64).reshape(len(payloads), 5)
 
 
 class Measurement(NamedTuple):
@@ -287,8 +359,20 @@ class Body:
         self.period_s = period_s
         self._arm = scenario.arm.numbers()
         self._contacts = contact_table(scenario.contacts)
-        self._payloads = np.array([(change.tick, change.mass_kg) for change in scenario.payloads], dtype=np.float64)
-        self._payloads = self._payloads.reshape(len(scenario.payloads), 2)
+        self._payloads = payload_table(scenario.payloads)
+        self._touch_numbers = touch_table(scenario)
+        self._touch_state = initial_touch_state(self._touch_numbers)
+        self._touched = np.zeros(TOUCH_TRUTH)
+        is_rigid = scenario.mechanics.is_rigid and self._touch_numbers.size == 0
+        self._mechanics = None if is_rigid else scenario.mechanics.numbers(scenario.arm)
+        self._substeps = (
+            SUBSTEPS
+            if is_rigid
+            else scenario.mechanics.substeps(
+                scenario.arm, scenario.payload_bodies, largest_rate_rad_s(self._touch_numbers)
+            )
+        )
+        self._work = work_space(self._touch_state.size)
         self._offset = np.array(scenario.torque_offset_Nm, dtype=np.float64)
         self._noise = TorqueNoise(scenario.seed if seed is None else seed, TORQUE_NOISE_NM if scenario.noise else 0.0)
         self._counts = np.zeros(6, dtype=np.int64)
@@ -298,15 +382,23 @@ class Body:
         self._state[_ENCODER : _ENCODER + 2] = encoder_rad
         self._state[_ESTIMATE : _ESTIMATE + 2] = encoder_rad
         self._state[_START_TICK] = -1.0
+        self._state[WARMTH : WARMTH + 2] = REFERENCE_C if is_rigid else scenario.mechanics.ambient_C
         fit_payload(self._state, self._arm, scenario.payload_kg)
+        mirror_stiff_joints(self._state)
         self._compile()
 
     def _compile(self) -> None:
         """Run every compiled function once, on a copy of the state."""
         state = self._state.copy()
-        _advance(state, self._arm, self._contacts, self._payloads, 0.0, 0.0, 0, 0, 1, SUBSTEPS)
+        _advance(
+            state, self._arm, self._mechanics, self._contacts, self._touch_numbers, self._touch_state.copy(),
+            self._payloads, 0.0, 0.0, 0, 0, 1, self._substeps, self._work,
+        )  # fmt: skip
         _sample(state, self._offset, self._offset, self._counts)
-        _fill_truth(state, self._arm, self._contacts, self._payloads, np.zeros(TRUTH_LAYOUT.size))
+        _fill_truth(
+            state, self._arm, self._mechanics, self._contacts, self._touch_numbers, self._touch_state.copy(),
+            self._payloads, self._work, self._touched, np.zeros(TRUTH_LAYOUT.size),
+        )  # fmt: skip
 
     def start_scenario(self) -> None:
         """Let scenario time start now: both drives are in Operation enabled. Later calls change nothing."""
@@ -343,14 +435,18 @@ class Body:
         _advance(
             self._state,
             self._arm,
+            self._mechanics,
             self._contacts,
+            self._touch_numbers,
+            self._touch_state,
             self._payloads,
             float(torque_setpoint_Nm[0]),
             float(torque_setpoint_Nm[1]),
             int(drive_mode[0]),
             int(drive_mode[1]),
             self._ticks_per_period if tick_count is None else tick_count,
-            SUBSTEPS,
+            self._substeps,
+            self._work,
         )
 
     def sample(self) -> Measurement:
@@ -361,4 +457,15 @@ class Body:
 
     def truth(self, out: Vector) -> None:
         """Fill a block laid out by TRUTH_LAYOUT with what is true now; changes nothing that is measured."""
-        _fill_truth(self._state, self._arm, self._contacts, self._payloads, out)
+        _fill_truth(
+            self._state,
+            self._arm,
+            self._mechanics,
+            self._contacts,
+            self._touch_numbers,
+            self._touch_state,
+            self._payloads,
+            self._work,
+            self._touched,
+            out,
+        )

@@ -2,11 +2,14 @@
 
 With φ₁ = q₁, φ₂ = q₁ + q₂ and the kinetic energy of `firmware_sim.arms`, Lagrange gives
 
-    α φ̈₁ + β cos q₂ φ̈₂ = T₁ + β sin q₂ φ̇₂²
-    γ φ̈₂ + β cos q₂ φ̈₁ = T₂ − β sin q₂ φ̇₁²
+    α φ̈₁ + h φ̈₂ = T₁ − h' φ̇₂²        h  =  β cos q₂ − σ sin q₂
+    γ φ̈₂ + h φ̈₁ = T₂ + h' φ̇₁²        h' = −β sin q₂ − σ cos q₂
 
-only centrifugal terms, no Coriolis ones. φ̇ = J q̇ with J = [[1, 0], [1, 1]] brings them to the joints, where the
-motors, the friction and the sensors are: (Jᵀ N J) q̈ = Jᵀ (...).  Torque of joint i, Nm, on the link side of its sensor:
+only centrifugal terms, no Coriolis ones: ∂T/∂φ₁ = −h' φ̇₁ φ̇₂ takes with it the part of d(h φ̇₂)/dt that has φ̇₁. σ is
+the payload's mass beside the axis of link 2 (`firmware_sim.arms`), 0 for a payload on the axis. φ̇ = J q̇ with
+J = [[1, 0], [1, 1]] brings them to the joints, where the motors, the friction and the sensors are:
+(Jᵀ N J + R) q̈ = Jᵀ (...), with the inertia R of rotors that turn rigidly with their joints (`firmware_sim.mechanics`;
+0 here). Torque of joint i, Nm, on the link side of its sensor:
 
     motor torque tau_J + external torque tau_ext − viscous friction F_v q̇ − Coulomb friction
 
@@ -39,7 +42,9 @@ VISCOUS: Final = 5  # 5, 6: Nm s/rad
 COULOMB: Final = 7  # 7, 8: Nm
 TORQUE_LIMIT: Final = 9  # 9, 10: Nm
 BRAKE_DAMPING: Final = 11  # 11, 12: Nm s/rad
-ARM_NUMBERS: Final = 13
+CURRENT_LOOP: Final = 13  # 13, 14: rad/s, bandwidth of the drives' torque loops
+MOMENT: Final = 15  # kg m, first moment of all masses about joint 1 with link 2 folded into joint 2; without payload
+ARM_NUMBERS: Final = 16
 
 # Places in the vector of the mechanical state.
 Q: Final = 0  # 0, 1: joint position, rad
@@ -47,7 +52,16 @@ DQ: Final = 2  # 2, 3: joint velocity, rad/s
 TAU: Final = 4  # 4, 5: motor torque = joint torque, Nm
 PAYLOAD: Final = 6  # kg, part of the inertia below
 INERTIA: Final = 7  # 7, 8, 9: α, β, γ with payload, kg m²
-MECHANICAL_STATE: Final = 10
+SKEW: Final = 10  # σ, kg m²
+ROTOR: Final = 11  # 11, 12: inertia of rotors that turn rigidly with their joints, kg m²
+SHAFT: Final = 13  # 13, 14: position of the motor side, rad; as q where the joint is stiff
+DSHAFT: Final = 15  # 15, 16: its velocity, rad/s
+JOINT_TORQUE: Final = 17  # 17, 18: torque through the sensor, Nm
+ENCODED: Final = 19  # 19, 20: position of the shaft that carries the encoder, rad
+BRISTLE: Final = 21  # 21, 22: deflection of LuGre's bristles, rad
+WARMTH: Final = 23  # 23, 24: temperature of the joint's lubricant, °C
+BRAKE: Final = 25  # 25, 26: torque of the holding brake that is closed, Nm
+MECHANICAL_STATE: Final = 27
 
 # A step is cut at most this often; a slip lasts much longer than a step, so three are never needed in practice.
 _LARGEST_CUTS: Final = 8
@@ -56,8 +70,15 @@ _BISECTIONS: Final = 40
 
 
 @compiled
-def fit_payload(state: Vector, arm: Vector, payload_kg: float) -> None:
-    """Change the payload at the tip.
+def fit_payload(
+    state: Vector,
+    arm: Vector,
+    payload_kg: float,
+    along_m: float = 0.0,
+    beside_m: float = 0.0,
+    inertia_kg_m2: float = 0.0,
+) -> None:
+    """Change the payload, a body with its centre of mass at (along, beside) from the tip in the frame of link 2.
 
     What is added was at rest: the momentum of the moving arm is shared with it, M q̇ stays. What is taken off leaves
     with the speed that it has: q̇ stays. At rest both change nothing but the inertia.
@@ -69,8 +90,11 @@ def fit_payload(state: Vector, arm: Vector, payload_kg: float) -> None:
     length1_m, length2_m = arm[LENGTH], arm[LENGTH + 1]
     state[PAYLOAD] = payload_kg
     state[INERTIA] = arm[ALPHA] + payload_kg * length1_m * length1_m
-    state[INERTIA + 1] = arm[BETA] + payload_kg * length1_m * length2_m
-    state[INERTIA + 2] = arm[GAMMA] + payload_kg * length2_m * length2_m
+    reach_m = length2_m + along_m
+    state[INERTIA + 1] = arm[BETA] + payload_kg * length1_m * reach_m
+    state[INERTIA + 2] = arm[GAMMA] + payload_kg * reach_m * reach_m
+    state[INERTIA + 2] += payload_kg * beside_m * beside_m + inertia_kg_m2
+    state[SKEW] = payload_kg * length1_m * beside_m
     if added_kg > 0.0 and (momentum1 != 0.0 or momentum2 != 0.0):
         m11, m12, m22 = mass_matrix(state, state[Q + 1])
         determinant = m11 * m22 - m12 * m12
@@ -80,10 +104,12 @@ def fit_payload(state: Vector, arm: Vector, payload_kg: float) -> None:
 
 @compiled
 def mass_matrix(state: Vector, q2: float) -> tuple[float, float, float]:
-    """Give m11, m12, m22 of Jᵀ N J at the elbow angle q2, kg m²."""
+    """Give m11, m12, m22 of Jᵀ N J + R at the elbow angle q2, kg m²."""
     coupling = state[INERTIA + 1] * math.cos(q2)
+    if state[SKEW] != 0.0:
+        coupling -= state[SKEW] * math.sin(q2)
     m22 = state[INERTIA + 2]
-    return state[INERTIA] + m22 + 2.0 * coupling, m22 + coupling, m22
+    return state[INERTIA] + m22 + 2.0 * coupling + state[ROTOR], m22 + coupling, m22 + state[ROTOR + 1]
 
 
 @compiled
@@ -104,6 +130,8 @@ def accelerate(
     be it more than F_c or not.
     """
     sine = state[INERTIA + 1] * math.sin(q2)
+    if state[SKEW] != 0.0:
+        sine += state[SKEW] * math.cos(q2)
     m11, m12, m22 = mass_matrix(state, q2)
     rate2 = dq1 + dq2
     # Jᵀ of the centrifugal terms, less viscous friction
@@ -169,6 +197,28 @@ def external_torque(arm: Vector, contact: Vector, elapsed_s: float, q1: float, q
 
 
 @compiled
+def follow_target(tau_Nm: float, target_Nm: float, turn: float) -> tuple[float, float]:
+    """Give the motor torque in the middle and at the end of a step of `turn` time constants.
+
+    The torque's distance from its target decays. In the middle of the step stands the value with which Simpson's rule
+    gives the exact impulse; the torque at the midpoint itself would be wrong by 1e-7 rad/s after a step of 3 Nm.
+    """
+    fall = -math.expm1(-turn)
+    middle = 0.25 * (6.0 * fall / turn - 2.0 + fall)
+    return target_Nm + (tau_Nm - target_Nm) * middle, tau_Nm + (target_Nm - tau_Nm) * fall
+
+
+@compiled
+def mirror_stiff_joints(state: Vector) -> None:
+    """Say what the sensors sit on where the joints are stiff: motor side is link side, joint torque is motor torque."""
+    for joint in range(2):
+        state[SHAFT + joint] = state[Q + joint]
+        state[DSHAFT + joint] = state[DQ + joint]
+        state[ENCODED + joint] = state[Q + joint]
+        state[JOINT_TORQUE + joint] = state[TAU + joint]
+
+
+@compiled
 def _runge_kutta(
     state: Vector,
     arm: Vector,
@@ -188,15 +238,8 @@ def _runge_kutta(
 ) -> tuple[float, float, float, float, float, float]:
     """Advance q1, q2, dq1, dq2, tau1, tau2 by one step of classical RK4 with constant slips."""
     half_s = 0.5 * step_s
-    # The torque's distance from its target decays. In the middle of the step stands the value with which Simpson's
-    # rule gives the exact impulse; the torque at the midpoint itself would be wrong by 1e-7 rad/s after a step of 3 Nm.
-    turn = CURRENT_LOOP_RAD_S * step_s
-    fall = -math.expm1(-turn)
-    middle = 0.25 * (6.0 * fall / turn - 2.0 + fall)
-    mid1 = target1 + (tau1 - target1) * middle
-    mid2 = target2 + (tau2 - target2) * middle
-    end1 = tau1 + (target1 - tau1) * fall
-    end2 = tau2 + (target2 - tau2) * fall
+    mid1, end1 = follow_target(tau1, target1, arm[CURRENT_LOOP] * step_s)
+    mid2, end2 = follow_target(tau2, target2, arm[CURRENT_LOOP + 1] * step_s)
 
     ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
     a1, a2, _, _ = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)

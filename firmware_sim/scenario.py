@@ -17,6 +17,7 @@ from adacd_hil.records import Vector
 from firmware_sim.arms import ARMS, Arm
 from firmware_sim.contact import ContactSettings, ticks
 from firmware_sim.faults import FaultSettings, check_rows
+from firmware_sim.mechanics_settings import MechanicsSettings, PayloadBody
 from firmware_sim.touch_settings import BodySettings, HandSettings, WallSettings
 
 
@@ -26,6 +27,10 @@ class PayloadSettings:
 
     at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="since the drives were enabled")
     mass_kg: float = setting(unit="kg", low=0.0, high=20.0, meaning="payload from then on, at the tip; 0: none")
+    center_m: tuple[float, float] = setting(
+        (0.0, 0.0), unit="m", low=-2.0, high=2.0, meaning="its centre of mass from the tip, along and beside link 2"
+    )
+    inertia_kg_m2: float = setting(0.0, unit="kg m²", low=0.0, high=10.0, meaning="its inertia about that point")
 
     @property
     def tick(self) -> int:
@@ -50,12 +55,15 @@ class Scenario:
     )
     payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
     contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
-    faults: tuple[FaultSettings, ...] = setting((), meaning="what goes wrong, each row by its own time")
     bodies: tuple[BodySettings, ...] = setting((), meaning="bodies in the arm's way")
     hands: tuple[HandSettings, ...] = setting((), meaning="hands that grasp and guide")
     walls: tuple[WallSettings, ...] = setting((), meaning="walls")
+    faults: tuple[FaultSettings, ...] = setting((), meaning="what goes wrong, each row by its own time")
+
+    mechanics: MechanicsSettings = setting(MechanicsSettings, meaning="the arm beyond rigid links")
 
     def __post_init__(self) -> None:
+        self.mechanics.check(self.arm, self.start_deg, self.payload_bodies)
         self._check_points("contacts", self.contacts)
         self._check_points("hands", self.hands)
         self._check_room("bodies", self.bodies)
@@ -66,6 +74,9 @@ class Scenario:
                     f"`contacts[{index}].at_s` = {second.at_s} s is before the end of the contact before it at "
                     f"{first.at_s + first.duration_s} s"
                 )
+        for index, change in enumerate(self.payloads):
+            if change.mass_kg == 0.0 and (change.center_m != (0.0, 0.0) or change.inertia_kg_m2 != 0.0):
+                raise ConfigError(f"`payloads[{index}].mass_kg` = 0 kg has neither `center_m` nor `inertia_kg_m2`")
         for index, (before, after) in enumerate(zip(self.payloads, self.payloads[1:], strict=False), start=1):
             if after.tick <= before.tick:
                 raise ConfigError(
@@ -95,6 +106,12 @@ class Scenario:
     def arm(self) -> Arm:
         """The arm of this profile."""
         return ARMS[self.profile]
+
+    @property
+    def payload_bodies(self) -> tuple[PayloadBody, ...]:
+        """Every payload of this scenario, and none."""
+        changes = ((change.mass_kg, change.center_m, change.inertia_kg_m2) for change in self.payloads)
+        return (0.0, (0.0, 0.0), 0.0), (self.payload_kg, (0.0, 0.0), 0.0), *changes
 
     @property
     def start_rad(self) -> Vector:

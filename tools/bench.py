@@ -7,6 +7,7 @@ Absolute figures are this machine's; compare ratios of one run. numpy's percenti
 """
 
 import argparse
+import dataclasses
 import os
 import platform
 import subprocess
@@ -33,11 +34,32 @@ from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.bench import Bench
 from firmware_sim.body import Body, DriveMode
+from firmware_sim.mechanics_settings import MechanicsSettings
 from firmware_sim.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 REPEATS = 20_000
+EVERYTHING = MechanicsSettings(
+    static_Nm=(0.06, 0.03),
+    sigma0_Nm_rad=(3000.0, 1500.0),
+    sigma1_Nm_s=(5.0, 2.0),
+    load_friction=(0.01, 0.01),
+    viscous_drop_per_K=(0.02, 0.02),
+    coulomb_drop_per_K=(0.01, 0.01),
+    heat_capacity_J_K=(300.0, 200.0),
+    stiffness_Nm_rad=(6000.0, 2000.0),
+    damping_Nm_s=(2.0, 0.5),
+    rotor_inertia_kg_m2=(0.3, 0.05),
+    backlash_rad=(2e-4, 2e-4),
+    ripple_Nm=(0.05, 0.03),
+    ripple_share=(0.01, 0.01),
+    motor_viscous_Nm_s=(0.1, 0.05),
+    motor_coulomb_Nm=(0.2, 0.1),
+    stop_low_deg=(-75.0, -120.0),
+    stop_high_deg=(75.0, 120.0),
+    tilt_deg=5.0,
+)
 WARM_UP = 1_000
 SHORT_RUN = """
 [operator]
@@ -111,6 +133,10 @@ def bench_in_process() -> None:
     body = Body(scenario, settings.bus.period_s, 1)
     torques, modes = (0.1, 0.05), (DriveMode.TORQUE, DriveMode.TORQUE)
     time_calls("plant: 1 ms of arm, drives and sensors", lambda: (body.advance(torques, modes), body.sample()))
+    rich = Body(dataclasses.replace(scenario, mechanics=EVERYTHING), settings.bus.period_s, 1)
+    time_calls(
+        "plant: the same with every option of [mechanics]", lambda: (rich.advance(torques, modes), rich.sample())
+    )
     bench_log(pipeline.step(arm), wire)
     bench_embedded()
 

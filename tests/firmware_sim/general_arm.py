@@ -1,0 +1,137 @@
+"""The general integrator by itself, for the tests: an arm with mechanics, driven by torque targets."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from firmware_sim.arms import ARMS, Arm
+from firmware_sim.contact import TICK_S
+from firmware_sim.mechanics import gravity_torque, integrate_mechanics, observe, work_space
+from firmware_sim.mechanics_settings import MechanicsSettings
+from firmware_sim.plant import (
+    DQ,
+    DSHAFT,
+    INERTIA,
+    JOINT_TORQUE,
+    LENGTH,
+    MECHANICAL_STATE,
+    MOMENT,
+    PAYLOAD,
+    SHAFT,
+    SKEW,
+    WARMTH,
+    Q,
+    fit_payload,
+    mass_matrix,
+)
+
+NOBODY = np.zeros(0)
+NO_TOUCH = np.zeros((0, 0))
+LOCKED_NM = 1e6
+
+
+@compiled
+def run_arm(
+    state, arm, mechanics, contact, touch_numbers, touch_state, first, target1, target2, count, substeps, work, history
+):
+    """Integrate `count` ticks of the targets (count,) and note after each one the first values of the state."""
+    for index in range(count):
+        time_s = (first + index) * TICK_S
+        integrate_mechanics(
+            state, arm, mechanics, contact, touch_numbers, touch_state,
+            time_s, time_s, target1[index], target2[index], TICK_S, substeps, work,
+        )  # fmt: skip
+        for place in range(state.size):
+            history[index, place] = state[place]
+
+
+def without_friction(name: str = "S") -> Arm:
+    return dataclasses.replace(ARMS[name], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0))
+
+
+def one_joint(coulomb_Nm: float = 0.0, viscous_Nm_s: float = 0.0) -> tuple[Arm, float]:
+    """An arm whose elbow is locked by friction, and the inertia about its shoulder with the elbow stretched."""
+    arm = dataclasses.replace(
+        ARMS["S"], viscous_Nm_s=(viscous_Nm_s, 0.0), coulomb_Nm=(coulomb_Nm, LOCKED_NM), rated_torque_Nm=(1e3, 1e3)
+    )
+    alpha, beta, gamma = arm.inertia()
+    return arm, alpha + gamma + 2.0 * beta
+
+
+class GeneralArm:
+    """An arm in the general integrator."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        settings: MechanicsSettings,
+        q=(0.0, 0.0),
+        dq=(0.0, 0.0),
+        payload=(0.0, (0.0, 0.0), 0.0),
+        substeps: int | None = None,
+    ) -> None:
+        self.arm, self.settings = arm, settings
+        self.numbers, self.mechanics = arm.numbers(), settings.numbers(arm)
+        self.substeps = settings.substeps(arm, [payload]) if substeps is None else substeps
+        self.state = np.zeros(MECHANICAL_STATE)
+        fit_payload(self.state, self.numbers, payload[0], *payload[1], payload[2])
+        self.state[Q : Q + 2] = self.state[SHAFT : SHAFT + 2] = q
+        self.state[DQ : DQ + 2] = self.state[DSHAFT : DSHAFT + 2] = dq
+        self.state[WARMTH : WARMTH + 2] = settings.ambient_C
+        self.work = work_space(0)
+        self.tick = 0
+
+    def run(self, count: int, target1=0.0, target2=0.0, contact=NOBODY) -> np.ndarray:
+        """Run `count` ticks; targets are numbers or histories (count,). Gives the state after each tick."""
+        targets = [np.broadcast_to(np.asarray(target, dtype=float), count).copy() for target in (target1, target2)]
+        history = np.zeros((count, self.state.size))
+        run_arm(
+            self.state, self.numbers, self.mechanics, contact, NO_TOUCH, NOBODY,
+            self.tick, *targets, count, self.substeps, self.work, history,
+        )  # fmt: skip
+        self.tick += count
+        return history
+
+    def observe(self, contact=NOBODY) -> dict[str, np.ndarray]:
+        """What is true now."""
+        time_s = self.tick * TICK_S
+        values = observe(self.state, self.numbers, self.mechanics, contact, NO_TOUCH, NOBODY, time_s, time_s, self.work)
+        return {name: np.array(values[2 * i : 2 * i + 2]) for i, name in enumerate(("tau_ext", "friction", "gravity"))}
+
+    @property
+    def q(self) -> np.ndarray:
+        return self.state[Q : Q + 2]
+
+    @property
+    def dq(self) -> np.ndarray:
+        return self.state[DQ : DQ + 2]
+
+    @property
+    def joint_torque(self) -> np.ndarray:
+        return self.state[JOINT_TORQUE : JOINT_TORQUE + 2]
+
+    def energy_J(self) -> float:
+        """Kinetic energy, energy of the springs and height in the field of gravity; from the end of a tick."""
+        state, settings = self.state, self.settings
+        m11, m12, m22 = mass_matrix(state, state[Q + 1])
+        dq1, dq2 = self.dq
+        energy = 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
+        for joint in range(2):
+            stiffness = settings.stiffness_Nm_rad[joint]
+            if stiffness > 0.0:
+                twist = state[SHAFT + joint] - state[Q + joint]
+                energy += 0.5 * settings.rotor_inertia_kg_m2[joint] * state[DSHAFT + joint] ** 2
+                energy += 0.5 * stiffness * max(abs(twist) - 0.5 * settings.backlash_rad[joint], 0.0) ** 2
+        slope = 9.80665 * math.sin(math.radians(settings.tilt_deg))
+        downhill = math.radians(settings.tilt_direction_deg)
+        first, second = state[Q], state[Q] + state[Q + 1]
+        length = self.numbers[LENGTH]
+        along1 = self.numbers[MOMENT] + state[PAYLOAD] * length
+        along2, beside2 = state[INERTIA + 1] / length, state[SKEW] / length
+        height = along1 * math.cos(downhill - first) + along2 * math.cos(downhill - second)
+        return energy - slope * (height + beside2 * math.sin(downhill - second))
+
+    def gravity_torque(self, q) -> np.ndarray:
+        return np.array(gravity_torque(self.state, self.numbers, self.mechanics, *q))

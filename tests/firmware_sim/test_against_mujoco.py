@@ -1,0 +1,245 @@
+"""The arm against MuJoCo, an engine that is not ours: trajectories, springs, backlash, and what a collision gives."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from general_arm import NOBODY, GeneralArm, without_friction
+
+from adacd_hil.control.quintic import corner_to_corner
+from firmware_sim.contact import TICK_S, ContactSettings
+from firmware_sim.mechanics_settings import MechanicsSettings
+from firmware_sim.plant import CURRENT_LOOP_RAD_S, DSHAFT, SHAFT, TAU, mass_matrix
+
+POINT_PAYLOAD = (1.0, (0.0, 0.0), 0.0)
+BODY_PAYLOAD = (1.5, (0.05, 0.08), 0.01)
+NONE = (0.0, (0.0, 0.0), 0.0)
+CORNER = np.radians([-30.0, -60.0])
+AS_RIGID = MechanicsSettings(heat_capacity_J_K=(1e9, 1e9))
+SPRINGS = {"stiffness_Nm_rad": (6000.0, 2000.0), "rotor_inertia_kg_m2": (0.3, 0.05)}
+
+
+def engine(arm: GeneralArm, payload=NONE, ball: str = "") -> mujoco.MjModel:
+    """Build the arm: links as bodies, rotors as wheels of their own, springs as tendons between wheel and joint."""
+    settings = arm.settings
+    first, second = arm.arm.links
+    slope = 9.80665 * math.sin(math.radians(settings.tilt_deg))
+    downhill = math.radians(settings.tilt_direction_deg)
+    mass_kg, (along_m, beside_m), inertia = payload
+    load = ""
+    if mass_kg > 0.0:
+        # an engine wants some inertia about every axis; only the one about z moves
+        load = (
+            f'<body pos="{second.length_m} 0 0"><inertial pos="{along_m} {beside_m} 0" mass="{mass_kg}" '
+            f'diaginertia="{max(inertia, 1e-12)} {max(inertia, 1e-12)} {max(inertia, 1e-12)}"/></body>'
+        )
+    wheels, tendons = "", ""
+    for joint in range(2):
+        if settings.stiffness_Nm_rad[joint] > 0.0:
+            rotor = settings.rotor_inertia_kg_m2[joint]
+            wheels += (
+                f'<body><joint name="m{joint}" type="hinge" axis="0 0 1"/>'
+                f'<inertial pos="0 0 0" mass="1" diaginertia="{rotor} {rotor} {rotor}"/></body>'
+            )
+            half = 0.5 * settings.backlash_rad[joint]
+            tendons += (
+                f'<fixed stiffness="{settings.stiffness_Nm_rad[joint]}" springlength="{-half} {half}" '
+                f'damping="{settings.damping_Nm_s[joint]}">'
+                f'<joint joint="m{joint}" coef="1"/><joint joint="j{joint}" coef="-1"/></fixed>'
+            )
+    text = f"""
+    <mujoco>
+      <compiler angle="radian" inertiafromgeom="false" balanceinertia="false" boundinertia="1e-12"/>
+      <option timestep="{TICK_S}" integrator="RK4"
+        gravity="{slope * math.cos(downhill)} {slope * math.sin(downhill)} 0"/>
+      <worldbody>
+        <body name="link1">
+          <joint name="j0" type="hinge" axis="0 0 1"/>
+          <inertial pos="{first.center_m} 0 0" mass="{first.mass_kg}"
+            diaginertia="{first.inertia_kg_m2} {first.inertia_kg_m2} {first.inertia_kg_m2}"/>
+          <body name="link2" pos="{first.length_m} 0 0">
+            <joint name="j1" type="hinge" axis="0 0 1"/>
+            <inertial pos="{second.center_m} 0 0" mass="{second.mass_kg}"
+              diaginertia="{second.inertia_kg_m2} {second.inertia_kg_m2} {second.inertia_kg_m2}"/>
+            <geom name="skin" type="capsule" fromto="0 0 0 {second.length_m} 0 0" size="0.02"
+              condim="1" solref="-40000 -40"/>
+            {load}
+          </body>
+        </body>
+        {wheels}
+        {ball}
+      </worldbody>
+      <tendon>{tendons}</tendon>
+    </mujoco>"""
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def place(model: mujoco.MjModel, name: str) -> int:
+    return int(model.joint(name).dofadr[0])
+
+
+def paper_torque(arm: GeneralArm, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Play a host that moves the motors by joint PD; gives q each millisecond and the mean torque of each tick."""
+    amplitude, half_s = np.radians([30.0, 60.0]), np.array([1.125, 4.5])
+    q_d, dq_d, ddq_d = np.zeros(2), np.zeros(2), np.zeros(2)
+    positions, torques = [], []
+    is_elastic = arm.settings.stiffness_Nm_rad[0] > 0.0
+    turn = CURRENT_LOOP_RAD_S * TICK_S
+    share = -math.expm1(-turn) / turn
+    for cycle in range(round(seconds * 1e3)):
+        corner_to_corner(cycle * 1e-3, amplitude, half_s, q_d, dq_d, ddq_d)
+        shaft = arm.state[SHAFT : SHAFT + 2] if is_elastic else arm.q
+        speed = arm.state[DSHAFT : DSHAFT + 2] if is_elastic else arm.dq
+        target = np.array([500.0, 40.0]) * (q_d - shaft) + np.array([25.0, 1.5]) * (dq_d - speed)
+        before = arm.state[TAU : TAU + 2].copy()
+        history = arm.run(10, *target)
+        reached = np.vstack([before, history[:-1, TAU : TAU + 2]])
+        torques.append(target + (reached - target) * share)
+        positions.append(arm.q.copy())
+    return np.array(positions), np.concatenate(torques)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "payload", "seconds"),
+    [
+        (AS_RIGID, NONE, 10.0),
+        (AS_RIGID, POINT_PAYLOAD, 10.0),
+        (MechanicsSettings(tilt_deg=20.0, tilt_direction_deg=-60.0), BODY_PAYLOAD, 10.0),
+        (MechanicsSettings(**SPRINGS), POINT_PAYLOAD, 10.0),
+        (MechanicsSettings(**SPRINGS, damping_Nm_s=(3.0, 1.0), tilt_deg=20.0), BODY_PAYLOAD, 10.0),
+        # flanks that rattle undamped forget their past: each knock enlarges what the knock before it left
+        (MechanicsSettings(**SPRINGS, backlash_rad=(2e-3, 2e-3)), NONE, 2.0),
+    ],
+)
+def test_the_paper_motion_is_that_of_mujoco_within_a_milliradian(settings, payload, seconds):
+    """The drives' torque of our run, played open loop into the engine."""
+    arm = GeneralArm(without_friction("S"), settings, q=CORNER, payload=payload)
+    model = engine(arm, payload)
+    data = mujoco.MjData(model)
+    links = [place(model, "j0"), place(model, "j1")]
+    data.qpos[links] = CORNER
+    motors = links
+    if settings.stiffness_Nm_rad[0] > 0.0:
+        motors = [place(model, "m0"), place(model, "m1")]
+        data.qpos[motors] = CORNER
+    positions, torques = paper_torque(arm, seconds)
+    found = np.zeros_like(positions)
+    for index, torque in enumerate(torques):
+        data.qfrc_applied[motors] = torque
+        mujoco.mj_step(model, data)
+        if index % 10 == 9:
+            found[index // 10] = data.qpos[links]
+    assert np.ptp(positions, axis=0).min() > 0.2
+    assert np.abs(torques).max() > 2.0
+    print(f"largest distance {np.abs(found - positions).max():.1e} rad")
+    assert np.abs(found - positions).max() < 1e-3
+
+
+def momentum(arm: GeneralArm, q, dq) -> np.ndarray:
+    m11, m12, m22 = mass_matrix(arm.state, q[1])
+    return np.array([[m11, m12], [m12, m22]]) @ dq
+
+
+@pytest.mark.parametrize("settings", [AS_RIGID, MechanicsSettings(**SPRINGS, damping_Nm_s=(3.0, 1.0))])
+@pytest.mark.parametrize(
+    ("link", "point_m", "angle_deg", "frame", "shape"),
+    [
+        (1, 0.25, 90.0, "link", "step"),
+        (2, 0.20, -90.0, "link", "half_sine"),
+        (2, 0.30, 40.0, "world", "push"),
+    ],
+)
+def test_a_prescribed_pulse_changes_the_momentum_as_in_mujoco(settings, link, point_m, angle_deg, frame, shape):
+    contact = ContactSettings(
+        at_s=0.0,
+        link=link,
+        point_m=point_m,
+        force_N=60.0,
+        duration_s=0.03,
+        angle_deg=angle_deg,
+        frame=frame,
+        shape=shape,
+    )
+    q, dq = np.array([0.3, 0.9]), np.array([0.8, -1.5])
+    arm = GeneralArm(without_friction("S"), settings, q=q, dq=dq)
+    before = momentum(arm, q, dq)
+    model = engine(arm)
+    data = mujoco.MjData(model)
+    links = [place(model, "j0"), place(model, "j1")]
+    data.qpos[links], data.qvel[links] = q, dq
+    if settings.stiffness_Nm_rad[0] > 0.0:
+        motors = [place(model, "m0"), place(model, "m1")]
+        data.qpos[motors], data.qvel[motors] = q, dq
+    body = model.body(f"link{link}").id
+    for index in range(300):
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        time_s = (index + 0.5) * TICK_S
+        force_N = {
+            "step": 60.0,
+            "half_sine": 60.0 * math.sin(math.pi * time_s / 0.03),
+            "push": 60.0 * min(1.0, time_s / 0.0075, (0.03 - time_s) / 0.0075),
+        }[shape]
+        rotation = data.xmat[body].reshape(3, 3)
+        direction = np.array([math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg)), 0.0])
+        if frame == "link":
+            direction = rotation @ direction
+        point = data.xpos[body] + rotation @ [point_m, 0.0, 0.0]
+        data.qfrc_applied[:] = 0.0
+        mujoco.mj_applyFT(model, data, force_N * direction, np.zeros(3), point, body, data.qfrc_applied)
+        mujoco.mj_step(model, data)
+    arm.run(300, contact=np.array(contact.row()))
+    gained = momentum(arm, arm.q, arm.dq) - before
+    expected = momentum(arm, data.qpos[links], data.qvel[links]) - before
+    assert np.linalg.norm(expected) > 0.1
+    assert np.linalg.norm(gained - expected) < 0.002 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("speed_m_s", [0.5, 2.0])
+@pytest.mark.parametrize("payload", [NONE, POINT_PAYLOAD])
+def test_a_ball_that_hits_link_2_in_mujoco_moves_our_arm_alike(speed_m_s, payload):
+    """The ball's loss of momentum in the engine, given to our arm as a pulse, changes the arm's momentum within 2 %."""
+    arm = GeneralArm(without_friction("S"), AS_RIGID, q=(0.3, 0.9), payload=payload)
+    ball = (
+        '<body name="ball"><joint name="bx" type="slide" axis="1 0 0"/><joint name="by" type="slide" axis="0 1 0"/>'
+        '<geom type="sphere" size="0.05" condim="1" solref="-40000 -40"/>'
+        '<inertial pos="0 0 0" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/></body>'
+    )
+    model = engine(arm, payload, ball)
+    data = mujoco.MjData(model)
+    links, slides = [place(model, "j0"), place(model, "j1")], [place(model, "bx"), place(model, "by")]
+    elbow = 0.35 * np.array([math.cos(0.3), math.sin(0.3)])
+    along, normal = np.array([math.cos(1.2), math.sin(1.2)]), np.array([-math.sin(1.2), math.cos(1.2)])
+    data.qpos[links] = 0.3, 0.9
+    data.qpos[slides] = elbow + 0.2 * along + 0.0702 * normal
+    data.qvel[slides] = -speed_m_s * normal
+    touching = []
+    for _ in range(1_000):
+        mujoco.mj_step(model, data)
+        touching.append(data.ncon > 0)
+        if touching[-1] is False and any(touching):
+            break
+    duration_ticks = sum(touching)
+    lost_N_s = 0.5 * np.linalg.norm(data.qvel[slides] + speed_m_s * normal)
+    assert 20 < duration_ticks < 400
+    duration_s = duration_ticks * TICK_S
+    pulse = ContactSettings(
+        at_s=0.0,
+        link=2,
+        point_m=0.2,
+        force_N=lost_N_s * math.pi / (2.0 * duration_s),
+        duration_s=duration_s,
+        angle_deg=-90.0,
+        shape="half_sine",
+    )
+    arm.run(duration_ticks, contact=np.array(pulse.row()))
+    arm.run(len(touching) - duration_ticks, contact=NOBODY)
+    gained = momentum(arm, arm.q, arm.dq)
+    expected = momentum(arm, data.qpos[links], data.qvel[links])
+    assert np.linalg.norm(expected) > 0.05
+    print(
+        f"difference {np.linalg.norm(gained - expected) / np.linalg.norm(expected):.2%} over {duration_s * 1e3:.1f} ms"
+    )
+    assert np.linalg.norm(gained - expected) < 0.02 * np.linalg.norm(expected)

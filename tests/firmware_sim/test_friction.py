@@ -1,0 +1,206 @@
+"""Friction beyond viscous and Coulomb: against closed forms, by itself and in the moving arm."""
+
+import math
+
+import numpy as np
+import pytest
+from general_arm import GeneralArm, one_joint
+
+from firmware_sim.contact import TICK_S
+from firmware_sim.friction import advance_bristle, bristle_rate
+from firmware_sim.mechanics_settings import MechanicsSettings
+from firmware_sim.plant import BRISTLE, DQ, DSHAFT, SHAFT, WARMTH, Q
+
+COULOMB_NM, STATIC_NM, STRIBECK_RAD_S = 0.5, 0.8, 0.1
+STRIBECK = {"static_Nm": (STATIC_NM, 0.0), "stribeck_velocity_rad_s": (STRIBECK_RAD_S, 0.1)}
+LUGRE = {**STRIBECK, "sigma0_Nm_rad": (2000.0, 0.0), "sigma1_Nm_s": (20.0, 0.0), "sigma2_Nm_s": (0.3, 0.0)}
+
+
+def level(velocity_rad_s: float) -> float:
+    return COULOMB_NM + (STATIC_NM - COULOMB_NM) * math.exp(-((velocity_rad_s / STRIBECK_RAD_S) ** 2))
+
+
+def sliding(
+    settings: MechanicsSettings, velocity_rad_s: float, seconds: float = 0.3, viscous: float = 0.0
+) -> GeneralArm:
+    """The shoulder, moved at a steady speed: by a torque of the drive that balances its friction exactly in the end.
+
+    A heavy rotor keeps the speed while friction settles.
+    """
+    arm, _ = one_joint(COULOMB_NM, viscous)
+    moved = GeneralArm(arm, settings, dq=(velocity_rad_s, 0.0))
+    moved.run(round(seconds / TICK_S))
+    return moved
+
+
+@pytest.mark.parametrize("velocity_rad_s", [0.01, 0.03, 0.1, 0.3, -0.05, 2.0])
+@pytest.mark.parametrize("model", [STRIBECK, LUGRE])
+def test_friction_at_steady_speed_lies_on_the_stribeck_curve(model, velocity_rad_s):
+    moved = sliding(MechanicsSettings(**model, rotor_inertia_kg_m2=(100.0, 0.0)), velocity_rad_s, viscous=0.3)
+    now = moved.dq[0]
+    assert now == pytest.approx(velocity_rad_s, abs=0.006)
+    expected = math.copysign(level(now), now) + 0.3 * now
+    assert moved.observe()["friction"][0] == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_joint_breaks_away_at_its_static_friction_and_not_before(way):
+    arm, _ = one_joint(COULOMB_NM)
+    held = GeneralArm(arm, MechanicsSettings(**STRIBECK))
+    history = held.run(5_000, way * 0.999 * STATIC_NM)
+    assert np.abs(history[:, [Q, DQ]]).max() == 0.0
+    assert held.observe()["friction"][0] == pytest.approx(way * 0.999 * STATIC_NM, rel=1e-9)
+    held.run(5_000, way * 1.001 * STATIC_NM)
+    assert way * held.dq[0] > 5e-4
+
+
+def test_a_joint_that_has_broken_away_accelerates_by_what_friction_falls():
+    """Above v_s the friction has fallen to Coulomb's: the torque that just broke it away accelerates by F_s - F_c."""
+    arm, inertia = one_joint(COULOMB_NM)
+    moved = GeneralArm(arm, MechanicsSettings(**STRIBECK), dq=(0.5, 0.0))
+    moved.state[4] = STATIC_NM
+    history = moved.run(1_000, STATIC_NM)
+    acceleration = (history[-1, DQ] - history[500, DQ]) / (499 * TICK_S)
+    assert acceleration == pytest.approx((STATIC_NM - COULOMB_NM) / inertia, rel=1e-6)
+
+
+def test_a_bristled_joint_is_a_spring_before_it_slides():
+    arm, _ = one_joint(COULOMB_NM)
+    pressed = GeneralArm(arm, MechanicsSettings(**LUGRE))
+    # LuGre's bristle creeps under load with a rate that vanishes with the speed: small loads are a spring
+    pressed.run(4_000, np.linspace(0.0, 0.05, 4_000))
+    pressed.run(4_000, 0.05)
+    assert pressed.q[0] == pytest.approx(0.05 / 2000.0, rel=0.05)
+    pressed.run(4_000, np.linspace(0.05, 0.0, 4_000))
+    pressed.run(4_000)
+    assert abs(pressed.q[0]) < 0.1 * 0.05 / 2000.0
+
+
+def test_small_swings_of_a_bristled_joint_have_the_frequency_of_its_bristles():
+    arm, inertia = one_joint(COULOMB_NM)
+    settings = MechanicsSettings(sigma0_Nm_rad=(2000.0, 0.0), sigma2_Nm_s=(0.0, 0.0))
+    swinging = GeneralArm(arm, settings, dq=(1e-5, 0.0))
+    velocity = swinging.run(20_000)[:, DQ]
+    upward = np.flatnonzero((velocity[:-1] < 0.0) & (velocity[1:] >= 0.0))
+    crossing = upward - velocity[upward] / (velocity[upward + 1] - velocity[upward])
+    period_s = np.diff(crossing).mean() * TICK_S
+    assert period_s == pytest.approx(2.0 * math.pi * math.sqrt(inertia / 2000.0), rel=1e-4)
+
+
+@pytest.mark.parametrize("start_rad", [0.0, 4e-4, -3e-4])
+@pytest.mark.parametrize("velocity_rad_s", [1e-3, 0.5, -5.0])
+def test_a_bristle_follows_a_steady_speed_as_its_equation_says_with_any_step(start_rad, velocity_rad_s):
+    exact = start_rad
+    for _ in range(20_000):
+        half = exact + 2.5e-8 * bristle_rate(2000.0, exact, velocity_rad_s, 0.7)
+        exact += 5e-8 * bristle_rate(2000.0, half, velocity_rad_s, 0.7)
+    found = advance_bristle(2000.0, start_rad, velocity_rad_s, 0.7, 1e-3)
+    assert found == pytest.approx(exact, abs=2e-9)
+    assert abs(advance_bristle(2000.0, start_rad, velocity_rad_s, 0.7, 10.0)) <= 0.7 / 2000.0 * (1.0 + 1e-12)
+
+
+def test_a_stiff_bristle_at_high_speed_stays_stable():
+    arm, _ = one_joint(COULOMB_NM)
+    settings = MechanicsSettings(sigma0_Nm_rad=(20_000.0, 0.0), sigma1_Nm_s=(20.0, 0.0))
+    fast = GeneralArm(arm, settings, dq=(8.0, 0.0))
+    history = fast.run(2_000)
+    assert np.all(np.diff(history[:, DQ]) < 0.0)
+    assert fast.observe()["friction"][0] == pytest.approx(COULOMB_NM, rel=1e-6)
+    assert np.abs(history[:, BRISTLE]).max() == pytest.approx(COULOMB_NM / 20_000.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("is_bristled", [False, True])
+def test_a_joint_drawn_slowly_through_a_spring_sticks_and_slips(is_bristled):
+    """A motor that creeps on draws the link by a soft spring: the spring tightens to F_s, then the link slips.
+
+    A limit cycle: each slip takes the spring below F_c by about as much as it was above, and all cycles last alike.
+    """
+    arm, _ = one_joint(COULOMB_NM)
+    bristles = {"sigma0_Nm_rad": (2e4, 0.0), "sigma1_Nm_s": (60.0, 0.0), "sigma2_Nm_s": (0.0, 0.0)}
+    settings = MechanicsSettings(
+        static_Nm=(STATIC_NM, 0.0),
+        stribeck_velocity_rad_s=(0.005, 0.1),
+        **(bristles if is_bristled else {}),
+        stiffness_Nm_rad=(50.0, 0.0),
+        rotor_inertia_kg_m2=(1e7, 0.0),
+    )
+    drawn = GeneralArm(arm, settings)
+    drawn.state[DSHAFT] = 0.02
+    history = drawn.run(80_000)
+    velocity, spring_Nm = history[:, DQ], 50.0 * (history[:, SHAFT] - history[:, Q])
+    if not is_bristled:
+        assert int(np.argmax(velocity != 0.0)) == pytest.approx(STATIC_NM / 50.0 / 0.02 / TICK_S, abs=2)
+    is_slipping = velocity > 0.02
+    slips = np.flatnonzero(~is_slipping[:-1] & is_slipping[1:])
+    cycles_s = np.diff(slips) * TICK_S
+    assert cycles_s.size >= 3
+    assert np.ptp(cycles_s) < 0.01 * cycles_s.mean()
+    assert (np.abs(velocity) < 1e-3).mean() > 0.3
+    assert spring_Nm.max() == pytest.approx(STATIC_NM, rel=0.1)
+    assert spring_Nm[slips[1] :].min() == pytest.approx(2.0 * COULOMB_NM - spring_Nm.max(), abs=0.05)
+
+
+@pytest.mark.parametrize("speed_rad_s", [0.7, -0.7])
+def test_dry_friction_grows_with_the_torque_through_the_joint(speed_rad_s):
+    arm, _ = one_joint(COULOMB_NM)
+    settings = MechanicsSettings(load_friction=(0.05, 0.0), rotor_inertia_kg_m2=(100.0, 0.0))
+    for torque_Nm in (0.0, 4.0, -8.0):
+        moved = GeneralArm(arm, settings, dq=(speed_rad_s, 0.0))
+        moved.run(100, torque_Nm)
+        friction_Nm = moved.observe()["friction"][0]
+        assert friction_Nm == pytest.approx(math.copysign(COULOMB_NM + 0.05 * abs(torque_Nm), speed_rad_s), rel=2e-3)
+
+
+def test_a_loaded_joint_holds_more_than_an_unloaded_one():
+    """Self-locking: with k_load = 0.5 a torque of 0.9 Nm meets 0.5 + 0.45 Nm of friction."""
+    arm, _ = one_joint(COULOMB_NM)
+    loaded = GeneralArm(arm, MechanicsSettings(load_friction=(0.5, 0.0)))
+    loaded.run(2_000, 0.9)
+    assert loaded.dq[0] == 0.0
+    loaded.run(2_000, 1.1)
+    assert loaded.dq[0] > 0.0
+
+
+def test_friction_of_a_warm_joint_has_fallen_and_of_a_cold_one_risen():
+    arm, _ = one_joint(COULOMB_NM, viscous_Nm_s=0.4)
+    for ambient_C in (5.0, 25.0, 60.0):
+        settings = MechanicsSettings(
+            ambient_C=ambient_C, viscous_drop_per_K=(0.03, 0.0), coulomb_drop_per_K=(0.01, 0.0)
+        )
+        moved = GeneralArm(arm, settings, dq=(1.5, 0.0))
+        expected = 0.5 * math.exp(-0.01 * (ambient_C - 25.0)) + 0.6 * math.exp(-0.03 * (ambient_C - 25.0))
+        assert moved.observe()["friction"][0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_joint_warms_by_the_power_of_its_friction_and_cools_to_ambient():
+    """At a steady 2 rad/s friction of 0.5 Nm is 1 W: up to 1 W · 0.5 s / 0.1 J/K = 5 K, within 0.5 s."""
+    arm, _ = one_joint(COULOMB_NM)
+    settings = MechanicsSettings(
+        heat_capacity_J_K=(0.1, 0.0), cooling_s=(0.5, 1.0), ambient_C=20.0, rotor_inertia_kg_m2=(100.0, 0.0)
+    )
+    warmed = GeneralArm(arm, settings, dq=(2.0, 0.0))
+    history = warmed.run(30_000, COULOMB_NM)
+    times_s = np.arange(1, 30_001) * TICK_S
+    expected = 20.0 + 5.0 * (1.0 - np.exp(-times_s / 0.5))
+    assert np.abs(history[:, WARMTH] - expected).max() < 0.005
+    assert np.ptp(history[:, WARMTH + 1]) == 0.0
+    warmed.state[DQ] = 0.0
+    warmed.run(5_000)
+    assert warmed.state[WARMTH] == pytest.approx(20.0 + 5.0 * math.exp(-1.0), abs=0.02)
+
+
+def test_motor_side_friction_warms_the_joint_as_well():
+    arm, _ = one_joint()
+    settings = MechanicsSettings(
+        heat_capacity_J_K=(0.1, 0.0),
+        cooling_s=(1e5, 1.0),
+        rotor_inertia_kg_m2=(100.0, 0.0),
+        stiffness_Nm_rad=(1e4, 0.0),
+        damping_Nm_s=(20.0, 0.0),
+        motor_coulomb_Nm=(0.3, 0.0),
+        motor_viscous_Nm_s=(0.1, 0.0),
+    )
+    warmed = GeneralArm(arm, settings, dq=(2.0, 0.0))
+    warmed.run(1_000)
+    heat_J = (0.3 + 0.2) * 2.0 * 0.1
+    assert warmed.state[WARMTH] == pytest.approx(25.0 + heat_J / 0.1, abs=0.01)

@@ -1,0 +1,242 @@
+"""The gear between motor and sensor: spring, rotor, backlash, ripple, and friction that the sensor does not see."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from general_arm import GeneralArm, one_joint, without_friction
+
+from firmware_sim.arms import ARMS
+from firmware_sim.body import Body, DriveMode
+from firmware_sim.contact import TICK_S, ContactSettings
+from firmware_sim.mechanics_settings import MechanicsSettings
+from firmware_sim.plant import DQ, DSHAFT, JOINT_TORQUE, SHAFT, Q, mass_matrix
+from firmware_sim.scenario import Scenario
+from firmware_sim.sensing import POSITION_LSB_RAD
+from firmware_sim.transmission import spring_torque
+
+TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
+
+
+def test_an_elastic_joint_swings_at_its_eigenfrequency():
+    arm, inertia = one_joint()
+    settings = MechanicsSettings(stiffness_Nm_rad=(5000.0, 0.0), rotor_inertia_kg_m2=(0.2, 0.0))
+    swinging = GeneralArm(arm, settings)
+    swinging.state[DSHAFT] = 0.1
+    torque_Nm = swinging.run(20_000)[:, JOINT_TORQUE]
+    upward = np.flatnonzero((torque_Nm[:-1] < 0.0) & (torque_Nm[1:] >= 0.0))
+    crossing = upward - torque_Nm[upward] / (torque_Nm[upward + 1] - torque_Nm[upward])
+    expected_rad_s = math.sqrt(5000.0 * (1.0 / 0.2 + 1.0 / inertia))
+    assert 2.0 * math.pi / (np.diff(crossing).mean() * TICK_S) == pytest.approx(expected_rad_s, rel=1e-5)
+
+
+def test_both_joints_swing_at_the_two_eigenfrequencies_of_the_linear_arm():
+    settings = MechanicsSettings(stiffness_Nm_rad=(5000.0, 1500.0), rotor_inertia_kg_m2=(0.3, 0.05))
+    swinging = GeneralArm(without_friction(), settings, q=(0.0, 0.8))
+    swinging.state[DSHAFT : DSHAFT + 2] = 1e-4, -2e-4
+    history = swinging.run(65_536)
+    m11, m12, m22 = mass_matrix(swinging.state, 0.8)
+    mass = np.zeros((4, 4))
+    mass[:2, :2] = [[m11, m12], [m12, m22]]
+    mass[2, 2], mass[3, 3] = 0.3, 0.05
+    spring = np.array(
+        [[5000.0, 0, -5000.0, 0], [0, 1500.0, 0, -1500.0], [-5000.0, 0, 5000.0, 0], [0, -1500.0, 0, 1500.0]]
+    )
+    eigenvalues = np.linalg.eigvals(np.linalg.solve(mass, spring))
+    expected_Hz = np.sort(np.sqrt(np.sort(eigenvalues.real)[2:])) / (2.0 * math.pi)
+    spectrum = np.abs(np.fft.rfft(history[:, JOINT_TORQUE + 1] * np.hanning(65_536)))
+    peaks = np.flatnonzero((spectrum[1:-1] > spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])) + 1
+    highest = np.sort(peaks[np.argsort(spectrum[peaks])[-2:]]) / (65_536 * TICK_S)
+    assert highest == pytest.approx(expected_Hz, abs=0.2)
+
+
+def test_a_stiffer_and_stiffer_joint_becomes_the_stiff_one():
+    arm = dataclasses.replace(ARMS["M"])
+    stiff = GeneralArm(arm, MechanicsSettings(rotor_inertia_kg_m2=(0.2, 0.05)), q=(0.3, -0.7))
+    times_s = np.arange(4_000) * TICK_S
+    targets = 1.5 * np.sin(8.0 * times_s), 0.4 * np.sin(11.0 * times_s)
+    limit = stiff.run(4_000, *targets)
+    away = []
+    for stiffness in (2e3, 2e4, 2e5):
+        settings = MechanicsSettings(
+            rotor_inertia_kg_m2=(0.2, 0.05),
+            stiffness_Nm_rad=(stiffness, stiffness),
+            damping_Nm_s=(0.01 * math.sqrt(stiffness), 0.01 * math.sqrt(stiffness)),
+        )
+        history = GeneralArm(arm, settings, q=(0.3, -0.7)).run(4_000, *targets)
+        away.append(np.abs(history[:, Q : Q + 2] - limit[:, Q : Q + 2]).max())
+    assert away[1] < 0.2 * away[0]
+    assert away[2] < 0.2 * away[1]
+    assert away[2] < 2e-5
+
+
+def test_the_sensor_of_a_stiff_joint_sees_what_is_left_for_the_link():
+    """The rotor takes its share of the torque: tau_J / tau_m is link inertia over total inertia."""
+    arm, inertia = one_joint()
+    settings = MechanicsSettings(rotor_inertia_kg_m2=(0.3, 0.0), motor_viscous_Nm_s=(0.5, 0.0))
+    driven = GeneralArm(arm, settings)
+    driven.run(1_000, 3.0)
+    expected_Nm = (3.0 - 0.5 * driven.dq[0]) * inertia / (inertia + 0.3)
+    assert driven.joint_torque[0] == pytest.approx(expected_Nm, rel=1e-9)
+
+
+def test_a_rotor_of_the_elbow_does_not_turn_the_shoulder():
+    """Kinetic energy of a geared rotor is J dq² / 2 of its own joint: no coupling term."""
+    driven = GeneralArm(without_friction(), MechanicsSettings(rotor_inertia_kg_m2=(0.0, 0.4)))
+    driven.run(1)
+    m11, m12, m22 = mass_matrix(driven.state, 0.0)
+    bare11, bare12, bare22 = mass_matrix(GeneralArm(without_friction(), MechanicsSettings()).state, 0.0)
+    assert (m11, m12) == (bare11, bare12)
+    assert m22 == pytest.approx(bare22 + 0.4, rel=1e-14)
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 8000.0])
+def test_motor_side_friction_is_invisible_to_the_sensor(stiffness):
+    """An arm that moves steadily on motor-side friction alone: the drive works, the sensor reads nothing."""
+    arm, _ = one_joint()
+    settings = MechanicsSettings(
+        rotor_inertia_kg_m2=(0.3, 0.0),
+        stiffness_Nm_rad=(stiffness, 0.0),
+        motor_coulomb_Nm=(0.7, 0.0),
+        motor_viscous_Nm_s=(0.4, 0.0),
+    )
+    moved = GeneralArm(arm, settings, dq=(1.0, 0.0))
+    moved.state[4] = 1.1
+    moved.run(1_000, 1.1)
+    assert moved.dq[0] == pytest.approx(1.0, abs=1e-9)
+    assert abs(moved.joint_torque[0]) < 1e-8
+    assert moved.observe()["friction"][0] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_motor_holds_below_its_own_friction_and_the_sensor_sees_the_load(way):
+    """A push on the link twists the spring against a motor that friction holds."""
+    arm, _ = one_joint()
+    settings = MechanicsSettings(
+        rotor_inertia_kg_m2=(0.3, 0.0),
+        stiffness_Nm_rad=(2000.0, 0.0),
+        damping_Nm_s=(30.0, 0.0),
+        motor_coulomb_Nm=(5.0, 0.0),
+    )
+    pushed = GeneralArm(arm, settings)
+    push = ContactSettings(at_s=0.0, link=1, point_m=0.2, force_N=10.0, duration_s=100.0, angle_deg=way * 90.0)
+    history = pushed.run(10_000, contact=np.array(push.row()))
+    assert np.abs(history[:, [SHAFT, DSHAFT]]).max() == 0.0
+    assert pushed.q[0] == pytest.approx(way * 2.0 / 2000.0, rel=1e-6)
+    assert pushed.joint_torque[0] == pytest.approx(-way * 2.0, rel=1e-6)
+
+
+def test_a_gear_with_backlash_transmits_nothing_in_its_dead_zone():
+    numbers = MechanicsSettings(
+        stiffness_Nm_rad=(1000.0, 1000.0),
+        rotor_inertia_kg_m2=(0.1, 0.1),
+        backlash_rad=(0.01, 0.0),
+        damping_Nm_s=(5.0, 5.0),
+    ).numbers(ARMS["P"])
+    assert [spring_torque(numbers, 0, twist, 3.0) for twist in (-0.005, -0.002, 0.0, 0.004, 0.005)] == [0.0] * 5
+    assert spring_torque(numbers, 0, 0.007, 0.0) == pytest.approx(2.0, rel=1e-12)
+    assert spring_torque(numbers, 0, -0.008, 0.0) == pytest.approx(-3.0, rel=1e-12)
+    assert spring_torque(numbers, 0, 0.007, -3.0) == 0.0
+    assert spring_torque(numbers, 1, 0.007, -3.0) == pytest.approx(-8.0, rel=1e-12)
+
+
+def test_a_motor_crosses_the_backlash_before_it_moves_the_link():
+    arm, _ = one_joint()
+    settings = MechanicsSettings(
+        stiffness_Nm_rad=(5000.0, 0.0),
+        rotor_inertia_kg_m2=(0.1, 0.0),
+        backlash_rad=(0.02, 0.0),
+        damping_Nm_s=(5.0, 0.0),
+    )
+    crossing = GeneralArm(arm, settings)
+    crossing.state[4] = 0.5
+    history = crossing.run(2_000, 0.5)
+    moved = int(np.argmax(history[:, DQ] != 0.0))
+    assert history[moved - 1, SHAFT] <= 0.01
+    assert history[moved, SHAFT] > 0.01
+    assert moved * TICK_S == pytest.approx(math.sqrt(2.0 * 0.01 * 0.1 / 0.5), abs=2e-4)
+
+
+def test_a_hand_finds_the_backlash_as_play_of_the_link():
+    arm, _ = one_joint()
+    settings = MechanicsSettings(
+        stiffness_Nm_rad=(5000.0, 0.0),
+        rotor_inertia_kg_m2=(0.1, 0.0),
+        backlash_rad=(0.02, 0.0),
+        damping_Nm_s=(50.0, 0.0),
+        motor_coulomb_Nm=(50.0, 0.0),
+    )
+    ends = []
+    for way in (1.0, -1.0):
+        held = GeneralArm(dataclasses.replace(arm, viscous_Nm_s=(2.0, 0.0)), settings)
+        push = ContactSettings(at_s=0.0, link=1, point_m=0.2, force_N=5.0, duration_s=100.0, angle_deg=way * 90.0)
+        held.run(20_000, contact=np.array(push.row()))
+        ends.append(held.q[0])
+    assert ends[0] - ends[1] == pytest.approx(0.02 + 2.0 * 1.0 / 5000.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("is_elastic", [False, True])
+def test_the_ripple_has_its_line_in_the_spectrum_of_the_sensor(is_elastic):
+    """Over whole revolutions at a steady speed: one line at the periods per revolution, of the given height."""
+    arm, inertia = one_joint()
+    spring = {"stiffness_Nm_rad": (20_000.0, 0.0), "damping_Nm_s": (40.0, 0.0)} if is_elastic else {}
+    settings = MechanicsSettings(
+        rotor_inertia_kg_m2=(0.01, 0.0),
+        ripple_Nm=(0.2, 0.0),
+        ripple_periods=(36.0, 1.0),
+        ripple_phase_deg=(30.0, 0.0),
+        **spring,
+    )
+    turning = GeneralArm(arm, settings, dq=(2.0 * math.pi, 0.0))
+    history = turning.run(20_000)
+    torque_Nm = history[10_000:, JOINT_TORQUE]
+    amplitude = np.abs(np.fft.rfft(torque_Nm)) * 2.0 / torque_Nm.size
+    assert int(np.argmax(amplitude[1:])) + 1 == 36
+    assert amplitude[36] == pytest.approx(0.2 * inertia / (inertia + 0.01), rel=0.03)
+    others = np.delete(amplitude, [0, 35, 36, 37])
+    assert others.max() < 0.05 * amplitude[36]
+
+
+def test_the_ripple_begins_with_its_phase_and_grows_with_the_motor_torque():
+    arm, _ = one_joint(coulomb_Nm=1e3)
+    settings = MechanicsSettings(ripple_Nm=(0.2, 0.0), ripple_share=(0.05, 0.0), ripple_phase_deg=(30.0, 0.0))
+    held = GeneralArm(arm, settings)
+    for torque_Nm in (0.0, 4.0, -4.0):
+        held.run(500, torque_Nm)
+        assert held.joint_torque[0] == pytest.approx(torque_Nm + 0.5 * (0.2 + 0.05 * abs(torque_Nm)), abs=1e-9)
+
+
+@pytest.mark.parametrize("side", ["motor", "link"])
+def test_the_encoder_is_on_its_side_of_the_spring(side):
+    settings = MechanicsSettings(
+        stiffness_Nm_rad=(500.0, 500.0), rotor_inertia_kg_m2=(0.2, 0.05), damping_Nm_s=(1.0, 1.0), encoder_side=side
+    )
+    body = Body(Scenario(mechanics=settings, noise=False))
+    for _ in range(10):
+        body.advance((5.0, 2.0), TORQUE)
+    state = body._state
+    read = state[SHAFT : SHAFT + 2] if side == "motor" else state[Q : Q + 2]
+    assert np.abs(state[SHAFT : SHAFT + 2] - state[Q : Q + 2]).min() > 10.0 * POSITION_LSB_RAD
+    assert body.sample().q == pytest.approx(read, abs=0.51 * POSITION_LSB_RAD)
+
+
+def test_the_sensor_of_an_elastic_arm_measures_its_springs():
+    settings = MechanicsSettings(stiffness_Nm_rad=(500.0, 500.0), rotor_inertia_kg_m2=(0.2, 0.05))
+    body = Body(Scenario(mechanics=settings, noise=False))
+    for _ in range(10):
+        body.advance((5.0, 2.0), TORQUE)
+    twist = body._state[SHAFT : SHAFT + 2] - body._state[Q : Q + 2]
+    assert body.sample().tau_J == pytest.approx(500.0 * twist, abs=1e-3)
+    assert body.motor_torque_Nm == pytest.approx((5.0, 2.0), rel=1e-9)
+
+
+def test_one_elastic_and_one_stiff_joint_go_together():
+    both = MechanicsSettings(stiffness_Nm_rad=(5000.0, 1e6), rotor_inertia_kg_m2=(0.2, 0.05), damping_Nm_s=(2.0, 50.0))
+    one = MechanicsSettings(stiffness_Nm_rad=(5000.0, 0.0), rotor_inertia_kg_m2=(0.2, 0.05), damping_Nm_s=(2.0, 0.0))
+    ends = []
+    for settings in (both, one):
+        arm = GeneralArm(ARMS["M"], settings, q=(0.3, -0.7))
+        ends.append(arm.run(3_000, 2.0, -0.5)[-1, [Q, Q + 1, SHAFT, SHAFT + 1]])
+    assert ends[0] == pytest.approx(ends[1], abs=5e-5)
+    assert ends[1][1] == ends[1][3]
