@@ -1,4 +1,4 @@
-"""Packets between the control process and the writer: one per cycle, one per event, one to end.
+"""Packets between the control process and the writer: one per cycle, one per event, one to end; see outbox.py too.
 
 A cycle's packet: kind, count of messages, count of frames, packets dropped so far, t_ns; then per frame identifier,
 count of data bytes, flags, the first 8 of them, t_ns; then per message channel and size; then the bodies; then what FD
@@ -22,6 +22,7 @@ from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, Frame
 CYCLE = 1
 EVENT = 2
 END = 3
+BATCH = 4
 
 _HEAD_FORMAT = "BBHIq"
 _FRAME_FORMAT = "IBB2x8sq"

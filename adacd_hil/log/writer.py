@@ -14,6 +14,7 @@ import contextlib
 import json
 import os
 import socket
+import struct
 import sys
 
 import numpy as np
@@ -23,6 +24,7 @@ from adacd_hil.log import packet
 from adacd_hil.log.channels import MessageLike, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import McapFile
+from adacd_hil.log.outbox import read_outbox, split
 from adacd_hil.log.packet_writer import PacketWriter
 from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
@@ -41,20 +43,20 @@ BATCH_BYTES = 256 * 1024
 class WriterProcess:
     """The loop around a PacketWriter."""
 
-    def __init__(self, connection: socket.socket, sink: Sink, setup: Setup) -> None:
+    def __init__(self, connection: socket.socket, sink: Sink, setup: Setup, outbox: int | None) -> None:
         messages = () if setup.is_truth else _dbc_messages(setup)
         channels = truth_channels() if setup.is_truth else run_channels(setup.parameter_count, messages)
         self._connection = connection
         self._sink = sink
+        self._outbox = outbox
         self._file = McapFile(sink, channels, setup.attachments, setup.metadata)
         self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count)
         self._is_blocking = setup.is_blocking
         connection.setblocking(False)
-        self._buffer = bytearray(BATCH_BYTES + RECEIVE_BYTES + packet.ROOM)
-        self._room = memoryview(self._buffer)
-        self._data = np.frombuffer(self._buffer, np.uint8)
-        self._starts: list[int] = []  # of the packets in the buffer
-        self._end = 0  # of the last of them
+        self._buffer = bytearray(RECEIVE_BYTES)
+        self._gathered: list[bytes] = []
+        self._gathered_bytes = 0
+        self._batch = 0  # number of the latest one
         self._packets_unclocked = 0
         self._clock = MonotonicClock()
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
@@ -63,10 +65,13 @@ class WriterProcess:
     def run(self) -> None:
         """Write until the end, then answer with the last word."""
         ending = "control process died"
-        while size := self._receive():
-            if not self._take(size):
+        while received := self._receive():
+            if received[0] == packet.END:
                 ending = "closed"
                 break
+            self._take(received)
+        else:
+            self._take_what_is_left()
         self._write()
         summary = {
             "frames": str(self._packets.frames),
@@ -78,19 +83,17 @@ class WriterProcess:
         self._sink.close()
         _send_word(self._connection, {**summary, "lost": str(self._lost), "error": self._sink.error})
 
-    def _receive(self) -> int:
-        """Put the next packet behind those in the buffer and return its size, 0 when there will be none.
-
-        In real time, flushes by the clock as time passes.
-        """
+    def _receive(self) -> bytes:
+        """Return the next packet, b"" when there will be none; in real time, flushes by the clock as time passes."""
         self._packets_unclocked += 1
         if self._packets_unclocked >= PACKETS_PER_CLOCK:
             self._look_at_clock()
         while True:
             try:
-                return self._connection.recv_into(self._room[self._end :], RECEIVE_BYTES)
+                count = self._connection.recv_into(self._buffer)
+                return bytes(memoryview(self._buffer)[:count])
             except ConnectionResetError:
-                return 0
+                return b""
             except BlockingIOError:
                 self._clock.sleep_until_ns(self._look_at_clock() + POLL_PERIOD_NS)
 
@@ -103,26 +106,40 @@ class WriterProcess:
             self._flushed_ns = now_ns
         return now_ns
 
-    def _take(self, size: int) -> bool:
-        """Keep the packet that was just received; False when it is the end."""
-        kind = self._buffer[self._end]
-        if kind == packet.END:
-            return False
-        if size < packet.HEAD.size or kind not in (packet.CYCLE, packet.EVENT):
+    def _take(self, received: bytes) -> None:
+        """Keep the packet that was just received, or the packets of a batch."""
+        if received[0] != packet.BATCH:
+            self._keep(received)
+            return
+        try:
+            self._batch, packets = split(received)
+        except struct.error:
             self._lost += 1
-            return True
+            return
+        for each in packets:
+            self._keep(each)
+
+    def _take_what_is_left(self) -> None:
+        """Keep the batch that the control process had not sent when it died."""
+        if self._outbox is not None:
+            batch = read_outbox(self._outbox)
+            if split(batch)[0] != self._batch:
+                self._take(batch)
+
+    def _keep(self, received: bytes) -> None:
+        """Keep a packet until it is written with others; in lockstep, flushes by its time."""
+        if len(received) < packet.HEAD.size or received[0] not in (packet.CYCLE, packet.EVENT):
+            self._lost += 1
+            return
         if self._is_blocking:
-            _, _, _, _, t_ns = packet.HEAD.unpack_from(self._buffer, self._end)
+            _, _, _, _, t_ns = packet.HEAD.unpack_from(received)
             if t_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
-                received = self._buffer[self._end : self._end + size]
                 self._flush()
-                self._buffer[:size] = received
                 self._flushed_ns = t_ns
-        self._starts.append(self._end)
-        self._end += size
-        if self._end >= BATCH_BYTES:
+        self._gathered.append(received)
+        self._gathered_bytes += len(received)
+        if self._gathered_bytes >= BATCH_BYTES:
             self._write()
-        return True
 
     def _flush(self) -> None:
         """Write what has been gathered and end the chunk in progress."""
@@ -132,12 +149,13 @@ class WriterProcess:
     def _write(self) -> None:
         """Write what has been gathered."""
         if self._sink.error:
-            self._lost += len(self._starts)
-        elif self._starts:
-            edges = np.array([*self._starts, self._end])
-            self._lost += self._packets.write(self._data, edges[:-1], np.diff(edges))
-        self._starts = []
-        self._end = 0
+            self._lost += len(self._gathered)
+        elif self._gathered:
+            edges = np.cumsum([0, *map(len, self._gathered)])
+            data = np.frombuffer(b"".join((*self._gathered, bytes(packet.ROOM))), np.uint8)
+            self._lost += self._packets.write(data, edges[:-1], np.diff(edges))
+        self._gathered = []
+        self._gathered_bytes = 0
 
 
 def _dbc_messages(setup: Setup) -> tuple[MessageLike, ...]:
@@ -158,14 +176,14 @@ def _schedule_plainly() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def main(socket_descriptor: int, file_descriptor: int) -> None:
+def main(socket_descriptor: int, file_descriptor: int, outbox_descriptor: int | None = None) -> None:
     """Write a log: say when ready, take packets until the end, say how it went."""
     _schedule_plainly()
     connection = socket.socket(fileno=socket_descriptor)
     sink = Sink(file_descriptor)
     try:
         setup = Setup.from_json(sys.stdin.buffer.read())
-        process = WriterProcess(connection, sink, setup)
+        process = WriterProcess(connection, sink, setup, outbox_descriptor)
         sink.settle()
         if sink.error:
             raise LogError(sink.error)
@@ -177,4 +195,4 @@ def main(socket_descriptor: int, file_descriptor: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    main(*map(int, sys.argv[1:]))
