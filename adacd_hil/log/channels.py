@@ -83,6 +83,34 @@ class SignalLike(Protocol):
     def unit(self) -> str:
         """Unit of the decoded value."""
 
+    @property
+    def scale(self) -> float:
+        """Physical value of one raw step."""
+
+    @property
+    def offset(self) -> float:
+        """Physical value of raw zero."""
+
+    @property
+    def container(self) -> int:
+        """Which of the integers that make up the frame holds it."""
+
+    @property
+    def shift(self) -> int:
+        """Its lowest bit within that integer, where it has a mask."""
+
+    @property
+    def mask(self) -> int:
+        """Its bits after the shift; 0 when it is the whole integer, of one byte otherwise."""
+
+    @property
+    def raw_low(self) -> int:
+        """Smallest raw value; below 0 it is signed."""
+
+    @property
+    def raw_high(self) -> int:
+        """Largest raw value."""
+
 
 class MessageLike(Protocol):
     """What the table needs to know of a DBC message."""
@@ -101,10 +129,7 @@ class MessageLike(Protocol):
 
     @property
     def signals(self) -> "tuple[SignalLike, ...]":
-        """Signals in the order of `decode`."""
-
-    def decode(self, data: bytes, /) -> tuple[float, ...]:
-        """Decode the data bytes to values in SI units, in the order of `signals`."""
+        """Signals in the order of their containers, and of the fields of its topic."""
 
 
 def _constants(prefix: str, values: type[IntEnum]) -> tuple[tuple[str, int], ...]:

@@ -1,7 +1,7 @@
 """The control side of the log: hands each cycle to the writer process in one packet, and never waits in real time.
 
 A full socket (the writer is behind) or a dead writer costs packets, never time and never an exception: `dropped`
-counts. In lockstep (`blocking`) it waits instead, and nothing is lost.
+counts. In lockstep (`blocking`) it waits instead, and nothing is lost; the packets of some cycles go together.
 """
 
 import contextlib
@@ -19,6 +19,7 @@ from typing import NamedTuple
 from adacd_hil.log import packet
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
+from adacd_hil.log.outbox import Outbox
 from adacd_hil.log.setup import Setup
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.wire.bus import Frame
@@ -83,6 +84,7 @@ class Recorder:
         self._summary: LogSummary | None = None
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         _enlarge_buffer(self._socket)
+        self._outbox = Outbox() if blocking else None
         with theirs:
             self._process = self._start(theirs, setup)
         self._wait_until_ready()
@@ -92,15 +94,16 @@ class Recorder:
         try:
             file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
-            self._socket.close()
+            self._release()
             raise LogError(f"log {self.path} can't be created: {error.strerror}") from None
+        descriptors = (theirs.fileno(), file, *([self._outbox.descriptor] if self._outbox else []))
         try:
             # A session of its own: Ctrl-C is for the control process. No folder but ours is searched for modules.
             process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "adacd_hil.log.writer", str(theirs.fileno()), str(file)],
+                [sys.executable, "-P", "-m", "adacd_hil.log.writer", *map(str, descriptors)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                pass_fds=(theirs.fileno(), file),
+                pass_fds=descriptors,
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": _module_path()},
             )
@@ -117,7 +120,7 @@ class Recorder:
         if error:
             self._process.kill()
             self._process.wait()
-            self._socket.close()
+            self._release()
             with contextlib.suppress(OSError):
                 if stat.S_ISREG(self.path.stat().st_mode):
                     self.path.unlink()
@@ -138,25 +141,45 @@ class Recorder:
         """Log an event."""
         self._send(packet.pack_event(t_ns, self.dropped, event))
 
+    def flush(self) -> None:
+        """Hand over what waits to be handed over together."""
+        if self._outbox is not None and self._outbox.count:
+            self._hand_over(self._outbox.batch(), self._outbox.count)
+            self._outbox.clear()
+
     def _send(self, data: bytes) -> None:
+        if self._outbox is None:
+            self._hand_over(data, 1)
+        elif not self._outbox.put(data):
+            self.flush()
+            if not self._outbox.put(data):
+                self._hand_over(data, 1)
+
+    def _hand_over(self, data: bytes, count: int) -> None:
         try:
             self._socket.send(data)
         except OSError:  # no room, or nobody there
-            self.dropped += 1
+            self.dropped += count
 
     def close(self) -> LogSummary:
         """End the file and say how it went; never raises, twice is once."""
         if self._summary is None:
+            self.flush()
             self._socket.settimeout(END_TIMEOUT_S)
             with contextlib.suppress(OSError):
                 self._socket.send(packet.pack_end(self.dropped))
             word = self._hear(END_TIMEOUT_S)
-            self._socket.close()
+            self._release()
             if word is None:
                 self._process.kill()
             self._process.wait()
             self._summary = self._summarise(word)
         return self._summary
+
+    def _release(self) -> None:
+        self._socket.close()
+        if self._outbox is not None:
+            self._outbox.close()
 
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
         if word is None:

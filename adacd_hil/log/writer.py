@@ -4,6 +4,8 @@ It shares nothing with the control process but the socket: neither its CAN socke
 so that Ctrl-C reaches only the control process. It ends the file when it is told to or when the control process dies.
 A disk that fails doesn't stop it from taking packets; they are counted as dropped.
 
+Packets are gathered and written many at a time, at the latest when a chunk has to end: see packet_writer.py.
+
 In lockstep the file depends on the packets only, bit for bit; so its chunks end by log time. Otherwise they end by the
 clock, so that silence doesn't keep data from the disk.
 """
@@ -15,17 +17,17 @@ import socket
 import struct
 import sys
 
+import numpy as np
+
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.log.cdr import ENCAPSULATION
-from adacd_hil.log.channels import SCHEME_BLOCK, ChannelId, MessageLike, run_channels, truth_channels
+from adacd_hil.log import packet
+from adacd_hil.log.channels import MessageLike, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import McapFile
-from adacd_hil.log.packet import CyclePacket, EventPacket, LoggedFrame, unpack
-from adacd_hil.log.ros_types import MAX_DATA, pack_can_frame, pack_fd_frame, pack_joint_state, pack_log
+from adacd_hil.log.outbox import read_outbox, split
+from adacd_hil.log.packet_writer import PacketWriter
 from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
-from adacd_hil.records import Event, scheme_layout
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES
 
 FLUSH_PERIOD_NS = 250_000_000
 POLL_PERIOD_NS = 10_000_000
@@ -34,89 +36,27 @@ PACKETS_PER_CLOCK = 32
 """How many packets are taken between two looks at the clock while the writer is behind."""
 RECEIVE_BYTES = 4 * 1024 * 1024
 """No packet is longer: the kernel's limit of a socket's buffer."""
-
-_TIME = struct.Struct("<II")
-
-
-class PacketWriter:
-    """Turns packets into messages of a file."""
-
-    def __init__(self, file: McapFile, messages: tuple[MessageLike, ...], epoch_ns: int, parameter_count: int) -> None:
-        self.frames = 0
-        self.dropped = 0  # packets that didn't reach the writer
-        self._file = file
-        self._epoch_ns = epoch_ns
-        self._decoders = {
-            message.can_id: (ChannelId.DECODED_FIRST + index, message, struct.Struct(f"<{len(message.signals)}d"))
-            for index, message in enumerate(messages)
-        }
-        slices = scheme_layout(parameter_count).slices
-        self._joint_slices = [
-            slice(SCHEME_BLOCK + 8 * slices[name].start, SCHEME_BLOCK + 8 * slices[name].stop)
-            for name in ("q", "dq", "tau_J")
-        ]
-
-    def write(self, packet: CyclePacket | EventPacket) -> None:
-        """Write all that a packet holds. Raises struct.error, ValueError or KeyError when it makes no sense."""
-        time_ns = packet.t_ns + self._epoch_ns
-        if packet.dropped != self.dropped:
-            missing = packet.dropped - self.dropped
-            self.dropped = packet.dropped
-            self._write_event(time_ns, Event("warning", "log", f"{missing} packets are missing before this"))
-        if isinstance(packet, EventPacket):
-            self._write_event(time_ns, packet.event)
-            return
-        for frame in packet.frames:
-            self._write_frame(frame, time_ns)
-        stamp = _stamp(time_ns)
-        for channel_id, body in packet.messages:
-            self._file.add(channel_id, time_ns, time_ns, ENCAPSULATION + stamp + body)
-            if channel_id == ChannelId.SCHEME:
-                joint_state = pack_joint_state(stamp, *(body[place] for place in self._joint_slices))
-                self._file.add(ChannelId.JOINT_STATES, time_ns, time_ns, joint_state)
-
-    def _write_frame(self, frame: LoggedFrame, cycle_time_ns: int) -> None:
-        if frame.length > MAX_DATA:
-            raise ValueError(f"a frame of {frame.length} bytes; {MAX_DATA} are the most")
-        time_ns = frame.t_ns + self._epoch_ns
-        stamp = _stamp(time_ns)
-        if frame.length > MAX_CLASSIC_BYTES:
-            channel_id = ChannelId.TO_CAN_BUS_FD if frame.is_tx else ChannelId.FROM_CAN_BUS_FD
-            payload = pack_fd_frame(stamp, frame.can_id, frame.data, frame.is_error)
-        else:
-            channel_id = ChannelId.TO_CAN_BUS if frame.is_tx else ChannelId.FROM_CAN_BUS
-            payload = pack_can_frame(stamp, frame.can_id, frame.data, frame.length, frame.is_error)
-        self._file.add(channel_id, time_ns, cycle_time_ns, payload)
-        self.frames += 1
-        decoder = self._decoders.get(frame.can_id)
-        if decoder is None or frame.is_error:
-            return
-        decoded_id, message, numbers = decoder
-        if frame.length == message.length:
-            values = numbers.pack(*message.decode(frame.data[: frame.length]))
-            self._file.add(decoded_id, time_ns, cycle_time_ns, ENCAPSULATION + stamp + values)
-
-    def _write_event(self, time_ns: int, event: Event) -> None:
-        self._file.add(ChannelId.EVENTS, time_ns, time_ns, pack_log(_stamp(time_ns), event))
-
-
-def _stamp(time_ns: int) -> bytes:
-    return _TIME.pack(*divmod(time_ns, 1_000_000_000))
+BATCH_BYTES = 256 * 1024
+"""Packets that are gathered at most, about 400 cycles: more would be no cheaper, each."""
 
 
 class WriterProcess:
     """The loop around a PacketWriter."""
 
-    def __init__(self, connection: socket.socket, sink: Sink, setup: Setup) -> None:
+    def __init__(self, connection: socket.socket, sink: Sink, setup: Setup, outbox: int | None) -> None:
         messages = () if setup.is_truth else _dbc_messages(setup)
         channels = truth_channels() if setup.is_truth else run_channels(setup.parameter_count, messages)
         self._connection = connection
         self._sink = sink
+        self._outbox = outbox
         self._file = McapFile(sink, channels, setup.attachments, setup.metadata)
         self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count)
         self._is_blocking = setup.is_blocking
         connection.setblocking(False)
         self._buffer = bytearray(RECEIVE_BYTES)
+        self._gathered: list[bytes] = []
+        self._gathered_bytes = 0
+        self._batch = 0  # number of the latest one
         self._packets_unclocked = 0
         self._clock = MonotonicClock()
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
@@ -126,9 +66,13 @@ class WriterProcess:
         """Write until the end, then answer with the last word."""
         ending = "control process died"
         while received := self._receive():
-            if not self._write(received):
+            if received[0] == packet.END:
                 ending = "closed"
                 break
+            self._take(received)
+        else:
+            self._take_what_is_left()
+        self._write()
         summary = {
             "frames": str(self._packets.frames),
             "messages": str(self._file.messages),
@@ -158,26 +102,60 @@ class WriterProcess:
         self._packets_unclocked = 0
         now_ns = self._clock.now_ns()
         if not self._is_blocking and now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
-            self._file.flush()
+            self._flush()
             self._flushed_ns = now_ns
         return now_ns
 
-    def _write(self, received: bytes) -> bool:
-        """Write one packet; False when it is the end."""
+    def _take(self, received: bytes) -> None:
+        """Keep the packet that was just received, or the packets of a batch."""
+        if received[0] != packet.BATCH:
+            self._keep(received)
+            return
         try:
-            packet = unpack(received)
-            if packet is None:
-                return False
-            if self._is_blocking and packet.t_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
-                self._file.flush()
-                self._flushed_ns = packet.t_ns
-            if self._sink.error:
-                self._lost += 1
-            else:
-                self._packets.write(packet)
-        except (struct.error, ValueError, KeyError):
+            self._batch, packets = split(received)
+        except struct.error:
             self._lost += 1
-        return True
+            return
+        for each in packets:
+            self._keep(each)
+
+    def _take_what_is_left(self) -> None:
+        """Keep the batch that the control process had not sent when it died."""
+        if self._outbox is not None:
+            batch = read_outbox(self._outbox)
+            if split(batch)[0] != self._batch:
+                self._take(batch)
+
+    def _keep(self, received: bytes) -> None:
+        """Keep a packet until it is written with others; in lockstep, flushes by its time."""
+        if len(received) < packet.HEAD.size or received[0] not in (packet.CYCLE, packet.EVENT):
+            self._lost += 1
+            return
+        if self._is_blocking:
+            _, _, _, _, t_ns = packet.HEAD.unpack_from(received)
+            if t_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
+                self._flush()
+                self._flushed_ns = t_ns
+        self._gathered.append(received)
+        self._gathered_bytes += len(received)
+        if self._gathered_bytes >= BATCH_BYTES:
+            self._write()
+
+    def _flush(self) -> None:
+        """Write what has been gathered and end the chunk in progress."""
+        self._write()
+        self._file.flush()
+
+    def _write(self) -> None:
+        """Write what has been gathered."""
+        if self._sink.error:
+            self._lost += len(self._gathered)
+        elif self._gathered:
+            edges = np.cumsum([0, *map(len, self._gathered)])
+            data = np.frombuffer(b"".join((*self._gathered, bytes(packet.ROOM))), np.uint8)
+            self._lost += self._packets.write(data, edges[:-1], np.diff(edges))
+        self._gathered = []
+        self._gathered_bytes = 0
 
 
 def _dbc_messages(setup: Setup) -> tuple[MessageLike, ...]:
@@ -198,14 +176,14 @@ def _schedule_plainly() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def main(socket_descriptor: int, file_descriptor: int) -> None:
+def main(socket_descriptor: int, file_descriptor: int, outbox_descriptor: int | None = None) -> None:
     """Write a log: say when ready, take packets until the end, say how it went."""
     _schedule_plainly()
     connection = socket.socket(fileno=socket_descriptor)
     sink = Sink(file_descriptor)
     try:
         setup = Setup.from_json(sys.stdin.buffer.read())
-        process = WriterProcess(connection, sink, setup)
+        process = WriterProcess(connection, sink, setup, outbox_descriptor)
         sink.settle()
         if sink.error:
             raise LogError(sink.error)
@@ -217,4 +195,4 @@ def main(socket_descriptor: int, file_descriptor: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    main(*map(int, sys.argv[1:]))

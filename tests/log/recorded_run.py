@@ -190,5 +190,6 @@ def waiting_bytes(recorder: Recorder) -> int:
 
 def wait_until_taken(recorder: Recorder) -> None:
     """Wait until the writer has taken every packet from the socket, or is dead."""
+    recorder.flush()
     while waiting_bytes(recorder) > 0:
         os.sched_yield()
