@@ -22,19 +22,24 @@ AUTOZERO_SAMPLES = 64
 TEMPERATURE_CENTIDEGREES = 2500
 """0x2111: the emulated sensor has room temperature, always."""
 
-_LOWEST_COUNT, _HIGHEST_COUNT = TORQUE_COUNTS
 _EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
 
 
 class SensorNode:
     """One torque sensor on the bus."""
 
-    def __init__(self, device: Device, codec: Codec, number: int) -> None:
-        """Connect the node to its device. `number`: 1 or 2, as in the DBC's names."""
+    def __init__(
+        self, device: Device, codec: Codec, number: int, converter_ends: tuple[int, int] = TORQUE_COUNTS
+    ) -> None:
+        """Connect the node to its device.
+
+        `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives.
+        """
         self.device = device
         self.has_news = False
         """Whether something has changed that the bus hasn't been told."""
         self._pdos = device.pdos
+        self._lowest_count, self._highest_count = converter_ends
         signals = codec.message(f"Sensor{number}Torque").signals
         scale_Nm = next(signal.scale for signal in signals if signal.name == "torque")
         self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / scale_Nm)  # exact: contracts have decimal fractions
@@ -58,9 +63,9 @@ class SensorNode:
     def on_sync(self, counts: int) -> None:
         """Take the torque that was sampled at this SYNC, in the converter's counts."""
         status = 0
-        if counts >= _HIGHEST_COUNT:
+        if counts >= self._highest_count:
             status = STATUS_POSITIVE_OVERLOAD | STATUS_NOT_VALID
-        elif counts <= _LOWEST_COUNT:
+        elif counts <= self._lowest_count:
             status = STATUS_NEGATIVE_OVERLOAD | STATUS_NOT_VALID
         if status != self._status:
             self._status = status
