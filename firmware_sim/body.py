@@ -30,7 +30,9 @@ from firmware_sim.contact import (
 from firmware_sim.encoder import NOISE_TICKS, EncoderNoise, encoder_numbers, read_angle
 from firmware_sim.motor import (
     HAS_LIMITS,
+    IS_LIMITED,
     MOTOR_STATE,
+    PEAK,
     TRACKING,
     believed_torque,
     command_torque,
@@ -40,7 +42,6 @@ from firmware_sim.motor import (
     motor_state,
     winding_temperature,
 )
-from firmware_sim.motor import IS_LIMITED as _IS_LIMITED
 from firmware_sim.plant import (
     BRAKE_DAMPING,
     COULOMB,
@@ -352,6 +353,9 @@ class Body:
         self._motor = motor_numbers(scenario.drives, scenario.arm.rated_torque_Nm)
         self._encoder = encoder_numbers(scenario.sensors)
         self._transducer = transducer_numbers(scenario.sensors, scenario.torque_offset_Nm)
+        self._is_never_limited = not self._motor[HAS_LIMITS] and np.array_equal(
+            self._motor[PEAK : PEAK + 2], scenario.arm.rated_torque_Nm
+        )
         self.torque_ends = converter_ends(scenario.sensors, 0), converter_ends(scenario.sensors, 1)
         """Lowest and highest counts of each torque sensor; there its value is a bound only."""
         seed = scenario.seed if seed is None else seed
@@ -418,12 +422,16 @@ class Body:
     @property
     def is_torque_limited(self) -> tuple[bool, bool]:
         """Whether each drive wants more torque than current limit, I²t or temperature leave; statusword bit 11."""
-        first = _MOTOR + _IS_LIMITED
+        if self._is_never_limited:
+            return False, False
+        first = _MOTOR + IS_LIMITED
         return bool(self._state[first]), bool(self._state[first + 1])
 
     @property
     def motor_error_code(self) -> tuple[int, int]:
         """Error code that each motor's I²t or temperature calls for now, 0 for none; 0x603F."""
+        if self._is_never_limited:
+            return 0, 0
         motors = self._state[_MOTOR:_TRANSDUCER]
         return error_code(self._motor, motors, 0), error_code(self._motor, motors, 1)
 

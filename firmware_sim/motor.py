@@ -7,7 +7,7 @@ zero error o of the current sensor, both of the scenario, the motor gives
 
     torque loop  τ' = ω (target − τ), ω = 2π · bandwidth
     I²t          E' = i² − i_c² within 0 … (i_p² − i_c²) t_p, i = m + o. At the upper end only i_c is left, until a
-                 tenth of E has gone
+                 tenth of E has gone (Copley lets go at once)
     temperature  T = ambient + w + h, w' = (w_r (i/i_r)² − w) / t_w, h' = (h_r (i/i_r)² − h) / t_h
     derating     what is left falls from the whole at derating start to nothing at derating end
     fault        T at or above the overheating temperature, until T is below derating start: 0x4310.
@@ -16,7 +16,8 @@ zero error o of the current sensor, both of the scenario, the motor gives
 i_p peak, i_c continuous, i_r rated, t_p peak time; w and h: winding over housing and housing over ambient, whose steady
 rises at rated torque are w_r and h_r. The winding's resistance and the torque constant don't change with temperature.
 
-Source: IEC 60034-11 and NEMA MG 1 (two-body thermal model); error codes of CiA 402-2 (IEC 61800-7-201).
+Source: I²t as in Copley Controls, CME 2 User Guide, appendix "I²T time limit algorithm"; temperature as the two thermal
+resistances and time constants of motor data sheets; error codes of CiA 402-2 (IEC 61800-7-201).
 """
 
 import math

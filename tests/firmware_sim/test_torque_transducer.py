@@ -343,3 +343,16 @@ def test_a_sensor_of_smaller_range_flags_its_overload_in_the_frame(monkeypatch, 
     assert frame[1] >> 4 == status
     assert struct.unpack_from("<i", frame, 2)[0] == pytest.approx(value_uNm, abs=12_000)
     assert host.read(3, 0x6150, 1) == status
+
+
+@pytest.mark.parametrize(
+    ("temperature_C", "centidegrees"), [(None, 2500), (41.237, 4124), (-10.0, -1000), (900.0, 0x7FFF)]
+)
+def test_a_sensor_tells_the_temperature_of_its_joint(monkeypatch, temperature_C, centidegrees):
+    def make(device, codec, number, *_):
+        if temperature_C is None:
+            return SensorNode(device, codec, number)
+        return SensorNode(device, codec, number, temperature_C=lambda: temperature_C)
+
+    monkeypatch.setattr(firmware_sim.bench, "SensorNode", make)
+    assert BenchHost().read(3, 0x2111) == centidegrees
