@@ -118,6 +118,21 @@ def test_chance_of_one_error_leaves_all_other_numbers_alone_to_the_bit(sensors, 
     assert differing == changed
 
 
+def test_the_walk_of_a_zero_and_the_noise_of_an_encoder_have_nothing_in_common():
+    sensors = {"offset_walk_Nm_rs": [10.0, 0.0], "encoder_noise_counts": [1000.0, 0.0], "torque_noise_Nm": [0.0, 0.0]}
+    body = Body(parse(Scenario, {"sensors": sensors}), seed=2)
+    torques, positions = [], []
+    for _ in range(1_000):
+        measured = body.sample()
+        torques.append(measured.torque_counts[0])
+        positions.append(measured.position_counts[0])
+        body.advance((0.0, 0.0), (DriveMode.OFF, DriveMode.OFF), 1)
+    steps = np.diff(torques)[2:-2]
+    for lag in range(5):
+        noise = np.array(positions[1:])[lag : lag + steps.size]
+        assert abs(np.corrcoef(steps, noise)[0, 1]) < 0.12
+
+
 def test_a_run_with_every_error_repeats_with_its_seed():
     assert run_with_everything(9).tobytes() == run_with_everything(9).tobytes()
 
