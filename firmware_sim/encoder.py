@@ -27,8 +27,8 @@ TWICE_PHASE: Final = 8  # p₂, rad
 LSB: Final = 10  # rad
 ENCODER_NUMBERS: Final = 12
 
-NOISE_TICKS: Final = 256
-"""Ticks whose noise is drawn at once; a call that advances the arm by more is divided."""
+NOISE_TICKS: Final = 64
+"""Ticks whose noise is drawn at once, in a few µs; a call that advances the arm by more is divided."""
 
 
 def encoder_numbers(settings: SensorSettings) -> Vector:

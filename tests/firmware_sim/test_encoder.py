@@ -8,7 +8,7 @@ import pytest
 from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
 from firmware_sim.body import Body, DriveMode
-from firmware_sim.encoder import encoder_numbers, read_angle
+from firmware_sim.encoder import NOISE_TICKS, encoder_numbers, read_angle
 from firmware_sim.scenario import Scenario
 from firmware_sim.sensing import POSITION_LSB_RAD, to_counts
 from firmware_sim.sensor_settings import SensorSettings
@@ -102,7 +102,7 @@ def test_encoder_noise_shakes_the_velocity_of_a_resting_arm_and_not_the_arm():
     assert not truth[TRUTH_LAYOUT.slices["dq"]].any()
 
 
-@pytest.mark.parametrize("ticks", [1, 7, 255, 256, 257])
+@pytest.mark.parametrize("ticks", [1, 7, NOISE_TICKS - 1, NOISE_TICKS, NOISE_TICKS + 1, 257])
 def test_encoder_noise_does_not_depend_on_how_the_ticks_are_asked_for(ticks):
     """A braking drive answers the noise of its velocity with torque, so the arm remembers all of it."""
     blocks = []
