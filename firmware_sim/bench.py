@@ -39,6 +39,7 @@ from firmware_sim.outbox import Outbox
 from firmware_sim.scenario import Scenario
 from firmware_sim.sensor_node import SensorNode
 from firmware_sim.time_marks import HOST_MARK, MarkKind, unpack_mark
+from firmware_sim.torque_transducer import converter_ends
 
 ClockMode = Literal["sync", "wall"]
 SYNC_COUNTERS = 240
@@ -119,7 +120,7 @@ class Bench:
         self.drives = tuple(
             DriveNode(self.devices[i], codec, i + 1, self._motor(i), rated_Nm[i], self._is_wall) for i in range(JOINTS)
         )
-        self.sensors = tuple(SensorNode(self.devices[JOINTS + i], codec, i + 1) for i in range(JOINTS))
+        self.sensors = tuple(self._make_sensor(i, codec) for i in range(JOINTS))
         self._injector.attach(self.devices, self.drives, self.sensors)
         self._period_ns = self.devices[0].value(0x1006) * 1000
         for device in self.devices:
@@ -410,6 +411,17 @@ class Bench:
         return Motor(
             velocity_rad_s=lambda: self._body.drive_velocity_rad_s[joint],
             torque_Nm=lambda: self._body.motor_torque_Nm[joint],
+            is_limited=lambda: self._body.is_torque_limited[joint],
+            error_code=lambda: self._body.motor_error_code[joint],
+        )
+
+    def _make_sensor(self, joint: int, codec: Codec) -> SensorNode:
+        return SensorNode(
+            self.devices[JOINTS + joint],
+            codec,
+            joint + 1,
+            converter_ends(self._scenario.sensors, joint),
+            lambda: self._body.joint_temperature_C[joint],
         )
 
     def _make_body(self) -> Body:

@@ -25,8 +25,23 @@ from firmware_sim.contact import (
     contact_table,
     ticks,
 )
+from firmware_sim.encoder import NOISE_TICKS, EncoderNoise, encoder_numbers, read_angle
 from firmware_sim.friction import REFERENCE_C
 from firmware_sim.mechanics import HOLDING_BRAKE, integrate_mechanics, observe, work_space
+from firmware_sim.motor import (
+    HAS_LIMITS,
+    IS_LIMITED,
+    MOTOR_STATE,
+    PEAK,
+    TRACKING,
+    believed_torque,
+    command_torque,
+    error_code,
+    heat_motor,
+    motor_numbers,
+    motor_state,
+    winding_temperature,
+)
 from firmware_sim.plant import (
     BRAKE,
     BRAKE_DAMPING,
@@ -54,14 +69,21 @@ from firmware_sim.plant import (
 from firmware_sim.scenario import PayloadSettings, Scenario
 from firmware_sim.sensing import (
     POSITION_LSB_RAD,
-    TORQUE_COUNTS,
     TORQUE_LSB_NM,
-    TORQUE_NOISE_NM,
     VELOCITY_LSB_RAD_S,
     TorqueNoise,
     to_counts,
-    torque_counts,
     track,
+)
+from firmware_sim.torque_transducer import (
+    HAS_MEMORY,
+    TRANSDUCER_STATE,
+    converter_ends,
+    sample_torque,
+    sense_torque,
+    settle_transducer,
+    transducer_numbers,
+    walk_offset,
 )
 from firmware_sim.touch import (
     FORCE,
@@ -101,7 +123,9 @@ _CHANGE: Final = _TICK + 3  # index of the next payload change
 _ENCODER: Final = _TICK + 4  # 2: encoder position, rad
 _ESTIMATE: Final = _TICK + 6  # 2: position of the tracking loop, rad
 _VELOCITY: Final = _TICK + 8  # 2: velocity of the tracking loop, rad/s
-_STATE: Final = _TICK + 10
+_MOTOR: Final = _TICK + 10  # places of `firmware_sim.motor`
+_TRANSDUCER: Final = _MOTOR + MOTOR_STATE  # places of `firmware_sim.torque_transducer`
+_STATE: Final = _TRANSDUCER + TRANSDUCER_STATE
 
 _OFF: Final = int(DriveMode.OFF)
 _TORQUE: Final = int(DriveMode.TORQUE)
@@ -111,6 +135,11 @@ _BRAKE_HARD: Final = int(DriveMode.BRAKE_HARD)
 _SLOW_SHARE: Final = 0.5
 _HARD_SHARE: Final = 1.5
 """Of BRAKE_DAMPING. The shortest time constant, 10 ms / 1.5, is four lags of the drive's velocity: no overshoot."""
+
+
+# Each source of chance has a stream of its own beside the sensors' noise, which has the seed itself.
+_WALK_STREAM: Final = (1,)
+_ENCODER_STREAM: Final = (2,)
 
 _PLACE: Final = {name: place.start for name, place in TRUTH_LAYOUT.slices.items()}
 _TRUE_Q: Final = _PLACE["q"]
@@ -181,13 +210,38 @@ def _torque_target(arm: Vector, joint: int, mode: int, setpoint_Nm: float, veloc
 
 
 @compiled
-def _read_encoder(state: Vector, joint: int) -> None:
-    """Take the encoder's position at the end of a tick and advance the drive's velocity."""
-    now_rad = to_counts(state[ENCODED + joint], POSITION_LSB_RAD) * POSITION_LSB_RAD
+def _read_encoder(
+    state: Vector, motor: Vector, encoder: Vector, joint: int, angle_rad: float, noise_counts: float
+) -> None:
+    """Take the encoder's position at the end of a tick and advance the drive's velocity. angle: that of its shaft."""
+    now_rad = read_angle(encoder, joint, angle_rad, noise_counts)
     state[_ESTIMATE + joint], state[_VELOCITY + joint] = track(
-        state[_ENCODER + joint], now_rad, state[_ESTIMATE + joint], state[_VELOCITY + joint], TICK_S
+        state[_ENCODER + joint],
+        now_rad,
+        state[_ESTIMATE + joint],
+        state[_VELOCITY + joint],
+        TICK_S,
+        motor[TRACKING + joint],
     )
     state[_ENCODER + joint] = now_rad
+
+
+@compiled
+def _measure_tick(
+    state: Vector, motor: Vector, encoder: Vector, transducer: Vector, encoder_noise: NDArray[np.float64]
+) -> None:
+    """Let motors, encoders and torque sensors see the end of a tick."""
+    tick = state[_TICK]
+    noise = encoder_noise[int(tick) % (2 * NOISE_TICKS)]
+    _read_encoder(state, motor, encoder, 0, state[ENCODED], noise[0])
+    _read_encoder(state, motor, encoder, 1, state[ENCODED + 1], noise[1])
+    if motor[HAS_LIMITS] != 0.0:
+        motors = state[_MOTOR:_TRANSDUCER]
+        heat_motor(motor, motors, 0, state[TAU])
+        heat_motor(motor, motors, 1, state[TAU + 1])
+    if transducer[HAS_MEMORY] != 0.0:
+        tau1, tau2 = state[JOINT_TORQUE], state[JOINT_TORQUE + 1]
+        sense_torque(transducer, state[_TRANSDUCER:], tick, tau1, tau2, state[WARMTH], state[WARMTH + 1])
 
 
 @compiled
@@ -199,6 +253,10 @@ def _advance(
     touch_numbers: NDArray[np.float64],
     touch_state: Vector,
     payloads: NDArray[np.float64],
+    motor: Vector,
+    encoder: Vector,
+    transducer: Vector,
+    encoder_noise: NDArray[np.float64],
     setpoint1_Nm: float,
     setpoint2_Nm: float,
     mode1: int,
@@ -209,6 +267,7 @@ def _advance(
 ) -> None:
     """Advance the body by `tick_count` ticks; without mechanics the rigid arm, and numba then compiles nothing else."""
     step_s = TICK_S / substeps
+    motors = state[_MOTOR:_TRANSDUCER]
     for _ in range(tick_count):
         _change_payload(state, arm, payloads)
         contact = _contact_in_force(state, contacts)
@@ -217,8 +276,10 @@ def _advance(
             elapsed_s = (state[_TICK] - state[_START_TICK] - contact[ONSET_TICK]) * TICK_S
         before1, before2 = state[Q], state[Q + 1]
         change_touch(touch_numbers, _scenario_s(state), before1, before2, touch_state, contact.size != 0)
-        target1 = _torque_target(arm, 0, mode1, setpoint1_Nm, state[_VELOCITY])
-        target2 = _torque_target(arm, 1, mode2, setpoint2_Nm, state[_VELOCITY + 1])
+        wanted1 = _torque_target(arm, 0, mode1, setpoint1_Nm, state[_VELOCITY])
+        wanted2 = _torque_target(arm, 1, mode2, setpoint2_Nm, state[_VELOCITY + 1])
+        target1 = command_torque(motor, motors, 0, wanted1, state[TAU], mode1 != _OFF)
+        target2 = command_torque(motor, motors, 1, wanted2, state[TAU + 1], mode2 != _OFF)
         if mechanics is None:
             for substep in range(substeps):
                 integrate(state, arm, contact, elapsed_s + substep * step_s, target1, target2, step_s)
@@ -233,18 +294,23 @@ def _advance(
         add_prescribed_work(
             contact, elapsed_s, TICK_S, arm[LENGTH], before1, before2, state[Q], state[Q + 1], touch_state
         )
-        _read_encoder(state, 0)
-        _read_encoder(state, 1)
+        _measure_tick(state, motor, encoder, transducer, encoder_noise)
         state[_TICK] += 1.0
 
 
 @compiled
-def _sample(state: Vector, noise: Vector, offset: Vector, out: NDArray[np.int64]) -> None:
+def _sample(state: Vector, transducer: Vector, noise: Vector, walk: Vector, out: NDArray[np.int64]) -> None:
     """Quantise what the devices measure now: position, velocity, torque counts, two each (6,)."""
+    tick = state[_TICK]
+    transducers = state[_TRANSDUCER:]
+    walk_offset(transducers, tick, walk)
     for joint in range(2):
-        out[joint] = to_counts(state[ENCODED + joint], POSITION_LSB_RAD)
+        tau, other = state[JOINT_TORQUE + joint], state[JOINT_TORQUE + 1 - joint]
+        out[joint] = to_counts(state[_ENCODER + joint], POSITION_LSB_RAD)
         out[2 + joint] = to_counts(state[_VELOCITY + joint], VELOCITY_LSB_RAD_S)
-        out[4 + joint] = torque_counts(state[JOINT_TORQUE + joint] + offset[joint] + noise[joint])
+        out[4 + joint] = sample_torque(
+            transducer, transducers, joint, tick, tau, other, state[WARMTH + joint], noise[joint]
+        )
 
 
 @compiled
@@ -338,11 +404,6 @@ class Measurement(NamedTuple):
         """Measured joint torque, Nm (2,)."""
         return np.array(self.torque_counts) * TORQUE_LSB_NM
 
-    @property
-    def is_saturated(self) -> tuple[bool, bool]:
-        """Whether each torque sensor is at an end of its range, where its value is a bound only."""
-        return self.torque_counts[0] in TORQUE_COUNTS, self.torque_counts[1] in TORQUE_COUNTS
-
 
 class Body:
     """One emulated arm, from power-on. Nothing is compiled and nothing large allocated after construction."""
@@ -373,28 +434,54 @@ class Body:
             )
         )
         self._work = work_space(self._touch_state.size)
-        self._offset = np.array(scenario.torque_offset_Nm, dtype=np.float64)
-        self._noise = TorqueNoise(scenario.seed if seed is None else seed, TORQUE_NOISE_NM if scenario.noise else 0.0)
+        self._motor = motor_numbers(scenario.drives, scenario.arm.rated_torque_Nm)
+        self._encoder = encoder_numbers(scenario.sensors)
+        self._transducer = transducer_numbers(scenario.sensors, scenario.torque_offset_Nm)
+        self._is_never_limited = not self._motor[HAS_LIMITS] and np.array_equal(
+            self._motor[PEAK : PEAK + 2], scenario.arm.rated_torque_Nm
+        )
+        self.torque_ends = converter_ends(scenario.sensors, 0), converter_ends(scenario.sensors, 1)
+        """Lowest and highest counts of each torque sensor; there its value is a bound only."""
+        seed = scenario.seed if seed is None else seed
+        quiet = (0.0, 0.0)
+        self._noise = TorqueNoise(seed, scenario.sensors.torque_noise_Nm if scenario.noise else quiet)
+        self._walk = TorqueNoise(
+            np.random.SeedSequence(seed, spawn_key=_WALK_STREAM), scenario.sensors.offset_walk_Nm_rs
+        )
+        self._encoder_noise = EncoderNoise(
+            np.random.SeedSequence(seed, spawn_key=_ENCODER_STREAM),
+            scenario.sensors.encoder_noise_counts if scenario.noise else quiet,
+        )
         self._counts = np.zeros(6, dtype=np.int64)
         self._state = np.zeros(_STATE)
         self._state[Q : Q + 2] = scenario.start_rad
-        encoder_rad = np.floor(scenario.start_rad / POSITION_LSB_RAD + 0.5) * POSITION_LSB_RAD
-        self._state[_ENCODER : _ENCODER + 2] = encoder_rad
-        self._state[_ESTIMATE : _ESTIMATE + 2] = encoder_rad
+        self._state[_MOTOR:_TRANSDUCER] = motor_state(scenario.drives)
         self._state[_START_TICK] = -1.0
         self._state[WARMTH : WARMTH + 2] = REFERENCE_C if is_rigid else scenario.mechanics.ambient_C
         fit_payload(self._state, self._arm, scenario.payload_kg)
         mirror_stiff_joints(self._state)
+        encoder_rad = [read_angle(self._encoder, joint, self._state[ENCODED + joint], 0.0) for joint in range(2)]
+        self._state[_ENCODER : _ENCODER + 2] = encoder_rad
+        self._state[_ESTIMATE : _ESTIMATE + 2] = encoder_rad
+        settle_transducer(
+            self._transducer,
+            self._state[_TRANSDUCER:],
+            self._state[JOINT_TORQUE],
+            self._state[JOINT_TORQUE + 1],
+            self._state[WARMTH],
+            self._state[WARMTH + 1],
+        )
         self._compile()
 
     def _compile(self) -> None:
         """Run every compiled function once, on a copy of the state."""
         state = self._state.copy()
+        motor, encoder, transducer, noise = self._motor, self._encoder, self._transducer, self._encoder_noise.table
         _advance(
             state, self._arm, self._mechanics, self._contacts, self._touch_numbers, self._touch_state.copy(),
-            self._payloads, 0.0, 0.0, 0, 0, 1, self._substeps, self._work,
+            self._payloads, motor, encoder, transducer, noise, 0.0, 0.0, 0, 0, 1, self._substeps, self._work,
         )  # fmt: skip
-        _sample(state, self._offset, self._offset, self._counts)
+        _sample(state, transducer, np.zeros(2), np.zeros(2), self._counts)
         _fill_truth(
             state, self._arm, self._mechanics, self._contacts, self._touch_numbers, self._touch_state.copy(),
             self._payloads, self._work, self._touched, np.zeros(TRUTH_LAYOUT.size),
@@ -418,7 +505,35 @@ class Body:
     @property
     def motor_torque_Nm(self) -> tuple[float, float]:
         """Torque that the drives know from their motor currents, without the sensor's noise; 0x6077."""
-        return float(self._state[TAU]), float(self._state[TAU + 1])
+        motor, state = self._motor, self._state
+        return believed_torque(motor, 0, state[TAU]), believed_torque(motor, 1, state[TAU + 1])
+
+    @property
+    def is_torque_limited(self) -> tuple[bool, bool]:
+        """Whether each drive wants more torque than current limit, I²t or temperature leave; statusword bit 11."""
+        if self._is_never_limited:
+            return False, False
+        first = _MOTOR + IS_LIMITED
+        return bool(self._state[first]), bool(self._state[first + 1])
+
+    @property
+    def motor_error_code(self) -> tuple[int, int]:
+        """Error code that each motor's I²t or temperature calls for now, 0 for none; 0x603F."""
+        if self._is_never_limited:
+            return 0, 0
+        motors = self._state[_MOTOR:_TRANSDUCER]
+        return error_code(self._motor, motors, 0), error_code(self._motor, motors, 1)
+
+    @property
+    def joint_temperature_C(self) -> tuple[float, float]:
+        """True temperature of each joint, °C."""
+        return float(self._state[WARMTH]), float(self._state[WARMTH + 1])
+
+    @property
+    def winding_temperature_C(self) -> tuple[float, float]:
+        """True temperature of each motor's winding, °C."""
+        motors = self._state[_MOTOR:_TRANSDUCER]
+        return winding_temperature(self._motor, motors, 0), winding_temperature(self._motor, motors, 1)
 
     @property
     def drive_velocity_rad_s(self) -> tuple[float, float]:
@@ -432,26 +547,37 @@ class Body:
 
         Set-points (2,) and `DriveMode` (2,) hold for the whole of it.
         """
-        _advance(
-            self._state,
-            self._arm,
-            self._mechanics,
-            self._contacts,
-            self._touch_numbers,
-            self._touch_state,
-            self._payloads,
-            float(torque_setpoint_Nm[0]),
-            float(torque_setpoint_Nm[1]),
-            int(drive_mode[0]),
-            int(drive_mode[1]),
-            self._ticks_per_period if tick_count is None else tick_count,
-            self._substeps,
-            self._work,
-        )
+        left = self._ticks_per_period if tick_count is None else tick_count
+        while left > 0:
+            count = left
+            if self._encoder_noise.is_on:
+                count = min(left, NOISE_TICKS)
+                self._encoder_noise.draw(int(self._state[_TICK]) + count - 1)
+            left -= count
+            _advance(
+                self._state,
+                self._arm,
+                self._mechanics,
+                self._contacts,
+                self._touch_numbers,
+                self._touch_state,
+                self._payloads,
+                self._motor,
+                self._encoder,
+                self._transducer,
+                self._encoder_noise.table,
+                float(torque_setpoint_Nm[0]),
+                float(torque_setpoint_Nm[1]),
+                int(drive_mode[0]),
+                int(drive_mode[1]),
+                count,
+                self._substeps,
+                self._work,
+            )
 
     def sample(self) -> Measurement:
         """Measure now. Call it once per SYNC: each call draws new noise."""
-        _sample(self._state, self._noise.draw(), self._offset, self._counts)
+        _sample(self._state, self._transducer, self._noise.draw(), self._walk.draw(), self._counts)
         q1, q2, dq1, dq2, tau1, tau2 = self._counts.tolist()
         return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))
 

@@ -81,6 +81,8 @@ class Device(ObjectDictionary):
         self.is_operational = False
         self.is_faulty = False
         """Whether the application is in a fault, 0x1001 bit 0."""
+        self.fault_bits = 0
+        """Bits of 0x1001 that name the kind of that fault."""
         self.now_ns = 0
         """Time of the last request, for what it starts."""
         self.power_on_ns = 0
@@ -100,7 +102,7 @@ class Device(ObjectDictionary):
     def error_register(self) -> int:
         """0x1001."""
         register = _GENERIC | _COMMUNICATION if self.watchdogs.tripped else 0
-        return register | (_GENERIC if self.is_faulty else 0)
+        return register | (_GENERIC | self.fault_bits if self.is_faulty else 0)
 
     def attach(self, application: Application) -> None:
         """Connect what the device does."""
@@ -193,13 +195,13 @@ class Device(ObjectDictionary):
         """Report that the cause of a tripped watchdog has gone, by an EMCY with code 0."""
         self.watchdogs.clear(watchdog, self._errors, t_ns, self._time_ms(t_ns))
 
+    def report_fault(self, code: int, t_ns: int) -> None:
+        """Send the EMCY of a fault that no watchdog found."""
+        self._errors.report(code, t_ns, time_ms=self._time_ms(t_ns))
+
     def report_no_error(self, t_ns: int) -> None:
         """Say by an EMCY with code 0 that a fault was reset."""
         self._errors.report(0, t_ns)
-
-    def report_error(self, code: int, t_ns: int) -> None:
-        """Report by an EMCY an error that no watchdog has found."""
-        self._errors.report(code, t_ns)
 
     def poll(self, t_ns: int) -> int:
         """Do what is due by its own clock; return when something is due next."""

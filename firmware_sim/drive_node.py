@@ -31,15 +31,22 @@ _ENABLE_OPERATION_WORD = 0x0F
 _REMOTE, _INTERNAL_LIMIT, _FOLLOWS_TARGET = 1 << 9, 1 << 11, 1 << 12
 _ENABLED = DriveState.OPERATION_ENABLED
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+_KIND_BITS = {2: 1 << 1, 4: 1 << 3}  # of 0x1001 by first digit of the error code: current, temperature
 _RAMPED = {DriveEvent.SHUTDOWN: 0x605B, DriveEvent.SWITCH_ON: 0x605C}  # option codes of transitions 8 and 5
 _EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
 
 
 class Motor(NamedTuple):
-    """What the drive knows of its motor without the bus: velocity in rad/s, torque in Nm."""
+    """What the drive knows of its motor without the bus: velocity in rad/s, torque in Nm.
+
+    is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
+    fault that the motor's state calls for now, 0 for none.
+    """
 
     velocity_rad_s: Callable[[], float]
     torque_Nm: Callable[[], float]
+    is_limited: Callable[[], bool] = lambda: False
+    error_code: Callable[[], int] = lambda: 0
 
 
 class DriveNode:
@@ -77,6 +84,7 @@ class DriveNode:
         self._stop = DISABLE
         self._ramp_end: DriveEvent | None = None
         self._is_braking = False
+        self._is_motor_limited = False
         self._standstill = Standstill()
         self._silent_syncs = _NO_COMMAND_YET
         self._sync_ns = 0
@@ -143,7 +151,7 @@ class DriveNode:
         word = STATE_BITS[self.state] | _REMOTE
         if self.is_enabled and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None:
             word |= _FOLLOWS_TARGET
-            if self._limits.is_limiting:
+            if self._limits.is_limiting or self._is_motor_limited:
                 word |= _INTERNAL_LIMIT
         return word
 
@@ -177,6 +185,7 @@ class DriveNode:
             self._obey_received(t_ns)
         if self._mode != self._wanted_mode:
             self._change_mode()
+        self._watch_motor(t_ns)
         if self._is_braking:
             self._watch_standstill(t_ns)
         self._drive_motor()
@@ -200,6 +209,7 @@ class DriveNode:
         """Live through a period whose SYNC never came, in a bench that counts periods by SYNC counters."""
         t_ns = self._clock.own_ns(t_ns)
         self._miss_command(t_ns)
+        self._watch_motor(t_ns)
         if self._is_braking:
             self._watch_standstill(t_ns)
         self._drive_motor()
@@ -263,6 +273,7 @@ class DriveNode:
         self._error_code = 0
         self._cause = None
         self.device.is_faulty = False
+        self.device.fault_bits = 0
         self._controlword = self._acted_commands = 0
         self._limits.target = 0
         self._mode = self._wanted_mode
@@ -353,6 +364,7 @@ class DriveNode:
         self._error_code = 0
         self._cause = None
         self.device.is_faulty = False
+        self.device.fault_bits = 0
         self.device.report_no_error(t_ns)
 
     def _fault(self, cause: Watchdog, t_ns: int, is_found_by_time: bool = False) -> None:
@@ -366,17 +378,28 @@ class DriveNode:
         self._cause = cause
         self._is_found_by_time = is_found_by_time
         self.device.is_faulty = True
+        self.device.fault_bits = _KIND_BITS.get(code >> 12, 0)
         self._limits.target = 0
         self._apply(DriveEvent.FAULT_DETECTED, t_ns)
         self._drive_motor()
         if cause is None:
-            self.device.report_error(code, t_ns)
+            self.device.report_fault(code, t_ns)
         else:
             self.device.trip(cause, t_ns)
 
+    def _watch_motor(self, t_ns: int) -> None:
+        """Fault when the motor's state calls for it; note when its limits come and go."""
+        code = self._motor.error_code()
+        if code:
+            self._latch(code, None, t_ns)
+        is_limited = self._motor.is_limited()
+        if is_limited != self._is_motor_limited:
+            self._is_motor_limited = is_limited
+            self.has_news = True
+
     def _is_cause_present(self, t_ns: int) -> bool:
-        """Whether the drive fails, or a watchdog that stops it is tripped, or would be at once."""
-        if self._failure or self._tripped - {Watchdog.LENGTH}:
+        """Whether the drive fails, the motor is too hot, or a watchdog that stops it is tripped or would be at once."""
+        if self._failure or self._tripped - {Watchdog.LENGTH} or self._motor.error_code():
             return True
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
 

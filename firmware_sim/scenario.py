@@ -16,8 +16,10 @@ from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, 
 from adacd_hil.records import Vector
 from firmware_sim.arms import ARMS, Arm
 from firmware_sim.contact import ContactSettings, ticks
+from firmware_sim.drive_settings import DriveSettings
 from firmware_sim.faults import FaultSettings, check_rows
 from firmware_sim.mechanics_settings import MechanicsSettings, PayloadBody
+from firmware_sim.sensor_settings import SensorSettings
 from firmware_sim.touch_settings import BodySettings, HandSettings, WallSettings
 
 
@@ -45,7 +47,7 @@ class Scenario:
     name: str = setting("", meaning="name of the scenario")
     profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
     seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the sensor noise")
-    noise: bool = setting(True, meaning="torque sensor noise; quantisation stays")
+    noise: bool = setting(True, meaning="noise of torque sensors and encoders; quantisation stays")
     start_deg: tuple[float, float] = setting(
         (0.0, 0.0), unit="deg", low=-180.0, high=180.0, meaning="pose at power-on, at rest"
     )
@@ -53,6 +55,8 @@ class Scenario:
     torque_offset_Nm: tuple[float, float] = setting(
         (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="zero error of the torque sensors"
     )
+    sensors: SensorSettings = setting(SensorSettings, meaning="errors of the torque sensors and the encoders")
+    drives: DriveSettings = setting(DriveSettings, meaning="errors and limits of the drives")
     payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
     contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
     bodies: tuple[BodySettings, ...] = setting((), meaning="bodies in the arm's way")

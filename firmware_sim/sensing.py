@@ -4,6 +4,8 @@ encoder    20 bit per revolution, rounded to the nearest count
 velocity   critically damped tracking loop on the encoder at 10 kHz, v̂/q = ω² s / (s + ω)², ω = 2π · 200 rad/s;
            it lags a steady acceleration by 2/ω = 1.59 ms; sent with an LSB of 5e-4 rad/s
 torque     white noise of 0.02 Nm rms at the SYNC sample, then a 16-bit converter over ±50 Nm that saturates
+
+These are the defaults. What a scenario changes of them is in `torque_transducer`, `encoder` and `motor`.
 """
 
 import math
@@ -46,11 +48,17 @@ def torque_counts(torque_Nm: float) -> int:
 
 @compiled
 def track(
-    before_rad: float, now_rad: float, estimate_rad: float, velocity_rad_s: float, tick_s: float
+    before_rad: float,
+    now_rad: float,
+    estimate_rad: float,
+    velocity_rad_s: float,
+    tick_s: float,
+    tracking_rad_s: float = TRACKING_RAD_S,
 ) -> tuple[float, float]:
     """Advance the drive's tracking loop by one tick: new position estimate rad, new velocity estimate rad/s.
 
-    before, now: encoder positions at the two ends of the tick, taken as joined by a straight line. Exact for
+    before, now: encoder positions at the two ends of the tick, taken as joined by a straight line. tracking: ω.
+    Exact for
 
         p̂' = v̂ + 2ω (p − p̂),  v̂' = ω² (p − p̂)
 
@@ -60,20 +68,21 @@ def track(
     slope_rad_s = (now_rad - before_rad) / tick_s
     away_rad = estimate_rad - before_rad
     away_rad_s = velocity_rad_s - slope_rad_s
-    turn = TRACKING_RAD_S * tick_s
+    turn = tracking_rad_s * tick_s
     decay = math.exp(-turn)
     return (
         now_rad + decay * ((1.0 - turn) * away_rad + tick_s * away_rad_s),
-        slope_rad_s + decay * ((1.0 + turn) * away_rad_s - TRACKING_RAD_S * turn * away_rad),
+        slope_rad_s + decay * ((1.0 + turn) * away_rad_s - tracking_rad_s * turn * away_rad),
     )
 
 
 class TorqueNoise:
     """The noise of both torque sensors, drawn block by block from one seed."""
 
-    def __init__(self, seed: int, rms_Nm: float) -> None:
+    def __init__(self, seed: int | np.random.SeedSequence, rms_Nm: float | tuple[float, float]) -> None:
         self._generator = np.random.default_rng(seed)
-        self._rms_Nm = rms_Nm
+        self._rms_Nm = np.broadcast_to(np.asarray(rms_Nm, dtype=np.float64), (2,))
+        self._is_on = bool(self._rms_Nm.any())
         self._block: NDArray[np.float64] = np.zeros((_BLOCK, 2))
         self._next = _BLOCK
 
@@ -81,7 +90,7 @@ class TorqueNoise:
         """Give the next sample (2,), Nm; valid until the next call."""
         if self._next == _BLOCK:
             self._next = 0
-            if self._rms_Nm > 0.0:
+            if self._is_on:
                 self._generator.standard_normal(out=self._block)
                 self._block *= self._rms_Nm
         sample: NDArray[np.float64] = self._block[self._next]

@@ -19,22 +19,33 @@ AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
 """What 0x6125 takes."""
 AUTOZERO_SAMPLES = 64
 """Samples whose mean becomes the zero: an eighth of the noise of one."""
-TEMPERATURE_CENTIDEGREES = 2500
-"""0x2111: the emulated sensor has room temperature, always."""
+ROOM_TEMPERATURE_C = 25.0
+"""What 0x2111 says of a sensor that isn't told its joint's temperature."""
 
-_LOWEST_COUNT, _HIGHEST_COUNT = TORQUE_COUNTS
 _EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
 
 
 class SensorNode:
     """One torque sensor on the bus."""
 
-    def __init__(self, device: Device, codec: Codec, number: int) -> None:
-        """Connect the node to its device. `number`: 1 or 2, as in the DBC's names."""
+    def __init__(
+        self,
+        device: Device,
+        codec: Codec,
+        number: int,
+        converter_ends: tuple[int, int] = TORQUE_COUNTS,
+        temperature_C: Callable[[], float] = lambda: ROOM_TEMPERATURE_C,
+    ) -> None:
+        """Connect the node to its device.
+
+        `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives.
+        `temperature_C`: of the joint, 0x2111.
+        """
         self.device = device
         self.has_news = False
         """Whether something has changed that the bus hasn't been told."""
         self._pdos = device.pdos
+        self._lowest_count, self._highest_count = converter_ends
         signals = codec.message(f"Sensor{number}Torque").signals
         scale_Nm = next(signal.scale for signal in signals if signal.name == "torque")
         self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / scale_Nm)  # exact: contracts have decimal fractions
@@ -46,7 +57,7 @@ class SensorNode:
         device.serve(0x2000, 1, lambda: codec.wire_version)
         device.serve(0x2000, 2, lambda: codec.layout_digest)
         device.serve(0x2110, 1, lambda: round(self._counts * self._lsbs_per_count))
-        device.serve(0x2111, 0, lambda: TEMPERATURE_CENTIDEGREES)
+        device.serve(0x2111, 0, lambda: max(-0x8000, min(0x7FFF, round(100.0 * temperature_C()))))
         device.serve(0x6150, 1, lambda: self._status)
         device.serve(0x9130, 1, lambda: self._torque)
         device.watch(0x6125, 1, check=self._start_autozero)
@@ -59,9 +70,9 @@ class SensorNode:
     def on_sync(self, counts: int) -> None:
         """Take the torque that was sampled at this SYNC, in the converter's counts."""
         status = self._error_bits
-        if counts >= _HIGHEST_COUNT:
+        if counts >= self._highest_count:
             status |= STATUS_POSITIVE_OVERLOAD | STATUS_NOT_VALID
-        elif counts <= _LOWEST_COUNT:
+        elif counts <= self._lowest_count:
             status |= STATUS_NEGATIVE_OVERLOAD | STATUS_NOT_VALID
         if status != self._status:
             self._status = status

@@ -1,0 +1,148 @@
+"""The imperfect encoder against closed forms, alone and in the arm."""
+
+import math
+
+import numpy as np
+import pytest
+
+from adacd_hil.config import parse
+from adacd_hil.records import TRUTH_LAYOUT
+from firmware_sim.body import Body, DriveMode
+from firmware_sim.encoder import NOISE_TICKS, encoder_numbers, read_angle
+from firmware_sim.scenario import Scenario
+from firmware_sim.sensing import POSITION_LSB_RAD, to_counts
+from firmware_sim.sensor_settings import SensorSettings
+
+TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
+OFF = (DriveMode.OFF, DriveMode.OFF)
+BRAKE = (DriveMode.BRAKE, DriveMode.BRAKE)
+
+
+def errors_over_a_turn(joint: int, count: int = 4096, **settings) -> np.ndarray:
+    """Give reading less true angle (count,) over one revolution, rad."""
+    numbers = encoder_numbers(parse(SensorSettings, settings))
+    angles = np.arange(count) * 2.0 * math.pi / count
+    return np.array([read_angle(numbers, joint, angle, 0.0) - angle for angle in angles])
+
+
+def arm(seed: int = 1, noise: bool = True, **sensors) -> Body:
+    return Body(parse(Scenario, {"profile": "S", "noise": noise, "sensors": sensors}), seed=seed)
+
+
+def test_a_perfect_encoder_gives_the_counts_of_the_wire():
+    numbers = encoder_numbers(SensorSettings())
+    for angle_rad in np.random.default_rng(2).uniform(-7.0, 7.0, 1_000):
+        expected = to_counts(angle_rad, POSITION_LSB_RAD) * POSITION_LSB_RAD
+        assert read_angle(numbers, 0, angle_rad, 0.0) == expected
+
+
+def test_an_eccentric_disc_errs_once_per_revolution():
+    settings = {"encoder_bits": [24, 24], "eccentricity_rad": [2e-3, 0.0], "eccentricity_phase_rad": [0.7, 0.0]}
+    harmonics = np.fft.rfft(errors_over_a_turn(0, **settings)) / 2048
+    assert abs(harmonics[1]) == pytest.approx(2e-3, abs=1e-7)
+    assert np.angle(harmonics[1]) == pytest.approx(0.7 - math.pi / 2, abs=1e-4)
+    assert np.abs(np.delete(harmonics, 1)).max() < 1e-7
+    assert np.abs(errors_over_a_turn(1, **settings)).max() < 4e-7
+
+
+def test_an_elliptic_disc_errs_twice_per_revolution():
+    settings = {"encoder_bits": [24, 24], "ellipticity_rad": [0.0, 1e-3], "ellipticity_phase_rad": [0.0, -0.4]}
+    harmonics = np.fft.rfft(errors_over_a_turn(1, **settings)) / 2048
+    assert abs(harmonics[2]) == pytest.approx(1e-3, abs=1e-7)
+    assert np.angle(harmonics[2]) == pytest.approx(-0.4 - math.pi / 2, abs=1e-4)
+    assert np.abs(np.delete(harmonics, 2)).max() < 1e-7
+
+
+@pytest.mark.parametrize("bits", [8, 12, 17, 20])
+def test_a_coarser_encoder_steps_in_whole_counts_of_the_wire(bits):
+    body = arm(noise=False, encoder_bits=[bits, 20])
+    positions = []
+    for _ in range(120):
+        body.advance((4.0, 0.0), TORQUE)
+        positions.append(body.sample().position_counts[0])
+    assert {position % (1 << (20 - bits)) for position in positions} == {0}
+    assert positions[-1] > 1 << 14
+    assert np.abs(errors_over_a_turn(0, 4099, encoder_bits=[bits, 20])).max() <= math.pi / (1 << bits) * (1 + 1e-9)
+
+
+def test_an_index_error_shifts_the_position_from_power_on_and_gives_no_velocity():
+    body = arm(noise=False, index_error_rad=[0.01, -0.02], eccentricity_rad=[1e-3, 1e-3])
+    first = body.sample()
+    assert first.q == pytest.approx([0.01, -0.02], abs=3.1e-6)
+    for _ in range(20):
+        body.advance((0.0, 0.0), OFF)
+        assert body.sample() == first
+    assert first.velocity_counts == (0, 0)
+
+
+def test_the_noise_has_its_rms_in_the_encoders_own_counts():
+    body = arm(encoder_bits=[16, 20], encoder_noise_counts=[3.0, 8.0])
+    rows = []
+    for _ in range(6_000):
+        body.advance((0.0, 0.0), OFF, 1)
+        rows.append(body.sample().position_counts)
+    deviations = np.array(rows).std(axis=0)
+    # rounding adds a twelfth of a count squared
+    assert deviations[0] / 16 == pytest.approx(math.sqrt(9.0 + 1 / 12), rel=0.03)
+    assert deviations[1] == pytest.approx(math.sqrt(64.0 + 1 / 12), rel=0.03)
+    assert abs(np.corrcoef(np.array(rows).T)[0, 1]) < 0.05
+
+
+def test_encoder_noise_shakes_the_velocity_of_a_resting_arm_and_not_the_arm():
+    body = arm(encoder_noise_counts=[5.0, 0.0])
+    velocities = []
+    for _ in range(300):
+        body.advance((0.0, 0.0), OFF)
+        velocities.append(body.sample().dq)
+    deviations = np.array(velocities).std(axis=0)
+    assert deviations[0] > 5e-3
+    assert deviations[1] == 0.0
+    truth = np.zeros(TRUTH_LAYOUT.size)
+    body.truth(truth)
+    assert not truth[TRUTH_LAYOUT.slices["dq"]].any()
+
+
+@pytest.mark.parametrize("ticks", [1, 7, NOISE_TICKS - 1, NOISE_TICKS, NOISE_TICKS + 1, 257])
+def test_encoder_noise_does_not_depend_on_how_the_ticks_are_asked_for(ticks):
+    """A braking drive answers the noise of its velocity with torque, so the arm remembers all of it."""
+    blocks = []
+    for step in (1_500, ticks):
+        body = arm(encoder_noise_counts=[20.0, 20.0])
+        for first in range(0, 1_500, step):
+            body.advance((0.0, 0.0), BRAKE, min(step, 1_500 - first))
+        blocks.append(np.zeros(TRUTH_LAYOUT.size))
+        body.truth(blocks[-1])
+    assert blocks[0][TRUTH_LAYOUT.slices["q"]].all()
+    assert blocks[0].tobytes() == blocks[1].tobytes()
+
+
+def test_encoder_noise_repeats_with_its_seed_and_not_with_another():
+    velocities = []
+    for seed in (5, 5, 6):
+        body = arm(seed, encoder_noise_counts=[5.0, 5.0])
+        body.advance((0.0, 0.0), OFF)
+        velocities.append(body.drive_velocity_rad_s)
+    assert velocities[0] == velocities[1]
+    assert velocities[0] != velocities[2]
+
+
+def test_a_scenario_without_noise_has_none_in_its_encoders():
+    body = arm(noise=False, encoder_noise_counts=[5.0, 5.0])
+    body.advance((0.0, 0.0), OFF)
+    assert body.drive_velocity_rad_s == (0.0, 0.0)
+
+
+def test_the_velocity_follows_from_the_eccentric_angle():
+    """The drive differentiates what it reads: dφ/dt = (1 + e cos(q + p)) dq."""
+    fine = {"noise": False, "encoder_bits": [24, 24]}
+    bodies = (arm(**fine), arm(**fine, eccentricity_rad=[0.02, 0.0], eccentricity_phase_rad=[0.5, 0.0]))
+    for _ in range(300):
+        for body in bodies:
+            body.advance((2.0, 0.0), TORQUE)
+    perfect, eccentric = (body.drive_velocity_rad_s[0] for body in bodies)
+    truth = np.zeros(TRUTH_LAYOUT.size)
+    bodies[0].truth(truth)
+    q = truth[TRUTH_LAYOUT.slices["q"]][0]
+    assert perfect > 1.0
+    # the tracking loop shows the state of 1.6 ms ago, in which the arm turns by a few milliradians
+    assert eccentric / perfect - 1.0 == pytest.approx(0.02 * math.cos(q + 0.5), abs=1e-4)

@@ -1,0 +1,233 @@
+"""Sections `[sensors]` and `[drives]`: what is refused, what their absence means, and that runs repeat."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adacd_hil.config import ConfigError, parse, to_toml
+from adacd_hil.records import TRUTH_LAYOUT
+from firmware_sim.body import Body, DriveMode
+from firmware_sim.contact import TICK_S
+from firmware_sim.drive_settings import DriveSettings
+from firmware_sim.scenario import Scenario, load_scenario
+from firmware_sim.sensing import (
+    POSITION_LSB_RAD,
+    VELOCITY_LSB_RAD_S,
+    TorqueNoise,
+    to_counts,
+    torque_counts,
+    track,
+)
+from firmware_sim.sensor_settings import SensorSettings
+
+TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
+EVERY_SENSOR_ERROR = {
+    "offset_drift_Nm_s": [0.1, -0.1],
+    "offset_walk_Nm_rs": [0.1, 0.2],
+    "offset_drift_Nm_K": [0.01, 0.01],
+    "gain_error": [0.02, -0.01],
+    "gain_drift_1_K": [1e-4, 1e-4],
+    "cross_talk": [0.01, -0.02],
+    "hysteresis_Nm": [0.2, 0.1],
+    "torque_bandwidth_Hz": [300.0, 0.0],
+    "torque_noise_Nm": [0.01, 0.03],
+    "torque_range_Nm": [30.0, 20.0],
+    "torque_bits": [14, 18],
+    "sample_rate_Hz": [1500.0, 700.0],
+    "clock_error_ppm": [50.0, -50.0],
+    "clock_phase": [0.2, 0.9],
+    "encoder_bits": [16, 22],
+    "encoder_noise_counts": [1.0, 2.0],
+    "index_error_rad": [0.01, -0.01],
+    "eccentricity_rad": [1e-3, 0.0],
+    "ellipticity_rad": [0.0, 1e-3],
+}
+EVERY_DRIVE_ERROR = {
+    "current_loop_Hz": [300.0, 1500.0],
+    "velocity_loop_Hz": [100.0, 300.0],
+    "torque_constant_error": [0.03, -0.03],
+    "torque_offset_Nm": [0.05, 0.02],
+    "peak_torque_Nm": [9.0, 5.0],
+    "continuous_torque_Nm": [0.5, 0.1],
+    "peak_time_s": [0.01, 0.01],
+    "winding_rise_K": [100.0, 100.0],
+    "housing_rise_K": [30.0, 30.0],
+    "preheat_K": [80.0, 90.0],
+}
+
+
+def run(seed: int, cycles: int = 150, **changes) -> np.ndarray:
+    """Give what is measured, true and believed over a run with commands given in advance, one row per cycle."""
+    body = Body(parse(Scenario, {"profile": "M", **changes}), seed=seed)
+    body.start_scenario()
+    block = np.zeros(TRUTH_LAYOUT.size)
+    rows = []
+    for cycle in range(cycles):
+        measured = body.sample()
+        body.truth(block)
+        believed = (*body.motor_torque_Nm, *body.drive_velocity_rad_s, *body.winding_temperature_C)
+        rows.append(np.concatenate([*measured, block, believed]))
+        body.advance((2.0 * np.sin(0.03 * cycle), 0.9 * np.cos(0.05 * cycle)), TORQUE)
+    return np.array(rows)
+
+
+def run_with_everything(seed: int, cycles: int = 150) -> np.ndarray:
+    return run(seed, cycles, sensors=EVERY_SENSOR_ERROR, drives=EVERY_DRIVE_ERROR)
+
+
+def test_an_arm_without_errors_measures_what_is_true_to_the_last_count():
+    """Position, velocity and torque from the truth of every tick, and the noise in the order of its seed."""
+    body = Body(parse(Scenario, {"profile": "M", "torque_offset_Nm": [0.3, -0.1]}), seed=11)
+    noise = TorqueNoise(11, 0.02)
+    block = np.zeros(TRUTH_LAYOUT.size)
+    encoder_rad, estimate_rad, velocity_rad_s = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+    for tick in range(3_000):
+        if tick % 10 == 0:
+            body.truth(block)
+            noise_Nm = noise.draw()
+            measured = body.sample()
+            for joint in range(2):
+                tau_Nm = block[TRUTH_LAYOUT.slices["tau_J"]][joint]
+                expected = torque_counts(tau_Nm + (0.3, -0.1)[joint] + noise_Nm[joint])
+                assert measured.torque_counts[joint] == expected
+                assert measured.position_counts[joint] == round(encoder_rad[joint] / POSITION_LSB_RAD)
+                assert measured.velocity_counts[joint] == to_counts(velocity_rad_s[joint], VELOCITY_LSB_RAD_S)
+        body.advance((2.0 * np.sin(3e-3 * tick), 0.9 * np.cos(5e-3 * tick)), TORQUE, 1)
+        body.truth(block)
+        for joint in range(2):
+            now_rad = to_counts(block[TRUTH_LAYOUT.slices["q"]][joint], POSITION_LSB_RAD) * POSITION_LSB_RAD
+            estimate_rad[joint], velocity_rad_s[joint] = track(
+                encoder_rad[joint], now_rad, estimate_rad[joint], velocity_rad_s[joint], TICK_S
+            )
+            encoder_rad[joint] = now_rad
+    assert abs(velocity_rad_s[0]) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("sensors", "changed"),
+    [({"offset_walk_Nm_rs": [0.5, 0.0]}, {4}), ({"encoder_noise_counts": [0.0, 5.0]}, {1, 3})],
+)
+def test_chance_of_one_error_leaves_all_other_numbers_alone_to_the_bit(sensors, changed):
+    """Columns 0 to 5: position, velocity and torque of both joints. The arm itself has no feedback here."""
+    plain, erroneous = run(4), run(4, sensors=sensors)
+    differing = {column for column in range(6 + TRUTH_LAYOUT.size) if np.any(plain[:, column] != erroneous[:, column])}
+    assert differing == changed
+
+
+CHANCE = {
+    "walk": {"offset_walk_Nm_rs": [10.0, 0.0], "torque_noise_Nm": [0.0, 0.0]},
+    "torque": {"torque_noise_Nm": [0.1, 0.0]},
+    "encoder": {"encoder_noise_counts": [1000.0, 0.0], "torque_noise_Nm": [0.0, 0.0]},
+}
+
+
+def chance(source: str) -> np.ndarray:
+    """Give what one source of chance adds at each tick to the measurements of a resting joint 1."""
+    body = Body(parse(Scenario, {"sensors": CHANCE[source]}), seed=2)
+    rows = []
+    for _ in range(1_000):
+        measured = body.sample()
+        rows.append(measured.position_counts[0] if source == "encoder" else measured.torque_counts[0])
+        body.advance((0.0, 0.0), (DriveMode.OFF, DriveMode.OFF), 1)
+    return np.diff(rows, prepend=0) if source == "walk" else np.array(rows)
+
+
+@pytest.mark.parametrize("pair", [("walk", "torque"), ("walk", "encoder"), ("torque", "encoder")])
+def test_sources_of_chance_have_nothing_in_common(pair):
+    first, second = chance(pair[0])[5:-5], chance(pair[1])
+    for shift in range(11):
+        correlation = np.corrcoef(first, second[shift : shift + first.size])[0, 1]
+        assert abs(correlation) < 0.13  # four times the rms of that of 990 independent pairs
+
+
+def test_a_run_with_every_error_repeats_with_its_seed():
+    assert run_with_everything(9).tobytes() == run_with_everything(9).tobytes()
+
+
+def test_a_run_with_every_error_differs_with_another_seed():
+    assert run_with_everything(9).tobytes() != run_with_everything(10).tobytes()
+
+
+@pytest.mark.slow
+def test_the_interpreted_errors_are_those_of_the_compiled_ones():
+    script = (
+        "import sys\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import test_sensor_settings\n"
+        "sys.stdout.buffer.write(test_sensor_settings.run_with_everything(9, 60).tobytes())\n"
+    )
+    results = []
+    for is_disabled in ("0", "1"):
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": is_disabled}
+        finished = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, check=True)
+        results.append(np.frombuffer(finished.stdout))
+    assert results[0].size == 60 * (12 + TRUTH_LAYOUT.size)
+    assert np.allclose(results[0], results[1], rtol=1e-9, atol=1e-9)
+
+
+def test_a_scenario_with_every_error_can_be_written_and_read_again(tmp_path):
+    scenario = parse(Scenario, {"name": "all", "sensors": EVERY_SENSOR_ERROR, "drives": EVERY_DRIVE_ERROR})
+    path = tmp_path / "all.toml"
+    path.write_text(to_toml(scenario), encoding="utf-8")
+    assert load_scenario(str(path)) == scenario
+
+
+@pytest.mark.parametrize("name", ["paper", "idle"])
+def test_the_built_in_scenarios_have_no_errors(name):
+    scenario = load_scenario(name)
+    assert scenario.sensors == SensorSettings()
+    assert scenario.drives == DriveSettings()
+
+
+@pytest.mark.parametrize(
+    ("section", "text", "message"),
+    [
+        ("sensors", "gain_eror = [0.0, 0.0]", "unknown key `sensors.gain_eror`; did you mean `sensors.gain_error`?"),
+        ("sensors", "gain_error = [0.0]", "`sensors.gain_error` has 1 values, 2 expected"),
+        ("sensors", "gain_error = 0.1", "`sensors.gain_error` = 0.1 must be a list"),
+        ("sensors", "cross_talk = [0.6, 0.0]", "`sensors.cross_talk[0]` = 0.6 is above 0.5"),
+        ("sensors", "torque_range_Nm = [50.0, 60.0]", "`sensors.torque_range_Nm[1]` = 60.0 Nm is above 50 Nm"),
+        ("sensors", "torque_bits = [16, 3]", "`sensors.torque_bits[1]` = 3 is below 4"),
+        ("sensors", "torque_bits = [16, 12.5]", "`sensors.torque_bits[1]` = 12.5 must be of type int"),
+        ("sensors", "encoder_bits = [25, 20]", "`sensors.encoder_bits[0]` = 25 is above 24"),
+        ("sensors", "torque_bandwidth_Hz = [-1.0, 0.0]", "`sensors.torque_bandwidth_Hz[0]` = -1.0 Hz is below 0 Hz"),
+        (
+            "sensors",
+            "hysteresis_Nm = [0.0, 6.0]",
+            "`sensors.hysteresis_Nm[1]` = 6.0 Nm is above half of its reach, 5 Nm",
+        ),
+        (
+            "sensors",
+            "clock_error_ppm = [0.0, 20.0]",
+            "`sensors.sample_rate_Hz[1]` = 0.0 Hz leaves `clock_error_ppm` and `clock_phase` no clock",
+        ),
+        ("drives", "current_loop_Hz = [0.5, 1000.0]", "`drives.current_loop_Hz[0]` = 0.5 Hz is below 1 Hz"),
+        ("drives", "i2t_reaction = 'stop'", "`drives.i2t_reaction` = 'stop' must be one of limit, fault"),
+        (
+            "drives",
+            "continuous_torque_Nm = [5.0, 0.0]\npeak_torque_Nm = [5.0, 0.0]",
+            "`drives.continuous_torque_Nm[0]` = 5.0 Nm is not below `peak_torque_Nm` = 5.0 Nm",
+        ),
+        (
+            "drives",
+            "derating_end_C = [140.0, 100.0]",
+            "`drives.derating_end_C[1]` = 100.0 °C is not above `derating_start_C` = 110.0 °C",
+        ),
+        (
+            "drives",
+            "overheat_C = [110.0, 130.0]",
+            "`drives.overheat_C[0]` = 110.0 °C is not above `derating_start_C` = 110.0 °C",
+        ),
+    ],
+)
+def test_an_error_that_cannot_be_is_refused_with_one_line(tmp_path, section, text, message):
+    path = tmp_path / "scenario.toml"
+    path.write_text(f"[{section}]\n{text}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as refusal:
+        load_scenario(str(path))
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value)
