@@ -188,7 +188,7 @@ def test_a_drive_that_fails_faults_with_its_code_and_says_so():
     drive = host.bench.drives[0]
     drive.fail(ERROR, host.bench.now_ns)
     assert host.state_bits(1) == REACTION_BITS
-    assert struct.unpack_from("<HBB", host.taken(0x081)[0]) == (ERROR, 0x01, 0)
+    assert struct.unpack_from("<HBB", host.taken(0x081)[0]) == (ERROR, 0x03, 0)
     assert host.read(1, 0x603F) == ERROR
     assert host.read(1, 0x1003, 1) == ERROR
     assert drive.torque_Nm == 0.0
