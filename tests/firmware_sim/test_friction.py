@@ -109,6 +109,7 @@ def test_a_stiff_bristle_at_high_speed_stays_stable():
     assert np.abs(history[:, BRISTLE]).max() == pytest.approx(COULOMB_NM / 20_000.0, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_bristled", [False, True])
 def test_a_joint_drawn_slowly_through_a_spring_sticks_and_slips(is_bristled):
     """A motor that creeps on draws the link by a soft spring: the spring tightens to F_s, then the link slips.

@@ -87,6 +87,7 @@ def test_the_general_integrator_with_nothing_to_do_is_the_rigid_plant(name):
     assert np.abs(history[:, :4] - rigid).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_an_arm_below_its_breakaway_torque_does_not_move_by_a_bit():
     arm = GeneralArm(
         ARMS["M"],
@@ -135,6 +136,7 @@ def test_accelerations_with_a_payload_beside_the_link_and_a_tilted_base_are_thos
         assert np.allclose(found, pinocchio.aba(model, data, q, dq, tau), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_hanging_arm_rests_where_the_slope_goes_down():
     settings = MechanicsSettings(tilt_deg=20.0, tilt_direction_deg=40.0, motor_viscous_Nm_s=(1.0, 0.3))
     arm = GeneralArm(without_friction(), settings)
