@@ -3,6 +3,8 @@
 import ctypes
 import gc
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 _MCL_CURRENT_AND_FUTURE = 3
@@ -40,6 +42,17 @@ def freeze_garbage() -> None:
     gc.collect()
     gc.freeze()
     gc.disable()
+
+
+@contextmanager
+def frozen_garbage() -> Iterator[None]:
+    """Collect once, and not again while the block lasts."""
+    freeze_garbage()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        gc.enable()
 
 
 def scheduler_name() -> str:

@@ -93,30 +93,35 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     The result raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
     switch and 11-bit identifier.
     """
-    bit_ns = 1_000_000_000 / bitrate
-    whole_ns = round(bit_ns) if bit_ns == round(bit_ns) else 0
+    stuffed = _stuffed
+    bits_to_ns = _round_up(bitrate)
+    whole_ns = 1_000_000_000 // bitrate if 1_000_000_000 % bitrate == 0 else 0
 
-    def nominal_ns(bits: int) -> int:
-        return bits * whole_ns if whole_ns else -(-bits * 1_000_000_000 // bitrate)
-
-    def classic(can_id: int, data: bytes) -> int:
-        length = len(data)
-        value = int.from_bytes(data, "big", signed=True)
-        if can_id <= _MAX_STANDARD_ID:
-            return nominal_ns(_stuffed(can_id << 7 | length, _HEAD_BITS, value, length) + _TAIL_BITS)
-        head = ((can_id >> 18) << 2 | 3) << 25 | (can_id & 0x3FFFF) << 7 | length
-        return nominal_ns(_stuffed(head, _EXTENDED_HEAD_BITS, value, length) + _TAIL_BITS)
-
-    def time_ns(can_id: int, data: bytes) -> int:
+    def other(can_id: int, data: bytes) -> int:
         length = len(data)
         if length <= CLASSIC_BYTES:
-            return classic(can_id, data)
+            value = int.from_bytes(data, "big", signed=True)
+            if can_id <= _MAX_STANDARD_ID:
+                return bits_to_ns(stuffed(can_id << 7 | length, _HEAD_BITS, value, length) + _TAIL_BITS)
+            head = ((can_id >> 18) << 2 | 3) << 25 | (can_id & 0x3FFFF) << 7 | length
+            return bits_to_ns(stuffed(head, _EXTENDED_HEAD_BITS, value, length) + _TAIL_BITS)
         plain = unstuffed_fd_bits(length)
         body = np.frombuffer(data, dtype=np.uint8)
         before, after = _fd_stuff_bits(can_id << 5 | 0b00101, body, FD_LENGTHS.index(length))
-        return nominal_ns(plain.nominal + before) - (-(plain.data + after) * 1_000_000_000 // data_bitrate)
+        return bits_to_ns(plain.nominal + before) - (-(plain.data + after) * 1_000_000_000 // data_bitrate)
 
-    return time_ns
+    def classic(can_id: int, data: bytes, from_bytes: Callable[..., int] = int.from_bytes) -> int:
+        length = len(data)
+        if length > CLASSIC_BYTES or can_id > _MAX_STANDARD_ID:
+            return other(can_id, data)
+        bits = stuffed(can_id << 7 | length, _HEAD_BITS, from_bytes(data, "big", signed=True), length)
+        return (bits + _TAIL_BITS) * whole_ns
+
+    return classic if whole_ns else other
+
+
+def _round_up(bitrate: int) -> Callable[[int], int]:
+    return lambda bits: -(-bits * 1_000_000_000 // bitrate)
 
 
 def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:

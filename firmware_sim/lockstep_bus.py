@@ -17,7 +17,7 @@ How devices let time pass: `firmware_sim.time_marks`. Devices that send no marks
 
 from collections import deque
 from collections.abc import Iterable
-from typing import Final, NamedTuple
+from typing import Final
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import Settings
@@ -36,13 +36,8 @@ _CYCLIC_PERIODS: Final = 2
 """For so many periods after a SYNC devices live by SYNC; after that the host lets time pass by ADVANCE."""
 
 
-class Offer(NamedTuple):
-    """A frame that waits for the bus; the smaller one wins."""
-
-    can_id: int
-    order: int  # among all, for equal identifiers
-    t_ns: int  # when it was handed over
-    data: bytes
+Offer = tuple[int, int, int, bytes]
+"""A frame that waits for the bus; the smaller one wins: identifier, order among all, when it was handed over, data."""
 
 
 class LockstepBus:
@@ -96,9 +91,10 @@ class LockstepBus:
     @property
     def waiting_frames(self) -> tuple[int, ...]:
         """Identifiers of the host's frames that are not on the bus yet, oldest first."""
-        if self._queue:
-            self._transmit_before(self._clock.now_ns())
-        return tuple(offer.can_id for offer in self._queue)
+        if not self._queue:
+            return ()
+        self._transmit_before(self._clock.now_ns())
+        return tuple([offer[0] for offer in self._queue])
 
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame at the clock's present time. Raises TransmitQueueError while nobody acknowledges."""
@@ -114,7 +110,7 @@ class LockstepBus:
         if self._received:
             self._withdraw(now_ns)
         self._count += 1
-        self._queue.append(Offer(can_id, self._count, now_ns, bytes(data)))
+        self._queue.append((can_id, self._count, now_ns, data))
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
@@ -155,30 +151,51 @@ class LockstepBus:
 
     def _transmit_next(self, limit_ns: int) -> bool:
         """Let the next frame win the bus, if one starts before `limit_ns`."""
-        if not (self._offered or self._queue):
+        queue = self._queue
+        if len(queue) == 1 and not self._offered:
+            return self._transmit_only(queue[0], limit_ns)
+        if not (self._offered or queue):
             return False
         while True:
             waiting = self._offered
-            if self._queue and self._is_acknowledged:
-                waiting = [*waiting, *(self._queue[:1] if self._is_fifo else self._queue)]
+            if queue and self._is_acknowledged:
+                waiting = [*waiting, *(queue[:1] if self._is_fifo else queue)]
             if not waiting:
                 return False
-            start_ns = max(min([offer.t_ns for offer in waiting]), self._free_ns)
+            start_ns = max(min([offer[2] for offer in waiting]), self._free_ns)
             if start_ns >= limit_ns:
                 return False
-            if start_ns <= self._granted_ns or not self._is_marked or self._is_cyclic(start_ns):
+            if not self._must_ask(start_ns):
                 break
             self._ask(start_ns)  # the devices may have something that comes first
-        winner = min([offer for offer in waiting if offer.t_ns <= start_ns])
+        winner = min([offer for offer in waiting if offer[2] <= start_ns])
         can_id, _, _, data = winner
         self._free_ns = start_ns + self._frame_time(can_id, data)
         if winner in self._offered:
             self._offered.remove(winner)
             self._received.append(Frame(can_id, data, self._free_ns))
         else:
-            self._queue.remove(winner)
+            queue.remove(winner)
             self._forward(can_id, data)
         return True
+
+    def _transmit_only(self, offer: Offer, limit_ns: int) -> bool:
+        """Let the only frame that waits win the bus, if it starts before `limit_ns`."""
+        can_id, _, t_ns, data = offer
+        start_ns = t_ns if t_ns > self._free_ns else self._free_ns
+        if start_ns >= limit_ns or not self._is_acknowledged:
+            return False
+        if self._must_ask(start_ns):
+            self._ask(start_ns)
+            return True  # whatever came: look again
+        self._free_ns = start_ns + self._frame_time(can_id, data)
+        self._queue.clear()
+        self._forward(can_id, data)
+        return True
+
+    def _must_ask(self, start_ns: int) -> bool:
+        """Whether devices that live by grants have not lived until then."""
+        return self._is_marked and start_ns > self._granted_ns and not self._is_cyclic(start_ns)
 
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame of the host's, which is through, to the devices; after SYNC take their answers."""
@@ -258,7 +275,7 @@ class LockstepBus:
             self._received.append(frame._replace(t_ns=t_ns))
             return
         self._count += 1
-        self._offered.append(Offer(frame.can_id, self._count, t_ns, frame.data))
+        self._offered.append((frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
         """Whether the devices live by SYNC at a time."""

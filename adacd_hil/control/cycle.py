@@ -162,7 +162,7 @@ class Cycle:
         self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
         is_open = output.state in _POWERED and arm.is_enabled and not self._is_stale()
         flags = self._gate.limit(self._tau_d, is_open, self._tau_c)
-        quick_stop = output.state is SchemeState.FAULT or bool(flags & GateFlag.NOT_A_NUMBER)
+        quick_stop = output.state is SchemeState.FAULT or (bool(flags) and GateFlag.NOT_A_NUMBER in flags)
         return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
 
     def _is_stale(self) -> bool:

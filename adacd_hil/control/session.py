@@ -20,7 +20,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.log.recorder import LogSummary, Recorder
 from adacd_hil.records import Event, FaultReason
-from adacd_hil.scheduling import RealtimeGrant, freeze_garbage, request_realtime, scheduler_name
+from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.tap import Tap
@@ -171,14 +171,13 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
-        if not self.is_lockstep:
-            freeze_garbage()
         self._has_started = True
-        try:
-            master.start()
-            return cycle.run(recorder)
-        finally:
-            self._stop(master, recorder, tap)
+        with frozen_garbage():
+            try:
+                master.start()
+                return cycle.run(recorder)
+            finally:
+                self._stop(master, recorder, tap)
 
     def _stop(self, master: Master, recorder: Recorder, tap: Tap) -> None:
         """Take the devices out of operation, as far as the bus still carries it."""

@@ -14,7 +14,7 @@ from adacd_hil.device.drive import Cia402State, Drive, option_codes, torque_limi
 from adacd_hil.device.emergency import name_error
 from adacd_hil.device.heartbeat import PATIENCE_PERIODS
 from adacd_hil.device.placement import Device, place_devices
-from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
+from adacd_hil.device.torque_sensor import USABLE, SensorStatus, TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
@@ -160,7 +160,8 @@ class Arm:
         self._was_enabled |= is_enabled
         if has_dropped_out:
             return FaultReason.DRIVE
-        if any(sensor.status & SensorStatus.NOT_VALID for sensor in self.sensors):
+        sensor1, sensor2 = self.sensors
+        if not (sensor1.status in USABLE and sensor2.status in USABLE):
             return FaultReason.SENSOR
         (drive1, drive2), (limit1, limit2) = self.drives, self._max_status_age
         if is_enabled and (self._cycle - drive1.status_cycle > limit1 or self._cycle - drive2.status_cycle > limit2):

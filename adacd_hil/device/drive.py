@@ -319,6 +319,8 @@ class Drive:
         return self._sender.protect(self.command_message.encode_raw(*raw))
 
     def _next_controlword(self, goal: Goal) -> int:
+        if goal is Goal.OPERATION_ENABLED and self.state is Cia402State.OPERATION_ENABLED:  # nearly always
+            return Controlword.ENABLE_OPERATION
         if goal is Goal.QUICK_STOP_ACTIVE:
             return Controlword.QUICK_STOP
         if goal is Goal.SWITCH_ON_DISABLED:

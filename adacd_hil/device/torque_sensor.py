@@ -21,6 +21,8 @@ class SensorStatus(IntFlag):
 
 _STATUS_BITS = 0x07
 _STATUSES = tuple(SensorStatus(bits) for bits in range(_STATUS_BITS + 1))
+USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_VALID)
+"""Statuses with which a torque may be used; an overloaded one is a bound."""
 _OVERLOAD = SensorStatus.POSITIVE_OVERLOAD | SensorStatus.NEGATIVE_OVERLOAD
 _STATUS_IN_HEADER = {0: None, 2: (1, 4), 4: (3, 0)}
 """Byte and shift of the sender's status, by the length of the end-to-end header: none, Profile 2, Profile 5."""
