@@ -16,14 +16,18 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import ClassVar
+from unittest.mock import patch
 
 import cantools
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.control.realtime import GridPacer, Tick
 from adacd_hil.control.session import Session
 from adacd_hil.log.channels import ChannelId, pack_scheme
 from adacd_hil.log.reader import read_log
@@ -39,6 +43,7 @@ from firmware_sim.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
+SYNC_ID = 0x080
 REPEATS = 20_000
 EVERYTHING = MechanicsSettings(
     static_Nm=(0.06, 0.03),
@@ -163,23 +168,56 @@ def bench_log(output: object, wire: bytes) -> None:
     show(f"log: hand over a cycle with 7 frames ({dropped} lost)", times_ns * 1e-3)
 
 
+class CountedBus:
+    """The devices' end of an embedded bus; remembers how long they took for each period."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.period_ns: list[int] = []
+        self._bench = bench
+        self._spent_ns = 0
+
+    def on_frame(self, frame: Frame) -> None:
+        """Pass a frame on."""
+        start_ns = time.perf_counter_ns()
+        if frame.can_id == SYNC_ID:
+            self.period_ns.append(self._spent_ns)
+            self._spent_ns = 0
+        self._bench.on_frame(frame)
+        self._spent_ns += time.perf_counter_ns() - start_ns
+
+
+class StampedPacer(GridPacer):
+    """A grid in virtual time that remembers when, by the wall clock, each cycle began."""
+
+    began_ns: ClassVar[list[int]] = []
+
+    def next(self) -> Tick:
+        """Begin a cycle."""
+        self.began_ns.append(time.perf_counter_ns())
+        return super().next()
+
+
 def bench_embedded() -> None:
-    """Run ten seconds in lockstep on the embedded bus and print the pace."""
+    """Run ten seconds in lockstep on the embedded bus, bus model on, and print the pace."""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "short.toml").write_text(SHORT_RUN)
         settings = load_settings(str(Path(folder) / "short.toml"), "P")
         clock = VirtualClock()
-        bus = EmbeddedBus(clock)
+        embedded = EmbeddedBus(clock)
         codec = load_codec()
-        bench = Bench(load_scenario("idle", "P"), codec, bus.deliver)
-        bus.attach(bench.on_frame)
+        bench = Bench(load_scenario("idle", "P"), codec, embedded.deliver)
+        counted = CountedBus(bench)
+        embedded.attach(counted.on_frame)
         bench.boot()
+        bus = model_time(embedded, clock, codec, settings)
         operator = ScriptedOperator(settings.operator)
-        session = Session(settings, codec, bus, clock, operator, Path(folder), "embedded")
-        start_s = time.perf_counter()
-        session.run()
-        elapsed_s = time.perf_counter() - start_s
-        show_log("embedded bus, lockstep", Path(folder) / "run.mcap", elapsed_s)
+        with patch("adacd_hil.control.realtime.GridPacer", StampedPacer):
+            summary = Session(settings, codec, bus, clock, operator, Path(folder), "embedded").run()
+        assert summary.result is not None
+        show("devices: 1 ms of plant, sensors and drives", np.array(counted.period_ns[WARM_UP:]) * 1e-3)
+        show("embedded bus, lockstep: one cycle of all", np.diff(StampedPacer.began_ns[WARM_UP:]) * 1e-3)
+        played_s = summary.result.cycles * settings.bus.period_s
+        print(f"  {played_s:.1f} s played in {summary.elapsed_s:.1f} s: {played_s / summary.elapsed_s:.1f} x real time")
 
 
 def bench_vcan() -> int:
@@ -224,6 +262,9 @@ def show_log(name: str, path: Path, elapsed_s: float) -> None:
     """Print the cycle's percentiles from a log."""
     log = read_log(path)
     cycle = log.cycle
+    if name.endswith("lockstep"):
+        print(f"{name}: {len(cycle)} cycles in {elapsed_s:.1f} s with start-up")
+        return
     feedback_us = np.asarray(cycle["feedback_ns"]) * 1e-3
     command_us = np.asarray(cycle["command_ns"]) * 1e-3
     scheduler = log.metadata.get("scheduler", "")
@@ -233,8 +274,7 @@ def show_log(name: str, path: Path, elapsed_s: float) -> None:
     show("  SYNC out to last frame decoded", feedback_us)
     show("  last frame in to last command out", command_us - feedback_us)
     show("  SYNC out to last command out", command_us)
-    if name.endswith("realtime"):
-        show("  lateness of wake-up", np.asarray(cycle["lateness_ns"]) * 1e-3)
+    show("  lateness of wake-up", np.asarray(cycle["lateness_ns"]) * 1e-3)
 
 
 if __name__ == "__main__":
