@@ -3,47 +3,22 @@
 SYNC and feedback take 565 µs at worst, the two commands 230, which leaves the host 205 µs of a period of 1 ms.
 """
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
+import lockstep_rig
 import numpy as np
 import pytest
 
-from adacd_hil.cli.connection import model_time
-from adacd_hil.clock import VirtualClock
-from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings, load_settings
-from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.session import Session
-from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.wire.bus import EmbeddedBus, Frame
-from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
-
-CODEC = load_codec()
+from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings
+from adacd_hil.log.reader import RunLog
 
 
 def play(folder: Path, **lockstep: Any) -> tuple[RunLog, list[int]]:
     """Run an idle arm for half a second with frames as long as can be; give log, and identifiers as they arrive."""
     operator = OperatorSettings(script=(RequestSettings(at_s=0.5, request="finish"),))
-    settings = dataclasses.replace(
-        load_settings(), operator=operator, lockstep=LockstepSettings(**({"stuffing": "worst"} | lockstep))
-    )
-    clock = VirtualClock()
-    embedded = EmbeddedBus(clock)
-    bench = Bench(load_scenario("idle"), CODEC, embedded.deliver)
-    arrived: list[int] = []
-
-    def on_frame(frame: Frame) -> None:
-        arrived.append(frame.can_id)
-        bench.on_frame(frame)
-
-    embedded.attach(on_frame)
-    bench.boot()
-    bus = model_time(embedded, clock, CODEC, settings)
-    summary = Session(settings, CODEC, bus, clock, ScriptedOperator(operator), folder, "embedded").run()
-    return read_log(summary.log.path), arrived
+    log, arrived = lockstep_rig.play(folder, operator, LockstepSettings(**({"stuffing": "worst"} | lockstep)))
+    return log, [frame.can_id for frame in arrived]
 
 
 def usual(values: np.ndarray) -> int:

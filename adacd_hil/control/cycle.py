@@ -117,6 +117,7 @@ class Cycle:
         Raises BusError, of it SilenceError in lockstep.
         """
         output = None
+        self._pacer.resume()
         while not self._is_over(output):
             tick = self._pacer.next()
             arm = self._watch(self._exchange.read(tick))

@@ -122,7 +122,6 @@ class Session:
                 if not (self._has_started and ending.is_faulted and recovery.await_acknowledgement()):
                     break
                 recoveries += 1
-                pacer.resume()
                 attempt = self._prepare(tap, pacer)
         finally:
             log = recorder.close()
