@@ -292,10 +292,7 @@ class Bench:
         torque_Nm = self.drives[0].torque_Nm, self.drives[1].torque_Nm
         if late_ticks:
             self._body.advance(torque_Nm, (self.drives[0].motor_mode, self.drives[1].motor_mode), late_ticks)
-        is_plain = (
-            self._injector.is_quiet and self._has_all_answers and self._outbox.due_ns >= sync_ns + self._period_ns
-        )
-        if self._is_wall or is_plain:
+        if self._is_wall or self._is_plain:
             self._sample_and_send(data)
             if self._is_wall:
                 self._outbox.release(self.now_ns)
