@@ -44,14 +44,11 @@ def received_ids(codec: Codec) -> list[int]:
 
 
 def contract_of(settings: Settings, out: Path) -> Codec:
-    """Load the contract of the configured devices; one that is composed from their profiles is written to `out`.
+    """Load the contract of the configured devices; one that is composed or moved is written to `out`.
 
     Raises ConfigError, CodecError, OSError.
     """
-    codec = load_contract(settings)
-    if not codec.path.is_file():
-        out.mkdir(parents=True, exist_ok=True)
-    return write_contract(codec, out)
+    return write_contract(load_contract(settings), out)
 
 
 @dataclass(frozen=True)
