@@ -25,7 +25,7 @@ def check_budget_of(codec: Codec, settings: Settings) -> None:
     """
     if b'"Trigger"' not in codec.text:
         return
-    budget = check_budget(codec, settings.bus.period_us)
+    budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
     if not budget.is_fit:
         raise ConfigError(f"contract {codec.path.stem}: {budget.line}")
 
