@@ -7,22 +7,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from adacd_hil.cli.connection import received_ids
+from adacd_hil.cli.main import cli
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, Settings, load_settings, parse
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.realtime import Tick, make_pacer
+from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.contract import load_contract
+from adacd_hil.device.contract import load_contract, write_contract
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import ArmCommand, FaultReason, SchemeState
-from adacd_hil.wire.bus import BusError, Frame
+from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame
 from adacd_hil.wire.tap import Tap
 from firmware_sim.bench import Bench
+from firmware_sim.lockstep_bus import make_lockstep_bus
 from firmware_sim.scenario import load_scenario
 
 pytestmark = pytest.mark.slow
@@ -246,3 +251,49 @@ def test_without_sync_the_follower_ends_with_one_line(tmp_path: Path) -> None:
 def test_to_follow_needs_another_arm_on_the_bus() -> None:
     with pytest.raises(ConfigError, match=r"`bus.sync` = 'follow' needs another arm's host on the bus"):
         parse(Settings, {"bus": {"sync": "follow"}})
+
+
+def test_an_arm_at_other_node_ids_runs_in_lockstep_on_a_bus_of_its_own(tmp_path: Path) -> None:
+    devices = dataclasses.replace(load_settings("paper").devices, drive_node=(5, 6), sensor_node=(7, 8))
+    script = OperatorSettings(script=(RequestSettings(at_s=0.1, request="finish"),))
+    settings = dataclasses.replace(load_settings("paper"), devices=devices, operator=script)
+    codec = write_contract(load_contract(settings), tmp_path)
+    clock = VirtualClock()
+    embedded = EmbeddedBus(clock)
+    bench = Bench(load_scenario("idle", "P"), codec, embedded.deliver)
+    embedded.attach(bench.on_frame)
+    bench.boot()
+    bus = make_lockstep_bus(embedded, clock, codec, settings)
+    session = Session(settings, codec, bus, clock, ScriptedOperator(script), tmp_path, "embedded")
+    summary = session.run()
+    assert (summary.error, summary.result and summary.result.fault) == ("", FaultReason.NONE)
+    frames = read_log(summary.log.path).frames
+    assert {0x185, 0x186, 0x187, 0x188} <= set(frames["can_id"].tolist())
+
+
+@pytest.mark.parametrize(
+    ("bus", "clock", "line"),
+    [
+        ("arms = 2\nperiod_us = 2000", "lockstep", "`bus.arms` = 2 hosts need --clock realtime"),
+        ("arms = 2", "realtime", "contract arm: 2 × arm.dbc at 1000 µs doesn't fit: the cyclic frames need 1525 µs"),
+        ('sync = "follow"', "realtime", "`bus.sync` = 'follow' needs another arm's host"),
+        ("host_node = 2", "realtime", "`bus.host_node` = 2 is the node id of a device"),
+    ],
+)
+def test_what_a_shared_bus_cannot_be_is_one_line(tmp_path: Path, bus: str, clock: str, line: str) -> None:
+    config = tmp_path / "two.toml"
+    config.write_text(f"[bus]\n{bus}\n")
+    arguments = ["-i", "virtual", "-c", "x", "--config", str(config), "--clock", clock, "--out", str(tmp_path / "out")]
+    ran = CliRunner().invoke(cli, ["run", *arguments])
+    assert ran.exit_code == 2
+    (complaint,) = ran.stderr.splitlines()
+    assert line in complaint
+
+
+@pytest.mark.parametrize(("is_following", "hears_sync"), [(False, False), (True, True)])
+def test_the_receive_filter_has_sync_for_the_follower_and_nothing_of_the_neighbour(
+    is_following: bool, hears_sync: bool
+) -> None:
+    heard = set(received_ids(load_contract(settings_of(SECOND)), is_following))
+    assert (0x080 in heard) == hears_sync
+    assert {can_id & 0x7F for can_id in heard} - {0} == {5, 6, 7, 8}
