@@ -167,7 +167,7 @@ class ArmSettings:
 
 @dataclass(frozen=True)
 class BusSettings:
-    """Timing on the bus; node ids are the DBC's."""
+    """Timing on the bus, and who else is on it."""
 
     period_us: int = setting(1000, unit="µs", low=500, high=10_000, meaning="SYNC period, 0x1006")
     heartbeat_ms: int = setting(100, unit="ms", low=10, high=10_000, meaning="heartbeat period, 0x1017")
@@ -181,6 +181,30 @@ class BusSettings:
     feedback_timeout_ms: int = setting(
         1000, unit="ms", low=1, high=60_000, meaning="lockstep: longest wait for one cycle's feedback"
     )
+    arms: int = setting(
+        1, low=1, high=7, meaning="arms of this contract on the bus, each with a host; from 2 on it is shared"
+    )
+    host_node: int = setting(127, low=1, high=127, meaning="node id of this host; each host on the bus has its own")
+    sync: str = setting(
+        "produce", choices=("produce", "follow"), meaning="send SYNC, or begin each cycle with that of another host"
+    )
+    sync_timeout_ms: int = setting(
+        100, unit="ms", low=1, high=60_000, meaning="follow: longest wait for SYNC; the drives have stopped before"
+    )
+
+    def __post_init__(self) -> None:
+        if self.follows and not self.is_shared:
+            raise ConfigError("`bus.sync` = 'follow' needs another arm's host on the bus, but `bus.arms` = 1")
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether other hosts and their arms are on the bus."""
+        return self.arms > 1
+
+    @property
+    def follows(self) -> bool:
+        """Whether another host sends SYNC."""
+        return self.sync == "follow"
 
     @property
     def period_s(self) -> float:
@@ -203,8 +227,8 @@ class DevicesSettings:
     sensor: tuple[str, str] = setting(
         ("adacd-sensor", "adacd-sensor"), meaning="device profile: a built-in name or a file"
     )
-    drive_node: tuple[int, int] = setting((1, 2), low=1, high=126, meaning="CANopen node ids; the host is 127")
-    sensor_node: tuple[int, int] = setting((3, 4), low=1, high=126, meaning="CANopen node ids; the host is 127")
+    drive_node: tuple[int, int] = setting((1, 2), low=1, high=126, meaning="CANopen node ids")
+    sensor_node: tuple[int, int] = setting((3, 4), low=1, high=126, meaning="CANopen node ids")
     contract: str = setting("arm", meaning="a DBC in dbc/ by name, or a file; empty: composed from the profiles")
     boot_timeout_s: float = setting(
         2.0, unit="s", low=0.1, high=60.0, meaning="longest wait for the nodes to boot after a reset of communication"
@@ -473,6 +497,8 @@ class Settings:
         count = len(self.estimator.parameter_names)
         if len(self.arm.cad_theta) not in (0, count):
             raise ValueError(f"arm.cad_theta has {len(self.arm.cad_theta)} values for {count} parameters")
+        if self.bus.host_node in (*self.devices.drive_node, *self.devices.sensor_node):
+            raise ConfigError(f"`bus.host_node` = {self.bus.host_node} is the node id of a device")
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

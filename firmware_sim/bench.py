@@ -95,6 +95,7 @@ class Bench:
         self._truth = np.zeros(TRUTH_LAYOUT.size)
         self._counter = 0  # of the last SYNC, 0: none since boot-up
         self._has_moved = False
+        self._has_been_operational = False  # a node, since the arm is there
         self._is_started = False
         self._due_ns = NEVER_NS
         self._body_ns = 0
@@ -149,6 +150,10 @@ class Bench:
     def is_operational(self) -> bool:
         """Whether all nodes are in NMT state Operational."""
         return all(device.is_operational for device in self.devices)
+
+    @property
+    def _is_any_operational(self) -> bool:
+        return any(device.is_operational for device in self.devices)
 
     @property
     def is_scenario_started(self) -> bool:
@@ -308,6 +313,7 @@ class Bench:
             self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
         if not self._is_wall:
             self._has_moved = True
+            self._has_been_operational = self._has_been_operational or self._is_any_operational
             drive1, drive2 = self.drives
             ticks = self._period_ns // _TICK_NS - late_ticks
             self._body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode), ticks)
@@ -424,18 +430,19 @@ class Bench:
     def _make_body(self) -> Body:
         """Make the arm as at power-on; by SYNC, one that moves by whole periods."""
         self._body_period_ns = _TICK_NS if self._is_wall else self._period_ns
-        self._has_moved = self._is_started = False
+        self._has_moved = self._has_been_operational = self._is_started = False
         return Body(self._scenario, self._body_period_ns * 1e-9, self._seed)
 
     def _check_period(self, period_us: int) -> None:
         """Accept whole ticks; by SYNC, once the arm has moved, only the period that it has moved by.
 
+        Until a node has been operational it has not: SYNC may be that of another arm's host, which runs already.
         A reset that restores another period's default makes a new arm at the next SYNC unless it is written again.
         """
         is_possible = 0 < period_us <= _LONGEST_PERIOD_US and period_us * 1000 % _TICK_NS == 0
         if not is_possible:
             refuse(Abort.VALUE_RANGE)
-        if not self._is_wall and self._has_moved and period_us * 1000 != self._body_period_ns:
+        if not self._is_wall and self._has_been_operational and period_us * 1000 != self._body_period_ns:
             refuse(Abort.DEVICE_STATE)
 
     def _set_period(self, period_us: int) -> None:

@@ -19,16 +19,18 @@ from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
+from adacd_hil.wire.node_offset import HOST_NODE, move_contract
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
 from firmware_sim.contracts import CONTRACTS, is_fd
-from firmware_sim.pdo_record import LISTENED_IDS
+from firmware_sim.pdo_record import LAST_NODE, LISTENED_IDS
 from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
 from firmware_sim.time_marks import HOST_MARK
 from firmware_sim.truth import TRUTH_NAME, TruthLog
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
 _LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus
+_DEVICES = 4
 _SILENCE_NS = 2_000_000_000  # a host that says nothing for this long has gone
 
 
@@ -175,6 +177,20 @@ def cli() -> None:
     help="Which devices: DBC and EDS files of this name.",
 )
 @click.option(
+    "--node-offset",
+    type=click.IntRange(0, LAST_NODE - _DEVICES),
+    default=0,
+    show_default=True,
+    help="Added to the devices' node ids: another arm on the bus.",
+)
+@click.option(
+    "--host-node",
+    type=click.IntRange(1, 127),
+    default=HOST_NODE,
+    show_default=True,
+    help="Node id of the arm's host: bus.host_node of its configuration.",
+)
+@click.option(
     "--clock",
     "clock_mode",
     type=click.Choice(get_args(ClockMode)),
@@ -200,6 +216,8 @@ def run(
     interface: str,
     channel: str,
     contract: str,
+    node_offset: int,
+    host_node: int,
     clock_mode: ClockMode,
     scenario: str,
     profile: str | None,
@@ -210,7 +228,7 @@ def run(
 ) -> int:
     """Run the emulated arm; prints "ready" on stderr once its nodes have announced themselves."""
     resolved = load_scenario(scenario, profile, seed)
-    codec = load_codec(CONTRACTS[contract].path)
+    codec = move_contract(load_codec(CONTRACTS[contract].path), node_offset, host_node)
     if out is not None:
         _make_folder(out)
     clock = MonotonicClock()

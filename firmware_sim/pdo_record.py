@@ -19,7 +19,8 @@ _NOT_VALID = 1 << 31  # of a COB-ID
 _IS_EXTENDED = 1 << 29
 _MAPPING = 0x200  # from a communication record to its mapping record
 
-LISTENED_IDS = frozenset(base + node for base in (0x200, 0x300, 0x400, 0x500) for node in range(1, 33))
+LAST_NODE = 32
+LISTENED_IDS = frozenset(base + node for base in (0x200, 0x300, 0x400, 0x500) for node in range(1, LAST_NODE + 1))
 """Identifiers that an RPDO may have: those of RPDO1 to 4 of nodes 1 to 32. A real controller's acceptance filter is no
 wider, and the emulator's kernel filter is this one."""
 

@@ -6,7 +6,7 @@ from typing import Any
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.config import load_settings
 from adacd_hil.device.contract import find_contract
-from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, us
+from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, share_bus, us
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.response_time import Response
 
@@ -20,15 +20,15 @@ _LEGEND = (
 
 
 def judge(
-    dbc: str, config: str, period_us: int | None, bitrate: int | None, data_bitrate: int | None
+    dbc: str, config: str, period_us: int | None, bitrate: int | None, data_bitrate: int | None, arms: int | None = None
 ) -> tuple[Budget, list[str], ExitCode]:
     """Find the budget of a contract, and what else there is to say of it. Raises CodecError, ConfigError.
 
-    The configuration's period counts where neither option nor DBC gives one.
+    The configuration's period counts where neither option nor DBC gives one, and how many arms share its bus.
     """
     settings = load_settings(config)
     codec = load_codec(find_contract(dbc))
-    contract = read_contract(codec.text, codec.path.name)
+    contract = share_bus(read_contract(codec.text, codec.path.name), arms or settings.bus.arms)
     budget = find_budget(contract, period_us or contract.period_us or settings.bus.period_us, bitrate, data_bitrate)
     notes = list(budget.notes)
     if period_us is None and settings.bus.period_us != budget.period_us:
@@ -97,6 +97,7 @@ def as_json(budget: Budget, notes: list[str]) -> dict[str, Any]:
     """Describe a budget for machines."""
     return {
         "contract": budget.contract.name,
+        "arms": budget.contract.arms,
         "period_us": budget.period_us,
         "bitrate": budget.bitrate,
         "data_bitrate": budget.data_bitrate,

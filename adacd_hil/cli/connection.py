@@ -30,6 +30,15 @@ def check_clock(name: str, interface: str, channel: str) -> None:
         )
 
 
+def check_shared(name: str, settings: Settings) -> None:
+    """Raise CommandError for lockstep on a bus that other hosts are on: in lockstep one host says the time."""
+    if name == "lockstep" and settings.bus.is_shared:
+        raise CommandError(
+            f"`bus.arms` = {settings.bus.arms} hosts need --clock realtime; in lockstep one says the time",
+            ExitCode.USAGE,
+        )
+
+
 def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
     """Give a bus without time of its own the modelled one of lockstep. Raises CodecError."""
     # The emulator's part of the host; real time does without.
@@ -38,20 +47,20 @@ def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) 
     return make_lockstep_bus(bus, clock, codec, settings)
 
 
-def received_ids(codec: Codec) -> list[int]:
-    """List the identifiers that the host receives."""
-    return [message.can_id for message in codec.messages.values() if "HOST" not in message.senders]
+def received_ids(codec: Codec, is_following: bool = False) -> list[int]:
+    """List the identifiers that the host receives, SYNC among them where another host sends it."""
+    sent = {message.name for message in codec.messages.values() if "HOST" in message.senders}
+    if is_following:
+        sent.discard("Sync")
+    return [message.can_id for message in codec.messages.values() if message.name not in sent]
 
 
 def contract_of(settings: Settings, out: Path) -> Codec:
-    """Load the contract of the configured devices; one that is composed from their profiles is written to `out`.
+    """Load the contract of the configured devices; one that is composed or moved is written to `out`.
 
     Raises ConfigError, CodecError, OSError.
     """
-    codec = load_contract(settings)
-    if not codec.path.is_file():
-        out.mkdir(parents=True, exist_ok=True)
-    return write_contract(codec, out)
+    return write_contract(load_contract(settings), out)
 
 
 @dataclass(frozen=True)
@@ -82,8 +91,8 @@ class Connection:
 
         Raises BusMissingError, CodecError.
         """
-        can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec)
-        bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd)
+        can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings.bus.follows)
+        bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
         return model_time(bus, clock, codec, settings) if isinstance(clock, VirtualClock) else bus
 
     @contextmanager

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from adacd_hil.analysis.report import Report, write_report
-from adacd_hil.cli.connection import contract_of, make_clock, model_time, on_interrupt
+from adacd_hil.cli.connection import check_shared, contract_of, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.report import TRUTH_NAME
@@ -22,6 +22,7 @@ SCENARIO = "paper"
 def play(config: str, profile: str | None, seed: int | None, clock_name: str, out: Path) -> tuple[Report, ExitCode]:
     """Play the experiment and report it. Raises ConfigError, CodecError, LogError, CommandError."""
     settings = load_settings(config, profile)
+    check_shared("lockstep", settings)  # an arm in this process has no neighbour
     scenario = load_scenario(SCENARIO, settings.arm.profile, seed)
     codec = contract_of(settings, out)
     clock = make_clock(clock_name)

@@ -206,15 +206,24 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
 @click.option(
     "--data-bitrate", type=click.IntRange(min=10_000, max=8_000_000), help="bit/s of CAN FD; default: the DBC's."
 )
+@click.option(
+    "--arms", type=click.IntRange(1, 7), help="Arms of this contract on the bus; default: the configuration's."
+)
 @_json
 @_explained
 def budget(
-    dbc: str, config: str, period_us: int | None, bitrate: int | None, data_bitrate: int | None, as_json: bool
+    dbc: str,
+    config: str,
+    period_us: int | None,
+    bitrate: int | None,
+    data_bitrate: int | None,
+    arms: int | None,
+    as_json: bool,
 ) -> ExitCode:
     """Say whether the frames of a contract get through in time: bits, response times, what is left for the host."""
     from adacd_hil.cli import budget as budgets
 
-    found, notes, code = budgets.judge(dbc, config, period_us, bitrate, data_bitrate)
+    found, notes, code = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
     print(json.dumps(budgets.as_json(found, notes), indent=2) if as_json else budgets.as_text(found, notes))
     return code
 

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, check_clock, contract_of, make_clock, on_interrupt
+from adacd_hil.cli.connection import Connection, check_clock, check_shared, contract_of, make_clock, on_interrupt
 from adacd_hil.cli.exit_codes import ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.clock import wall_ns
@@ -25,13 +25,16 @@ def check_budget_of(codec: Codec, settings: Settings) -> None:
     """
     if b'"Trigger"' not in codec.text:
         return
-    budget = check_budget(codec, settings.bus.period_us)
+    budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
     if not budget.is_fit:
         raise ConfigError(f"contract {codec.path.stem}: {budget.line}")
 
 
 def drop_old_frames(bus: Bus, interface: str) -> None:
-    """Empty the transmit queue if a process before this one has left frames in it. Raises BusError."""
+    """Empty the transmit queue if a process before this one has left frames in it. Raises BusError.
+
+    On a shared bus those of a neighbour leave by themselves.
+    """
     if interface == "socketcan" and CanInterface(bus.channel).waiting_frames():
         bus.recover()
 
@@ -46,6 +49,7 @@ def run_on_bus(
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
     settings = connection.settings()
+    check_shared(clock_name, settings)
     tare = None
     if tare_path is not None:
         tare = use_tare(tare_path, settings, wall_ns())

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, check_clock, make_clock, on_interrupt
+from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.commission.tare import TareRefusedError
@@ -67,6 +67,7 @@ def tare_on_bus(
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
     settings = _with_options(connection.settings(), poses, seconds)
+    check_shared(clock_name, settings)
     # A file that is no tare isn't overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
     codec = load_contract(settings)

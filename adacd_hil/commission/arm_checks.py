@@ -126,6 +126,10 @@ def check_other_masters(patient: ArmExamination) -> Outcome:
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take()
     host_ids = {message.can_id for message in patient.codec.messages.values() if "HOST" in message.senders}
+    if patient.settings.bus.is_shared:
+        host_ids -= {patient.codec.message("Nmt").can_id}
+    if patient.settings.bus.follows:
+        host_ids -= {patient.arm.sync_id}
     heard = [message_name(patient.codec, can_id) for can_id in sorted(host_ids & traffic.talks.keys())]
     if heard:
         return failed(f"somebody else sends {', '.join(heard)}", "end the other program; an arm has one master")

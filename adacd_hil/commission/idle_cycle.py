@@ -17,7 +17,7 @@ class IdleCycle:
 
     def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, clock: Clock) -> None:
         self._bus, self._arm, self._master = bus, arm, master
-        self._pacer = make_pacer(settings, clock)
+        self._pacer = make_pacer(settings, clock, bus, arm.sync_id)
         self._exchange = Exchange(settings, bus, arm, master, clock)
         self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
         self._off = ArmCommand(np.zeros(JOINTS), enable=False, quick_stop=False)

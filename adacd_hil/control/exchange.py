@@ -1,4 +1,7 @@
-"""One exchange with the arm: SYNC out, feedback and torque in. The first half of every cycle, torque or no torque."""
+"""One exchange with the arm: SYNC out, feedback and torque in. The first half of every cycle, torque or no torque.
+
+SYNC comes in, too, where another host sends it.
+"""
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
@@ -21,7 +24,7 @@ _MOST_FRAMES = 1000
 class Exchange:
     """Reads the arm once per cycle.
 
-    `sync_ns`, `feedback_ns`: when SYNC went out, when the last frame was decoded.
+    `sync_ns`, `feedback_ns`: when SYNC went out or came, when the last frame was decoded.
     """
 
     def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, clock: Clock) -> None:
@@ -32,20 +35,34 @@ class Exchange:
         self._bus, self._arm, self._master = bus, arm, master
         self._clock = clock
         self._command_ids = tuple(drive.command_id for drive in arm.drives)
+        self._is_following = settings.bus.follows
         self._patience_s = FEEDBACK_SHARE * settings.bus.period_s
 
     def read(self, tick: Tick) -> ArmState:
-        """Send SYNC and take in what the devices sampled on it. Raises BusError, of it SilenceError in lockstep."""
+        """Begin with SYNC and take in what the devices sampled on it.
+
+        Raises BusError, of it SilenceError in lockstep.
+        """
         bus, arm, clock = self._bus, self._arm, self._clock
-        self._take_late_frames()
+        is_following = self._is_following
+        if is_following:
+            for late in tick.late:
+                self._accept(late)
+        else:
+            self._take_late_frames()
         waiting = bus.waiting_frames
-        self.sync_ns = bus.held_ns = clock.now_ns()
-        late = sum(waiting.count(can_id) for can_id in self._command_ids) if waiting else 0
-        self.late_commands.note(tick.cycle, late, self.sync_ns)
+        self.sync_ns = bus.held_ns = tick.t_ns if is_following else clock.now_ns()
+        late_count = sum(waiting.count(can_id) for can_id in self._command_ids) if waiting else 0
+        self.late_commands.note(tick.cycle, late_count, self.sync_ns)
         arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
+        for early in tick.ahead:
+            self._accept(early)
         patience_s = self._patience_s
         for _ in range(_MOST_FRAMES):
             if arm.has_all_frames or (frame := bus.receive(patience_s)) is None:
+                break
+            if is_following and frame.can_id == arm.sync_id and not frame.is_error:
+                bus.unread(frame)
                 break
             self._accept(frame)
             patience_s = self._patience_s - (frame.t_ns - self.sync_ns) * 1e-9

@@ -1,19 +1,37 @@
-"""When a cycle begins: on a fixed grid, of the host's clock in real time, of a virtual one in lockstep."""
+"""When a cycle begins: on a fixed grid, of the host's clock in real time, of a virtual one in lockstep.
 
+Where another host on the bus sends SYNC, with that.
+"""
+
+import statistics
 from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock, VirtualClock
 from adacd_hil.config import Settings
 from adacd_hil.control.host_latency import HostLatency
+from adacd_hil.device.arm import SYNC_OVERFLOW
+from adacd_hil.wire.bus import BusError, Frame
+from adacd_hil.wire.tap import Tap
+
+_MOST_FRAMES = 1000
+"""Frames taken at once, so that a bus that somebody floods can't hold up the cycle."""
+_JUDGED_SYNCS = 101
+"""SYNCs after which their period is judged. The median of so many doesn't mind that a host stalls."""
+_PERIOD_TOLERANCE = 0.1
 
 
 class Tick(NamedTuple):
-    """The beginning of one cycle. `periods` since the previous one, 1 unless periods were skipped."""
+    """The beginning of one cycle. `periods` since the previous one, 1 unless periods were skipped.
+
+    Of a SYNC that was received: `late` came before it and belongs to the cycle before, `ahead` came after it.
+    """
 
     cycle: int
     t_ns: int
     periods: int
     lateness_ns: int
+    late: tuple[Frame, ...] = ()
+    ahead: tuple[Frame, ...] = ()
 
 
 class Pacer(Protocol):
@@ -90,8 +108,114 @@ class GridPacer:
             self._cycle = max(self._cycle, (self._clock.now_ns() - self._start_ns) // self._period_ns)
 
 
-def make_pacer(settings: Settings, clock: Clock) -> Pacer:
+class FollowingPacer:
+    """Begins a cycle with each SYNC that another host sends. Of several that wait, the last one counts.
+
+    The first SYNC heard is cycle 0; from there its counter 1…240 is unwrapped, with the help of the clock after a long
+    gap.
+    """
+
+    def __init__(self, bus: Tap, clock: Clock, period_ns: int, sync_id: int, timeout_ns: int) -> None:
+        self.overruns = 0
+        self._bus = bus
+        self._clock = clock
+        self._period_ns = period_ns
+        self._sync_id = sync_id
+        self._timeout_ns = timeout_ns
+        self._cycle = 0
+        self._last: Frame | None = None
+        self._is_resuming = False
+        self._periods_ns: list[float] = []
+
+    def next(self) -> Tick:
+        """Wait for SYNC. Raises BusError when none comes in time, or at another period than the configured one."""
+        frames, place = self._receive()
+        sync = frames[place]
+        periods = self._count(sync)
+        self._last = sync
+        self._cycle += periods
+        skipped = 0 if self._is_resuming else max(periods - 1, 0)
+        self._is_resuming = False
+        self.overruns += skipped
+        lateness_ns = self._clock.now_ns() - sync.t_ns
+        return Tick(self._cycle, sync.t_ns, 1 + skipped, lateness_ns, tuple(frames[:place]), tuple(frames[place + 1 :]))
+
+    def spend(self, feedback_ns: int) -> int:
+        """Let the commands carry the feedback's stamp."""
+        return feedback_ns
+
+    def resume(self) -> None:
+        """Count no overruns for what was passed over."""
+        self._is_resuming = True
+
+    def _receive(self) -> tuple[list[Frame], int]:
+        """Receive up to SYNC and all that waits behind it; also return the place of the last SYNC."""
+        bus, clock = self._bus, self._clock
+        frames: list[Frame] = []
+        place = -1
+        limit_ns = clock.now_ns() + self._timeout_ns
+        while place < 0:
+            begin_ns = clock.now_ns()
+            frame = bus.receive((limit_ns - begin_ns) * 1e-9)
+            if frame is not None:
+                frames.append(frame)
+                place = len(frames) - 1 if self._is_sync(frame) else -1
+            now_ns = clock.now_ns()
+            if place < 0 and (now_ns >= limit_ns or (frame is None and now_ns == begin_ns)):
+                raise BusError(
+                    f"no SYNC on {bus.channel} within {self._timeout_ns // 1_000_000} ms: the host that sends it "
+                    "begins first and ends last"
+                )
+        for _ in range(_MOST_FRAMES):
+            frame = bus.receive(0.0)
+            if frame is None:
+                break
+            frames.append(frame)
+            if self._is_sync(frame):
+                place = len(frames) - 1
+        return frames, place
+
+    def _is_sync(self, frame: Frame) -> bool:
+        return frame.can_id == self._sync_id and not frame.is_error
+
+    def _count(self, sync: Frame) -> int:
+        """Count the periods since the SYNC before, at least 1; 0 for the first."""
+        last = self._last
+        if last is None:
+            return 0
+        elapsed_ns = sync.t_ns - last.t_ns
+        periods = round(elapsed_ns / self._period_ns)
+        if sync.data and last.data:
+            steps = (sync.data[0] - last.data[0]) % SYNC_OVERFLOW
+            periods = steps + SYNC_OVERFLOW * round((periods - steps) / SYNC_OVERFLOW)
+            self._judge(elapsed_ns / max(steps, 1))
+        return max(periods, 1)
+
+    def _judge(self, period_ns: float) -> None:
+        """Compare the period of SYNC with the configured one, once. Raises BusError."""
+        if len(self._periods_ns) == _JUDGED_SYNCS:
+            return
+        self._periods_ns.append(period_ns)
+        if len(self._periods_ns) < _JUDGED_SYNCS:
+            return
+        found_ns = statistics.median(self._periods_ns)
+        if abs(found_ns - self._period_ns) > _PERIOD_TOLERANCE * self._period_ns:
+            raise BusError(
+                f"SYNC on {self._bus.channel} comes every {found_ns / 1000:.0f} µs, but `bus.period_us` = "
+                f"{self._period_ns // 1000} µs"
+            )
+
+
+def make_follower(settings: Settings, clock: Clock, bus: Tap, sync_id: int) -> FollowingPacer:
+    """Make the pacer of a host that sends no SYNC."""
+    timeout_ns = settings.bus.sync_timeout_ms * 1_000_000
+    return FollowingPacer(bus, clock, settings.bus.period_ns, sync_id, timeout_ns)
+
+
+def make_pacer(settings: Settings, clock: Clock, tap: Tap, sync_id: int) -> Pacer:
     """Make the pacer that goes with a clock: with a VirtualClock the host's work takes a modelled time."""
     bus = settings.bus
+    if bus.follows:
+        return make_follower(settings, clock, tap, sync_id)
     is_virtual = isinstance(clock, VirtualClock)
     return GridPacer(clock, bus.period_ns, HostLatency(settings.lockstep, bus.period_s) if is_virtual else None)

@@ -102,7 +102,7 @@ class Session:
         Raises LogError when the log can't be created.
         """
         tap = Tap(self.bus, self.clock)
-        pacer = make_pacer(self.settings, self.clock)
+        pacer = make_pacer(self.settings, self.clock, tap, self.codec.message("Sync").can_id)
         self.progress("compiling")
         attempt = self._prepare(tap, pacer)
         # After compiling: a second of work at real-time priority would be paid back by 50 ms of throttling later.

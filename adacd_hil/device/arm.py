@@ -54,7 +54,8 @@ class Arm:
         self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
         self._devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
         self._bus = bus
-        self._sync_id = codec.message("Sync").can_id
+        self.sync_id = codec.message("Sync").can_id
+        self._is_following = settings.bus.follows
         self._sign = settings.arm.sign
         self._offset_Nm = settings.arm.torque_offset_Nm
         self._permille_per_Nm = tuple(
@@ -87,7 +88,10 @@ class Arm:
         return self._cycle
 
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
-        """Begin a cycle: every device samples on this SYNC, every drive takes its last command. Raises BusError."""
+        """Begin a cycle: every device samples on this SYNC, every drive takes its last command. Raises BusError.
+
+        SYNC is sent here, unless another host sends it.
+        """
         if self._cycle >= 0 and self._seen != _COMPLETE:
             self._miss()
         self._cycle = cycle
@@ -95,7 +99,8 @@ class Arm:
         self._periods = periods
         self._received = 0
         self._seen = 0
-        self._bus.send(self._sync_id, bytes((1 + cycle % SYNC_OVERFLOW,)))
+        if not self._is_following:
+            self._bus.send(self.sync_id, bytes((1 + cycle % SYNC_OVERFLOW,)))
 
     def _miss(self) -> None:
         """Let every device note that its frame of the cycle that ends now did not come."""

@@ -14,8 +14,8 @@ from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.placement import Device, place_devices
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings
 from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
+from adacd_hil.wire.node_offset import NODE_MASK, move_contract
 
-HOST_NODE = 127
 COMPOSED_NAME = "contract.dbc"
 WIRE_VERSION = 1
 _TRIGGERS = ("sync", "command", "event", "request")
@@ -67,26 +67,27 @@ _HEARTBEAT = (_Signal("state", 8),)
 def load_contract(settings: Settings) -> Codec:
     """Return the codec of the configured devices: from the DBC that `devices.contract` names, or composed.
 
-    Raises ConfigError when a profile can't be used or says otherwise than the DBC, CodecError for a DBC that can't
-    serve.
+    The DBC's node ids are moved as a whole to the configured ones. Raises ConfigError when a profile can't be used or
+    says otherwise than the DBC, CodecError for a DBC that can't serve.
     """
     devices = place_devices(settings)
     composed = compose(settings, devices)
     name = settings.devices.contract
     if not name:
         return composed
-    codec = load_codec(find_contract(name))
+    codec = _move(load_codec(find_contract(name)), settings, devices)
     _compare(codec, composed, name)
     return codec
 
 
 def write_contract(codec: Codec, folder: Path) -> Codec:
-    """Return the codec with a file behind it: a composed one is written to `folder`, which must exist.
+    """Return the codec with a file behind it: one that is composed or moved is written to `folder`.
 
     Raises OSError, CodecError.
     """
-    if codec.path.is_file():
+    if codec.path.is_file() and codec.path.read_bytes() == codec.text:
         return codec
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / codec.path.name
     path.write_bytes(codec.text)
     return load_codec(path)
@@ -110,6 +111,18 @@ def find_contract(name: str) -> Path:
     nearest = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}"
     raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint}")
+
+
+def _move(codec: Codec, settings: Settings, devices: list[Device]) -> Codec:
+    """Move a DBC to the configured node ids, if they all lie equally far from its own; else leave them."""
+    offsets = {
+        device.node_id - (codec.messages[name].can_id & NODE_MASK)
+        for device in devices
+        if (name := f"{device.name}Heartbeat") in codec.messages
+    }
+    if "HostHeartbeat" not in codec.messages:
+        return codec
+    return move_contract(codec, offsets.pop() if len(offsets) == 1 else 0, settings.bus.host_node)
 
 
 def _compare(codec: Codec, composed: Codec, name: str) -> None:
@@ -149,7 +162,7 @@ def _messages(settings: Settings, devices: list[Device]) -> list[_Message]:
     messages = [
         _Message(0x000, "Nmt", "HOST", names, nmt, "request", values={"command": _NMT_COMMANDS}),
         _Message(0x080, "Sync", "HOST", names, (_Signal("counter", 8),), "sync"),
-        _heartbeat("Host", HOST_NODE, "HOST", names, heartbeat_ms),
+        _heartbeat("Host", settings.bus.host_node, "HOST", names, heartbeat_ms),
     ]
     for device in devices:
         node, sender, host = device.node_id, device.name.upper(), ("HOST",)

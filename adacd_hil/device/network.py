@@ -100,7 +100,7 @@ class Master:
         return [f"{name}: {text}" for name, text in self._emergencies.items()]
 
     def reset(self) -> None:
-        """Reset the communication of all nodes and wait until each has booted. Raises DeviceError, BusError."""
+        """Reset the communication of the arm's nodes and wait until each has booted. Raises DeviceError, BusError."""
         for _ in range(_MOST_OLD_FRAMES):  # from before the reset; a full queue has no room for what follows
             if self._bus.receive(0.0) is None:
                 break
@@ -108,7 +108,7 @@ class Master:
         waiting = {slave.node_id: slave.name for slave in self.slaves}
         self._heartbeats.stop()
         self._emergencies.clear()
-        self._canopen.command(_RESET_COMMUNICATION)
+        self._command(_RESET_COMMUNICATION)
 
         def is_last_boot(frame: Frame) -> bool:
             if frame.can_id & 0x780 == 0x700 and frame.data == b"\x00":
@@ -211,7 +211,7 @@ class Master:
         """Let all nodes exchange cyclic frames, the sensors first by default. Raises BusError."""
         self._heartbeats.start()
         if self._settings.devices.start == "all":
-            self._canopen.command(_START)
+            self._command(_START)
             return
         # False sorts first: a drive that starts finds its sensor sending.
         for slave in sorted(self.slaves, key=lambda slave: slave.device.settings.kind == "drive"):
@@ -220,7 +220,12 @@ class Master:
     def stop(self) -> None:
         """Put all nodes back to pre-operational; drives drop out if they are still enabled. Raises BusError."""
         self._heartbeats.stop()
-        self._canopen.command(_ENTER_PRE_OPERATIONAL)
+        self._command(_ENTER_PRE_OPERATIONAL)
+
+    def _command(self, nmt_command: int) -> None:
+        """Send an NMT command to the arm: to all nodes at once, or to each of its own where other arms listen too."""
+        for node_id in [slave.node_id for slave in self.slaves] if self._settings.bus.is_shared else [0]:
+            self._canopen.command(nmt_command, node_id)
 
     def watch(self, t_ns: int) -> list[str]:
         """Name what is wrong with the nodes' heartbeats now, one line per node; empty when nothing is.
@@ -230,5 +235,5 @@ class Master:
         return self._heartbeats.watch(t_ns)
 
     def send_heartbeat(self) -> None:
-        """Say that the host lives, 0x700 + 127. Raises BusError."""
+        """Say that the host lives, 0x700 + its node id. Raises BusError."""
         self._bus.send(self._heartbeat_id, bytes((OPERATIONAL,)))

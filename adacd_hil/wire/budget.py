@@ -15,9 +15,11 @@ needs nothing known about the devices' and the host's delays. Response times (`a
 for three kinds of traffic: operation (without requests and EMCY), which decides whether the contract fits; the same
 with one SDO frame per SYNC; and with the EMCY of every device besides. What the last two make late is said, not failed:
 a command that is late acts one SYNC later. NMT commands begin and end operation and disturb none of them.
+
+On a bus that arms share, what has no node id counts once and everything else once per arm.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import cantools
@@ -25,11 +27,13 @@ from cantools.database.can import Database, Message
 
 from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.frame_bits import CLASSIC_BYTES, FrameBits, unstuffed_frame, worst_case_frame
+from adacd_hil.wire.node_offset import NODE_MASK, move_id
 from adacd_hil.wire.response_time import Response, Stream, response_time
 
 ASSUMED_INTERVAL_MS = 100
 """Interval of an event frame that declares none: the usual heartbeat period."""
 _NMT_ID = 0  # CiA 301, pre-defined connection set
+_HOST_HEARTBEAT = "HostHeartbeat"
 _EMCY_FUNCTION = 1  # 0x080 + node; 0x080 itself is SYNC
 _HEARTBEAT_FUNCTION = 14  # 0x700 + node
 
@@ -100,13 +104,17 @@ class ContractFrame:
 
 @dataclass(frozen=True)
 class Contract:
-    """Frames of a DBC in the order of arbitration; rates in bit/s; a period of 0 is not given."""
+    """Frames of a DBC in the order of arbitration; rates in bit/s; a period of 0 is not given.
+
+    `arms`: how many, each with a host.
+    """
 
     name: str
     bitrate: int
     data_bitrate: int
     period_us: int
     frames: tuple[ContractFrame, ...]
+    arms: int = 1
 
 
 @dataclass(frozen=True)
@@ -223,7 +231,8 @@ class Budget:
         if self.longest_event_ns:
             notes.append(f"each event frame in the way takes up to {us(self.longest_event_ns)} µs of the host's time")
         if any(entry.frame.trigger is Trigger.REQUEST for entry in self.frames):
-            notes.append(f"one SDO in every cycle: {self._describe_traffic(Traffic.REQUESTS)}")
+            whose = "one SDO" if self.contract.arms == 1 else "one SDO of each host"
+            notes.append(f"{whose} in every cycle: {self._describe_traffic(Traffic.REQUESTS)}")
         if any(entry.frame.is_emergency for entry in self.frames):
             notes.append(f"and every EMCY at once: {self._describe_traffic(Traffic.EMERGENCIES)}")
         open_ended = [entry.frame for entry in self.frames if not entry.frame.has_interval]
@@ -297,11 +306,43 @@ def _attribute(owner: Database | Message, name: str) -> int | str:
     return value if isinstance(value, str) else int(value or 0)
 
 
+def share_bus(contract: Contract, arms: int) -> Contract:
+    """Return what is on a bus that several arms of a contract share, whatever their order on it.
+
+    The devices' node ids follow each other from 1, the hosts' go down from the contract's. Raises CodecError for an
+    identifier without node id.
+    """
+    if arms == 1:
+        return contract
+    nodes = {f.can_id & NODE_MASK for f in contract.frames if f.name != _HOST_HEARTBEAT and f.can_id & NODE_MASK}
+    first, step = min(nodes, default=1), max(nodes, default=1) - min(nodes, default=1) + 1
+    frames = [frame for frame in contract.frames if not (frame.is_extended or frame.can_id & NODE_MASK)]
+    for arm in range(arms):
+        for frame in contract.frames:
+            if frame in frames:
+                continue
+            if frame.name == _HOST_HEARTBEAT:
+                can_id = frame.can_id - arm
+            else:
+                can_id = move_id(frame.can_id, 1 - first + arm * step, 0, f"DBC {contract.name}: {frame.name}")
+            frames.append(replace(frame, name=f"Arm{arm + 1}.{frame.name}", can_id=can_id))
+    frames.sort(key=lambda frame: frame.priority)
+    return replace(contract, name=f"{arms} × {contract.name}", frames=tuple(frames), arms=arms)
+
+
 def check_budget(
-    codec: Codec, period_us: int | None = None, bitrate: int | None = None, data_bitrate: int | None = None
+    codec: Codec,
+    period_us: int | None = None,
+    bitrate: int | None = None,
+    data_bitrate: int | None = None,
+    arms: int = 1,
 ) -> Budget:
-    """Find the budget of a contract; period in µs and rates in bit/s default to the DBC's own. Raises CodecError."""
-    return find_budget(read_contract(codec.text, codec.path.name), period_us, bitrate, data_bitrate)
+    """Find the budget of a contract, or of several arms of it on one bus.
+
+    Period in µs and rates in bit/s default to the DBC's own. Raises CodecError.
+    """
+    contract = share_bus(read_contract(codec.text, codec.path.name), arms)
+    return find_budget(contract, period_us, bitrate, data_bitrate)
 
 
 def find_budget(
@@ -326,7 +367,7 @@ def find_budget(
     bit_ns = FrameBits(1).duration_ns(bitrate)
     for place, entry in enumerate(entries):
         for traffic in Traffic:
-            entry.responses[traffic] = _respond(entries, place, traffic, bit_ns, period_ns)
+            entry.responses[traffic] = _respond(entries, place, traffic, bit_ns, period_ns, contract.arms)
     return Budget(contract, period_us, bitrate, data_bitrate, tuple(entries))
 
 
@@ -343,8 +384,10 @@ def _is_sent(entry: FrameBudget, traffic: Traffic) -> bool:
     return not entry.frame.is_emergency or traffic is Traffic.EMERGENCIES
 
 
-def _respond(entries: list[FrameBudget], place: int, traffic: Traffic, bit_ns: int, period_ns: int) -> Response:
-    """Response time of the frame at `place` in the order of arbitration, one request at most in a period."""
+def _respond(
+    entries: list[FrameBudget], place: int, traffic: Traffic, bit_ns: int, period_ns: int, hosts: int
+) -> Response:
+    """Response time of the frame at `place` in the order of arbitration, one request at most of a host in a period."""
     entry = entries[place]
     above = [other for other in entries[:place] if _is_sent(other, traffic)]
     below = [other for other in entries[place + 1 :] if _is_sent(other, traffic)]
@@ -353,7 +396,7 @@ def _respond(entries: list[FrameBudget], place: int, traffic: Traffic, bit_ns: i
     higher = [Stream(o.duration_ns, o.interval_ns) for o in above if o.frame.trigger is not Trigger.REQUEST]
     request_ns = max((o.duration_ns for o in above if o.frame.trigger is Trigger.REQUEST), default=0)
     if request_ns:
-        higher.append(Stream(request_ns, period_ns))
+        higher.extend([Stream(request_ns, period_ns)] * hosts)
     blocking_ns = max((o.duration_ns for o in below), default=0)
     # A frame that this traffic doesn't have is judged as a single one.
     interval_ns = entry.interval_ns if _is_sent(entry, traffic) else ASSUMED_INTERVAL_MS * 1_000_000

@@ -43,6 +43,8 @@ _SO_MEMINFO = 55
 _MEMINFO = struct.Struct("=9I")
 _MEMINFO_DROPS = 8
 _DOWN = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
+_LIVE_S = 0.25
+"""Longest silence of a bus with two arms: 2.5 of the usual heartbeat periods."""
 _SEND_PATIENCE_S = 0.05
 """Longest wait for room in the transmit queue: over 300 frames at 1 Mbit/s, so a live bus has drained by then."""
 
@@ -54,8 +56,16 @@ class SocketCanBus:
     frame where it is a system call.
     """
 
-    def __init__(self, channel: str, clock: Clock, can_ids: Iterable[int] | None = None, is_fd: bool = False) -> None:
-        """Open `channel`, receiving only `can_ids` when given. Raises BusMissingError."""
+    def __init__(
+        self,
+        channel: str,
+        clock: Clock,
+        can_ids: Iterable[int] | None = None,
+        is_fd: bool = False,
+        is_shared: bool = False,
+    ) -> None:
+        """Open `channel`, receiving only `can_ids` when given; `is_shared`: see `recover`. Raises BusMissingError."""
+        self._is_shared = is_shared
         self.channel = channel
         self._clock = clock
         self._filters = _pack_filters(can_ids)
@@ -204,7 +214,8 @@ class SocketCanBus:
         """Open the socket anew, and empty the interface's transmit queue by taking it down and up where need be.
 
         Need is: frames wait in the queue, or a controller is there, which may hold some. None is where the interface
-        has been down since this end last sent. Other sockets of the interface see it go down.
+        has been down since this end last sent. Other sockets of the interface see it go down. Where it is shared, none
+        is either while the bus carries frames: what waits then leaves by itself.
 
         Raises InterfaceDownError while the interface is down, BusError with the command where it isn't permitted.
         """
@@ -215,11 +226,18 @@ class SocketCanBus:
             raise InterfaceDownError(problem)
         if not self._is_down and self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) in _DOWN:
             self._is_down = True  # unheard of, so nothing was sent since
-        if self._interface.waiting_frames() > 0 or (self._interface.is_hardware and not self._is_down):
+        may_hold = self._interface.waiting_frames() > 0 or (self._interface.is_hardware and not self._is_down)
+        if may_hold and not (self._is_shared and self._carries_frames()):
             self._interface.restart()
         self._retire_socket()
         self._is_down = True  # should it not open
         self._open()
+
+    def _carries_frames(self) -> bool:
+        """Whether something is heard on the bus, a frame of another program's that is through included."""
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as listener:
+            listener.bind((self.channel,))
+            return bool(select.select([listener], [], [], _LIVE_S)[0])
 
     def _retire_socket(self) -> None:
         """Close the socket, keeping its count of drops."""

@@ -15,6 +15,7 @@ class Tap:
         self._bus = bus
         self._clock = clock
         self._passed: list[tuple[bool, Frame]] = []
+        self._unread: Frame | None = None
         self.held_ns: int | None = None
 
     @property
@@ -31,6 +32,9 @@ class Tap:
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Receive and remember a frame. Raises BusError."""
+        if self._unread is not None:
+            unread, self._unread = self._unread, None
+            return unread
         try:
             frame = self._bus.receive(timeout_s)
         except BusOffError as error:
@@ -40,6 +44,10 @@ class Tap:
             self._passed.append((False, frame))
         return frame
 
+    def unread(self, frame: Frame) -> None:
+        """Put a received frame back: it is the next one to be received."""
+        self._unread = frame
+
     def take(self) -> list[tuple[bool, Frame]]:
         """Return the frames since the last call."""
         passed, self._passed = self._passed, []
@@ -47,6 +55,7 @@ class Tap:
 
     def recover(self) -> None:
         """Drop everything queued in the bus behind it; what has passed stays. Raises BusError."""
+        self._unread = None
         self._bus.recover()
 
     def close(self) -> None:

@@ -41,6 +41,35 @@ def test_can_fd_contracts_are_judged_at_both_rates() -> None:
     assert budget("--dbc", str(CONTRACTS / "fd_500us.dbc")).exit_code == FITS
 
 
+@pytest.mark.parametrize(
+    ("dbc", "period_us", "bits", "status"),
+    [
+        ("arm", 1000, 65 + 2 * 730, DOES_NOT_FIT),
+        ("arm", 2000, 65 + 2 * 730, FITS),
+        ("arm_fd", 1000, None, DOES_NOT_FIT),
+        ("arm_fd", 2000, None, FITS),
+        ("arm_fd_500us", 1000, None, FITS),
+    ],
+)
+def test_two_arms_on_one_bus_have_one_sync(dbc: str, period_us: int, bits: int | None, status: int) -> None:
+    ran = budget("--dbc", dbc, "--arms", "2", "--period-us", str(period_us), "--json")
+    found = json.loads(ran.stdout)
+    one = json.loads(budget("--dbc", dbc, "--json").stdout)
+    assert ran.exit_code == status
+    assert found["worst_bits"] == (bits or 2 * one["worst_bits"] - 65)
+    assert len(found["messages"]) == 2 * len(one["messages"]) - 2  # NMT and SYNC are there once
+    assert found["arms"] == 2
+
+
+def test_the_configuration_says_how_many_arms_share_the_bus(tmp_path: Path) -> None:
+    config = tmp_path / "two.toml"
+    config.write_text("[bus]\narms = 2\nperiod_us = 2000\n")
+    said = budget("--config", str(config), "--period-us", "2000").stdout
+    assert said.splitlines()[-1] == (
+        "verdict       2 × arm.dbc at 2000 µs fits: 1525 µs of cyclic frames, 475 µs left for the host"
+    )
+
+
 def test_the_text_has_table_phases_and_verdict_within_120_columns() -> None:
     lines = budget().stdout.splitlines()
     assert max(len(line) for line in lines) <= 120

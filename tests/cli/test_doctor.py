@@ -1,5 +1,6 @@
 """Doctor's findings about an emulated arm in virtual time; what it sends is judged on the wire."""
 
+import dataclasses
 import json
 from collections.abc import Callable
 
@@ -7,8 +8,9 @@ import pytest
 from bench_bus import CODEC, BenchBus
 
 from adacd_hil.cli.doctor import as_json, as_text
-from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_pdo_map
+from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
 from adacd_hil.commission.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
+from adacd_hil.config import load_settings
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.device import NmtState
 
@@ -67,6 +69,26 @@ def test_each_kind_of_host_frame_shows_another_master(can_id: int) -> None:
     rig = BenchBus()
     rig.bus.deliver(can_id, b"\x05\x00\x00\x00\x00\x00")
     assert CODEC.by_id[can_id].name in doctor(rig)["other masters"].reason
+
+
+@pytest.mark.parametrize(
+    ("sync", "can_id", "status"),
+    [
+        ("follow", 0x080, Status.OK),
+        ("produce", 0x080, Status.FAILED),
+        ("follow", 0x000, Status.OK),
+        ("produce", 0x000, Status.OK),
+        ("follow", 0x201, Status.FAILED),
+        ("follow", 0x77F, Status.FAILED),
+    ],
+)
+def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync: str, can_id: int, status: Status) -> None:
+    base = load_settings("paper")
+    rig = BenchBus(dataclasses.replace(base, bus=dataclasses.replace(base.bus, arms=2, sync=sync)))
+    patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
+    patient.connect()
+    rig.bus.deliver(can_id, b"\x01")
+    assert check_other_masters(patient).status is status
 
 
 def test_a_missing_node_fails_and_nothing_is_reset() -> None:

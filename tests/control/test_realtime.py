@@ -6,6 +6,8 @@ from typing import Any
 from adacd_hil.clock import MonotonicClock, VirtualClock
 from adacd_hil.config import LockstepSettings, load_settings
 from adacd_hil.control.realtime import GridPacer, Pacer, Recurrence, Tick, make_pacer
+from adacd_hil.wire.bus import EmbeddedBus
+from adacd_hil.wire.tap import Tap
 
 PERIOD_NS = 1_000_000
 
@@ -76,7 +78,7 @@ def test_the_grid_is_that_of_the_clocks_whole_periods() -> None:
 def paced(**lockstep: Any) -> tuple[VirtualClock, Pacer]:
     clock = VirtualClock()
     settings = dataclasses.replace(load_settings(), lockstep=LockstepSettings(**lockstep))
-    return clock, make_pacer(settings, clock)
+    return clock, make_pacer(settings, clock, Tap(EmbeddedBus(clock), clock), 0x080)
 
 
 def test_in_lockstep_the_hosts_work_takes_its_modelled_time() -> None:
@@ -86,7 +88,8 @@ def test_in_lockstep_the_hosts_work_takes_its_modelled_time() -> None:
 
 
 def test_in_real_time_nothing_is_added_to_the_time_that_the_work_takes() -> None:
-    assert make_pacer(load_settings(), MonotonicClock()).spend(500_000) == 500_000
+    clock = MonotonicClock()
+    assert make_pacer(load_settings(), clock, Tap(EmbeddedBus(clock), clock), 0x080).spend(500_000) == 500_000
 
 
 def test_a_modelled_host_that_is_slower_than_a_period_skips_periods() -> None:

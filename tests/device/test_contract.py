@@ -1,5 +1,6 @@
 """Contracts composed from device profiles, against the DBC files written by hand."""
 
+import dataclasses
 import warnings
 from pathlib import Path
 
@@ -74,6 +75,32 @@ def test_node_ids_move_every_identifier_of_a_device() -> None:
         "Drive2SdoRequest": 0x60C,
         "Drive2Heartbeat": 0x70C,
     }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("config", ["paper", "fd", "fd_500us", "stock"])
+def test_a_contract_moves_to_the_configured_node_ids_and_is_what_the_profiles_say(config: str) -> None:
+    bus, devices = load_settings(config).bus, load_settings(config).devices
+    bus = dataclasses.replace(bus, host_node=126)
+    devices = dataclasses.replace(devices, drive_node=(5, 6), sensor_node=(7, 8))
+    named = dataclasses.replace(load_settings(config), bus=bus, devices=devices)
+    composed = dataclasses.replace(named, devices=dataclasses.replace(devices, contract=""))
+    codec = load_contract(named)
+    assert (codec.message("Sensor2Torque").can_id, codec.message("HostHeartbeat").can_id) == (0x188, 0x77E)
+    assert codec.layout_digest == load_contract(composed).layout_digest
+
+
+def test_a_moved_contract_gets_a_file_for_the_log_and_is_not_mistaken_for_another(tmp_path: Path) -> None:
+    codec = load_contract(parse(Settings, {"devices": {"drive_node": [5, 6], "sensor_node": [7, 8]}}))
+    (tmp_path / "arm.dbc").write_bytes(load_codec().text)
+    written = write_contract(codec, tmp_path)
+    assert written.path == tmp_path / "arm.dbc"
+    assert load_codec(written.path).layout_digest == codec.layout_digest
+
+
+def test_the_host_has_a_node_id_of_its_own() -> None:
+    with pytest.raises(ConfigError, match=r"`bus.host_node` = 3 is the node id of a device"):
+        parse(Settings, {"bus": {"host_node": 3}})
 
 
 def test_a_composed_contract_gets_a_file_for_the_log(tmp_path: Path) -> None:

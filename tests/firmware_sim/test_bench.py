@@ -8,6 +8,7 @@ from bench_host import (
     ENABLE,
     FAULT_RESET,
     PERIOD_NS,
+    PRE_OPERATIONAL,
     RESET_COMMUNICATION,
     START,
     BenchHost,
@@ -203,9 +204,21 @@ def test_a_sync_counter_beyond_its_overflow_is_ignored(counter):
 
 def test_another_period_is_refused_once_the_arm_has_moved():
     host = BenchHost()
+    host.nmt(START)
     host.sync()
+    host.nmt(PRE_OPERATIONAL)
     assert host.abort_code(lambda: host.write(1, 0x1006, 0, 2000)) == 0x08000022
     host.write(1, 0x1006, 0, 1000)
+
+
+def test_sync_before_any_node_is_operational_does_not_fix_the_period():
+    host = BenchHost()
+    host.sync()
+    host.write(1, 0x1006, 0, 2000)
+    host.sync()
+    now_ns = host.bench.now_ns
+    host.sync()
+    assert host.bench.now_ns == now_ns + 2 * PERIOD_NS
 
 
 def test_by_wall_clock_the_arm_moves_without_sync_and_a_sync_samples_it():

@@ -59,6 +59,7 @@ def test_a_request_that_can_not_be_served_is_aborted_with_its_reason(host, node,
 
 
 def test_another_period_is_a_matter_of_the_devices_state(host):
+    host.start()
     host.sync()
     assert host.abort_code(lambda: host.write(1, 0x1006, 0, 2000)) == STATE
 

@@ -8,10 +8,12 @@ import pytest
 
 from adacd_hil.wire.budget import Budget, ContractFrame, Traffic, Trigger, check_budget, find_budget, read_contract, us
 from adacd_hil.wire.codec import CodecError, contract_folder, load_codec
+from adacd_hil.wire.node_offset import move_contract
 from adacd_hil.wire.response_time import Response
 
 CONTRACTS = Path(__file__).parent / "contracts"
 ARM = load_codec()
+SYNCHRONOUS = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 
 
 def budget_of(name: str, period_us: int | None = None) -> Budget:
@@ -225,3 +227,37 @@ def test_arbitration_is_by_the_bits_on_the_wire() -> None:
     assert ContractFrame("a", 0x81, False, 8, Trigger.EVENT, 0, 0).priority == (0x81, 0)
     assert ContractFrame("a", 0x81 << 18, True, 8, Trigger.EVENT, 0, 0).priority > (0x81, 0)
     assert names[:5] == ["Nmt", "Sync", "Drive1Emcy", "HostHeartbeat", "Drive2Emcy"]
+
+
+def test_frames_of_two_arms_compete_by_their_identifiers() -> None:
+    shared = check_budget(ARM, 2000, arms=2)
+    order = [f"{entry.frame.can_id:03X} {entry.frame.name}" for entry in shared.frames if entry.frame.is_cyclic]
+    assert order == [
+        "080 Sync",
+        *(f"{0x181 + n:03X} Arm{1 + n // 4}.{name}" for n, name in enumerate(2 * SYNCHRONOUS)),
+        *(f"{0x201 + n:03X} Arm{1 + n // 4}.Drive{1 + n % 4}Command" for n in (0, 1, 4, 5)),
+    ]
+
+
+def test_which_arm_of_a_shared_bus_asks_makes_no_difference() -> None:
+    def times(node_offset: int) -> list[tuple[int, str]]:
+        budget = check_budget(move_contract(ARM, node_offset), 2000, arms=3)
+        return [(entry.responses[Traffic.EMERGENCIES].time_ns, entry.frame.name) for entry in budget.frames]
+
+    assert times(0) == times(8)
+
+
+def test_each_host_of_a_shared_bus_may_ask_once_per_period() -> None:
+    heartbeat = check_budget(ARM, 4000, arms=2).frames[-1]
+    alone = check_budget(ARM, 4000).frames[-1]
+    assert heartbeat.frame.name == "Arm1.HostHeartbeat"
+    waits = [
+        entry.responses[Traffic.REQUESTS].time_ns - entry.responses[Traffic.OPERATION].time_ns
+        for entry in (alone, heartbeat)
+    ]
+    assert waits == [135_000, 2 * 135_000]
+
+
+def test_hosts_of_a_shared_bus_have_heartbeats_of_their_own() -> None:
+    ids = [e.frame.can_id for e in check_budget(ARM, 4000, arms=3).frames if e.frame.name.endswith("HostHeartbeat")]
+    assert ids == [0x77D, 0x77E, 0x77F]

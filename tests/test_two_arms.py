@@ -1,0 +1,299 @@
+"""Two arms on one bus in virtual time: the first host sends SYNC, the second follows it."""
+
+import dataclasses
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from adacd_hil.cli.connection import received_ids
+from adacd_hil.cli.main import cli
+from adacd_hil.clock import VirtualClock
+from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, Settings, load_settings, parse
+from adacd_hil.control.cycle import Cycle, RunResult
+from adacd_hil.control.exchange import Exchange
+from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.control.realtime import Tick, make_pacer
+from adacd_hil.control.session import Session
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.contract import load_contract, write_contract
+from adacd_hil.device.network import Master
+from adacd_hil.log.reader import read_log
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import ArmCommand, FaultReason, SchemeState
+from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame
+from adacd_hil.wire.tap import Tap
+from firmware_sim.bench import Bench
+from firmware_sim.lockstep_bus import make_lockstep_bus
+from firmware_sim.scenario import load_scenario
+
+pytestmark = pytest.mark.slow
+
+PERIOD_NS = 2_000_000
+HOST_NODES = (127, 126)
+FIRST, SECOND = 0, 1
+PUSH_NM = np.array([0.2, 0.05])
+
+
+def settings_of(arm: int, finish_s: float = 0.4) -> Settings:
+    """Configure one of two arms that share a bus at 2 ms."""
+    base = load_settings("paper")
+    return dataclasses.replace(
+        base,
+        bus=dataclasses.replace(
+            base.bus,
+            period_us=PERIOD_NS // 1000,
+            arms=2,
+            host_node=HOST_NODES[arm],
+            sync="follow" if arm == SECOND else "produce",
+        ),
+        devices=dataclasses.replace(
+            base.devices, drive_node=(1 + 4 * arm, 2 + 4 * arm), sensor_node=(3 + 4 * arm, 4 + 4 * arm)
+        ),
+        operator=OperatorSettings(script=(RequestSettings(at_s=finish_s, request="finish"),)),
+    )
+
+
+class End:
+    """One host's end of the bus. `on_wait`: lets time pass until something may have come, False at the limit."""
+
+    waiting_frames = ()
+
+    def __init__(self, wire: "Wire") -> None:
+        self.channel = "shared"
+        self.sent: list[tuple[int, bytes]] = []
+        self.received: deque[Frame] = deque()
+        self.on_wait: Callable[[int], bool] = lambda limit_ns: False
+        self._wire = wire
+
+    def send(self, can_id: int, data: bytes) -> None:
+        self.sent.append((can_id, bytes(data)))
+        self._wire.carry(Frame(can_id, bytes(data), self._wire.clock.now_ns()), self)
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        limit_ns = self._wire.clock.now_ns() + round(max(timeout_s, 0.0) * 1e9)
+        while not self.received:
+            if timeout_s <= 0.0 or not self.on_wait(limit_ns):
+                return None
+        return self.received.popleft()
+
+    def recover(self) -> None:
+        self.received.clear()
+
+    def close(self) -> None:
+        pass
+
+
+class Wire:
+    """Everybody hears every frame, in the order in which they are sent."""
+
+    def __init__(self) -> None:
+        self.clock = VirtualClock()
+        self.ends = (End(self), End(self))
+        self.benches: list[Bench] = []
+
+    def carry(self, frame: Frame, sender: object) -> None:
+        for end in self.ends:
+            if end is not sender:
+                end.received.append(frame)
+        for bench in self.benches:
+            if bench is not sender:
+                bench.on_frame(frame)
+
+    def add_arm(self, settings: Settings) -> None:
+        bench = Bench(load_scenario("idle", "P"), load_contract(settings), lambda *frame: self._answer(bench, *frame))
+        self.benches.append(bench)
+        bench.boot()
+
+    def _answer(self, bench: Bench, can_id: int, data: bytes) -> None:
+        self.carry(Frame(can_id, bytes(data), self.clock.now_ns()), bench)
+
+
+class FirstHost:
+    """Pushes its arm a little, once per period; sends SYNC."""
+
+    def __init__(self, wire: Wire) -> None:
+        settings = settings_of(FIRST)
+        codec = load_contract(settings)
+        self.tap = Tap(wire.ends[FIRST], wire.clock)
+        self.arm = Arm(settings, codec, self.tap)
+        self.master = Master(settings, codec, self.tap)
+        self._exchange = Exchange(settings, self.tap, self.arm, self.master, wire.clock)
+        self.cycle = -1
+        self._clock = wire.clock
+        self.states = []
+
+    def boot(self) -> None:
+        self.master.reset()
+        self.master.identify()
+        self.master.configure()
+        self.master.start()
+
+    def step(self) -> None:
+        self.cycle += 1
+        state = self._exchange.read(Tick(self.cycle, self._clock.now_ns(), 1, 0))
+        self.states.append(state)
+        self.arm.write(ArmCommand(PUSH_NM if state.is_enabled else np.zeros(2), True, False))
+        if self.cycle % 50 == 0:
+            self.master.send_heartbeat()
+
+
+class Rig:
+    """`dies_ns`: when the first host falls silent."""
+
+    def __init__(self, folder: Path, dies_ns: int = 1 << 62, finish_s: float = 0.4) -> None:
+        self.wire = Wire()
+        for arm in (FIRST, SECOND):
+            self.wire.add_arm(settings_of(arm))
+        self.first = FirstHost(self.wire)
+        self.first.boot()
+        self._dies_ns = dies_ns
+        settings = settings_of(SECOND, finish_s)
+        codec = load_contract(settings)
+        self.end = self.wire.ends[SECOND]
+        self.end.on_wait = self._let_pass
+        clock = self.wire.clock
+        self.tap = Tap(self.end, clock)
+        self.arm = Arm(settings, codec, self.tap)
+        self.master = Master(settings, codec, self.tap)
+        self.pacer = make_pacer(settings, clock, self.tap, self.arm.sync_id)
+        operator = ScriptedOperator(settings.operator)
+        self.cycle = Cycle(settings, self.tap, self.arm, self.master, self.pacer, operator, lambda _: None, clock)
+        self.cycle.compile()
+        self.path = folder / "run.mcap"
+        self.recorder = Recorder(self.path, blocking=True)
+
+    def _let_pass(self, limit_ns: int) -> bool:
+        """Let time pass to the first host's next period, or to the limit."""
+        clock = self.wire.clock
+        due_ns = (clock.now_ns() // PERIOD_NS + 1) * PERIOD_NS
+        if due_ns > limit_ns or due_ns >= self._dies_ns:
+            clock.sleep_until_ns(limit_ns)
+            return False
+        clock.sleep_until_ns(due_ns)
+        self.first.step()
+        return True
+
+    def run(self) -> RunResult:
+        for _ in range(5):  # SYNC is there before the second arm is
+            self.first.step()
+        self.master.reset()
+        self.master.identify()
+        self.master.configure()
+        self.master.start()
+        try:
+            return self.cycle.run(self.recorder)
+        finally:
+            self.master.stop()
+            self.recorder.close()
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, RunResult]:
+    rig = Rig(tmp_path_factory.mktemp("two_arms"))
+    return rig, rig.run()
+
+
+def test_the_second_host_moves_its_arm_by_the_first_ones_sync(played: tuple[Rig, RunResult]) -> None:
+    rig, result = played
+    assert (result.fault, result.overruns, result.state) == (FaultReason.NONE, 0, SchemeState.ADAPT)
+    log = read_log(rig.path)
+    assert np.abs(np.degrees(log.scheme["q"][-1])).max() > 5.0
+    assert (log.cycle["frames_missing"] > 0).sum() <= 1
+
+
+def test_the_first_arm_is_not_disturbed(played: tuple[Rig, RunResult]) -> None:
+    rig, _ = played
+    states = rig.first.states
+    assert states[-1].is_enabled
+    assert {state.fault for state in states} == {FaultReason.NONE}
+    assert [state.cycle for state in states if not state.is_complete] == []
+    assert [event for event in rig.first.master.take_events() if event.level != "info"] == []
+    assert np.abs(states[-1].q).min() > 0.1
+
+
+def test_the_follower_sends_no_sync_and_nothing_that_is_not_its_own(played: tuple[Rig, RunResult]) -> None:
+    rig, _ = played
+    sent = {can_id for can_id, _ in rig.end.sent}
+    assert sent == {0x000, 0x205, 0x206, 0x605, 0x606, 0x607, 0x608, 0x77E}
+
+
+@pytest.mark.parametrize("arm", [FIRST, SECOND])
+def test_on_a_shared_bus_nmt_names_a_node_of_the_own_arm(played: tuple[Rig, RunResult], arm: int) -> None:
+    rig, _ = played
+    commands = [tuple(data) for can_id, data in rig.wire.ends[arm].sent if can_id == 0x000]
+    nodes = [1 + 4 * arm, 2 + 4 * arm, 3 + 4 * arm, 4 + 4 * arm]
+    assert {node for _, node in commands} == set(nodes)
+    assert [node for command, node in commands if command == 0x82] == nodes
+
+
+def test_each_host_is_watched_by_its_own_devices(played: tuple[Rig, RunResult]) -> None:
+    rig, _ = played
+    watched = [{device.value(0x1016, 1) >> 16 for device in bench.devices} for bench in rig.wire.benches]
+    assert watched == [{127}, {126}]
+
+
+def test_both_arms_live_by_the_period_that_their_hosts_wrote(played: tuple[Rig, RunResult]) -> None:
+    rig, _ = played
+    assert {bench.devices[0].value(0x1006) for bench in rig.wire.benches} == {2000}
+
+
+def test_without_sync_the_follower_ends_with_one_line(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, dies_ns=500 * PERIOD_NS)
+    with pytest.raises(BusError, match="no SYNC on shared within 100 ms"):
+        rig.run()
+    assert [tuple(data) for can_id, data in rig.end.sent[-4:]] == [(0x80, node) for node in (5, 6, 7, 8)]
+
+
+def test_to_follow_needs_another_arm_on_the_bus() -> None:
+    with pytest.raises(ConfigError, match=r"`bus.sync` = 'follow' needs another arm's host on the bus"):
+        parse(Settings, {"bus": {"sync": "follow"}})
+
+
+def test_an_arm_at_other_node_ids_runs_in_lockstep_on_a_bus_of_its_own(tmp_path: Path) -> None:
+    devices = dataclasses.replace(load_settings("paper").devices, drive_node=(5, 6), sensor_node=(7, 8))
+    script = OperatorSettings(script=(RequestSettings(at_s=0.1, request="finish"),))
+    settings = dataclasses.replace(load_settings("paper"), devices=devices, operator=script)
+    codec = write_contract(load_contract(settings), tmp_path)
+    clock = VirtualClock()
+    embedded = EmbeddedBus(clock)
+    bench = Bench(load_scenario("idle", "P"), codec, embedded.deliver)
+    embedded.attach(bench.on_frame)
+    bench.boot()
+    bus = make_lockstep_bus(embedded, clock, codec, settings)
+    session = Session(settings, codec, bus, clock, ScriptedOperator(script), tmp_path, "embedded")
+    summary = session.run()
+    assert (summary.error, summary.result and summary.result.fault) == ("", FaultReason.NONE)
+    frames = read_log(summary.log.path).frames
+    assert {0x185, 0x186, 0x187, 0x188} <= set(frames["can_id"].tolist())
+
+
+@pytest.mark.parametrize(
+    ("bus", "clock", "line"),
+    [
+        ("arms = 2\nperiod_us = 2000", "lockstep", "`bus.arms` = 2 hosts need --clock realtime"),
+        ("arms = 2", "realtime", "contract arm: 2 × arm.dbc at 1000 µs doesn't fit: the cyclic frames need 1525 µs"),
+        ('sync = "follow"', "realtime", "`bus.sync` = 'follow' needs another arm's host"),
+        ("host_node = 2", "realtime", "`bus.host_node` = 2 is the node id of a device"),
+    ],
+)
+def test_what_a_shared_bus_cannot_be_is_one_line(tmp_path: Path, bus: str, clock: str, line: str) -> None:
+    config = tmp_path / "two.toml"
+    config.write_text(f"[bus]\n{bus}\n")
+    arguments = ["-i", "virtual", "-c", "x", "--config", str(config), "--clock", clock, "--out", str(tmp_path / "out")]
+    ran = CliRunner().invoke(cli, ["run", *arguments])
+    assert ran.exit_code == 2
+    (complaint,) = ran.stderr.splitlines()
+    assert line in complaint
+
+
+@pytest.mark.parametrize(("is_following", "hears_sync"), [(False, False), (True, True)])
+def test_the_receive_filter_has_sync_for_the_follower_and_nothing_of_the_neighbour(
+    is_following: bool, hears_sync: bool
+) -> None:
+    heard = set(received_ids(load_contract(settings_of(SECOND)), is_following))
+    assert (0x080 in heard) == hears_sync
+    assert {can_id & 0x7F for can_id in heard} - {0} == {5, 6, 7, 8}

@@ -1,0 +1,93 @@
+"""A contract at other node ids, against cantools and against the contract that the host composes."""
+
+import cantools
+import pytest
+
+from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec, parse_codec
+from adacd_hil.wire.node_offset import move_contract
+
+CONTRACTS = ("arm", "arm_fd", "arm_fd_500us", "arm_stock")
+
+
+def contract(name: str) -> Codec:
+    return load_codec(contract_folder() / f"{name}.dbc")
+
+
+def moved_by_cantools(name: str, node_offset: int, host_node: int) -> cantools.database.can.Database:
+    """Move the messages in cantools' own model and write that as a DBC."""
+    database = cantools.database.load_file(contract_folder() / f"{name}.dbc")
+    for message in database.messages:
+        if message.name == "HostHeartbeat":
+            message.frame_id = 0x700 + host_node
+        elif message.frame_id & 0x7F:
+            message.frame_id += node_offset
+    return cantools.database.load_string(database.as_dbc_string(), "dbc")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONTRACTS)
+def test_a_moved_contract_is_the_one_that_cantools_moves_bit_for_bit(name: str) -> None:
+    reference = moved_by_cantools(name, 4, 126)
+    codec = move_contract(contract(name), 4, 126)
+    assert {m.name: m.can_id for m in codec.messages.values()} == {m.name: m.frame_id for m in reference.messages}
+    for message in codec.messages.values():
+        theirs = reference.get_message_by_frame_id(message.can_id)
+        data = bytes(range(1, 1 + message.length))
+        ours = dict(zip((signal.name for signal in message.signals), message.decode(data), strict=True))
+        assert ours == pytest.approx(theirs.decode(data, decode_choices=False), rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONTRACTS)
+def test_attributes_comments_and_values_of_a_message_move_with_it(name: str) -> None:
+    reference = moved_by_cantools(name, 8, 120)
+    moved = cantools.database.load_string(move_contract(contract(name), 8, 120).text.decode(), "dbc")
+    for theirs in reference.messages:
+        ours = moved.get_message_by_name(theirs.name)
+        attributes = [{key: value.value for key, value in m.dbc.attributes.items()} for m in (ours, theirs)]
+        assert attributes[0] == attributes[1]
+        assert [s.choices for s in ours.signals] == [s.choices for s in theirs.signals]
+        assert ours.comment == theirs.comment
+
+
+def test_protection_moves_with_the_frame() -> None:
+    codec, moved = contract("arm"), move_contract(contract("arm"), 4)
+    frame = codec.message("Drive1Command").sender().protect(codec.message("Drive1Command").encode(15, 100))
+    again = moved.message("Drive1Command").sender().protect(moved.message("Drive1Command").encode(15, 100))
+    assert moved.message("Drive1Command").can_id == 0x205
+    assert bytes(frame) == bytes(again)
+
+
+def test_nmt_sync_and_the_host_stay() -> None:
+    moved = move_contract(contract("arm"), 4)
+    assert [moved.message(name).can_id for name in ("Nmt", "Sync", "HostHeartbeat")] == [0x000, 0x080, 0x77F]
+
+
+def test_a_moved_contract_has_another_digest() -> None:
+    digests = {move_contract(contract("arm"), n, host).layout_digest for n, host in ((0, 127), (4, 127), (4, 126))}
+    assert len(digests) == 3
+
+
+def test_a_contract_that_stays_is_the_file_itself() -> None:
+    codec = contract("arm")
+    assert move_contract(codec, 0, 127) is codec
+
+
+@pytest.mark.parametrize(
+    ("node_offset", "host_node", "line"),
+    [
+        (123, 127, r"arm.dbc: Sensor2Emcy: node id 127 is none of 1 to 126"),
+        (-1, 127, r"arm.dbc: Drive1Emcy: node id 0 is none of 1 to 126"),
+        (4, 6, r"arm.dbc: Drive2Emcy: node id 6 is the host's"),
+    ],
+)
+def test_node_ids_that_cant_be_are_refused(node_offset: int, host_node: int, line: str) -> None:
+    with pytest.raises(CodecError, match=line):
+        move_contract(contract("arm"), node_offset, host_node)
+
+
+def test_an_identifier_without_node_id_is_refused() -> None:
+    codec = contract("arm")
+    text = codec.text.decode().replace("385 ", f"{0x80000000 | 0x18100000} ")
+    with pytest.raises(CodecError, match="Drive1Feedback: identifier 0x18100000 has no node id"):
+        move_contract(parse_codec(text.encode(), codec.path), 4)
