@@ -141,6 +141,15 @@ class Bench:
         }
 
     @property
+    def on_event(self) -> OnEvent | None:
+        """Called with t_ns, level, name and text when a fault begins or ends."""
+        return self._injector.on_event
+
+    @on_event.setter
+    def on_event(self, on_event: OnEvent) -> None:
+        self._injector.on_event = on_event
+
+    @property
     def is_paced(self) -> bool:
         """Whether a host in lockstep says how much time passes."""
         return self._outbox.is_paced
