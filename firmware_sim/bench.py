@@ -142,9 +142,23 @@ class Bench:
         }
 
     @property
+    def on_event(self) -> OnEvent | None:
+        """Called with t_ns, level, name and text when a fault begins or ends."""
+        return self._injector.on_event
+
+    @on_event.setter
+    def on_event(self, on_event: OnEvent) -> None:
+        self._injector.on_event = on_event
+
+    @property
     def is_paced(self) -> bool:
         """Whether a host in lockstep says how much time passes."""
         return self._outbox.is_paced
+
+    @property
+    def is_acknowledged(self) -> bool:
+        """Whether some device has power and is on the bus, so that what the host sends is acknowledged."""
+        return self._injector.plan.is_acknowledged
 
     @property
     def is_operational(self) -> bool:
@@ -184,7 +198,9 @@ class Bench:
         if can_id == self._sync_id:
             if self._injector.has_faults:
                 self._advance_faults(t_ns, self._time_to_sync_ns(data))
-            self._injector.receive_by_all(can_id, data, self._on_sync, t_ns)
+            is_heard = self._injector.receive_by_all(can_id, data, self._on_sync, t_ns)
+            if not (is_heard or self._is_wall):
+                self._miss_sync(data, t_ns)
         elif can_id in self._commands:
             for place, take in self._commands[can_id]:
                 self._injector.receive(place, can_id, data, take, self.now_ns)
@@ -209,6 +225,7 @@ class Bench:
         """Let faults begin and end by now, or by what is `ahead_ns` of it."""
         if self._injector.has_faults:
             self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if self.is_paced else stamp_ns)
+            self._injector.flood(self._period_ns)
 
     def _time_to_sync_ns(self, data: bytes) -> int:
         """Say by how much this SYNC moves the bench's time, if it is heard."""
@@ -304,13 +321,9 @@ class Bench:
         else:
             self._outbox.collect(sync_ns + late_ns)
             self._sample_and_send(data)
-            self._injector.flood(self._period_ns)
             self._outbox.close(sync_ns, sync_ns + self._period_ns)
         self._granted = self._outbox.sent
-        if self.on_truth is not None:
-            self._body.truth(self._truth)
-            self._truth[_FAULTS] = self._injector.plan.mask
-            self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
+        self._tell_truth(t_ns)
         if not self._is_wall:
             self._has_moved = True
             self._has_been_operational = self._has_been_operational or self._is_any_operational
@@ -318,11 +331,24 @@ class Bench:
             ticks = self._period_ns // _TICK_NS - late_ticks
             self._body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode), ticks)
 
-    @property
-    def _is_plain(self) -> bool:
-        """Whether all cyclic frames, undisturbed and without company, answer this SYNC."""
-        is_undisturbed = self._injector.is_quiet and self._outbox.due_ns >= self.now_ns + self._period_ns
-        return is_undisturbed and self._has_all_answers
+    def _miss_sync(self, data: bytes, t_ns: int) -> None:
+        """By SYNC, live through one that a fault keeps from all devices; what they send besides goes out."""
+        counter = data[0] if data else 0
+        periods = self._count_periods(counter) if self._counter and counter <= SYNC_COUNTERS else 0
+        if self._has_moved and self._period_ns == self._body_period_ns:
+            self._live_through_lost_syncs(periods)
+        self._outbox.collect(self.now_ns)
+        self._poll(self.now_ns)
+        self._outbox.close(self.now_ns, self.now_ns + self._period_ns)
+        self._granted = self._outbox.sent
+        self._tell_truth(t_ns)
+
+    def _tell_truth(self, t_ns: int) -> None:
+        """Say what is true at this SYNC, which came at `t_ns`."""
+        if self.on_truth is not None:
+            self._body.truth(self._truth)
+            self._truth[_FAULTS] = self._injector.plan.mask
+            self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
 
     def _sample_and_send(self, data: bytes) -> None:
         """Give the nodes their samples, and let them send."""

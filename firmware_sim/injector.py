@@ -12,7 +12,7 @@ from firmware_sim.body import Measurement
 from firmware_sim.device import Device
 from firmware_sim.drive_node import DriveNode
 from firmware_sim.fault_plan import EVERYBODY, ActionKind, FaultPlan, NodeAction
-from firmware_sim.object_dictionary import Send
+from firmware_sim.object_dictionary import NEVER_NS, Send
 from firmware_sim.outbox import Outbox
 from firmware_sim.scenario import Scenario
 from firmware_sim.sensor_node import SensorNode
@@ -38,6 +38,7 @@ class Injector:
         self._is_acknowledged = True
         self._power_on_ns = 0
         self._started_ns: int | None = None
+        self._flooded_ns = 0  # up to here babbling nodes have sent
         self._devices: Sequence[Device] = ()
         self._drives: Sequence[DriveNode] = ()
         self._sensors: Sequence[SensorNode] = ()
@@ -62,7 +63,7 @@ class Injector:
     @property
     def due_ns(self) -> int:
         """When a fault begins, ends or goes on."""
-        return self.now_ns + self.plan.wait_ns
+        return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:
         """Return what a device sends by."""
@@ -80,21 +81,23 @@ class Injector:
 
         return put if self.has_faults else outbox.put
 
-    def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> None:
-        """Give a frame of the host, or what becomes of it, to a node (or to `EVERYBODY`)."""
+    def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
+        """Give a frame of the host, or what becomes of it, to a node (or to `EVERYBODY`); tell whether anything."""
         if self.plan.is_quiet:
             take(data, t_ns)
-            return
-        for delay_ns, received in self.plan.receive(place, can_id, data):
+            return True
+        frames = self.plan.receive(place, can_id, data)
+        for delay_ns, received in frames:
             if delay_ns == 0:
                 take(received, t_ns)
             else:
                 due_ns = t_ns + delay_ns
                 self._outbox.hold(due_ns, lambda received=received, due_ns=due_ns: take(received, due_ns))  # type: ignore[misc]
+        return bool(frames)
 
-    def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> None:
-        """Give a frame of the host, or what becomes of it on its way to all, to a handler."""
-        self.receive(EVERYBODY, can_id, data, take, t_ns)
+    def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
+        """Give a frame of the host, or what becomes of it on its way to all, to a handler; tell whether anything."""
+        return self.receive(EVERYBODY, can_id, data, take, t_ns)
 
     def advance(self, now_ns: int, stamp_ns: int) -> None:
         """Let faults begin and end by now, and do what they do to nodes. `stamp_ns`: of the events that say so."""
@@ -115,8 +118,9 @@ class Injector:
         return 0 if self.plan.is_quiet else min(self.plan.sync_delay_ns(), period_ns - 1)
 
     def flood(self, period_ns: int) -> None:
-        """Let babbling nodes send what they send until the next SYNC."""
+        """Let babbling nodes send what they send in the period that begins now."""
         if self.plan.is_flooding:
+            self._flooded_ns = self.now_ns + period_ns
             for offset_ns, can_id, data in self.plan.babble(period_ns):
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 

@@ -23,6 +23,7 @@ from adacd_hil.wire.node_offset import HOST_NODE, move_contract
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
 from firmware_sim.contracts import CONTRACTS, is_fd
+from firmware_sim.injector import OnEvent
 from firmware_sim.pdo_record import LAST_NODE, LISTENED_IDS
 from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
 from firmware_sim.time_marks import HOST_MARK
@@ -240,11 +241,13 @@ def run(
         if out is not None:
             metadata = {"scenario": resolved.name, "profile": resolved.profile, "seed": str(resolved.seed)}
             # By SYNC, time waits for the log; by wall clock nothing may.
-            truth = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata)
+            truth = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
             stack.enter_context(truth)
         bench = Bench(resolved, codec, bus.send, clock_mode=clock_mode)
         if truth is not None:
-            bench.on_truth = _stamp_truth(truth, bench, wall_ns() - clock.now_ns())
+            epoch_ns = wall_ns() - clock.now_ns()
+            bench.on_truth = _stamp_truth(truth, bench, epoch_ns)
+            bench.on_event = _stamp_events(truth, bench, epoch_ns)
         service = Service(bench, bus, clock, clock_mode, stop, is_once)
         for line in request_realtime().missing:
             _complain(f"not granted: {line}")
@@ -260,6 +263,15 @@ def _stamp_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> Callable[[int,
 
     def write(cycle: int, t_ns: int, block: Vector) -> None:
         truth.write(cycle, t_ns if bench.is_paced else t_ns + epoch_ns, block)
+
+    return write
+
+
+def _stamp_events(truth: TruthLog, bench: Bench, epoch_ns: int) -> OnEvent:
+    """Stamp the beginnings and ends of faults as the truth."""
+
+    def write(t_ns: int, level: str, name: str, text: str) -> None:
+        truth.event(t_ns if bench.is_paced else t_ns + epoch_ns, level, name, text)
 
     return write
 

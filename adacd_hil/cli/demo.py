@@ -31,8 +31,8 @@ def play(config: str, profile: str | None, seed: int | None, clock_name: str, ou
     out.mkdir(parents=True, exist_ok=True)
     progress = Progress()
     progress(f"experiment of configuration {settings.name}, profile {settings.arm.profile}, in {out}")
-    with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep") as truth:
-        bench = Bench(scenario, codec, embedded.deliver, on_truth=truth.write)
+    with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", scenario=scenario) as truth:
+        bench = Bench(scenario, codec, embedded.deliver, on_truth=truth.write, on_event=truth.event)
         embedded.attach(bench.on_frame)
         bench.boot()
         session = Session(

@@ -215,7 +215,8 @@ class Cycle:
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
-        causes = [*self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
+        excess = self._arm.describe_excess() if output.fault is FaultReason.LIMIT else []
+        causes = [*excess, *self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
         details = "; ".join([output.fault.name, *causes])
         return Event("error", "supervisor", f"{text}: {details}")
 

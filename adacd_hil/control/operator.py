@@ -36,7 +36,10 @@ class Operator(Protocol):
 
 
 class ScriptedOperator:
-    """Plays the user by the clock: requests at given times, acknowledgement a given time after each stop."""
+    """Plays the user by the clock: requests at given times, acknowledgement a given time after each stop.
+
+    A faulted arm is asked nothing: what falls due then is asked once it has been enabled again.
+    """
 
     def __init__(self, settings: OperatorSettings) -> None:
         self._script = deque(sorted(settings.script, key=lambda entry: entry.at_s))
@@ -56,7 +59,7 @@ class ScriptedOperator:
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return what the script asks at this time."""
-        if elapsed_s is None:
+        if elapsed_s is None or state is SchemeState.FAULT:
             return Request.NONE
         if self._script and elapsed_s >= self._script[0].at_s:
             return Request[self._script.popleft().request.upper()]
@@ -95,8 +98,8 @@ class ConsoleOperator:
                 self._asked.append(request)
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return what the user asked first, else what the script asks."""
-        if self._asked:
+        """Return what the user asked first, else what the script asks; of a faulted arm, leave it to `answer_fault`."""
+        if self._asked and state is not SchemeState.FAULT:
             return self._asked.popleft()
         return self._script.request(elapsed_s, state)
 

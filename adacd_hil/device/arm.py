@@ -58,6 +58,8 @@ class Arm:
         self._is_following = settings.bus.follows
         self._sign = settings.arm.sign
         self._offset_Nm = settings.arm.torque_offset_Nm
+        self._position_limit_deg = settings.arm.position_limit_deg
+        self._velocity_limit_deg_s = settings.arm.velocity_limit_deg_s
         self._permille_per_Nm = tuple(
             sign * 1000.0 / rated for sign, rated in zip(settings.arm.sign, settings.arm.rated_torque_Nm, strict=True)
         )
@@ -225,6 +227,19 @@ class Arm:
             for age in self.ages()
             if age.is_over
         )
+        return lines
+
+    def describe_excess(self) -> list[str]:
+        """Say which joint is beyond which of the arm's limits, one line each; empty when none is."""
+        lines = []
+        for joint, (drive, sign) in enumerate(zip(self.drives, self._sign, strict=True)):
+            for quantity, value, bound, unit in (
+                ("position", drive.position_rad, self._position_limit_deg[joint], "deg"),
+                ("velocity", drive.velocity_rad_s, self._velocity_limit_deg_s[joint], "deg/s"),
+            ):
+                value_deg = math.degrees(sign * value)
+                if abs(value_deg) > bound:
+                    lines.append(f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed")
         return lines
 
 

@@ -31,6 +31,16 @@ def test_nothing_is_asked_before_the_drives_are_enabled() -> None:
     assert script((0.0, "finish")).request(None, SchemeState.ENABLE) is Request.NONE
 
 
+def test_what_falls_due_while_the_arm_is_faulted_is_asked_afterwards() -> None:
+    operator = script((2.0, "finish"))
+    asked = [
+        operator.request(2.1, SchemeState.FAULT),
+        operator.request(0.5, SchemeState.ADAPT),
+        operator.request(2.0, SchemeState.ADAPT),
+    ]
+    assert asked == [Request.NONE, Request.NONE, Request.FINISH]
+
+
 def test_a_stop_is_acknowledged_after_its_time() -> None:
     operator = script(acknowledge_after_s=0.5)
     asked = [operator.request(t, SchemeState.STOPPED) for t in (1.0, 1.4, 1.5)]
@@ -64,6 +74,13 @@ def test_the_console_takes_a_word_a_line(word: str, request_: Request) -> None:
     operator = ConsoleOperator(script(), io.StringIO(f"{word}\n"))
     operator.join(1.0)
     assert operator.request(1.0, SchemeState.STOPPED) is request_
+
+
+def test_what_the_user_types_while_the_arm_is_faulted_answers_the_fault() -> None:
+    operator = ConsoleOperator(script(), io.StringIO("finish\n"))
+    operator.join(1.0)
+    asked = operator.request(1.0, SchemeState.FAULT)
+    assert (asked, operator.answer_fault(0.5)) == (Request.NONE, FaultAnswer.END)
 
 
 def faults(count: int) -> ScriptedOperator:

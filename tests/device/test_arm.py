@@ -150,6 +150,17 @@ def test_a_drive_that_never_moved_up_is_no_fault_but_one_that_dropped_is_describ
     assert devices.arm.describe_faults() == [expected]
 
 
+def test_a_joint_beyond_its_limits_is_described_with_value_and_bound() -> None:
+    devices = Devices({"sign": [1, -1]})
+    devices.arm.synchronise(0, 0, 1)
+    devices.send("Drive1Feedback", np.radians(75.2), np.radians(250.0) - 1e-3)
+    devices.send("Drive2Feedback", np.radians(119.9), np.radians(301.0))
+    assert devices.arm.describe_excess() == [
+        "joint 1: position 75.20 deg, ±75 deg allowed",
+        "joint 2: velocity -301.00 deg/s, ±300 deg/s allowed",
+    ]
+
+
 def test_signals_that_are_too_old_are_described_with_age_and_limit() -> None:
     devices = Devices()
     devices.arm.synchronise(0, 0, 1)

@@ -8,10 +8,13 @@ import sys
 from collections import deque
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bench_host import CODEC, ENABLE, RESET_COMMUNICATION, START, STOP, BenchHost, quiet_scenario
 
 from adacd_hil.clock import VirtualClock
+from adacd_hil.log.reader import read_log
+from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import Frame
 from firmware_sim.bench import Bench
 from firmware_sim.main import EPILOG, Service, StopRequest, main
@@ -186,6 +189,40 @@ def test_by_wall_clock_a_host_that_goes_silent_faults_the_drives_within_two_peri
     emergencies = [(t_ns, can_id, data[:2]) for t_ns, can_id, data in bus.sent if can_id in (0x081, 0x082)]
     assert emergencies == [(6_500_000, 0x081, b"\x00\x87"), (6_500_000, 0x082, b"\x00\x87")]
     assert [drive.state.value for drive in bench.drives] == ["fault", "fault"]
+
+
+LOST_TORQUE = """
+[[faults]]
+kind = "lose"
+node = "sensor1"
+frame = "torque"
+at_s = 0.01
+duration_s = 0.02
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, tmp_path, clock_mode):
+    clock = VirtualClock()
+    bus = ScriptedBus(clock, StopRequest(), 0)
+    bus.script.extend(((t_ms + 1) * MS, can_id, data) for t_ms, can_id, data in enabling_script(60))
+    monkeypatch.setattr("firmware_sim.main.MonotonicClock", lambda: clock)
+    monkeypatch.setattr("firmware_sim.main.wall_ns", lambda: 10**18)
+    monkeypatch.setattr("firmware_sim.main._open_bus", lambda *_: bus)
+    monkeypatch.setattr("firmware_sim.main.request_realtime", lambda: RealtimeGrant("SCHED_OTHER", ()))
+    monkeypatch.setattr("firmware_sim.main.freeze_garbage", lambda: None)
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text(LOST_TORQUE)
+    options = ("--scenario", str(scenario), "--clock", clock_mode, "--out", str(tmp_path), "--once")
+    assert run_main("run", "-i", "scripted", "-c", "scripted", *options) == 0
+    log = read_log(tmp_path / "truth.mcap")
+    edges = np.flatnonzero(np.diff(log.truth["faults"])) + 1
+    assert [(entry.t_ns, entry.event.message.split(":")[0]) for entry in log.events] == [
+        (log.truth.t_ns[edges[0]], "begins"),
+        (log.truth.t_ns[edges[1]], "ends"),
+    ]
+    assert log.metadata["fault_0"].startswith("lose torque of sensor1")
 
 
 def test_frames_that_waited_since_before_power_on_are_dropped():

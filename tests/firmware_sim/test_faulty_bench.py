@@ -1,0 +1,97 @@
+"""What a bench sends while a scenario's faults act: SYNCs that nobody hears, and floods."""
+
+import pytest
+from bench_host import ENABLE, PERIOD_NS, BenchHost, quiet_scenario
+
+from firmware_sim.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+
+ANSWERS = [0x181, 0x182, 0x183, 0x184]
+
+
+def enabled_host(fault: dict[str, object]) -> BenchHost:
+    """Return a host in lockstep whose arm is enabled, 5 ms before a fault."""
+    host = BenchHost(quiet_scenario(faults=[{"at_s": 0.0, **fault}]))
+    host.put(HOST_MARK, pack_mark(MarkKind.ADVANCE, 0))
+    host.enable()
+    while not host.bench.is_scenario_started:
+        host.step(ENABLE)
+    host.take()
+    return host
+
+
+def answer(host: BenchHost) -> list[int]:
+    """Return the identifiers of what a SYNC brings, in their order."""
+    host.step(ENABLE)
+    return [can_id for can_id, _ in host.take()]
+
+
+def test_a_host_in_lockstep_hears_that_a_lost_sync_brings_nothing() -> None:
+    host = enabled_host({"kind": "lose", "frame": "sync", "at_s": 0.002, "count": 1})
+    answer(host)
+    host.step(ENABLE)
+    marks = [unpack_mark(data) for _, data in host.take()]
+    assert marks == [(MarkKind.RELEASE, 0), (MarkKind.END, 0)]
+
+
+def test_after_a_lost_sync_the_arm_answers_again() -> None:
+    host = enabled_host({"kind": "lose", "frame": "sync", "at_s": 0.002, "count": 1})
+    answers = [[can_id for can_id in answer(host) if can_id in ANSWERS] for _ in range(3)]
+    assert answers == [ANSWERS, [], ANSWERS]
+
+
+def test_lost_syncs_last_as_long_as_others_and_are_in_the_truth() -> None:
+    host = enabled_host({"kind": "lose", "frame": "sync", "at_s": 0.002, "duration_s": 0.3})
+    host.truths.clear()
+    start_ns, start = host.bench.now_ns, host.bench.cycle
+    for _ in range(310):
+        host.step(ENABLE)
+    masks = [block[-1] for _, _, block in host.truths]
+    assert host.bench.now_ns - start_ns == 310 * PERIOD_NS
+    assert [cycle for cycle, _, _ in host.truths] == list(range(start + 1, start + 311))
+    assert masks == [0.0] + [1.0] * 300 + [0.0] * 9
+
+
+def test_a_drive_that_gets_no_commands_faults_while_syncs_are_lost() -> None:
+    host = enabled_host({"kind": "lose", "frame": "sync", "at_s": 0.001, "count": 30})
+    for _ in range(12):
+        host.sync()
+    assert [drive.error_code for drive in host.bench.drives] == [0x8250, 0x8250]
+
+
+def test_held_back_frames_go_out_although_a_sync_is_lost() -> None:
+    host = BenchHost(
+        quiet_scenario(
+            faults=[
+                {"kind": "delay", "node": "sensor1", "frame": "torque", "delay_us": 1200.0, "at_s": 0.001, "count": 1},
+                {"kind": "lose", "frame": "sync", "at_s": 0.002, "count": 1},
+            ]
+        )
+    )
+    host.enable()
+    while not host.bench.is_scenario_started:
+        host.step(ENABLE)
+    host.take()
+    answer(host)
+    assert answer(host) == [0x183]
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_a_node_babbles_without_any_sync(clock_mode: str) -> None:
+    flood = {"kind": "babble", "node": "drive1", "can_id": 0x7F0, "rate_Hz": 2000.0, "since": "power_on"}
+    host = BenchHost(quiet_scenario(faults=[{**flood, "at_s": 0.01, "duration_s": 0.02}]), clock_mode)
+    for t_ns in range(0, 50_000_000, 250_000):
+        host.bench.advance_to(t_ns)
+    assert len(host.taken(0x7F0)) == 40
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_a_node_babbles_on_between_syncs(clock_mode: str) -> None:
+    flood = {"kind": "babble", "node": "drive1", "can_id": 0x7F0, "rate_Hz": 4000.0}
+    host = BenchHost(quiet_scenario(faults=[{**flood, "at_s": 0.005, "duration_s": 0.01}]), clock_mode)
+    host.enable()
+    for _ in range(40):
+        host.step(ENABLE)
+        if clock_mode == "wall":
+            host.bench.advance_to(host.t_ns + PERIOD_NS - 1)
+    frames = [can_id for can_id, _ in host.take() if can_id != DEVICE_MARK]
+    assert frames.count(0x7F0) == 40

@@ -1,0 +1,62 @@
+"""Each kind of fault against its row: on the wire, in the host's reaction and in the emulator's ground truth.
+
+`tools/fault_campaign.py` plays all rows.
+"""
+
+from pathlib import Path
+
+import pytest
+from fault_rig import deviations, play, run_lockstep
+from fault_table import CASES, Case, covering, rows_of
+
+from firmware_sim.faults import KINDS
+
+FAULTS_PAGE = Path(__file__).parent.parent / "docs" / "emulator" / "faults.md"
+
+
+def test_every_kind_of_fault_has_a_row() -> None:
+    assert {str(row["kind"]) for case, _ in covering() for row in rows_of(case)} == set(KINDS)
+
+
+def test_the_page_has_a_line_for_every_row() -> None:
+    lines = FAULTS_PAGE.read_text().splitlines()
+    assert [case.name for case in CASES if not any(line.startswith(f"| {case.name} |") for line in lines)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("case", "clock"), covering(), ids=lambda value: getattr(value, "name", value))
+def test_the_host_makes_of_a_fault_what_its_row_says(tmp_path: Path, case: Case, clock: str) -> None:
+    assert deviations(play(case, clock, tmp_path), getattr(case, clock), case.wire) == []
+
+
+@pytest.mark.slow
+def test_the_truth_shows_a_fault_for_as_long_as_it_lasts(tmp_path: Path) -> None:
+    row = {"kind": "lose", "node": "sensor1", "frame": "status", "at_s": 0.8, "duration_s": 0.1}
+    outcome = run_lockstep(tmp_path, [row, {**row, "at_s": 0.85}], finish_s=1.2)
+    masks = outcome.masks[outcome.onset - 1 : outcome.onset + 152]
+    assert masks == [0] + [1] * 50 + [3] * 50 + [2] * 50 + [0] * 2
+
+
+@pytest.mark.slow
+def test_the_same_faults_make_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
+    rows = [{"kind": "corrupt", "node": "all", "frame": "torque", "probability": 0.05, "at_s": 0.1}]
+    runs = [run_lockstep(tmp_path / name, rows, 0.8, seed=seed) for name, seed in (("a", 1), ("b", 1), ("c", 2))]
+    first, same, other = (run.log.frames["data"].tobytes() for run in runs)
+    assert first == same
+    assert first != other
+
+
+@pytest.mark.slow
+def test_faults_that_never_begin_change_no_frame(tmp_path: Path) -> None:
+    rows = [{"kind": "lose", "node": "all", "frame": "torque", "at_s": 100.0}]
+    runs = [run_lockstep(tmp_path / name, faults, 0.8) for name, faults in (("none", []), ("later", rows))]
+    plain, waiting = (run.log.frames for run in runs)
+    assert plain.tobytes() == waiting.tobytes()
+
+
+@pytest.mark.slow
+def test_a_sensor_that_is_well_again_can_be_acknowledged(tmp_path: Path) -> None:
+    rows = [{"kind": "sensor_error", "node": "sensor1", "at_s": 0.8, "duration_s": 0.1}]
+    outcome = run_lockstep(tmp_path, rows, finish_s=2.0, acknowledge_faults=1)
+    assert outcome.faulted == outcome.onset
+    assert (outcome.fault, outcome.error) == ("NONE", "")
