@@ -350,6 +350,12 @@ class Bench:
             self._truth[_FAULTS] = self._injector.plan.mask
             self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
 
+    @property
+    def _is_plain(self) -> bool:
+        """Whether all cyclic frames, undisturbed and without company, answer this SYNC."""
+        is_undisturbed = self._injector.is_quiet and self._outbox.due_ns >= self.now_ns + self._period_ns
+        return is_undisturbed and self._has_all_answers
+
     def _sample_and_send(self, data: bytes) -> None:
         """Give the nodes their samples, and let them send."""
         now_ns = self.now_ns
