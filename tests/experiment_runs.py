@@ -12,6 +12,7 @@ from typing import Any
 
 BIN = Path(sys.executable).parent
 LIMIT_S = 280
+MARK = "1ADACD0"  # how lockstep keeps time: 29-bit identifiers, none of CANopen
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,23 @@ def emulator(folder: Path, *arguments: str) -> Iterator["subprocess.Popen[str]"]
         finally:
             process.terminate()
             process.communicate(timeout=30)
+
+
+@contextlib.contextmanager
+def candump(dump: Path) -> Iterator[None]:
+    """Write down what is on vcan0 while the block lasts."""
+    command = ["candump", "-L", "-r", "16777216", "vcan0"]  # room for what it can't write down at once
+    with dump.open("w") as sink, subprocess.Popen(command, stdout=sink) as listener:
+        try:
+            yield
+        finally:
+            listener.terminate()
+            listener.wait(10)
+
+
+def frames_of(dump: Path) -> str:
+    """Return what candump saw of CANopen."""
+    return "".join(line for line in dump.read_text().splitlines(keepends=True) if MARK not in line)
 
 
 def run_on_vcan(folder: Path, *arguments: str) -> Played:

@@ -246,7 +246,8 @@ FRAMES = [
         "SYNC is late by 0.3 periods",
         'kind = "late_sync", delay_us = 300.0, duration_s = 0.5',
         *both(TOLERATED),
-        note="torque comes later than the host waits, 0.7 ms, so it is a cycle old",
+        note="torque comes later than the host waits, 0.7 ms, and is a cycle old; "
+        "in lockstep the devices have no time but SYNC",
     ),
     Case(
         "SYNC is late by 0.6 periods",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiment_runs import BIN, Played, demo, emulator, run_on_vcan
+from experiment_runs import BIN, Played, candump, demo, emulator, frames_of, run_on_vcan
 from mcap.reader import make_reader
 
 from adacd_hil.config import load_settings
@@ -21,7 +21,6 @@ pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 SEED = "7"
 UP_TO_THE_PAYLOAD = '[operator]\nscript = [{ at_s = 22.0, request = "finish" }]\n'
 """One adaptation and four contacts: what comes after takes as long again and is the same code."""
-MARK = "1ADACD0"  # how lockstep keeps time: 29-bit identifiers, none of CANopen
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +31,7 @@ def lockstep(tmp_path_factory: pytest.TempPathFactory) -> Played:
     dump = folder / "candump.log"
     with contextlib.ExitStack() as stack:
         if shutil.which("candump"):
-            command = ["candump", "-L", "-r", "16777216", "vcan0"]  # room for what it can't write down at once
-            listener = subprocess.Popen(command, stdout=stack.enter_context(dump.open("w")))
-            stack.callback(listener.wait, 10)
-            stack.callback(listener.terminate)
+            stack.enter_context(candump(dump))
         stack.enter_context(emulator(folder, "--seed", SEED))
         return run_on_vcan(folder, "--clock", "lockstep", "--config", str(folder / "settings.toml"))
 
@@ -109,11 +105,6 @@ def contents(path: Path) -> dict[str, bytes]:
         summary = make_reader(file).get_summary()
     assert summary is not None
     return {channel.topic: topic_bytes(path, channel.topic) for channel in summary.channels.values()}
-
-
-def frames_of(dump: Path) -> str:
-    """Return what candump saw of CANopen."""
-    return "".join(line for line in dump.read_text().splitlines(keepends=True) if MARK not in line)
 
 
 def longest_stall_cycles(path: Path) -> int:

@@ -194,6 +194,28 @@ def test_a_drive_that_fails_faults_with_its_code_and_says_so():
     assert drive.torque_Nm == 0.0
 
 
+def test_a_drive_says_by_its_own_clock_when_it_failed():
+    host = enabled_host()
+    start_ns = host.bench.now_ns
+    host.bench.devices[0].clock.set_drift(500_000.0, start_ns)
+    pass_ms(host, 100)
+    host.take()
+    host.bench.drives[0].fail(ERROR, host.bench.now_ns)
+    own_ms = (start_ns + 1.5 * (host.bench.now_ns - start_ns)) // MS
+    assert struct.unpack("<HBBI", host.taken(0x081)[0])[3] == own_ms
+
+
+def test_a_drive_says_by_its_own_clock_when_it_lost_its_commands_with_sync():
+    host = enabled_host()
+    host.write(1, 0x2200, 0, 10)
+    start_ns = host.bench.now_ns
+    host.bench.devices[0].clock.set_drift(500_000.0, start_ns)
+    host.cycle += 20
+    host.sync()
+    code, _, _, time_ms = struct.unpack("<HBBI", host.taken(0x081)[0])
+    assert (code, time_ms) == (0x8250, (start_ns + 1.5 * 10 * PERIOD_NS) // MS)
+
+
 def test_fault_reset_is_refused_until_the_failure_is_mended():
     host = enabled_host()
     drive = host.bench.drives[0]
