@@ -10,6 +10,7 @@ import math
 import tomllib
 import types
 import typing
+from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -53,21 +54,70 @@ def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Sec
     hints = typing.get_type_hints(section)
     for key in table:
         if key not in fields:
-            nearest = difflib.get_close_matches(key, fields, n=1, cutoff=0.4)
-            hint = f"; did you mean `{where}{nearest[0]}`?" if nearest else f"; known: {', '.join(fields)}"
-            raise ConfigError(f"unknown key `{where}{key}`{hint}")
+            raise ConfigError(_unknown(key, fields, where))
     values = {}
     for name, field in fields.items():
         if name in table:
             values[name] = _parse_value(hints[name], table[name], f"{where}{name}", field.metadata)
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+        elif _is_required(field):
             raise ConfigError(f"missing key `{where}{name}`")
+    place = where.rstrip(".")
     try:
         return section(**values)
-    except ConfigError:
-        raise
+    except ConfigError as error:
+        if place in str(error):
+            raise
+        raise ConfigError(f"`{place}`: {error}") from error
     except ValueError as error:
-        raise ConfigError(f"{where.rstrip('.')}: {error}") from error
+        raise ConfigError(f"{place}: {error}") from error
+
+
+def find_problems(section: type[Any], table: dict[str, Any], where: str = "") -> list[str]:
+    """List everything for which `parse` would refuse a table, a line each.
+
+    What concerns several keys of a section is looked at only where each of them is right, and then the first of it.
+    """
+    fields = {field.name: field for field in dataclasses.fields(section)}
+    hints = typing.get_type_hints(section)
+    problems = [_unknown(key, fields, where) for key in table if key not in fields]
+    for name, field in fields.items():
+        if name in table:
+            problems += _value_problems(hints[name], table[name], f"{where}{name}", field.metadata)
+        elif _is_required(field):
+            problems.append(f"missing key `{where}{name}`")
+    if not problems:
+        try:
+            parse(section, table, where)
+        except ConfigError as error:
+            problems.append(str(error))
+    return problems
+
+
+def _value_problems(hint: Any, value: Any, key: str, metadata: Any) -> list[str]:
+    options = [option for option in typing.get_args(hint) if option is not type(None)]
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return _value_problems(options[0], value, key, metadata)
+    if dataclasses.is_dataclass(hint) and isinstance(value, dict):
+        return find_problems(typing.cast(type[Any], hint), value, f"{key}.")
+    if typing.get_origin(hint) is tuple and dataclasses.is_dataclass(options[0]) and isinstance(value, list):
+        rows = enumerate(value)
+        return [text for index, row in rows for text in _value_problems(options[0], row, f"{key}[{index}]", metadata)]
+    try:
+        _parse_value(hint, value, key, metadata)
+    except ConfigError as error:
+        return [str(error)]
+    return []
+
+
+def _unknown(key: str, known: Iterable[str], where: str) -> str:
+    known = list(known)
+    nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
+    hint = f"; did you mean `{where}{nearest[0]}`?" if nearest else f"; known: {', '.join(known)}"
+    return f"unknown key `{where}{key}`{hint}"
+
+
+def _is_required(field: "dataclasses.Field[Any]") -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
 def _parse_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
@@ -522,6 +572,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"configuration {path}: {error}") from None
 
 
+_MOST_NAMES = 12
+"""More built-in names than this make no line that anybody reads."""
+
+
 def toml_names(folder: Traversable) -> list[str]:
     """Name the TOML files of a package's folder, without their ending."""
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
@@ -535,7 +589,8 @@ def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
     path = Path(name_or_file)
     if not path.suffix and not path.exists():
         nearest = difflib.get_close_matches(name_or_file, names, n=1)
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; built in: {', '.join(names)}"
+        some = ", ".join(names) if len(names) <= _MOST_NAMES else f"{len(names)}, such as {', '.join(names[:3])}"
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; built in: {some}"
         raise ConfigError(f"{kind} {name_or_file!r} is neither built in nor a file{hint}")
     return path
 
@@ -582,32 +637,61 @@ def to_toml(settings: Any) -> str:
     return "\n".join(lines).strip() + "\n"
 
 
-def _write_section(section: Any, prefix: str, lines: list[str]) -> None:
+def to_short_toml(settings: Any) -> str:
+    """Write what differs from the defaults, a row per line, as TOML that `parse` reads back to the same value."""
+    lines: list[str] = []
+    _write_section(settings, "", lines, is_short=True)
+    return "\n".join(lines).strip() + "\n"
+
+
+def is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
+    """Tell whether a setting has the value that it has when it is absent."""
+    if field.default_factory is not dataclasses.MISSING:
+        return bool(value == field.default_factory())
+    return field.default is not dataclasses.MISSING and bool(value == field.default)
+
+
+def _write_section(section: Any, prefix: str, lines: list[str], is_short: bool = False) -> None:
     nested = []
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
+        if is_short and is_default(field, value):
+            continue
         if dataclasses.is_dataclass(value):
             nested.append((field.name, value))
         elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
-            inner = ", ".join("{" + _inline(item) + "}" for item in value)
-            lines.append(f"{field.name} = [{inner}]")
+            rows = ["{" + _inline(item, is_short) + "}" for item in value]
+            if is_short:
+                lines.extend((f"{field.name} = [", *(f"    {row}," for row in rows), "]"))
+            else:
+                lines.append(f"{field.name} = [{', '.join(rows)}]")
         elif value is not None:
             lines.append(f"{field.name} = {_toml_value(value)}")
     for name, value in nested:
         lines.extend(("", f"[{prefix}{name}]"))
-        _write_section(value, f"{prefix}{name}.", lines)
+        _write_section(value, f"{prefix}{name}.", lines, is_short)
 
 
-def _inline(section: Any) -> str:
-    values = ((field.name, getattr(section, field.name)) for field in dataclasses.fields(section))
-    return ", ".join(f"{name} = {_toml_value(value)}" for name, value in values if value is not None)
+def _inline(section: Any, is_short: bool) -> str:
+    values = [
+        (field.name, value)
+        for field in dataclasses.fields(section)
+        if (value := getattr(section, field.name)) is not None and not (is_short and is_default(field, value))
+    ]
+    return ", ".join(f"{name} = {_toml_value(value)}" for name, value in values)
+
+
+_TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
+    ord('"'): '\\"',
+    ord("\\"): "\\\\",
+}
 
 
 def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+        return '"' + value.translate(_TOML_ESCAPES) + '"'
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml_value(item) for item in value) + "]"
     return repr(value)

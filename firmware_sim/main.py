@@ -25,7 +25,8 @@ from firmware_sim.bench import Bench, ClockMode
 from firmware_sim.contracts import CONTRACTS, is_fd
 from firmware_sim.injector import OnEvent
 from firmware_sim.pdo_record import LAST_NODE, LISTENED_IDS
-from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
+from firmware_sim.scenario import Scenario, load_scenario
+from firmware_sim.scenario_list import as_text, check, describe_all, show, show_as_table
 from firmware_sim.time_marks import HOST_MARK
 from firmware_sim.truth import TRUTH_NAME, TruthLog
 
@@ -204,7 +205,7 @@ def cli() -> None:
     default="paper",
     show_default=True,
     metavar="NAME|FILE",
-    help=f"One of {', '.join(builtin_scenarios())}, or a TOML file.",
+    help="One that `firmware-sim list` names, or a TOML file.",
 )
 @click.option("--profile", type=click.Choice(list(ARMS)), help="Arm; default: the scenario's.")
 @click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
@@ -256,6 +257,51 @@ def run(
         print("ready", file=sys.stderr, flush=True)
         service.run()
         return _report(bench, resolved, clock_mode, truth, as_json)
+
+
+@cli.command("list", epilog=EPILOG)
+@click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
+def list_scenarios(as_json: bool) -> int:
+    """List the scenarios that come with the package: name, group, what happens."""
+    described = describe_all()
+    if as_json:
+        print(json.dumps(described, indent=2, ensure_ascii=False))
+    else:
+        print(as_text([("name", "group", "about"), *((row["name"], row["group"], row["about"]) for row in described)]))
+    return ExitCode.OK
+
+
+@cli.command("show", epilog=EPILOG)
+@click.argument("scenario", metavar="NAME|FILE")
+@click.option("--all", "is_whole", is_flag=True, help="Everything, defaults included.")
+@click.option("--profile", type=click.Choice(list(ARMS)), help="Arm; default: the scenario's.")
+@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON in place of TOML.")
+def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int | None, as_json: bool) -> int:
+    """Print a scenario, resolved, as TOML that loads to the same: what differs from the defaults."""
+    resolved = load_scenario(scenario, profile, seed)
+    if as_json:
+        print(json.dumps(show_as_table(resolved, is_whole), indent=2, ensure_ascii=False))
+    else:
+        print(show(resolved, is_whole), end="")
+    return ExitCode.OK
+
+
+@cli.command("check", epilog="Exit status: 0 every file can be played; 2 one can't.")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option(
+    "--contract", type=click.Choice(list(CONTRACTS)), default="arm", show_default=True, help="Whose frames faults hit."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print what was found as JSON.")
+def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
+    """Check scenario files, a line per problem: file, key, value, bound and unit, nearest name."""
+    codec = load_codec(CONTRACTS[contract].path)
+    findings = [check(file, codec) for file in files]
+    if as_json:
+        print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
+    else:
+        print("\n".join(line for finding in findings for line in finding.lines))
+    return ExitCode.USAGE if any(finding.problems for finding in findings) else ExitCode.OK
 
 
 def _stamp_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> Callable[[int, int, Vector], None]:

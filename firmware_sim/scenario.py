@@ -1,7 +1,8 @@
 """A scenario: which arm, where it starts, who touches it when, when the payload changes, and what goes wrong.
 
 Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
-package are in the folder `scenarios`.
+package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults` and `expect` are for those who
+play a scenario and change nothing on the arm.
 """
 
 import math
@@ -9,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from adacd_hil.records import Vector
 from firmware_sim.arms import ARMS, Arm
 from firmware_sim.contact import ContactSettings, ticks
 from firmware_sim.drive_settings import DriveSettings
+from firmware_sim.expectation import ExpectSettings
 from firmware_sim.faults import FaultSettings, check_rows
 from firmware_sim.mechanics_settings import MechanicsSettings, PayloadBody
 from firmware_sim.sensor_settings import SensorSettings
@@ -45,6 +48,18 @@ class Scenario:
     """Everything that the emulated arm and the person beside it do, resolved."""
 
     name: str = setting("", meaning="name of the scenario")
+    about: str = setting("", meaning="what happens, in one line")
+    group: str = setting("", meaning="which scenarios it belongs to")
+    lasts_s: float = setting(
+        51.0,
+        unit="s",
+        low=0.1,
+        high=1e6,
+        meaning="how long a run of it is meant to take, since the drives were enabled",
+    )
+    acknowledge_faults: int = setting(
+        0, low=0, high=1000, meaning="how many faults the person acknowledges, each 1 s after it"
+    )
     profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
     seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the sensor noise")
     noise: bool = setting(True, meaning="noise of torque sensors and encoders; quantisation stays")
@@ -65,8 +80,11 @@ class Scenario:
     faults: tuple[FaultSettings, ...] = setting((), meaning="what goes wrong, each row by its own time")
 
     mechanics: MechanicsSettings = setting(MechanicsSettings, meaning="the arm beyond rigid links")
+    expect: ExpectSettings | None = setting(None, meaning="what a healthy host of configuration `paper` makes of it")
 
     def __post_init__(self) -> None:
+        if len(self.about.splitlines()) > 1:
+            raise ConfigError(f"`about` has {len(self.about.splitlines())} lines, 1 expected")
         self.mechanics.check(self.arm, self.start_deg, self.payload_bodies)
         self._check_points("contacts", self.contacts)
         self._check_points("hands", self.hands)
@@ -134,9 +152,7 @@ def _builtin_folder() -> Traversable:
 
 def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
     """Read a scenario: a built-in name or a TOML file. `profile` and `seed` outweigh the file's. Raises ConfigError."""
-    path = find_toml("scenario", name_or_file, _builtin_folder())
-    table = read_toml(path)
-    table.setdefault("name", path.stem)
+    table = read_table(name_or_file)
     if profile is not None:
         table["profile"] = profile
     if seed is not None:
@@ -145,3 +161,17 @@ def load_scenario(name_or_file: str, profile: str | None = None, seed: int | Non
         return parse(Scenario, table)
     except ConfigError as error:
         raise ConfigError(f"scenario {name_or_file}: {error}") from None
+
+
+def read_table(name_or_file: str) -> dict[str, Any]:
+    """Read a scenario's TOML, unchecked but for its syntax. Raises ConfigError."""
+    path = find_toml("scenario", name_or_file, _builtin_folder())
+    table = read_toml(path)
+    table.setdefault("name", path.stem)
+    return table
+
+
+def named_profile(name_or_file: str) -> str | None:
+    """Give the profile that a scenario's file names, unchecked; None where it leaves that open. Raises ConfigError."""
+    profile = read_table(name_or_file).get("profile")
+    return None if profile is None else str(profile)

@@ -319,7 +319,7 @@ def split_sections(run: Run) -> tuple[Section, ...]:
         if not kind:
             continue
         end_s = float(time_s[-1] if end is None else time_s[end])
-        is_complete = end is not None and kinds[end] != "fault"
+        is_complete = end is not None and kinds[end] not in ("", "fault")  # "": begun again after a bus that failed
         sections.append(Section(section_label(len(sections)), kind, float(time_s[start]), end_s, is_complete))
     return tuple(sections)
 

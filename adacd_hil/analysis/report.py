@@ -32,7 +32,8 @@ SCHEMA: Final = 1
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
 
-_RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact")
+RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact")
+"""Of a run's log, what a report reads."""
 _PNG_FIGURES: Final = ("fig5", "fig6", "fig7")
 _DIGITS: Final = 6
 
@@ -72,7 +73,7 @@ def write_report(log_path: Path, truth_path: Path | None, out_dir: Path) -> Repo
 
     Raises LogError when a log can't be read or the report can't be written.
     """
-    log = read_log(log_path, _RUN_TOPICS)
+    log = read_log(log_path, RUN_TOPICS)
     truth_log = None if truth_path is None else read_log(truth_path, ("/truth",))
     logs = [log] if truth_log is None else [log, truth_log]
     return write_run_report(

@@ -1,6 +1,9 @@
-"""The paper's experiment in one process: host and emulated arm on the embedded bus, then the report."""
+"""A scenario in one process: host and emulated arm on the embedded bus, then the report."""
 
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from adacd_hil.analysis.report import Report, write_report
 from adacd_hil.cli.connection import check_shared, contract_of, make_clock, model_time, on_interrupt
@@ -8,29 +11,56 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.report import TRUTH_NAME
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import load_settings
+from adacd_hil.config import RequestSettings, Settings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.session import Session
+from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
+from firmware_sim.scenario import Scenario, load_scenario, named_profile
 from firmware_sim.truth import TruthLog
 
 SCENARIO = "paper"
+"""Whose requests to the host the configuration has in its script; the user of another one only asks to finish."""
 
 
-def play(config: str, profile: str | None, seed: int | None, clock_name: str, out: Path) -> tuple[Report, ExitCode]:
-    """Play the experiment and report it. Raises ConfigError, CodecError, LogError, CommandError."""
-    settings = load_settings(config, profile)
+class Cast(NamedTuple):
+    """Host and emulated arm of a run, resolved."""
+
+    settings: Settings
+    scenario: Scenario
+
+
+def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None) -> Cast:
+    """Read configuration and scenario. Raises ConfigError.
+
+    The profile is the given one, else that of the scenario's file, else the configuration's.
+    """
+    settings = load_settings(config, profile or named_profile(scenario_name))
+    scenario = load_scenario(scenario_name, settings.arm.profile, seed)
+    if scenario_name == SCENARIO:
+        return Cast(settings, scenario)
+    operator = dataclasses.replace(
+        settings.operator,
+        script=(RequestSettings(at_s=scenario.lasts_s, request="finish"),),
+        acknowledge_faults=scenario.acknowledge_faults,
+    )
+    return Cast(dataclasses.replace(settings, operator=operator), scenario)
+
+
+def run_embedded(
+    cast: Cast, clock_name: str, out: Path, progress: Callable[[str], None] = lambda _: None
+) -> tuple[SessionSummary, Path]:
+    """Run host and arm in this process, logs in `out`; return how it ended and where the truth is.
+
+    Raises ConfigError, CodecError, LogError.
+    """
+    settings, scenario = cast
     check_shared("lockstep", settings)  # an arm in this process has no neighbour
-    scenario = load_scenario(SCENARIO, settings.arm.profile, seed)
     codec = contract_of(settings, out)
     clock = make_clock(clock_name)
     embedded = EmbeddedBus(clock)
     bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
     out.mkdir(parents=True, exist_ok=True)
-    progress = Progress()
-    progress(f"experiment of configuration {settings.name}, profile {settings.arm.profile}, in {out}")
     with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", scenario=scenario) as truth:
         bench = Bench(scenario, codec, embedded.deliver, on_truth=truth.write, on_event=truth.event)
         embedded.attach(bench.on_frame)
@@ -43,17 +73,30 @@ def play(config: str, profile: str | None, seed: int | None, clock_name: str, ou
             ScriptedOperator(settings.operator),
             out,
             "embedded",
-            metadata={"scenario": SCENARIO, "seed": str(scenario.seed)},
+            metadata={"scenario": scenario.name, "seed": str(scenario.seed)},
             progress=progress,
         )
         with on_interrupt(session.interrupt):
             summary = session.run()
+    return summary, truth.path
+
+
+def play(
+    config: str, scenario_name: str, profile: str | None, seed: int | None, clock_name: str, out: Path
+) -> tuple[Report, ExitCode]:
+    """Play a scenario and report it. Raises ConfigError, CodecError, LogError, CommandError."""
+    cast = resolve(config, scenario_name, profile, seed)
+    settings, scenario = cast
+    progress = Progress()
+    what = "experiment" if scenario_name == SCENARIO else f"scenario {scenario.name}"
+    progress(f"{what} of configuration {settings.name}, profile {settings.arm.profile}, in {out}")
+    summary, truth_path = run_embedded(cast, clock_name, out, progress)
     if summary.result is not None:
         played_s = summary.result.cycles * settings.bus.period_s
         pace = played_s / summary.elapsed_s
         progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
     progress("drawing the report")
-    report = write_report(summary.log.path, truth.path, out)
+    report = write_report(summary.log.path, truth_path, out)
     progress(f"report: {out / 'report.html'}")
     progress.close()
     if summary.error:

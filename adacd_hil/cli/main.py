@@ -112,17 +112,30 @@ def cli() -> None:
 
 @cli.command(epilog=EPILOG)
 @_config
+@click.option(
+    "--scenario",
+    default="paper",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="What happens: one that `firmware-sim list` names, or a TOML file.",
+)
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/demo"), show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
 @_clock(default="lockstep")
 @_profile
 @_json
 @_explained
-def demo(config: str, out: Path, seed: int | None, clock: str, profile: str | None, as_json: bool) -> ExitCode:
-    """Play the paper's experiment with an emulated arm in this process, and report it."""
+def demo(
+    config: str, scenario: str, out: Path, seed: int | None, clock: str, profile: str | None, as_json: bool
+) -> ExitCode:
+    """Play the paper's experiment, or another scenario, with an emulated arm in this process, and report it.
+
+    The configuration's script plays the user of the paper's experiment. In any other scenario the user acknowledges
+    stops as the configuration says, and asks to finish at the scenario's `lasts_s`.
+    """
     from adacd_hil.cli.demo import play
 
-    report, code = play(config, profile, seed, clock, out)
+    report, code = play(config, scenario, profile, seed, clock, out)
     print(json.dumps(report.as_json(), indent=2) if as_json else report.as_text())
     return code
 

@@ -699,3 +699,8 @@ def test_the_hand_made_run_differs_from_its_cad_model():
 
 def test_the_hand_made_run_has_the_papers_order():
     assert [state for state, _ in PAPER_LIKE] == [SchemeState.ENABLE, A, M, P, A, M]
+
+
+def test_an_adaptation_that_begins_again_after_a_bus_failed_has_not_come_to_its_end():
+    run = make_run((SchemeState.ADAPT, 500), (SchemeState.INIT, 10), (SchemeState.ADAPT, 700), (SchemeState.MONITOR, 9))
+    assert evaluate(run).adaptation_s == {"A": None, "B": pytest.approx(0.7)}

@@ -16,7 +16,7 @@ OVERLAPPING = "{ at_s = 1.05, link = 1, point_m = 0.2, force_N = 10.0, duration_
 
 
 def test_paper_and_idle_come_with_the_package():
-    assert builtin_scenarios() == ["idle", "paper"]
+    assert {"idle", "paper"} <= set(builtin_scenarios())
 
 
 def test_nobody_touches_the_idle_arm():
@@ -69,6 +69,8 @@ def test_every_contact_of_the_paper_scenario_is_well_above_the_threshold(index):
         ("profile = 'X'", "`profile` = 'X' must be one of P, S, M"),
         ("seed = -1", "`seed` = -1 is below 0"),
         ("noise = 1", "`noise` = 1 must be of type bool"),
+        ('about = "one\\ntwo"', "`about` has 2 lines, 1 expected"),
+        ("lasts_s = 0.0", "`lasts_s` = 0.0 s is below 0.1 s"),
         ("start_deg = [0.0]", "`start_deg` has 1 values, 2 expected"),
         ("payload_kg = 21.0", "`payload_kg` = 21.0 kg is above 20 kg"),
         ("contacts = [{ at_s = 1.0 }]", "missing key `contacts[0].link`"),
@@ -106,9 +108,9 @@ def test_a_misspelt_scenario_is_answered_with_the_nearest_name():
         load_scenario("papr")
 
 
-def test_a_scenario_without_a_near_name_is_answered_with_all_names():
-    with pytest.raises(ConfigError, match="built in: idle, paper"):
-        load_scenario("zzz")
+def test_a_scenario_without_a_near_name_is_answered_with_some_names():
+    with pytest.raises(ConfigError, match="built in: "):
+        load_scenario("zzzzz")
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -1,0 +1,84 @@
+"""Expectations of a scenario: what is refused, and which runs differ from what is expected."""
+
+import pytest
+
+from adacd_hil.config import ConfigError, parse
+from firmware_sim.expectation import ExpectSettings, Outcome, deviations
+from firmware_sim.scenario import Scenario
+
+EXPECTED = ExpectSettings(
+    adaptations=1, contacts=2, false_alarms=1, false_alarms_most=3, adaptation_s=(5.0, 6.0), delay_ms=30.0, force_N=80.0
+)
+AS_EXPECTED = Outcome("finished", None, None, 1, 5.2, 2, 2, 0, 12.0, 60.0)
+
+
+def test_a_run_as_expected_has_no_deviation():
+    assert deviations(EXPECTED, AS_EXPECTED) == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"end": "lost"}, "end: lost, expected finished"),
+        ({"fault": "DRIVE"}, "fault: DRIVE, expected none"),
+        ({"adaptations": 0}, "adaptations: none, expected 1"),
+        ({"contacts": 1}, "contacts: 1, expected 2"),
+        ({"contacts": 3}, "contacts: 3, expected 2"),
+        ({"missed": 1}, "missed: 1, expected 0"),
+        ({"false_alarms": 0}, "false_alarms: 0, expected 1 to 3"),
+        ({"false_alarms": 4}, "false_alarms: 4, expected 1 to 3"),
+        ({"adaptation_s": 4.99}, "adaptation_s: 4.99 s, expected 5 to 6 s"),
+        ({"adaptation_s": 6.01}, "adaptation_s: 6.01 s, expected 5 to 6 s"),
+        ({"adaptation_s": None}, "adaptation_s: none s, expected 5 to 6 s"),
+        ({"delay_ms": 30.1}, "delay_ms: 30.1 ms, expected at most 30 ms"),
+        ({"force_N": 80.1}, "force_N: 80.1 N, expected at most 80 N"),
+    ],
+)
+def test_each_difference_is_told_with_what_was_expected(changes, text):
+    assert deviations(EXPECTED, AS_EXPECTED._replace(**changes)) == (text,)
+
+
+@pytest.mark.parametrize("changes", [{"false_alarms": 1}, {"false_alarms": 3}, {"delay_ms": 30.0}, {"delay_ms": None}])
+def test_bounds_are_inclusive_and_a_delay_needs_a_contact(changes):
+    assert deviations(EXPECTED, AS_EXPECTED._replace(**changes)) == ()
+
+
+def test_a_fault_is_expected_with_its_time():
+    expected = ExpectSettings(adaptations=0, contacts=0, end="fault", fault="DRIVE", fault_s=(1.0, 1.2))
+    faulted = Outcome("fault", "DRIVE", 1.1, 0, None, 0, 0, 0, None, 0.0)
+    assert deviations(expected, faulted) == ()
+    assert deviations(expected, faulted._replace(fault_s=1.3)) == ("fault_s: 1.3 s, expected 1 to 1.2 s",)
+
+
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [
+        ({}, "missing key `expect.adaptations`"),
+        ({"adaptations": 1}, "missing key `expect.contacts`"),
+        ({"adaptations": 1, "contacts": -1}, "`expect.contacts` = -1 is below 0"),
+        ({"adaptations": 1, "contacts": 1, "contact": 1}, "unknown key `expect.contact`; did you mean"),
+        (
+            {"adaptations": 1, "contacts": 2, "contacts_most": 1},
+            "`expect.contacts_most` = 1 is below `expect.contacts`",
+        ),
+        ({"adaptations": 1, "contacts": 0, "fault": "DRIV"}, "did you mean 'DRIVE'"),
+        ({"adaptations": 1, "contacts": 0, "fault": "NONE"}, "`expect.fault` = 'NONE' must be one of DATA_AGE"),
+        ({"adaptations": 1, "contacts": 0, "end": "fault"}, "`expect.end` = 'fault' lacks the key `expect.fault`"),
+        ({"adaptations": 1, "contacts": 0, "fault_s": [1.0, 2.0]}, "`expect.fault_s` lacks the key `expect.fault`"),
+        ({"adaptations": 1, "contacts": 0, "adaptation_s": [6.0, 5.0]}, "`expect.adaptation_s[1]` = 5 s is below"),
+    ],
+)
+def test_an_expectation_that_cannot_be_is_refused_with_its_key(table, text):
+    with pytest.raises(ConfigError) as refusal:
+        parse(Scenario, {"expect": table})
+    assert text in str(refusal.value)
+
+
+def test_what_is_expected_fits_in_a_few_words():
+    assert EXPECTED.text == "1 adapted, 2 detected, 1-3 false"
+    fault = ExpectSettings(adaptations=0, contacts=0, missed=1, end="lost", fault="HEARTBEAT")
+    assert fault.text == "0 adapted, 0 detected, 1 missed, HEARTBEAT, lost"
+
+
+def test_a_run_is_told_in_the_words_of_an_expectation():
+    assert AS_EXPECTED.text == "1 adapted, 2 detected, 2 false"

@@ -1,0 +1,170 @@
+"""`firmware-sim list`, `show` and `check`: what they print, and what is wrong with a file."""
+
+import json
+
+import pytest
+
+from firmware_sim.main import main
+from firmware_sim.scenario import builtin_scenarios, load_scenario
+
+GOOD_CONTACT = "{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
+
+
+def run_main(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    return int(ended.value.code)
+
+
+def test_list_has_a_line_for_each_scenario(capsys):
+    assert run_main("list") == 0
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.split() == ["name", "group", "about"]
+    assert sorted(line.split()[0] for line in lines) == builtin_scenarios()
+
+
+def test_list_as_json_says_what_happens_and_what_is_expected(capsys):
+    assert run_main("list", "--json") == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    paper = load_scenario("paper")
+    assert rows["paper"] == {
+        "name": "paper",
+        "group": paper.group,
+        "about": paper.about,
+        "lasts_s": 51.0,
+        "expect": "2 adapted, 8 detected",
+    }
+
+
+def test_show_leaves_out_what_is_as_by_default(capsys):
+    assert run_main("show", "idle") == 0
+    shown = capsys.readouterr().out
+    assert "start_deg = [-30.0, -60.0]" in shown
+    assert "payload_kg" not in shown
+    assert "mechanics" not in shown
+
+
+def test_show_all_says_everything_that_has_a_value(capsys):
+    assert run_main("show", "idle", "--all") == 0
+    shown = capsys.readouterr().out
+    assert "payload_kg = 0.0" in shown
+    assert "torque_noise_Nm = [0.02, 0.02]" in shown
+
+
+def test_show_takes_profile_and_seed(capsys):
+    assert run_main("show", "idle", "--profile", "M", "--seed", "77", "--json") == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["profile"], shown["seed"]) == ("M", 77)
+
+
+@pytest.mark.parametrize("option", [(), ("--all",)])
+def test_what_show_prints_loads_to_the_same_scenario(capsys, tmp_path, option):
+    assert run_main("show", "paper", *option) == 0
+    path = tmp_path / "mine.toml"
+    path.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert load_scenario(str(path)) == load_scenario("paper")
+    assert run_main("check", str(path)) == 0
+
+
+def test_a_name_that_is_none_is_answered_with_the_nearest(capsys):
+    assert run_main("show", "papr") == 2
+    assert "did you mean 'paper'" in capsys.readouterr().err
+
+
+BAD_FILES = {
+    "not TOML": ("name = ", ["Invalid value"]),
+    "unknown key": ("payload_Kg = 1.0", ["unknown key `payload_Kg`; did you mean `payload_kg`?"]),
+    "wrong type": ("payload_kg = 'heavy'", ["`payload_kg` = 'heavy' must be of type float"]),
+    "out of bounds": ("payload_kg = -1.0", ["`payload_kg` = -1.0 kg is below 0 kg"]),
+    "not finite": ("lasts_s = inf", ["`lasts_s` = inf is not finite"]),
+    "a row that lacks a key": (
+        f"contacts = [{GOOD_CONTACT.replace('link = 2, ', '')}]",
+        ["missing key `contacts[0].link`"],
+    ),
+    "the second of two rows": (
+        f"contacts = [{GOOD_CONTACT}, {GOOD_CONTACT.replace('link = 2', 'link = 3')}]",
+        ["`contacts[1].link` = 3 is above 2"],
+    ),
+    "a section that is no table": ("mechanics = 3", ["`mechanics` = 3 must be a table"]),
+    "a choice": ("[mechanics]\nencoder_side = 'lnk'", ["`mechanics.encoder_side` = 'lnk' must be one of motor, link"]),
+    "a region": (
+        "[[bodies]]\nat_s = 1.0\nlink = 2\nx_m = 0.5\ny_m = 0.4\nregion = 'hand_fingers'",
+        ["`bodies[0].region` = 'hand_fingers' must be one of", "did you mean 'hand_finger'?"],
+    ),
+    "two keys of a row": (
+        "[[bodies]]\nat_s = 1.0\nlink = 2\nx_m = 0.5\ny_m = 0.4\nregion = 'chest'\nclamped = true\ngap_m = 0.1",
+        ["`bodies[0]`: gap_m = 0.1 m: a clamped body has no gap"],
+    ),
+    "a fault's key": (
+        "[[faults]]\nkind = 'lose'\nat_s = 1.0\nframe = 'torque'\nnode = 'sensor1'\ndelay_us = 3.0",
+        ["faults[0]: kind 'lose' has no key `delay_us`"],
+    ),
+    "a start pose inside a wall": (
+        "[[walls]]\nx_m = 0.0\ny_m = 0.0\nnormal_deg = 180.0",
+        ["`walls[0]`: at at_s = 0 s the arm in its start pose (0.0, 0.0) deg is 0.65 m inside it"],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_FILES)
+def test_check_names_file_key_value_and_bound(capsys, tmp_path, kind):
+    text, words = BAD_FILES[kind]
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    assert run_main("check", str(path)) == 2
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"{path}: ")
+    assert [word for word in words if word not in line] == []
+
+
+def test_check_has_a_line_for_each_problem_of_each_file(capsys, tmp_path):
+    first, second = tmp_path / "first.toml", tmp_path / "second.toml"
+    first.write_text("seed = -1\npayload_kg = 21.0\nnoize = false\n[sensors]\ntorque_bits = [3, 16]\n")
+    second.write_text("profile = 'X'\n")
+    assert run_main("check", str(first), "idle", str(second)) == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(": ")[0] for line in lines] == [str(first)] * 4 + ["idle", str(second)]
+    assert [line.split("`")[1] for line in lines if "`" in line] == [
+        "noize",
+        "seed",
+        "payload_kg",
+        "sensors.torque_bits[0]",
+        "profile",
+    ]
+
+
+def test_check_says_what_it_has_looked_at(capsys, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(f"contacts = [{GOOD_CONTACT}]\n[[faults]]\nkind = 'reboot'\nnode = 'drive1'\nat_s = 1.0\n")
+    assert run_main("check", str(path)) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"{path}: good: ")
+    for what in ("1 of [[contacts]]", "1 of [[faults]]", "against arm P", "against contract arm"):
+        assert what in line
+
+
+def test_check_knows_the_contract(capsys, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[[faults]]\nkind = 'freeze_counter'\nframe = 'torque'\nnode = 'sensor1'\nat_s = 1.0\n")
+    assert run_main("check", str(path), "--contract", "arm") == 0
+    assert run_main("check", str(path), "--contract", "arm_stock") == 2
+    assert "faults[0]: Sensor1Torque has no counter" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_check_as_json_has_the_problems_of_each_file(capsys, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("seed = -1\n")
+    assert run_main("check", str(path), "idle", "--json") == 2
+    bad, good = json.loads(capsys.readouterr().out)
+    assert (bad["file"], bad["problems"]) == (str(path), ["`seed` = -1 is below 0"])
+    assert (good["file"], good["problems"]) == ("idle", [])
+
+
+def test_a_missing_file_is_a_problem_of_its_own(capsys):
+    assert run_main("check", "nowhere.toml") == 2
+    assert capsys.readouterr().out == "nowhere.toml: does not exist\n"
+
+
+def test_check_needs_a_file(capsys):
+    assert run_main("check") == 2
+    assert "FILE" in capsys.readouterr().err

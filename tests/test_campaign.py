@@ -1,0 +1,66 @@
+"""tools/campaign.py: what is chosen, and what a run that deviates or can't be played comes to."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CAMPAIGN = Path(__file__).parent.parent / "tools" / "campaign.py"
+SHORT = """
+about = "Too short to adapt."
+group = "short"
+lasts_s = 0.3
+start_deg = [-30.0, -60.0]
+
+[expect]
+adaptations = {adaptations}
+contacts = 0
+"""
+
+
+def campaign(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run([sys.executable, CAMPAIGN, *arguments], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_a_run_that_deviates_is_told_and_is_the_exit_status(tmp_path: Path) -> None:
+    good, bad = tmp_path / "good.toml", tmp_path / "bad.toml"
+    good.write_text(SHORT.format(adaptations=0))
+    bad.write_text(SHORT.format(adaptations=1))
+    done = campaign(str(good), str(bad), "--json", "--keep", str(tmp_path / "logs"))
+    assert done.returncode == 1
+    rows = {row["name"]: row for row in json.loads(done.stdout)}
+    assert (rows["good"]["is_good"], rows["good"]["deviations"]) == (True, [])
+    assert (rows["bad"]["is_good"], rows["bad"]["deviations"]) == (False, ["adaptations: none, expected 1"])
+    assert rows["bad"]["outcome"]["end"] == "finished"
+    assert (tmp_path / "logs" / "bad" / "run.mcap").is_file()
+    assert "2/2" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_pattern_chooses_by_name_or_group(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
+    one.write_text(SHORT.format(adaptations=0))
+    two.write_text(SHORT.format(adaptations=0).replace('"short"', '"other"'))
+    done = campaign(str(one), str(two), "--only", "sho*")
+    assert done.returncode == 0
+    assert [line.split()[0] for line in done.stdout.splitlines() if "pass" in line] == ["one"]
+    assert done.stdout.splitlines()[-1] == "1 of 1 as expected"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--only", "nothing-fits"), "no scenario fits"),
+        (("papr",), "did you mean 'paper'"),
+        (("-j", "0"), "no process"),
+    ],
+)
+def test_wrong_usage_is_a_line_and_exit_status_2(arguments: tuple[str, ...], words: str) -> None:
+    done = campaign(*arguments)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert words in done.stderr

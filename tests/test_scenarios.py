@@ -1,0 +1,134 @@
+"""The scenarios that come with the package: each says what it is about and expects, and some are played."""
+
+from pathlib import Path
+
+import pytest
+
+from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.cli.outcome import outcome_of
+from adacd_hil.config import parse, to_short_toml, to_toml
+from adacd_hil.log.reader import read_log
+from firmware_sim.expectation import deviations
+from firmware_sim.faults import KINDS
+from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
+
+NAMES = builtin_scenarios()
+GROUPS = {"experiment", "people", "mechanics", "measurement", "faults"}
+PLAYED = (
+    "clamped-hand-link2",
+    "blow-chest",
+    "dropped-payload",
+    "power-loss-and-return",
+    "one-percent-loss",
+    "wrong-node-id",
+)
+"""One of each way to end that a short run can have."""
+SHORT_TOML = """
+lasts_s = 0.4
+
+[expect]
+adaptations = 0
+contacts = 0
+"""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_scenario_says_in_a_line_what_happens_and_belongs_to_a_group(name: str) -> None:
+    scenario = load_scenario(name)
+    assert scenario.name == name
+    assert scenario.about.endswith(".")
+    assert scenario.group in GROUPS
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_scenario_says_what_a_healthy_host_makes_of_it(name: str) -> None:
+    assert load_scenario(name).expect is not None
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("write", [to_toml, to_short_toml])
+def test_a_scenario_that_is_written_and_read_again_is_the_same(name: str, write, tmp_path: Path) -> None:
+    scenario = load_scenario(name)
+    path = tmp_path / "written.toml"
+    path.write_text(write(scenario), encoding="utf-8")
+    assert load_scenario(str(path)) == scenario
+
+
+def test_awkward_text_survives_being_written(tmp_path: Path) -> None:
+    scenario = parse(Scenario, {"about": 'tab\t, "quotes", back\\slash, \x01, ²'})
+    path = tmp_path / "written.toml"
+    path.write_text(to_short_toml(scenario), encoding="utf-8")
+    assert load_scenario(str(path)).about == scenario.about
+
+
+def test_no_two_scenarios_are_about_the_same() -> None:
+    abouts = [load_scenario(name).about for name in NAMES]
+    assert len(set(abouts)) == len(abouts)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_fault_befalls_some_scenario(kind: str) -> None:
+    assert kind in {row.kind for name in NAMES for row in load_scenario(name).faults}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_contact_that_counts_comes_while_the_run_lasts(name: str) -> None:
+    scenario = load_scenario(name)
+    things = (*scenario.contacts, *scenario.bodies, *scenario.hands, *scenario.walls, *scenario.payloads)
+    assert [thing.at_s for thing in things if thing.at_s >= scenario.lasts_s] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PLAYED)
+def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None:
+    cast = resolve("paper", name, None, None)
+    outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))
+    assert cast.scenario.expect is not None
+    assert deviations(cast.scenario.expect, outcome) == ()
+
+
+def test_the_user_of_a_scenario_only_acknowledges_and_finishes() -> None:
+    settings, scenario = resolve("paper", "power-loss-and-return", None, None)
+    assert [(entry.at_s, entry.request) for entry in settings.operator.script] == [(scenario.lasts_s, "finish")]
+    assert (settings.operator.acknowledge_after_s, settings.operator.acknowledge_faults) == (0.6, 1)
+
+
+def test_the_papers_experiment_keeps_the_script_of_the_configuration() -> None:
+    settings, _ = resolve("paper", "paper", None, None)
+    assert [entry.request for entry in settings.operator.script] == ["payload", "payload_changed", "finish"]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "profile", "expected"),
+    [("geared-arm", None, "M"), ("geared-arm", "S", "S"), ("idle", None, "P"), ("idle", "M", "M")],
+)
+def test_host_and_arm_are_of_one_profile(scenario: str, profile: str | None, expected: str) -> None:
+    cast = resolve("paper", scenario, profile, None)
+    assert (cast.settings.arm.profile, cast.scenario.profile) == (expected, expected)
+
+
+def test_a_configuration_of_another_profile_counts_where_the_scenario_names_none(tmp_path: Path) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text("[arm]\nprofile = 'S'\n")
+    assert resolve(str(config), "idle", None, None).scenario.profile == "S"
+    assert resolve(str(config), "geared-arm", None, None).settings.arm.profile == "M"
+
+
+@pytest.mark.slow
+def test_the_logs_of_a_short_scenario_name_it_and_its_faults(tmp_path: Path) -> None:
+    path = tmp_path / "short.toml"
+    path.write_text(
+        f"{SHORT_TOML}\n[[faults]]\nkind = 'emcy_storm'\nnode = 'sensor1'\ncode = 4096\nrate_Hz = 100.0\nat_s = 0.1\n"
+    )
+    summary, truth_path = run_embedded(resolve("paper", str(path), None, None), "lockstep", tmp_path)
+    assert read_log(summary.log.path).metadata["scenario"] == "short"
+    events = [entry.event.message for entry in read_log(truth_path).events]
+    assert [text for text in events if text.startswith("begins: emcy_storm of sensor1")] != []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_documentation_lists_it_with_what_is_expected(name: str) -> None:
+    scenario = load_scenario(name)
+    page = Path(__file__).parent.parent / "docs" / "emulator" / "scenarios.md"
+    assert scenario.expect is not None
+    assert f"| `{name}` | {scenario.about} | {scenario.expect.text} |" in page.read_text(encoding="utf-8").splitlines()

@@ -1,0 +1,137 @@
+"""Plays scenarios with host and arm in one process each, and compares what they came to with what they expect.
+
+    python tools/campaign.py                    all that come with the package
+    python tools/campaign.py --only 'clamp*'    those whose name or group fits a pattern
+    python tools/campaign.py my.toml -j 2       files, two at a time
+    python tools/campaign.py --seed 2           with other noise and other chance: expectations have to bear it
+
+Lockstep, configuration `paper`. The table goes to stdout, progress to stderr. Exit status:
+0 all as expected, 1 one deviates or can't be played, 2 wrong usage or a scenario that is not one.
+"""
+
+import argparse
+import fnmatch
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.cli.table import format_table
+from adacd_hil.config import ConfigError
+from firmware_sim.expectation import deviations
+from firmware_sim.scenario import builtin_scenarios, load_scenario
+
+CONFIG = "paper"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A scenario that has been played. `problem`: empty, or why it could not be."""
+
+    name: str
+    group: str
+    expected: str
+    measured: str
+    deviations: tuple[str, ...]
+    pace: float | None
+    outcome: dict[str, Any] | None
+    problem: str = ""
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it came as expected."""
+        return not self.deviations and not self.problem
+
+
+def play(name_or_file: str, seed: int | None, keep: Path | None) -> Row:
+    """Play one scenario, its logs in a folder below `keep` or nowhere."""
+    from adacd_hil.cli.demo import resolve, run_embedded
+    from adacd_hil.cli.outcome import outcome_of
+
+    scenario = load_scenario(name_or_file)
+    expected = scenario.expect.text if scenario.expect else "–"
+    try:
+        cast = resolve(CONFIG, name_or_file, None, seed)
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) if keep is None else keep / scenario.name
+            summary, truth_path = run_embedded(cast, "lockstep", out)
+            outcome = outcome_of(summary, truth_path)
+    except Exception as error:
+        problem = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return Row(scenario.name, scenario.group, expected, "–", (), None, None, problem)
+    found = deviations(scenario.expect, outcome) if scenario.expect else ()
+    cycles = 0 if summary.result is None else summary.result.cycles
+    pace = cycles * cast.settings.bus.period_s / summary.elapsed_s if cycles else None
+    return Row(scenario.name, scenario.group, expected, outcome.text, found, pace, outcome._asdict())
+
+
+def chosen(scenarios: Sequence[str], pattern: str) -> list[str]:
+    """List what to play. Raises ConfigError for a file that is not a scenario."""
+    names = list(scenarios) or builtin_scenarios()
+    loaded = [(name, load_scenario(name)) for name in names]
+    return [
+        name
+        for name, scenario in loaded
+        if fnmatch.fnmatch(scenario.name, pattern) or fnmatch.fnmatch(scenario.group, pattern)
+    ]
+
+
+def as_text(rows: Sequence[Row]) -> str:
+    """Make the table and, below it, what deviates."""
+    head = ("scenario", "expected", "measured", "", "pace")
+    cells = [
+        (
+            row.name,
+            row.expected,
+            row.measured,
+            "pass" if row.is_good else "FAIL",
+            "–" if row.pace is None else f"{row.pace:.1f}",
+        )
+        for row in rows
+    ]
+    lines = [format_table(head, cells, right=(4,)), ""]
+    lines += [f"{row.name}: {text}" for row in rows for text in (*row.deviations, row.problem) if text]
+    return "\n".join([*lines, f"{sum(row.is_good for row in rows)} of {len(rows)} as expected"])
+
+
+def main() -> int:
+    """Play what was asked for."""
+    parser = argparse.ArgumentParser(description="Plays scenarios and compares them with what they expect.")
+    parser.add_argument("scenarios", nargs="*", metavar="NAME|FILE", help="default: all that come with the package")
+    parser.add_argument("--only", default="*", metavar="PATTERN", help="shell pattern for name or group")
+    parser.add_argument("-j", "--jobs", type=int, default=1, metavar="N", help="how many at a time")
+    parser.add_argument("--seed", type=int, metavar="N", help="another than the scenarios' own")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the logs, a folder for each scenario")
+    parser.add_argument("--json", action="store_true", dest="as_json", help="print JSON in place of the table")
+    options = parser.parse_args()
+    try:
+        names = chosen(options.scenarios, options.only)
+    except ConfigError as error:
+        print(f"campaign: {error}", file=sys.stderr)
+        return 2
+    if not names or options.jobs < 1:
+        print("campaign: no scenario fits, or no process to play it in", file=sys.stderr)
+        return 2
+    rows: dict[str, Row] = {}
+    # Spawned: what is compiled and logged here is nobody else's.
+    with ProcessPoolExecutor(min(options.jobs, len(names)), mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(play, name, options.seed, options.keep): name for name in names}
+        for future in as_completed(futures):
+            row = rows[futures[future]] = future.result()
+            state = "as expected" if row.is_good else "; ".join((*row.deviations, row.problem)).strip("; ")
+            print(f"{len(rows)}/{len(names)} {row.name}: {state}", file=sys.stderr, flush=True)
+    played = [rows[name] for name in names]
+    if options.as_json:
+        print(json.dumps([vars(row) | {"is_good": row.is_good} for row in played], indent=2))
+    else:
+        print(as_text(played))
+    return 0 if all(row.is_good for row in played) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
