@@ -1,0 +1,172 @@
+"""Two arms as processes on real SocketCAN: on one bus with one SYNC, and on a bus each."""
+
+import contextlib
+import shutil
+import signal
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from experiment_runs import BIN, LIMIT_S, Played, adacd_hil
+from test_on_vcan import longest_stall_cycles
+
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.wire.can_interface import CanInterface
+from adacd_hil.wire.socketcan import SocketCanBus
+
+pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+
+FIRST, SECOND = 0, 1
+# User-mode Linux has one processor for two hosts and two arms, and stalls for longer than an arm should forgive. Here
+# it may: soft control bears periods without a command. At 2 ms both run in virtual time, in test_two_arms.py.
+MAX_AGE_CYCLES = 100
+PATIENT = f"""
+[controller]
+Kp = [20.0, 2.0]
+Kd = [4.0, 0.3]
+[safety]
+commission_cycles = 50
+phase_timeout_s = 60.0
+[bus]
+period_us = 10000
+heartbeat_ms = 2000
+command_patience_cycles = 250
+max_age_cycles = {MAX_AGE_CYCLES}
+sync_timeout_ms = 30000
+"""
+ARMS = (
+    'arms = 2\nhost_node = 127\n[operator]\nscript = [{ at_s = 600.0, request = "finish" }]\n',
+    'arms = 2\nhost_node = 126\nsync = "follow"\n'
+    "[devices]\ndrive_node = [5, 6]\nsensor_node = [7, 8]\n"
+    '[operator]\nscript = [{ at_s = 2.0, request = "finish" }]\n',
+)
+ALONE = (
+    '[devices]\ndrive_node = [5, 6]\nsensor_node = [7, 8]\n[operator]\nscript = [{ at_s = 0.3, request = "finish" }]\n'
+)
+
+
+@contextlib.contextmanager
+def emulators(*arms: tuple[str, ...]) -> Iterator[None]:
+    """Run emulators while the block lasts; they are ready when it begins."""
+    with contextlib.ExitStack() as stack:
+        processes = []
+        for options in arms:
+            command = [BIN / "firmware-sim", "run", "-i", "socketcan", "--scenario", "idle", *options]
+            process = stack.enter_context(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
+            stack.callback(process.terminate)
+            processes.append(process)
+        for process in processes:
+            assert process.stderr is not None
+            assert any(line.strip() == "ready" for line in process.stderr)
+        yield
+
+
+@dataclass(frozen=True)
+class TwoArms:
+    """What two hosts left behind."""
+
+    hosts: tuple[Played, Played]
+    logs: tuple[RunLog, RunLog]
+    dump: list[str]
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> TwoArms:
+    """Let both arms move on one bus; the first host, which sends SYNC, is interrupted when the second has ended."""
+    folder = tmp_path_factory.mktemp("shared")
+    configs = []
+    for arm, text in enumerate(ARMS):
+        configs.append(folder / f"arm{arm + 1}.toml")
+        configs[arm].write_text(PATIENT + text)
+    with contextlib.ExitStack() as stack:
+        if shutil.which("candump"):
+            dump = stack.enter_context((folder / "candump.log").open("w"))
+            listener = subprocess.Popen(["candump", "-L", "-r", "16777216", "vcan0"], stdout=dump)
+            stack.callback(listener.wait, 10)
+            stack.callback(listener.terminate)
+        stack.enter_context(emulators(("-c", "vcan0"), ("-c", "vcan0", "--node-offset", "4", "--host-node", "126")))
+        on_bus = ("run", "-i", "socketcan", "-c", "vcan0", "--json", "--config")
+        command = [BIN / "adacd-hil", *on_bus, configs[FIRST], "--out", folder / "first"]
+        first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        stack.callback(first.kill)
+        second = adacd_hil(folder, *on_bus, str(configs[SECOND]), "--out", str(folder / "second"))
+        first.send_signal(signal.SIGINT)
+        stdout, stderr = first.communicate(timeout=LIMIT_S)
+    stall = max(longest_stall_cycles(folder / name / "run.mcap") for name in ("first", "second"))
+    if stall > MAX_AGE_CYCLES:
+        pytest.skip(f"the machine stalled for {10 * stall} ms, longer than the hosts forgive")
+    hosts = (Played(folder / "first", first.returncode, stdout, stderr), second)
+    logs = (read_log(folder / "first" / "run.mcap"), read_log(folder / "second" / "run.mcap"))
+    path = folder / "candump.log"
+    return TwoArms(hosts, logs, path.read_text().splitlines() if path.exists() else [])
+
+
+def test_both_arms_end_as_asked(shared: TwoArms) -> None:
+    first, second = shared.hosts
+    assert (second.status, second.json["fault"]) == (0, "NONE"), second.stderr
+    assert (first.status, first.json["fault"]) == (130, "NONE"), first.stderr
+
+
+@pytest.mark.parametrize("arm", [FIRST, SECOND])
+def test_both_arms_moved(shared: TwoArms, arm: int) -> None:
+    assert np.abs(np.degrees(shared.logs[arm].scheme["q"])).max() > 5.0
+
+
+@pytest.mark.parametrize(("arm", "is_sent"), [(FIRST, True), (SECOND, False)])
+def test_the_follower_hears_the_sync_that_the_first_host_sends(shared: TwoArms, arm: int, is_sent: bool) -> None:
+    frames = shared.logs[arm].frames
+    sync = frames[frames["can_id"] == 0x080]
+    assert len(sync) > 50
+    assert set(sync["is_tx"].tolist()) == {is_sent}
+
+
+def test_candump_shows_both_arms_and_no_nmt_to_all(shared: TwoArms) -> None:
+    if not shared.dump:
+        pytest.skip("candump (Debian package can-utils) is not installed")
+    frames = [line.split()[2].split("#") for line in shared.dump]
+    seen = {can_id for can_id, _ in frames}
+    assert {"181", "184", "201", "185", "188", "205", "77F", "77E"} <= seen
+    nodes = {data[2:4] for can_id, data in frames if can_id == "000"}
+    assert nodes == {f"{node:02X}" for node in range(1, 9)}
+
+
+def test_the_second_arm_has_a_bus_of_its_own_in_lockstep(tmp_path: Path) -> None:
+    config = tmp_path / "second.toml"
+    config.write_text(ALONE)
+    on_bus = ("run", "-i", "socketcan", "-c", "vcan1", "--json", "--clock", "lockstep", "--config")
+    with emulators(("-c", "vcan1", "--node-offset", "4")):
+        played = adacd_hil(tmp_path, *on_bus, str(config), "--out", str(tmp_path))
+    assert played.status == 0, played.stderr
+    log = read_log(played.log)
+    assert np.abs(np.degrees(log.scheme["q"][-1])).max() > 5.0
+    assert 0x188 in set(log.frames["can_id"].tolist())
+
+
+class _Adapter(CanInterface):
+    """Says that a controller is there, and counts how often it is taken down."""
+
+    restarts = 0
+    is_hardware = True
+
+    def restart(self) -> None:
+        self.restarts += 1
+
+
+@pytest.mark.parametrize(("is_shared", "is_alive", "restarts"), [(True, True, 0), (True, False, 1), (False, True, 1)])
+def test_a_shared_interface_is_not_taken_down_while_frames_are_on_it(
+    is_shared: bool, is_alive: bool, restarts: int
+) -> None:
+    bus = SocketCanBus("vcan1", MonotonicClock(), is_shared=is_shared)
+    bus._interface = adapter = _Adapter("vcan1")
+    with contextlib.ExitStack() as stack:
+        if is_alive:
+            command = ["cangen", "vcan1", "-g", "20"]
+            neighbour = stack.enter_context(subprocess.Popen(command))
+            stack.callback(neighbour.terminate)
+        bus.recover()
+    bus.close()
+    assert adapter.restarts == restarts
