@@ -194,6 +194,14 @@ def test_a_drive_that_fails_faults_with_its_code_and_says_so():
     assert drive.torque_Nm == 0.0
 
 
+def test_a_drive_whose_host_has_died_ends_its_braking_without_any_sync():
+    host = enabled_host()
+    host.write(1, 0x1016, 1, 127 << 16 | 50)
+    host.put(0x77F, b"\x05")
+    pass_ms(host, 500)
+    assert host.state_bits(1) == FAULT_BITS
+
+
 def test_a_drive_says_by_its_own_clock_when_it_failed():
     host = enabled_host()
     start_ns = host.bench.now_ns
