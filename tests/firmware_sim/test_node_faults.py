@@ -194,6 +194,14 @@ def test_a_drive_that_fails_faults_with_its_code_and_says_so():
     assert drive.torque_Nm == 0.0
 
 
+def test_a_drive_whose_host_has_died_ends_its_braking_without_any_sync():
+    host = enabled_host()
+    host.write(1, 0x1016, 1, 127 << 16 | 50)
+    host.put(0x77F, b"\x05")
+    pass_ms(host, 500)
+    assert host.state_bits(1) == FAULT_BITS
+
+
 def test_a_drive_says_by_its_own_clock_when_it_failed():
     host = enabled_host()
     start_ns = host.bench.now_ns
@@ -242,6 +250,16 @@ def test_a_failure_that_lasts_is_back_after_a_reset_of_the_node():
     assert errors(host, 1) == [ERROR]
 
 
+def test_a_failure_that_is_mended_is_forgotten_with_a_reset_of_the_node():
+    host = enabled_host()
+    drive = host.bench.drives[0]
+    drive.fail(ERROR, host.bench.now_ns)
+    host.wait_until_at_rest()
+    drive.mend()
+    host.nmt(RESET_NODE, 1)
+    assert (drive.error_code, host.read(1, 0x1001), host.state_bits(1)) == (0, 0, DISABLED_BITS)
+
+
 def test_a_drive_without_power_does_not_fail_before_it_has_some():
     host = enabled_host()
     host.bench.devices[0].power_off(host.bench.now_ns)
@@ -265,11 +283,12 @@ def test_a_sensor_that_finds_fault_with_itself_says_so_in_frame_and_status(bits)
     assert host.taken(0x283)[0][0] == 0
 
 
-def test_an_overload_is_added_to_the_error_of_a_sensor():
+@pytest.mark.parametrize(("bits", "counts"), [(4, 32767), (2, -32768)])
+def test_an_overload_is_added_to_the_error_of_a_sensor(bits, counts):
     host = enabled_host()
     sensor = host.bench.sensors[0]
-    sensor.set_error(4)
-    sensor.on_sync(32767)
+    sensor.set_error(bits)
+    sensor.on_sync(counts)
     assert host.read(3, 0x6150, 1) == 7
 
 
