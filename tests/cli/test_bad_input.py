@@ -46,6 +46,8 @@ def test_a_setting_that_cant_be_used_is_named_with_its_bound(tmp_path: Path, tex
     ("arguments", "status", "line"),
     [
         (("demo", "--config", "papper"), USAGE, "did you mean 'paper'?"),
+        (("demo", "--scenario", "papr"), USAGE, "did you mean 'paper'?"),
+        (("demo", "--scenario", "nowhere.toml"), USAGE, "nowhere.toml does not exist"),
         (("demo", "--config", "none.toml"), USAGE, "configuration none.toml does not exist"),
         (("run", "-i", "sockecan", "-c", "x"), BUS_MISSING, "did you mean 'socketcan'?"),
         (("run", "-i", "socketcan", "-c", "can77"), BUS_MISSING, "can77"),
