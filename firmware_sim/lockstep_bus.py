@@ -222,7 +222,7 @@ class LockstepBus:
                 if frame.can_id in self._answers:
                     missing -= 1
         if missing == len(self._answers) != 0 and not came:
-            raise SilenceError(f"no answer to SYNC on {self.channel} within {self._patience_s:g} s")
+            raise SilenceError(f"silence on {self.channel} for {self._patience_s:g} s")
         if len(came) == len(self._answers) and not (self._queue or self._offered):
             self._line_up(came)
         else:

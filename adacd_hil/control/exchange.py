@@ -11,7 +11,7 @@ from adacd_hil.control.trouble_report import TroubleReport
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmState
-from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.bus import Frame, SilenceError
 from adacd_hil.wire.tap import Tap
 
 FEEDBACK_SHARE = 0.7
@@ -57,17 +57,26 @@ class Exchange:
         arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
         for early in tick.ahead:
             self._accept(early)
+        try:
+            self._await_feedback()
+        except SilenceError as silence:
+            names = ", ".join(arm.missing_names())
+            raise SilenceError(f"no answer from {names} to SYNC of cycle {tick.cycle}: {silence}") from None
+        self.feedback_ns = bus.held_ns = clock.now_ns()
+        return arm.state()
+
+    def _await_feedback(self) -> None:
+        """Take frames until all of this cycle are in or the time for them is over."""
+        bus, arm = self._bus, self._arm
         patience_s = self._patience_s
         for _ in range(_MOST_FRAMES):
             if arm.has_all_frames or (frame := bus.receive(patience_s)) is None:
-                break
-            if is_following and frame.can_id == arm.sync_id and not frame.is_error:
+                return
+            if self._is_following and frame.can_id == arm.sync_id and not frame.is_error:
                 bus.unread(frame)
-                break
+                return
             self._accept(frame)
             patience_s = self._patience_s - (frame.t_ns - self.sync_ns) * 1e-9
-        self.feedback_ns = bus.held_ns = clock.now_ns()
-        return arm.state()
 
     def _take_late_frames(self) -> None:
         """Take what came after the cycle before was over; it belongs to that cycle."""
