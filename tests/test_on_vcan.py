@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 SEED = "7"
 FIRST_CONTACT = '[operator]\nscript = [{ at_s = 11.5, request = "finish" }]\n'
 """One adaptation, one contact and the reaction to it: what comes after is the same code."""
-THREE_CONTACTS = '[operator]\nscript = [{ at_s = 17.5, request = "finish" }]\n'
+TWO_CONTACTS = '[operator]\nscript = [{ at_s = 14.5, request = "finish" }]\n'
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_lockstep_on_vcan_logs_the_same_as_the_embedded_bus_bit_for_bit(lockstep
     for name in ("run.mcap", "truth.mcap"):
         ours, theirs = (contents(folder / name) for folder in (embedded.folder, lockstep.folder))
         assert [topic for topic in ours if ours[topic] != theirs.get(topic)] == []
-        assert len(ours["/truth" if name == "truth.mcap" else "/cycle"]) > 1_000_000
+        assert len(ours["/truth" if name == "truth.mcap" else "/cycle"]) > 500_000
 
 
 def test_the_experiment_ends_well_on_vcan(lockstep: Played) -> None:
@@ -79,7 +79,7 @@ def test_real_time_at_1_khz_detects_the_same_contacts(tmp_path: Path) -> None:
     # A shared machine stalls for longer than an arm should forgive. Here it may: stalls are counted, not hidden, and
     # contacts are judged only where the bus kept up as it has to on an arm.
     config = tmp_path / "patient.toml"
-    config.write_text(THREE_CONTACTS + "[bus]\ncommand_patience_cycles = 250\nmax_age_cycles = 100\n")
+    config.write_text(TWO_CONTACTS + "[bus]\ncommand_patience_cycles = 250\nmax_age_cycles = 100\n")
     with emulator(tmp_path, "--seed", SEED):
         played = run_on_vcan(tmp_path, "--config", str(config), "--clock", "realtime")
     stall = longest_stall_cycles(played.log)
@@ -94,8 +94,8 @@ def test_real_time_at_1_khz_detects_the_same_contacts(tmp_path: Path) -> None:
     )
     (described,) = json.loads(report.stdout)
     contacts = described["contacts"]
-    assert (len(contacts), described["missed"], described["false_alarms"]) == (3, 0, 0)
-    assert [contact["link_detected"] for contact in contacts] == [1, 1, 2]
+    assert (len(contacts), described["missed"], described["false_alarms"]) == (2, 0, 0)
+    assert [contact["link_detected"] for contact in contacts] == [1, 1]
     assert all(contact["direction_ok"] for contact in contacts)
     assert described["cycle"]["clock"] == "realtime"
 
