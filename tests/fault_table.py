@@ -550,12 +550,15 @@ CLOCKS = ("lockstep", "realtime")
 
 
 def covering() -> list[tuple[Case, str]]:
-    """Return the first case of each kind, by both clocks."""
+    """Return the first case of each kind in lockstep, and in real time where the host makes something else of it."""
     first: dict[str, Case] = {}
     for case in CASES:
         for row in rows_of(case):
             first.setdefault(str(row["kind"]), case)
-    return [(case, clock) for case in CASES if case in first.values() for clock in CLOCKS]
+    chosen = [case for case in CASES if case in first.values()]
+    return [
+        (case, clock) for case in chosen for clock in CLOCKS if clock == "lockstep" or case.realtime != case.lockstep
+    ]
 
 
 def rows_of(case: Case) -> list[dict[str, object]]:

@@ -1,4 +1,4 @@
-"""Devices of every contract on real SocketCAN, CAN FD included: booted, mapped, enabled, moved, stopped."""
+"""Devices of other contracts on real SocketCAN, CAN FD included: booted, mapped, enabled, moved, stopped."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 @pytest.mark.parametrize(
     ("config", "contract", "length"),
-    [("fd", "arm_fd", 24), ("fd_500us", "arm_fd_500us", 16), ("stock", "arm_stock", 8)],
+    [("fd_500us", "arm_fd_500us", 16), ("stock", "arm_stock", 8)],  # arm_fd differs in layout only
 )
 def test_an_arm_of_another_contract_runs(tmp_path: Path, config: str, contract: str, length: int) -> None:
     settings = tmp_path / "short.toml"
