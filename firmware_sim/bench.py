@@ -311,9 +311,8 @@ class Bench:
         """Sample and answer a SYNC that reaches the devices now, or by SYNC `late_ns` after its time."""
         sync_ns = self.now_ns
         late_ticks = late_ns // _TICK_NS
-        torque_Nm = self.drives[0].torque_Nm, self.drives[1].torque_Nm
         if late_ticks:
-            self._body.advance(torque_Nm, (self.drives[0].motor_mode, self.drives[1].motor_mode), late_ticks)
+            self._advance_body(late_ticks)
         if self._is_wall or self._is_plain:
             self._sample_and_send(data)
             if self._is_wall:
@@ -327,9 +326,13 @@ class Bench:
         if not self._is_wall:
             self._has_moved = True
             self._has_been_operational = self._has_been_operational or self._is_any_operational
-            drive1, drive2 = self.drives
-            ticks = self._period_ns // _TICK_NS - late_ticks
-            self._body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode), ticks)
+            self._advance_body(self._period_ns // _TICK_NS - late_ticks)
+
+    def _advance_body(self, tick_count: int) -> None:
+        """Let the body move with what its motors are told."""
+        drive1, drive2 = self.drives
+        torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
+        self._body.advance(torque_Nm, (drive1.motor_mode, drive2.motor_mode), tick_count)
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
         """By SYNC, live through one that a fault keeps from all devices; what they send besides goes out."""
@@ -371,6 +374,8 @@ class Bench:
             sensor2.on_sync(torque2)
         else:
             heard = self._injector.sync(self._sync_id, data, measured, now_ns)
+            if not self._is_wall:  # by the clock, a drive that hears no SYNC has nothing to count
+                self._lose_sync(heard)
         if now_ns >= self._due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
             self._poll(now_ns)
         if not self._is_started and drive1.is_enabled and drive2.is_enabled:
@@ -380,6 +385,11 @@ class Bench:
         for place, send in self._senders:
             if heard[place]:
                 send()
+
+    def _lose_sync(self, heard: tuple[bool, ...]) -> None:
+        for drive, has_heard in zip(self.drives, heard, strict=False):  # the drives come first
+            if not has_heard:
+                drive.on_lost_sync(self.now_ns)
 
     def _count_periods(self, counter: int) -> int:
         """Unwrap the SYNC counter; return the periods since the SYNC before, 0 for a repeated one.
@@ -404,7 +414,7 @@ class Bench:
             self.now_ns += self._period_ns
             drive1.on_lost_sync(self.now_ns)
             drive2.on_lost_sync(self.now_ns)
-            self._body.advance((drive1.torque_Nm, drive2.torque_Nm), (drive1.motor_mode, drive2.motor_mode))
+            self._advance_body(self._period_ns // _TICK_NS)
 
     def _move_to(self, t_ns: int) -> None:
         """Let the bench's time reach `t_ns`; by wall clock the body too, by SYNC only if a drive is left alone.
@@ -417,12 +427,10 @@ class Bench:
             self._body_ns = self.now_ns
             return
         step_ns = self._body_period_ns
-        torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
-        mode = (drive1.motor_mode, drive2.motor_mode)
         while self._body_ns + step_ns <= t_ns:
             self._body_ns += step_ns
             self._has_moved = True
-            self._body.advance(torque_Nm, mode)
+            self._advance_body(step_ns // _TICK_NS)
 
     def _listen(self) -> None:
         """Take over which PDOs the devices exchange."""

@@ -135,8 +135,6 @@ class Injector:
             if heard[joint]:
                 is_distorted = velocity[joint] != measured.velocity_counts[joint]
                 drive.on_sync(position[joint], velocity[joint], now_ns, is_distorted=is_distorted)
-            else:
-                drive.on_lost_sync(now_ns)
         for joint, sensor in enumerate(self._sensors):
             if heard[JOINTS + joint]:
                 sensor.on_sync(torque[joint])

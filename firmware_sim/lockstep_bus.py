@@ -90,8 +90,8 @@ class LockstepBus:
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of the host's frames that are not on the bus yet, oldest first."""
-        if not self._queue:
+        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo it overtakes none."""
+        if self._is_fifo or not self._queue:
             return ()
         self._transmit_before(self._clock.now_ns())
         return tuple([offer[0] for offer in self._queue])
@@ -199,12 +199,10 @@ class LockstepBus:
 
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame of the host's, which is through, to the devices; after SYNC take their answers."""
+        self._bus.send(can_id, data)
         if can_id == self._sync_id:
-            self._bus.send(can_id, data)
             self.sync_ns = self._free_ns
             self._take_answers()
-        else:
-            self._bus.send(can_id, data)
 
     def _take_answers(self) -> None:
         """Take what belongs to this SYNC. Raises SilenceError when nobody says anything."""
@@ -215,12 +213,13 @@ class LockstepBus:
             if frame is None:
                 break
             if frame.can_id == DEVICE_MARK:
+                for earlier in came:
+                    self._offer(earlier, self.sync_ns)
                 self._take_marked(frame)
-                missing = 0
-            else:
-                came.append(frame)
-                if frame.can_id in self._answers:
-                    missing -= 1
+                return
+            came.append(frame)
+            if frame.can_id in self._answers:
+                missing -= 1
         if missing == len(self._answers) != 0 and not came:
             raise SilenceError(f"silence on {self.channel} for {self._patience_s:g} s")
         if len(came) == len(self._answers) and not (self._queue or self._offered):

@@ -43,7 +43,7 @@ class Outbox:
     def put(self, can_id: int, data: bytes) -> None:
         """Send a frame; while an answer is collected, with it."""
         if self._is_open:
-            self.hold(self._now_ns, lambda: self._put(can_id, data))
+            self.put_later(self._now_ns, can_id, data)
         else:
             self._put(can_id, data)
 

@@ -9,7 +9,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.realtime import GridPacer, Pacer, Recurrence, make_follower
+from adacd_hil.control.realtime import Recurrence, make_pacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
@@ -37,9 +37,7 @@ class ZeroTorqueLoop:
     def __init__(
         self, settings: Settings, bus: Tap, clock: Clock, arm: Arm, master: Master, is_enabling: bool = False
     ) -> None:
-        is_following = settings.bus.follows
-        grid = GridPacer(clock, settings.bus.period_ns)
-        self.pacer: Pacer = make_follower(settings, clock, bus, arm.sync_id) if is_following else grid
+        self.pacer = make_pacer(settings, clock, bus, arm.sync_id)
         self._period_ns = settings.bus.period_ns
         self._clock = clock
         self._bus, self._arm, self._master = bus, arm, master

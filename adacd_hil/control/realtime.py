@@ -206,16 +206,10 @@ class FollowingPacer:
             )
 
 
-def make_follower(settings: Settings, clock: Clock, bus: Tap, sync_id: int) -> FollowingPacer:
-    """Make the pacer of a host that sends no SYNC."""
-    timeout_ns = settings.bus.sync_timeout_ms * 1_000_000
-    return FollowingPacer(bus, clock, settings.bus.period_ns, sync_id, timeout_ns)
-
-
 def make_pacer(settings: Settings, clock: Clock, tap: Tap, sync_id: int) -> Pacer:
     """Make the pacer that goes with a clock: with a VirtualClock the host's work takes a modelled time."""
     bus = settings.bus
     if bus.follows:
-        return make_follower(settings, clock, tap, sync_id)
+        return FollowingPacer(tap, clock, bus.period_ns, sync_id, bus.sync_timeout_ms * 1_000_000)
     is_virtual = isinstance(clock, VirtualClock)
     return GridPacer(clock, bus.period_ns, HostLatency(settings.lockstep, bus.period_s) if is_virtual else None)

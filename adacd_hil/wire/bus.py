@@ -69,7 +69,7 @@ class Bus(Protocol):
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of what was sent and is not on the bus yet, as far as this end can know."""
+        """Identifiers of what was sent and would be overtaken by SYNC now, as far as this end can know."""
 
     def send(self, can_id: int, data: bytes) -> None:
         """Hand a frame to the bus. Raises BusError, of it TransmitQueueError and InterfaceDownError."""

@@ -20,7 +20,7 @@ class Tap:
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of what was sent and is not on the bus yet, as far as the bus behind it knows."""
+        """Identifiers of what was sent and would be overtaken by SYNC, as far as the bus behind it knows."""
         return self._bus.waiting_frames
 
     def send(self, can_id: int, data: bytes) -> None:

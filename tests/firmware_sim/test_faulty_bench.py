@@ -58,6 +58,18 @@ def test_a_drive_that_gets_no_commands_faults_while_syncs_are_lost() -> None:
     assert [drive.error_code for drive in host.bench.drives] == [0x8250, 0x8250]
 
 
+def test_by_the_clock_a_drive_that_hears_no_sync_has_nothing_to_count() -> None:
+    host = BenchHost(
+        quiet_scenario(faults=[{"kind": "lose", "frame": "sync", "node": "drive1", "at_s": 0.001}]), clock_mode="wall"
+    )
+    for node in (1, 2):
+        host.nodes[node].sdo[0x2201].raw = 255  # 25 periods: nothing else stops it within the test
+    host.enable()
+    for _ in range(20):
+        host.step(ENABLE)
+    assert [drive.error_code for drive in host.bench.drives] == [0, 0]
+
+
 def test_held_back_frames_go_out_although_a_sync_is_lost() -> None:
     host = BenchHost(
         quiet_scenario(

@@ -228,6 +228,28 @@ def test_after_release_frames_beyond_the_expected_ones_are_awaited() -> None:
     assert rig.receive_all(0.0009) == [(0x181, 200_000), (0x181, 300_000)]
 
 
+def test_what_came_before_the_first_mark_is_before_it() -> None:
+    rig = Rig((0x181, 0x182))
+
+    def answer(can_id: int, data: bytes) -> None:
+        rig.devices.say(0x181, b"old")
+        rig.devices.mark(MarkKind.RELEASE, 0)
+        rig.devices.say(0x181, b"new")
+        rig.devices.mark(MarkKind.END)
+
+    rig.devices.on_frame = answer
+    rig.bus.send(SYNC, b"\x01")
+    assert [frame.data for _ in range(2) if (frame := rig.bus.receive(0.0007))] == [b"old", b"new"]
+
+
+def test_in_a_fifo_sync_overtakes_nothing() -> None:
+    rig = Rig(is_fifo=True)
+    rig.at(950_000).bus.send(0x201, b"")
+    rig.bus.send(0x202, b"")
+    rig.at(PERIOD_NS)
+    assert rig.bus.waiting_frames == ()
+
+
 def test_end_says_that_what_is_missing_does_not_come() -> None:
     rig = Rig((0x181, 0x182))
     rig.devices.on_frame = lambda can_id, data: rig.devices.mark(MarkKind.END)
