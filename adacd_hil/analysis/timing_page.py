@@ -47,7 +47,7 @@ def _times_table(evidence: TimingEvidence) -> str:
         words = f"{reaction.count} reaction{'' if reaction.count == 1 else 's'}"
         label = _label("Reaction", f"detection decision to first reaction frame, {words}")
         rows.append((label, *_values(reaction.percentiles, PERCENTILE_NAMES)))
-    head = [("", "strong"), *((name, "head") for name in LOW_PERCENTILE_NAMES)]
+    head: list[Cell] = ["", *((name, "head") for name in LOW_PERCENTILE_NAMES)]
     rows += [head, *(_time_row(quantity, evidence, LOW_PERCENTILE_NAMES) for quantity in reserves)]
     return make_table(("µs", *PERCENTILE_NAMES), rows)
 

@@ -224,12 +224,14 @@ def _timing_lines(described: dict[str, Any]) -> list[str]:
     for quantity in QUANTITIES:
         found = _percentile_text(timing["times_us"][quantity.name])
         lines += ["", f"{quantity.title}, µs ({quantity.meaning}): {found}"]
-        previous, labels = 0.0, []
-        bins = described["bins_us"][quantity.name]
-        for entry in bins:
-            labels.append(f">= {previous:g}" if entry["below"] is None else f"< {entry['below']:g}")
+        previous = 0.0
+        rows: list[tuple[str, int]] = []
+        for entry in described["bins_us"][quantity.name]:
+            label = f">= {previous:g}" if entry["below"] is None else f"< {entry['below']:g}"
             previous = entry["below"] or previous
-        lines += bar_chart(labels, [entry["count"] for entry in bins])
+            if rows or entry["count"]:  # bins before the first value say nothing
+                rows.append((label, entry["count"]))
+        lines += bar_chart([label for label, _ in rows], [count for _, count in rows])
     queues = "; ".join(f"{name} {_percentile_text(found)}" for name, found in timing["queues_bytes"].items())
     counts = ", ".join(f"{name.replace('_', ' ')} {count['total']}" for name, count in timing["counts"].items())
     return [*lines, "", f"queues, bytes: {queues}", f"{counts}, in {timing['cycles']} cycles"]

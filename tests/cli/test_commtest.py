@@ -12,7 +12,7 @@ from adacd_hil.commission.communication_test import CommunicationReport, Communi
 from adacd_hil.commission.zero_torque import ZeroTorqueLoop
 
 
-def tested(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
+def played(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
     rig.start()
     rig.tap.take()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
@@ -23,7 +23,7 @@ def tested(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, Commu
 
 
 def judged(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> dict:
-    return tested(rig, scheduler)[0]
+    return played(rig, scheduler)[0]
 
 
 def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
@@ -63,7 +63,7 @@ def test_the_report_is_json() -> None:
 
 
 def test_the_pictures_are_those_of_the_report_with_the_numbers_of_the_test(tmp_path: Path) -> None:
-    described, report = tested(BenchBus())
+    described, report = played(BenchBus())
     paths = write_pictures(tmp_path, report, described)
     assert [path.name for path in paths] == ["commtest.html", "timing-distributions.png", "timing-line.png"]
     assert {path.read_bytes()[:4] for path in paths[1:]} == {b"\x89PNG"}
