@@ -73,6 +73,7 @@ def distributions(evidence: TimingEvidence) -> Drawing:
         _label_times(axes, end_us, statistics.histogram.below > 0)
     for axes in grid[:, 0]:
         axes.set_ylabel("cycles")
+        axes.yaxis.set_label_coords(-0.085, 0.5)
     label_below(figure, "time, µs")
     handles = [Line2D([], [], color=COLOURS["ink"], linewidth=1.0, linestyle=line) for _, line in _LINES]
     labels = ["p50", "p99, of slack p1", "p99.9, of slack p0.1", "period"]
