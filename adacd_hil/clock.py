@@ -50,3 +50,14 @@ class VirtualClock:
 def wall_ns() -> int:
     """Return the wall clock, ns since 1970; for log headers only."""
     return time.time_ns()
+
+
+def wall_offset_ns() -> int:
+    """Return the wall clock minus CLOCK_MONOTONIC, ns; of three readings the one that was interrupted least."""
+    offsets = []
+    for _ in range(3):
+        before_ns = time.monotonic_ns()
+        now_ns = time.time_ns()
+        after_ns = time.monotonic_ns()
+        offsets.append((after_ns - before_ns, now_ns - (before_ns + after_ns) // 2))
+    return min(offsets)[1]

@@ -124,8 +124,9 @@ class Cycle:
             request = self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
+            self._follow(arm, output)
             self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
-            command, flags = self._control(arm, output)
+            command, flags = self._limit(arm, output, self._bus.held_ns)
             self._arm.write(command)
             if self._heartbeats.is_due(tick.cycle):
                 self._master.send_heartbeat()
@@ -156,19 +157,22 @@ class Cycle:
             self._reference.park()
         return Request.FINISH
 
-    def _control(self, arm: ArmState, output: SchemeOutput) -> tuple[ArmCommand, GateFlag]:
-        """Turn the decision into a limited command."""
+    def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
+        """Turn the desired motion into a desired torque."""
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
         self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
-        is_open = output.state in _POWERED and arm.is_enabled and not self._is_stale()
+
+    def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
+        """Turn the desired torque into a limited command, to be sent now.
+
+        A cycle that took so long, as when the process was stopped, that its torque belongs to the past has none.
+        """
+        is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
+        is_open = output.state in _POWERED and arm.is_enabled and not is_stale
         flags = self._gate.limit(self._tau_d, is_open, self._tau_c)
         quick_stop = output.state is SchemeState.FAULT or (bool(flags) and GateFlag.NOT_A_NUMBER in flags)
         return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
-
-    def _is_stale(self) -> bool:
-        """Whether this cycle took so long, as when the process was stopped, that its torque belongs to the past."""
-        return self._clock.now_ns() - self._exchange.sync_ns > self._stale_ns
 
     def _record(
         self,
@@ -182,14 +186,15 @@ class Cycle:
     ) -> None:
         """Hand the cycle to the logger and remember where the scheme stands."""
         t_ns = arm.t_ns
+        exchange = self._exchange
         record = CycleRecord(
             cycle=tick.cycle,
             lateness_ns=tick.lateness_ns,
-            feedback_ns=self._exchange.feedback_ns - self._exchange.sync_ns,
-            command_ns=self._clock.now_ns() - self._exchange.sync_ns,
+            feedback_ns=exchange.feedback_ns - exchange.sync_ns,
+            command_ns=self._clock.now_ns() - exchange.sync_ns,
             overruns=self._pacer.overruns,
             frames_missing=self._arm.missing_frames,
-            commands_late=self._exchange.late_commands.count,
+            commands_late=exchange.late_commands.count,
         )
         messages = [
             (ChannelId.SCHEME, pack_scheme(output, request)),
@@ -201,7 +206,6 @@ class Cycle:
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
-        exchange = self._exchange
         for source in (self._master, exchange.troubles, exchange.late_commands):
             for event in source.take_events():
                 recorder.event(t_ns, event)

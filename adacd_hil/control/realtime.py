@@ -43,7 +43,7 @@ class Pacer(Protocol):
         """Wait for the next cycle and return its beginning."""
 
     def spend(self, feedback_ns: int) -> int:
-        """Let the host's work after the feedback take its time; return when its commands leave."""
+        """Let the host's work after the feedback take its time; return the time at which its commands leave."""
 
     def resume(self) -> None:
         """Go on after a pause that was meant: its periods are passed over and not counted as overruns."""
@@ -96,11 +96,10 @@ class GridPacer:
         return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)
 
     def spend(self, feedback_ns: int) -> int:
-        """Move a virtual clock by the modelled latency; in real time the commands carry the feedback's stamp."""
+        """Move a virtual clock by the modelled latency; in real time, read the clock."""
         if self._latency is not None:
-            feedback_ns += self._latency.draw_ns()
-            self._clock.sleep_until_ns(feedback_ns)
-        return feedback_ns
+            self._clock.sleep_until_ns(feedback_ns + self._latency.draw_ns())
+        return self._clock.now_ns()
 
     def resume(self) -> None:
         """Let the next cycle begin on the next grid point that is ahead."""
@@ -140,9 +139,9 @@ class FollowingPacer:
         lateness_ns = self._clock.now_ns() - sync.t_ns
         return Tick(self._cycle, sync.t_ns, 1 + skipped, lateness_ns, tuple(frames[:place]), tuple(frames[place + 1 :]))
 
-    def spend(self, feedback_ns: int) -> int:
-        """Let the commands carry the feedback's stamp."""
-        return feedback_ns
+    def spend(self, feedback_ns: int) -> int:  # noqa: ARG002 (the protocol's signature)
+        """Read the clock."""
+        return self._clock.now_ns()
 
     def resume(self) -> None:
         """Count no overruns for what was passed over."""

@@ -23,6 +23,8 @@ from adacd_hil.wire.e2e import E2eStatus
 SYNC_OVERFLOW = 240
 """0x1019: the SYNC counter runs 1…240."""
 
+_Take = Callable[[bytes, int], bool]
+"""What takes a frame's data and its cycle, and says whether something cyclic came of it."""
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
 
 
@@ -73,15 +75,15 @@ class Arm:
         self._seen = 0
         self._was_enabled = False
 
-    def _build_handlers(self) -> dict[int, tuple[Callable[[bytes], bool], int]]:
-        handlers: dict[int, tuple[Callable[[bytes], bool], int]] = {}
+    def _build_handlers(self) -> dict[int, tuple[_Take, int]]:
+        handlers: dict[int, tuple[_Take, int]] = {}
         for joint, (drive, sensor) in enumerate(zip(self.drives, self.sensors, strict=True)):
-            handlers[drive.feedback_message.can_id] = (_at_cycle(self, drive.accept_feedback), 1 << joint)
-            handlers[sensor.torque_message.can_id] = (_at_cycle(self, sensor.accept_torque), 4 << joint)
+            handlers[drive.feedback_message.can_id] = (drive.accept_feedback, 1 << joint)
+            handlers[sensor.torque_message.can_id] = (sensor.accept_torque, 4 << joint)
             if drive.status_message is not None:
-                handlers[drive.status_message.can_id] = (_drive_status(self, drive), 0)
+                handlers[drive.status_message.can_id] = (drive.accept_status, 0)
             if sensor.status_message is not None:
-                handlers[sensor.status_message.can_id] = (_without_cycle(sensor.accept_status), 0)
+                handlers[sensor.status_message.can_id] = (sensor.accept_status, 0)
         return handlers
 
     @property
@@ -110,14 +112,20 @@ class Arm:
             if not self._seen & (1 << bit):
                 device.miss()
 
-    def accept(self, frame: Frame) -> bool:
-        """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing."""
+    def accept(self, frame: Frame, is_late: bool = False) -> bool:
+        """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing.
+
+        `is_late`: it belongs to the cycle before.
+        """
         handler = self._handlers.get(frame.can_id)
         if handler is None or frame.is_error:
             return False
         take, bit = handler
+        if is_late:
+            take(frame.data, self._cycle - 1)
+            return True
         self._seen |= bit
-        if take(frame.data):
+        if take(frame.data, self._cycle):
             self._received |= bit
         return True
 
@@ -189,9 +197,15 @@ class Arm:
 
     def write(self, command: ArmCommand) -> None:
         """Send the commands of this cycle; they act at the next SYNC. Raises BusError."""
-        for drive, tau_c, ratio in zip(self.drives, command.tau_c.tolist(), self._permille_per_Nm, strict=True):
-            frame = drive.command(round(tau_c * ratio), command.enable, command.quick_stop)
-            self._bus.send(drive.command_id, frame)
+        (drive1, drive2), (ratio1, ratio2) = self.drives, self._permille_per_Nm
+        tau1, tau2 = command.tau_c.tolist()
+        enable, quick_stop = command.enable, command.quick_stop
+        self._bus.send_all(
+            (
+                (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
+                (drive2.command_id, drive2.command(round(tau2 * ratio2), enable, quick_stop)),
+            )
+        )
 
     def frame_checks(self) -> FrameChecks:
         """Return what the checks have said of all cyclic frames so far."""
@@ -285,23 +299,3 @@ def _describe_status(status: SensorStatus) -> str:
         (SensorStatus.NOT_VALID, "not valid"),
     )
     return ", ".join(text for bit, text in words if status & bit)
-
-
-def _at_cycle(arm: Arm, accept: Callable[[bytes, int], bool]) -> Callable[[bytes], bool]:
-    return lambda data: accept(data, arm.cycle)
-
-
-def _drive_status(arm: Arm, drive: Drive) -> Callable[[bytes], bool]:
-    def take(data: bytes) -> bool:
-        drive.accept_status(data, arm.cycle)
-        return False
-
-    return take
-
-
-def _without_cycle(accept: Callable[[bytes], None]) -> Callable[[bytes], bool]:
-    def take(data: bytes) -> bool:
-        accept(data)
-        return False
-
-    return take
