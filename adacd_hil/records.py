@@ -223,15 +223,22 @@ class SchemeOutput(NamedTuple):
 
 
 class CycleRecord(NamedTuple):
-    """How one cycle went; times in ns. Not part of the decisions."""
+    """How one cycle went; times in ns. Not part of the decisions. The queues are 0 in lockstep."""
 
     cycle: int
     lateness_ns: int  # wake-up after the grid point
     feedback_ns: int  # SYNC sent to last frame decoded
     command_ns: int  # SYNC sent to last command handed to the bus
-    overruns: int  # periods skipped since the run began
-    frames_missing: int  # cyclic frames of this cycle that did not arrive or failed their checks
-    commands_late: int  # commands of the cycle before that were not on the bus at this SYNC: they act at the next one
+    compute_ns: int = 0  # last cyclic frame received to last command handed to the bus
+    slack_ns: int = 0  # last command handed to the bus to the next grid point; negative: overrun
+    data_age: int = 0  # cycles, of the oldest value that was used
+    overruns: int = 0  # periods skipped since the run began
+    frames_missing: int = 0  # cyclic frames of this cycle that did not arrive or failed their checks
+    commands_late: int = 0  # commands of the cycle before that were not on the bus at this SYNC: they act at the next
+    frames_lost: int = 0  # received frames that the kernel dropped since the run began
+    receive_queue_bytes: int = 0  # frames that wait in the socket to be received
+    transmit_queue_bytes: int = 0  # frames that wait in the socket to be sent
+    log_queue_bytes: int = 0  # what waits for the log's writer
 
 
 class FrameChecks(NamedTuple):

@@ -170,9 +170,16 @@ _CYCLE = (
     Member("lateness_ns", "int64", unit="ns", meaning="wake-up after the grid point"),
     Member("feedback_ns", "int64", unit="ns", meaning="SYNC sent to last frame decoded"),
     Member("command_ns", "int64", unit="ns", meaning="SYNC sent to last command handed to the bus"),
+    Member("compute_ns", "int64", unit="ns", meaning="last cyclic frame received to last command handed to the bus"),
+    Member("slack_ns", "int64", unit="ns", meaning="last command to the next grid point; negative: overrun"),
+    Member("data_age", "uint64", meaning="age of the oldest value that was used, cycles"),
     Member("overruns", "uint64", meaning="periods skipped since the run began"),
     Member("frames_missing", "uint64", meaning="cyclic frames that did not arrive or failed their checks"),
     Member("commands_late", "uint64", meaning="commands of the cycle before that missed this SYNC and act at the next"),
+    Member("frames_lost", "uint64", meaning="received frames that the kernel dropped since the run began"),
+    Member("receive_queue_bytes", "uint64", meaning="waits in the socket to be received, bytes"),
+    Member("transmit_queue_bytes", "uint64", meaning="waits in the socket to be sent, bytes"),
+    Member("log_queue_bytes", "uint64", meaning="waits for the log's writer, bytes"),
 )
 _DEVICES = ("drive1", "drive2", "sensor1", "sensor2")
 _FRAME_CHECKS = (

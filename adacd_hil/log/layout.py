@@ -24,7 +24,7 @@ def _both_joints(field: str) -> tuple[str, str]:
 
 
 def viewer_layout() -> bytes:
-    """Write the layout: torques against thresholds, motion, states, parameters, lateness, events."""
+    """Write the layout: torques against thresholds, motion, states, parameters, timing, queues, events."""
     panels = {
         "Plot!contact": _plot(
             "External torque, Nm", *_both_joints("/scheme.tau_ext_hat"), *_both_joints("/scheme.threshold")
@@ -32,7 +32,12 @@ def viewer_layout() -> bytes:
         "Plot!torque": _plot("Joint torque, Nm", *_both_joints("/scheme.tau_j"), *_both_joints("/control.tau_c")),
         "Plot!motion": _plot("Position, rad", *_both_joints("/scheme.q"), *_both_joints("/control.q_d")),
         "Plot!theta": _plot("Parameters", "/scheme.theta_hat[:]"),
-        "Plot!cycle": _plot("Cycle, ns", "/cycle.lateness_ns", "/cycle.feedback_ns", "/cycle.command_ns"),
+        "Plot!cycle": _plot(
+            "Cycle, ns", *(f"/cycle.{name}_ns" for name in ("lateness", "feedback", "command", "slack"))
+        ),
+        "Plot!queues": _plot(
+            "Queues, bytes", *(f"/cycle.{name}_queue_bytes" for name in ("receive", "transmit", "log"))
+        ),
         "StateTransitions!state": {
             "paths": [{"value": f"/scheme.{field}", "timestampMethod": "receiveTime"} for field in ("state", "fault")],
             "isSynced": True,
@@ -40,7 +45,9 @@ def viewer_layout() -> bytes:
         "RosOut!events": {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/events"},
     }
     left = _stack("Plot!contact", _stack("Plot!torque", "Plot!motion"))
-    right = _stack("StateTransitions!state", _stack("Plot!theta", _stack("Plot!cycle", "RosOut!events")))
+    right = _stack(
+        "StateTransitions!state", _stack("Plot!theta", _stack("Plot!cycle", _stack("Plot!queues", "RosOut!events")))
+    )
     layout = {
         "configById": panels,
         "globalVariables": {},

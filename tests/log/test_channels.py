@@ -162,10 +162,9 @@ def test_contact_is_laid_out_as_its_type_says():
 
 
 def test_cycle_is_laid_out_as_its_type_says():
-    message = decode(ChannelId.CYCLE, pack_cycle(CycleRecord(1, -2, 3, 4, 5, 6, 7)))
-    values = (message.cycle, message.lateness_ns, message.feedback_ns, message.command_ns)
-    assert values == (1, -2, 3, 4)
-    assert (message.overruns, message.frames_missing, message.commands_late) == (5, 6, 7)
+    record = CycleRecord(1, -2, 3, 4, 5, -6, 7, 8, 9, 10, 11, 12, 13, 14)
+    message = decode(ChannelId.CYCLE, pack_cycle(record))
+    assert {name: getattr(message, name) for name in CycleRecord._fields} == record._asdict()
 
 
 def test_states_are_named_before_the_field_that_holds_them():
