@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES, Vector
+from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
 
 
 class ConfigError(ValueError):
@@ -462,6 +463,29 @@ class LockstepSettings:
 
 
 @dataclass(frozen=True)
+class RealtimeSettings:
+    """How the process that runs the cycle gets on time."""
+
+    scheduler: str = setting(
+        "fifo", choices=("fifo", "deadline", "other"), meaning="SCHED_FIFO, SCHED_DEADLINE, or none of real time"
+    )
+    priority: int = setting(80, low=1, high=98, meaning="of SCHED_FIFO; threaded interrupts have 50, the kernel 99")
+    cpu: str = setting(
+        ANY_CPU, meaning="processor to stay on: its number, 'isolated' for the first isolated one, or 'any'"
+    )
+    lock_memory: bool = setting(True, meaning="keep all memory in place, with a reserve")
+
+    def __post_init__(self) -> None:
+        if self.cpu not in (ANY_CPU, ISOLATED_CPU) and not self.cpu.isdecimal():
+            raise ConfigError(f"`realtime.cpu` = {self.cpu!r} must be a processor's number, 'isolated' or 'any'")
+        if self.scheduler == "deadline" and self.cpu != ANY_CPU:
+            raise ConfigError(
+                f"`realtime.cpu` = {self.cpu!r} can't be had with `realtime.scheduler` = 'deadline', which the kernel "
+                "refuses to a process that is pinned; start it in an exclusive cpuset instead"
+            )
+
+
+@dataclass(frozen=True)
 class SafetySettings:
     """Checks before torque."""
 
@@ -535,6 +559,7 @@ class Settings:
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
     operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
     lockstep: LockstepSettings = setting(LockstepSettings, meaning="modelled time of the host")
+    realtime: RealtimeSettings = setting(RealtimeSettings, meaning="being on time")
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
 
@@ -542,6 +567,12 @@ class Settings:
     def cad_theta(self) -> Vector:
         """The CAD model's parameters (p,)."""
         return np.array(self.arm.cad_theta, dtype=np.float64)
+
+    @property
+    def realtime_request(self) -> RealtimeRequest:
+        """What the control process asks of the operating system."""
+        wish = self.realtime
+        return RealtimeRequest(wish.scheduler, wish.priority, wish.cpu, wish.lock_memory, self.bus.period_ns)
 
     def __post_init__(self) -> None:
         count = len(self.estimator.parameter_names)

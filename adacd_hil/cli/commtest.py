@@ -50,7 +50,7 @@ def run_commtest(
         except DeviceError as error:
             raise CommandError(str(error), ExitCode.BUS_MISSING) from None
         boot_frames = tap.take()
-        grant = request_realtime()
+        grant = request_realtime(settings.realtime_request)
         for line in grant.missing:
             _progress(f"not granted: {line}")
         recorder = None if out is None else _open_log(out, settings, codec, connection, grant)
@@ -118,21 +118,22 @@ def _exit_code(report: CommunicationReport, fault: FaultReason, is_interrupted: 
 
 def _open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, grant: RealtimeGrant) -> Recorder:
     out.mkdir(parents=True, exist_ok=True)
-    return Recorder(
-        out / LOG_NAME,
-        codec_path=codec.path,
-        attachments={codec.path.name: codec.text, "config.toml": to_toml(settings).encode()},
-        metadata={
-            "command": "commtest",
-            "config": settings.name,
-            "interface": connection.interface,
-            "channel": connection.channel,
-            "clock": "realtime",
-            "scheduler": grant.scheduler,
-            "period_us": str(settings.bus.period_us),
-        },
-        epoch_ns=wall_ns() - MonotonicClock().now_ns(),
-    )
+    with grant.unpinned():
+        return Recorder(
+            out / LOG_NAME,
+            codec_path=codec.path,
+            attachments={codec.path.name: codec.text, "config.toml": to_toml(settings).encode()},
+            metadata={
+                "command": "commtest",
+                "config": settings.name,
+                "interface": connection.interface,
+                "channel": connection.channel,
+                "clock": "realtime",
+                **grant.describe(),
+                "period_us": str(settings.bus.period_us),
+            },
+            epoch_ns=wall_ns() - MonotonicClock().now_ns(),
+        )
 
 
 def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
@@ -169,7 +170,7 @@ def describe(report: CommunicationReport, settings: Settings, scheduler: str) ->
 def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
     """Say what makes the figures worth less."""
     warnings = []
-    if not scheduler.startswith("SCHED_FIFO"):
+    if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
         warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
     silent = [name for name, device in report.devices.items() if not any(device.ages)]
     if silent:
