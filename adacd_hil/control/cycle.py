@@ -13,6 +13,7 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
+from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
@@ -83,8 +84,8 @@ class Cycle:
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
-        self._clock = clock
         self._exchange = Exchange(settings, bus, arm, master, clock)
+        self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
         self._controller = Controller(settings)
@@ -128,9 +129,10 @@ class Cycle:
             self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
             command, flags = self._limit(arm, output, self._bus.held_ns)
             self._arm.write(command)
+            record = self._evidence.record(tick, arm, self._pacer.overruns, recorder)
             if self._heartbeats.is_due(tick.cycle):
                 self._master.send_heartbeat()
-            self._record(recorder, tick, arm, request, output, command, flags)
+            self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
@@ -174,10 +176,10 @@ class Cycle:
         quick_stop = output.state is SchemeState.FAULT or (bool(flags) and GateFlag.NOT_A_NUMBER in flags)
         return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
 
-    def _record(
+    def _log(
         self,
         recorder: Recorder,
-        tick: Tick,
+        record: CycleRecord,
         arm: ArmState,
         request: Request,
         output: SchemeOutput,
@@ -186,34 +188,25 @@ class Cycle:
     ) -> None:
         """Hand the cycle to the logger and remember where the scheme stands."""
         t_ns = arm.t_ns
-        exchange = self._exchange
-        record = CycleRecord(
-            cycle=tick.cycle,
-            lateness_ns=tick.lateness_ns,
-            feedback_ns=exchange.feedback_ns - exchange.sync_ns,
-            command_ns=self._clock.now_ns() - exchange.sync_ns,
-            overruns=self._pacer.overruns,
-            frames_missing=self._arm.missing_frames,
-            commands_late=exchange.late_commands.count,
-        )
         messages = [
             (ChannelId.SCHEME, pack_scheme(output, request)),
-            (ChannelId.CONTROL, pack_control(tick.cycle, self._block, flags, command.enable, command.quick_stop)),
+            (ChannelId.CONTROL, pack_control(arm.cycle, self._block, flags, command.enable, command.quick_stop)),
             (ChannelId.CYCLE, pack_cycle(record)),
         ]
-        if self._frame_checks.is_due(tick.cycle):
+        if self._frame_checks.is_due(arm.cycle):
             messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
+        exchange = self._exchange
         for source in (self._master, exchange.troubles, exchange.late_commands):
             for event in source.take_events():
                 recorder.event(t_ns, event)
         if output.state is not self._state:
             event = self._transition(output)
             recorder.event(t_ns, event)
-            self._follow_state(output.state, tick.cycle)
-            self._progress(f"{tick.cycle * self._period_s:9.3f} s  {event.message}")
+            self._follow_state(output.state, arm.cycle)
+            self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
 
     def _transition(self, output: SchemeOutput) -> Event:
         text = f"{output.previous_state.name} -> {output.state.name}"

@@ -6,17 +6,18 @@ SYNC comes in, too, where another host sends it.
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.late_commands import LateCommands
-from adacd_hil.control.realtime import Tick
+from adacd_hil.control.realtime import Recurrence, Tick
 from adacd_hil.control.trouble_report import TroubleReport
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmState
-from adacd_hil.wire.bus import Frame, SilenceError
+from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError
 from adacd_hil.wire.tap import Tap
 
 FEEDBACK_SHARE = 0.7
 """Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
 the worst, and two commands need 230 µs before the next SYNC."""
+QUEUES_S = 0.01
 _MOST_FRAMES = 1000
 """Frames taken at once, so that a bus that somebody floods can't hold up the cycle: a classic one carries 21 per ms."""
 
@@ -32,12 +33,15 @@ class Exchange:
     def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, clock: Clock) -> None:
         self.sync_ns = 0
         self.feedback_ns = 0
+        self.queues = NOTHING_QUEUED
+        """What waited just after SYNC, SYNC included where it is sent here; looked at every 10 ms, a system call."""
         self.late_commands = LateCommands()
         self.troubles = TroubleReport()
         self._bus, self._arm, self._master = bus, arm, master
         self._clock = clock
         self._command_ids = tuple(drive.command_id for drive in arm.drives)
         self._is_following = settings.bus.follows
+        self._looks_at_queues = Recurrence(QUEUES_S, settings.bus.period_s)
         self._patience_s = FEEDBACK_SHARE * settings.bus.period_s
 
     def read(self, tick: Tick) -> ArmState:
@@ -55,6 +59,8 @@ class Exchange:
         late_count = sum(waiting.count(can_id) for can_id in self._command_ids) if waiting else 0
         self.late_commands.note(tick.cycle, late_count, self.sync_ns)
         arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
+        if self._looks_at_queues.is_due(tick.cycle):
+            self.queues = bus.queue_bytes()
         for early in tick.ahead:
             self._accept(early)
         try:

@@ -131,6 +131,11 @@ class Recorder:
         """Process id of the writer."""
         return self._process.pid
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that wait for the writer."""
+        return 0
+
     def cycle(
         self, t_ns: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]] = ()
     ) -> None:

@@ -230,9 +230,10 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
 def test_frames_that_waited_since_before_power_on_are_dropped():
     clock, stop = VirtualClock(), StopRequest()
     bus = ScriptedBus(clock, stop, 50 * MS)
-    bench = Bench(quiet_scenario(), CODEC, bus.send)
+    departure = Departure(bus)
+    bench = Bench(quiet_scenario(), CODEC, departure.send, on_answer=departure.go)
     bus.script.extend([(0, 0x080, b"\x05"), (0, *START_ALL)])
-    service = Service(bench, bus, clock, "sync", stop)
+    service = Service(bench, bus, departure, clock, "sync", stop)
     service.boot()
     service.run()
     assert bench.cycle == -1
