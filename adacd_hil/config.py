@@ -239,6 +239,11 @@ class BusSettings:
     sync: str = setting(
         "produce", choices=("produce", "follow"), meaning="send SYNC, or begin each cycle with that of another host"
     )
+    schedule: str = setting(
+        "same_cycle",
+        choices=("same_cycle", "pipelined"),
+        meaning="commands leave when they are ready, to act at the next SYNC; or behind that one, to act one later",
+    )
     sync_timeout_ms: int = setting(
         100, unit="ms", low=1, high=60_000, meaning="follow: longest wait for SYNC; the drives have stopped before"
     )
@@ -256,6 +261,11 @@ class BusSettings:
     def follows(self) -> bool:
         """Whether another host sends SYNC."""
         return self.sync == "follow"
+
+    @property
+    def is_pipelined(self) -> bool:
+        """Whether the commands of a cycle leave behind the SYNC of the next."""
+        return self.schedule == "pipelined"
 
     @property
     def period_s(self) -> float:

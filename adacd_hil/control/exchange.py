@@ -35,7 +35,7 @@ class Exchange:
         self.feedback_ns = 0
         self.queues = NOTHING_QUEUED
         """What waited just after SYNC, SYNC included where it is sent here; looked at every 10 ms, a system call."""
-        self.late_commands = LateCommands()
+        self.late_commands = LateCommands(settings.bus.is_pipelined)
         self.troubles = TroubleReport()
         self._bus, self._arm, self._master = bus, arm, master
         self._clock = clock

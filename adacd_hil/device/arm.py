@@ -25,6 +25,8 @@ SYNC_OVERFLOW = 240
 
 _Take = Callable[[bytes, int], bool]
 """What takes a frame's data and its cycle, and says whether something cyclic came of it."""
+_Command = tuple[list[float], bool, bool]
+"""Commanded torque of each joint, Nm; whether the drives are to be enabled; whether they are to stop quickly."""
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
 
 
@@ -58,6 +60,8 @@ class Arm:
         self._bus = bus
         self.sync_id = codec.message("Sync").can_id
         self._is_following = settings.bus.follows
+        self._is_pipelined = settings.bus.is_pipelined
+        self._pending: _Command | None = None
         self._sign = settings.arm.sign
         self._offset_Nm = settings.arm.torque_offset_Nm
         self._position_limit_deg = settings.arm.position_limit_deg
@@ -94,7 +98,7 @@ class Arm:
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
         """Begin a cycle: every device samples on this SYNC, every drive takes its last command. Raises BusError.
 
-        SYNC is sent here, unless another host sends it.
+        SYNC is sent here, unless another host sends it; pipelined commands leave behind it.
         """
         if self._cycle >= 0 and self._seen != _COMPLETE:
             self._miss()
@@ -103,8 +107,15 @@ class Arm:
         self._periods = periods
         self._received = 0
         self._seen = 0
-        if not self._is_following:
-            self._bus.send(self.sync_id, bytes((1 + cycle % SYNC_OVERFLOW,)))
+        frames: tuple[tuple[int, bytes], ...] = (
+            () if self._is_following else ((self.sync_id, bytes((1 + cycle % SYNC_OVERFLOW,))),)
+        )
+        if self._pending is not None:
+            tau_c, enable, quick_stop = self._pending
+            is_stale = periods > self._max_age
+            frames += self._encode([0.0] * JOINTS if is_stale else tau_c, enable, quick_stop)
+            self._pending = None
+        self._bus.send_all(frames)
 
     def _miss(self) -> None:
         """Let every device note that its frame of the cycle that ends now did not come."""
@@ -196,15 +207,21 @@ class Arm:
         return ages
 
     def write(self, command: ArmCommand) -> None:
-        """Send the commands of this cycle; they act at the next SYNC. Raises BusError."""
-        (drive1, drive2), (ratio1, ratio2) = self.drives, self._permille_per_Nm
-        tau1, tau2 = command.tau_c.tolist()
-        enable, quick_stop = command.enable, command.quick_stop
-        self._bus.send_all(
-            (
-                (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
-                (drive2.command_id, drive2.command(round(tau2 * ratio2), enable, quick_stop)),
-            )
+        """Send the commands of this cycle, to act at the next SYNC; pipelined, keep them until then. Raises BusError.
+
+        What has been kept for longer than a value may be old carries no torque.
+        """
+        values = command.tau_c.tolist(), command.enable, command.quick_stop
+        if self._is_pipelined:
+            self._pending = values
+        else:
+            self._bus.send_all(self._encode(*values))
+
+    def _encode(self, tau_c: list[float], enable: bool, quick_stop: bool) -> tuple[tuple[int, bytes], ...]:
+        (drive1, drive2), (ratio1, ratio2), (tau1, tau2) = self.drives, self._permille_per_Nm, tau_c
+        return (
+            (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
+            (drive2.command_id, drive2.command(round(tau2 * ratio2), enable, quick_stop)),
         )
 
     def frame_checks(self) -> FrameChecks:
