@@ -1,179 +1,41 @@
-"""The report's figures: the paper's figures 5 to 7, the contacts close up, and how punctual the cycles were.
-
-Drawn with matplotlib's object interface on a white ground; `svg` makes a fragment for a page instead, whose colours are
-the page's own CSS variables and which carries no style, script, date or reference to anything outside.
+"""The report's figures: the paper's figures 5 to 7, and the contacts close up.
 
 Colours mean one thing throughout: blue the identified model, orange the CAD model (told apart by every kind of colour
 vision), green joint 1 and purple joint 2 where the two share an axis, red what was detected.
 """
 
-import io
-import re
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.metrics import (
-    Contact,
-    Metrics,
-    Run,
-    Section,
-    filtered,
-    is_realtime,
-)
+from adacd_hil.analysis.drawing import COLOURS, PANEL_BINS, PAPER, Drawing, label_below, note, plot, style
+from adacd_hil.analysis.metrics import Contact, Metrics, Run, Section, filtered
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
 
-# Each colour is written once on paper and once as the page's variable of the same name.
-COLOURS: Final = {
-    "ink": "#1a2027",
-    "muted": "#5a6672",
-    "rule": "#c9d0d7",
-    "grid": "#e6eaee",
-    "identified": "#0067b1",
-    "cad": "#d9780a",
-    "joint1": "#00856a",
-    "joint2": "#8a4fa3",
-    "alarm": "#c4342d",
-    "adaptation": "#dcebf8",
-    "detection": "#fdfdfe",
-    "payload": "#f3ebdb",
-    "fault": "#f7dedc",
-}
-_PAPER: Final = "#ffffff"
-_DOTS_PER_INCH: Final = 150
-_FONT: Final = "DejaVu Sans"
-_ENVELOPE_BINS: Final = 1000
-"""Two points each: as fine as the widest screen on which the report is read."""
-_PANEL_BINS: Final = 250
-"""The same for a panel of which four share the width."""
 CLOSE_UPS: Final = 24
 """Contacts shown close up; six rows of four are a page."""
 _BEFORE_S: Final = 0.012
 _AFTER_S: Final = 0.06
 """From the onset, and at least: a typical detection, and the isolation window after it."""
 
-_STYLE: Final[dict[Any, Any]] = {
-    "font.family": _FONT,
-    "font.size": 8.5,
-    "mathtext.fontset": "dejavusans",
-    "axes.titlesize": 9.0,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlepad": 5.0,
-    "axes.labelsize": 8.5,
-    "axes.labelcolor": COLOURS["muted"],
-    "axes.edgecolor": COLOURS["rule"],
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.xmargin": 0.0,
-    "axes.unicode_minus": True,
-    "axes.titlecolor": COLOURS["ink"],
-    "grid.color": COLOURS["grid"],
-    "grid.linewidth": 0.6,
-    "text.color": COLOURS["ink"],
-    "xtick.color": COLOURS["rule"],
-    "ytick.color": COLOURS["rule"],
-    "xtick.labelcolor": COLOURS["muted"],
-    "ytick.labelcolor": COLOURS["muted"],
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "xtick.major.size": 3.0,
-    "ytick.major.size": 3.0,
-    "legend.frameon": False,
-    "legend.handlelength": 1.6,
-    "legend.borderpad": 0.0,
-    "legend.borderaxespad": 0.0,
-    "lines.solid_joinstyle": "round",
-    "path.simplify": False,
-    "svg.fonttype": "none",
-}
-
-
-def _style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
-    """Apply the figures' style for a while, whatever the user's own matplotlib configuration says."""
-    return mpl.rc_context({**mpl.rcParamsDefault, **_STYLE, **(more or {}), "backend": mpl.rcParams["backend"]})
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure with its name, its title and one sentence that says what to see."""
-
-    name: str
-    title: str
-    caption: str
-    figure: Figure
-
-    def png(self) -> bytes:
-        """Render on white, 150 dots per inch."""
-        out = io.BytesIO()
-        with _style():
-            canvas: Any = FigureCanvasAgg(self.figure)
-            self.figure.dpi = _DOTS_PER_INCH
-            canvas.print_png(out, metadata={"Software": None})
-        return out.getvalue()
-
-    def svg(self) -> str:
-        """Render a fragment for a page, see the module's first lines. Its ids begin with the figure's name."""
-        out = io.StringIO()
-        with _style({"svg.hashsalt": self.name}):
-            canvas: Any = FigureCanvasSVG(self.figure)
-            self.figure.patch.set_visible(False)
-            canvas.print_svg(out)
-            self.figure.patch.set_visible(True)
-        return _fragment(out.getvalue(), self.name, f"{self.title}. {self.caption}")
-
 
 def draw(run: Run, metrics: Metrics) -> list[Drawing]:
     """Draw every figure that the run has something for."""
     if run.cycle.size == 0:
         return []
-    with _style():
+    with style():
         drawings = [residuals(run, metrics)]
         adaptations = [section for section in metrics.sections if section.kind == "adaptation"]
         for number, section in enumerate(adaptations):
             drawings.append(adaptation(run, metrics, section, number))
         if metrics.contacts:
             drawings.append(close_ups(run, metrics))
-        if is_realtime(run) and run.timing.cycle.size:
-            drawings.append(punctuality(run))
     return drawings
-
-
-def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
-    """Choose the rows that keep the smallest and the largest value of each of `bins` equal parts, and both ends.
-
-    Rows ascend. A series of at most two rows per part is kept whole. NaN is chosen only where a part has nothing else.
-    """
-    count = y.shape[0]
-    width = -(-count // bins)
-    if width <= 2:
-        return np.arange(count)
-    whole = count // width * width
-    low = np.where(np.isnan(y), np.inf, y)
-    high = np.where(np.isnan(y), -np.inf, y)
-    starts = np.arange(0, whole, width)
-    chosen = [starts + part[:whole].reshape(-1, width).argmin(axis=1) for part in (low, -high)]
-    if whole < count:
-        chosen += [[whole + part[whole:].argmin()] for part in (low, -high)]
-    return np.unique(np.concatenate([*chosen, [0, count - 1]]))
-
-
-def _plot(axes: Axes, x: Vector, y: Vector, bins: int = _ENVELOPE_BINS, **style: Any) -> None:
-    rows = envelope(y, bins)
-    axes.plot(x[rows], y[rows], **style)
 
 
 def residuals(run: Run, metrics: Metrics) -> Drawing:
@@ -192,7 +54,7 @@ def residuals(run: Run, metrics: Metrics) -> Drawing:
             for level in (-h, h):
                 axes.axhline(level, color=COLOURS["ink"], linewidth=0.8, dashes=(4, 2.5), label="threshold")
             if run.has_cad:
-                _plot(
+                plot(
                     axes,
                     time_s[shown],
                     run.tau_ext_hat_cad[shown, joint],
@@ -200,7 +62,7 @@ def residuals(run: Run, metrics: Metrics) -> Drawing:
                     linewidth=0.7,
                     label="with the CAD model",
                 )
-            _plot(
+            plot(
                 axes,
                 time_s[shown],
                 run.tau_ext_hat[shown, joint],
@@ -320,7 +182,7 @@ def _mark(axes: Axes, metrics: Metrics) -> None:
             va="center_baseline",
             fontsize=7.0,
             fontweight="bold",
-            color=_PAPER if is_seen else COLOURS["alarm"],
+            color=PAPER if is_seen else COLOURS["alarm"],
         )
     for false_s in metrics.false_alarms_s or ():
         axes.plot(
@@ -367,7 +229,7 @@ def adaptation(run: Run, metrics: Metrics, section: Section, number: int) -> Dra
         true, final = identified[name]
         if true is not None:
             axes.axhline(true, color=COLOURS["ink"], linewidth=0.9, dashes=(4, 2.5))
-        _plot(axes, time_s[rows], run.theta_hat[rows, column], _PANEL_BINS, color=COLOURS["identified"], linewidth=1.3)
+        plot(axes, time_s[rows], run.theta_hat[rows, column], PANEL_BINS, color=COLOURS["identified"], linewidth=1.3)
         _head(axes, name, true, final)
         _fit(axes, run.theta_hat[rows, column], true)
     _ending(panels[len(names)], run, rows, time_s)
@@ -379,7 +241,7 @@ def adaptation(run: Run, metrics: Metrics, section: Section, number: int) -> Dra
         if section.is_complete:
             axes.axvspan(0.0, section.duration_s, color=COLOURS["adaptation"], linewidth=0.0, zorder=0, alpha=0.55)
             axes.axvline(section.duration_s, color=COLOURS["muted"], linewidth=0.8, zorder=1)
-    _label_below(figure, "time since the adaptation began, s")
+    label_below(figure, "time since the adaptation began, s")
     ordinal = ("first", "second", "third", "fourth", "fifth")[number] if number < 5 else f"{number + 1}th"
     payload_kg = metrics.payload_kg[section.label]
     payload = "" if payload_kg is None else f", {payload_kg:g} kg payload" if payload_kg else ", no payload"
@@ -402,22 +264,7 @@ def _head(axes: Axes, name: str, true: float | None, final: float) -> None:
     text = f"{final:.4f}"
     if true:
         text += f"  ({100.0 * (final - true) / true:+.1f} %)".replace("-", "−")
-    _note(axes, f"{text}  {PARAMETER_UNITS[name]}")
-
-
-def _note(axes: Axes, text: str) -> None:
-    """Write above the right end of a panel."""
-    axes.annotate(
-        text,
-        (1.0, 1.0),
-        xycoords="axes fraction",
-        xytext=(0, 5),
-        textcoords="offset points",
-        ha="right",
-        va="bottom",
-        fontsize=7.8,
-        color=COLOURS["muted"],
-    )
+    note(axes, f"{text}  {PARAMETER_UNITS[name]}")
 
 
 def _fit(axes: Axes, values: Vector, true: float | None) -> None:
@@ -429,25 +276,18 @@ def _fit(axes: Axes, values: Vector, true: float | None) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
 
 
-def _label_below(figure: Figure, text: str) -> None:
-    """Write one label for the abscissae of all panels."""
-    figure.text(
-        0.5175, 0.08 / figure.get_figheight(), text, ha="center", va="bottom", fontsize=8.5, color=COLOURS["muted"]
-    )
-
-
 def _ending(axes: Axes, run: Run, rows: NDArray[np.bool_], time_s: Vector) -> None:
     """Draw the larger residual of both joints against β, on a logarithmic ordinate."""
     largest = np.abs(run.tau_ext_hat[rows]).max(axis=1)
     beta_Nm = run.settings.termination.beta_Nm
     axes.set_yscale("log")
-    _plot(axes, time_s[rows], np.maximum(largest, 1e-4), _PANEL_BINS, color=COLOURS["muted"], linewidth=0.8)
+    plot(axes, time_s[rows], np.maximum(largest, 1e-4), PANEL_BINS, color=COLOURS["muted"], linewidth=0.8)
     axes.axhline(beta_Nm, color=COLOURS["alarm"], linewidth=0.9, dashes=(4, 2.5))
     high = float(np.nanmax(largest, initial=beta_Nm))
     axes.set_ylim(1e-3, max(3.0 * high, 5.0 * beta_Nm))
     axes.minorticks_off()
     axes.set_title("eq. (15)")
-    _note(axes, f"residual, β = {beta_Nm:g} Nm")
+    note(axes, f"residual, β = {beta_Nm:g} Nm")
 
 
 def close_ups(run: Run, metrics: Metrics) -> Drawing:
@@ -466,7 +306,7 @@ def close_ups(run: Run, metrics: Metrics) -> Drawing:
         _close_up(axes, run, contact, time_s)
     for axes in list(grid.flat)[len(contacts) :]:
         axes.set_axis_off()
-    _label_below(figure, "time since onset, ms" if run.truth else "time since detection, ms")
+    label_below(figure, "time since onset, ms" if run.truth else "time since detection, ms")
     handles, labels = grid.flat[0].get_legend_handles_labels()
     figure.legend(
         handles,
@@ -558,95 +398,3 @@ def _describe(axes: Axes, contact: Contact) -> None:
         fontsize=7.8,
         color=colour,
     )
-
-
-def punctuality(run: Run) -> Drawing:
-    """Draw how late the cycles woke, and when their feedback was in and their commands were out."""
-    figure = Figure(figsize=(10.0, 2.5))
-    grid = figure.subplots(1, 3)
-    figure.subplots_adjust(left=0.05, right=0.985, bottom=0.2, top=0.87, wspace=0.2)
-    period_us = run.settings.bus.period_us
-    timing = run.timing
-    panels = (
-        ("Wake-up", timing.lateness_ns),
-        ("Feedback in", timing.feedback_ns),
-        ("Commands out", timing.command_ns),
-    )
-    for axes, (title, values_ns) in zip(grid, panels, strict=True):
-        values_us = values_ns * 1e-3
-        top_us = max(float(values_us.max()) * 1.02, 1.0)
-        heights, edges = np.histogram(values_us, bins=60, range=(min(0.0, float(values_us.min())), top_us))
-        axes.set_yscale("log")
-        axes.stairs(heights, edges, fill=True, color=COLOURS["muted"], baseline=0.5)
-        axes.set_ylim(0.5, 2.0 * max(float(heights.max()), 1.0))
-        axes.set_xlim(edges[0], edges[-1])
-        axes.minorticks_off()
-        axes.set_title(title)
-        p99, largest = np.percentile(values_us, (99.0, 100.0))
-        if top_us > period_us:
-            axes.axvline(period_us, color=COLOURS["alarm"], linewidth=0.9, dashes=(4, 2.5))
-        axes.annotate(
-            f"99 %: {p99:.0f} µs   max {largest:.0f} µs",
-            (1.0, 1.0),
-            xycoords="axes fraction",
-            xytext=(0, 5),
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            fontsize=7.8,
-            color=COLOURS["muted"],
-        )
-    grid[0].set_ylabel("cycles")
-    grid[0].set_xlabel("after the grid point, µs")
-    for axes in grid[1:]:
-        axes.set_xlabel("after SYNC, µs")
-    caption = f"Distribution over all cycles, logarithmic; the period is {period_us} µs."
-    return Drawing("cycle", "Punctuality of the cycles", caption, figure)
-
-
-_VARIABLES: Final = {colour: f"var(--{name})" for name, colour in COLOURS.items()} | {_PAPER: "var(--paper)"}
-_HEAD: Final = re.compile(r".*?<svg[^>]*viewBox=\"([^\"]*)\"[^>]*>", re.DOTALL)
-_UNWANTED: Final = re.compile(r"<metadata>.*?</metadata>|<style[^>]*>.*?</style>|<!--.*?-->", re.DOTALL)
-_STYLES: Final = re.compile(r' style="([^"]*)"')
-_COLOUR: Final = re.compile(r"#[0-9a-f]{6}")
-_ID: Final = re.compile(r' id="([^"]*)"')
-_USE: Final = re.compile(r'(?:xlink:)?href="#([^"]*)"')
-_URL: Final = re.compile(r"url\(#([^)]*)\)")
-
-
-def _fragment(text: str, name: str, description: str) -> str:
-    """Turn matplotlib's file into a fragment: attributes for styles, variables for colours, ids of its own."""
-    head = _HEAD.match(text)
-    assert head is not None
-    body = _UNWANTED.sub("", text[head.end() :])
-    body = _STYLES.sub(_attributes, body)
-    used = {found for pattern in (_USE, _URL) for found in pattern.findall(body)}
-    body = _ID.sub(lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", body)
-    body = _USE.sub(lambda m: f'href="#{name}-{m[1]}"', body)
-    body = _URL.sub(lambda m: f"url(#{name}-{m[1]})", body)
-    body = _COLOUR.sub(lambda m: _VARIABLES.get(m[0], m[0]), body)
-    body = re.sub(r"\n\s*", "\n", body)
-    label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
-    return f'<svg viewBox="{head[1]}" role="img" aria-label="{label}">{body.strip()}'
-
-
-def _attributes(match: re.Match[str]) -> str:
-    """Write a style as presentation attributes, so that a strict content policy need not allow inline styles."""
-    attributes = []
-    for declaration in match[1].replace("&quot;", "'").split(";"):
-        key, _, value = declaration.strip().partition(": ")
-        if key == "font":
-            attributes += _font(value)
-        elif key:
-            attributes.append((key, value.strip()))
-    return "".join(f' {key}="{value}"' for key, value in attributes)
-
-
-def _font(value: str) -> list[tuple[str, str]]:
-    """Split the shorthand `[italic] [bold] 8.5px family`; the family is the page's own."""
-    words = value.split("px", 1)[0].split()
-    attributes = [("font-size", words[-1])]
-    if "italic" in words or "oblique" in words:
-        attributes.append(("font-style", "italic"))
-    attributes += [("font-weight", word) for word in words[:-1] if word.isdigit() or word == "bold"]
-    return attributes

@@ -1,16 +1,53 @@
 """Histograms and percentiles as text."""
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 PERCENTILE_NAMES = ("p50", "p99", "p99.9", "max")
+LOW_PERCENTILE_NAMES = ("p50", "p1", "p0.1", "min")
+BINS_PER_DECADE = 20
+DECADES = 6
+"""Of a histogram with logarithmic bins, from 1 on: of times in µs up to 1 s."""
 _BAR = 40
 
+Values = NDArray[np.int64] | NDArray[np.float64]
 
-def percentiles(values: NDArray[np.int64] | NDArray[np.float64]) -> dict[str, float]:
+
+class LogHistogram(NamedTuple):
+    """Counts (n,) of values in bins of equal width on a logarithmic axis, between `edges` (n + 1,).
+
+    below: values less than the first edge, negative ones too. above: values from the last edge on.
+    """
+
+    edges: NDArray[np.float64]
+    counts: NDArray[np.int64]
+    below: int
+    above: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values; empty bins at both ends are left out."""
+        filled = np.flatnonzero(self.counts)
+        first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)
+        return {
+            "edges": self.edges[first : end + 1].tolist(),
+            "counts": self.counts[first:end].tolist(),
+            "below": self.below,
+            "above": self.above,
+        }
+
+
+def log_histogram(values: Values) -> LogHistogram:
+    """Count values in logarithmic bins from 1 on; a value on an edge belongs to the upper bin."""
+    edges = np.logspace(0.0, DECADES, BINS_PER_DECADE * DECADES + 1)
+    places = np.bincount(np.searchsorted(edges, values, side="right"), minlength=edges.size + 1)
+    return LogHistogram(edges, places[1:-1], int(places[0]), int(places[-1]))
+
+
+def percentiles(values: Values) -> dict[str, float]:
     """Return p50, p99, p99.9 and max of values that occurred (no interpolation); empty without values."""
     if values.size == 0:
         return {}
@@ -18,7 +55,13 @@ def percentiles(values: NDArray[np.int64] | NDArray[np.float64]) -> dict[str, fl
     return dict(zip(PERCENTILE_NAMES, map(float, found), strict=True))
 
 
-def doubling_bins(values: NDArray[np.int64] | NDArray[np.float64], first: float, count: int) -> list[tuple[float, int]]:
+def low_percentiles(values: Values) -> dict[str, float]:
+    """Return p50, p1, p0.1 and min of values that occurred, for values that must not be small."""
+    mirrored = percentiles(-values)
+    return {name: -value for name, value in zip(LOW_PERCENTILE_NAMES, mirrored.values(), strict=False)}
+
+
+def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float, int]]:
     """Count values below first, 2 first, 4 first, …; the last bin has no upper bound (inf). Trailing empty bins go."""
     bounds = [first * 2.0**power for power in range(count - 1)] + [float("inf")]
     places = np.searchsorted(bounds, values, side="right")

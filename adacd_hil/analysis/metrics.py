@@ -29,10 +29,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.timing import CycleColumns, Cycles, TimingEvidence, collect_evidence, find_reactions
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, FaultReason, SchemeState, Vector
 
-Cycles = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SETTLING_TIME_CONSTANTS: Final = 10.0
@@ -52,19 +52,6 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Timing:
-    """How the cycles went, on their own numbers (k,); times in ns."""
-
-    cycle: Cycles
-    lateness_ns: Cycles
-    feedback_ns: Cycles
-    command_ns: Cycles
-    overruns: Cycles
-    frames_missing: Cycles
-    commands_late: Cycles
-
-
-@dataclass(frozen=True)
 class Run:
     """A run as plain arrays over its n cycles; `truth` is None on a real arm."""
 
@@ -78,7 +65,7 @@ class Run:
     threshold: Vector
     quiet_s: Vector
     reports: tuple[ContactReport, ...]
-    timing: Timing
+    timing: CycleColumns
     truth: Truth | None
     settings: Settings
     metadata: Mapping[str, str]
@@ -171,27 +158,11 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Percentiles:
-    """Percentiles of a time, µs."""
-
-    p50: float
-    p99: float
-    p999: float
-    max: float
-
-
-@dataclass(frozen=True)
 class CycleStatistics:
-    """How the cycles went; `lateness_us` is None in lockstep, where there is no grid to be late on."""
+    """How many cycles, for how long, and what drove them."""
 
     count: int
     duration_s: float
-    overruns: int
-    frames_missing: int
-    commands_late: int
-    feedback_us: Percentiles | None
-    command_us: Percentiles | None
-    lateness_us: Percentiles | None
     clock: str | None
     scheduler: str | None
 
@@ -221,6 +192,7 @@ class Metrics:
     fault: str | None
     fault_s: float | None
     cycle: CycleStatistics
+    timing: TimingEvidence
     frames: int | None
     dropped: int | None
     paper: tuple[PaperRow, ...]
@@ -282,6 +254,7 @@ def evaluate(run: Run) -> Metrics:
         fault=fault,
         fault_s=fault_s,
         cycle=cycle_statistics(run),
+        timing=timing_evidence(run),
         frames=run.frames,
         dropped=run.dropped,
         paper=_paper_rows(run, sections, adaptation_s, residuals, contacts, payload_kg),
@@ -617,14 +590,6 @@ def _payload_at(run: Run, cycle: int) -> float | None:
     return float(run.truth.payload_kg[row])
 
 
-def percentiles(values_ns: NDArray[Any]) -> Percentiles | None:
-    """Give percentiles in µs of times in ns; None if there are none."""
-    if values_ns.size == 0:
-        return None
-    p50, p99, p999, largest = np.percentile(values_ns, (50.0, 99.0, 99.9, 100.0)) * 1e-3
-    return Percentiles(float(p50), float(p99), float(p999), float(largest))
-
-
 def is_realtime(run: Run) -> bool:
     """Tell whether the host's own clock drove the cycles."""
     return run.metadata.get("clock") == "realtime"
@@ -632,19 +597,18 @@ def is_realtime(run: Run) -> bool:
 
 def cycle_statistics(run: Run) -> CycleStatistics:
     """Give the statistics of all cycles, those before motion start included."""
-    timing = run.timing
     return CycleStatistics(
-        count=int(timing.cycle.size),
+        count=len(run.timing),
         duration_s=float((run.t_ns[-1] - run.t_ns[0]) * 1e-9) if run.t_ns.size else 0.0,
-        overruns=int(timing.overruns.max(initial=0)),
-        frames_missing=int(timing.frames_missing.sum()),
-        commands_late=int(timing.commands_late.sum()),
-        feedback_us=percentiles(timing.feedback_ns),
-        command_us=percentiles(timing.command_ns),
-        lateness_us=percentiles(timing.lateness_ns) if is_realtime(run) else None,
         clock=run.metadata.get("clock"),
         scheduler=run.metadata.get("scheduler"),
     )
+
+
+def timing_evidence(run: Run) -> TimingEvidence:
+    """Sum up the times of all cycles, those before motion start included."""
+    reactions = find_reactions(run.timing, run.cycle, run.state)
+    return collect_evidence(run.timing, run.settings.bus.period_us, not is_realtime(run), reactions)
 
 
 def _paper_rows(

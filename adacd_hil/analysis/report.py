@@ -8,26 +8,28 @@ import dataclasses
 import hashlib
 import json
 import math
-import re
 import tomllib
-from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from adacd_hil.analysis.figures import Drawing, draw
-from adacd_hil.analysis.metrics import Contact, Metrics, Percentiles, Residual, Run, Timing, Truth, evaluate
+from adacd_hil.analysis.drawing import Drawing
+from adacd_hil.analysis.figures import draw
+from adacd_hil.analysis.metrics import Contact, Metrics, Residual, Run, Truth, evaluate
+from adacd_hil.analysis.page import NONE, Cell, document, embed, heading, make_table, number_text, wrap_section
+from adacd_hil.analysis.timing import columns_of_series
+from adacd_hil.analysis.timing_figures import draw_timing
+from adacd_hil.analysis.timing_page import timing_section
 from adacd_hil.config import Settings, parse
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import PARAMETER_UNITS, Request
 
-SCHEMA: Final = 1
+SCHEMA: Final = 2
 """Version of report.json; goes up when a key changes its meaning or disappears."""
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
@@ -89,6 +91,7 @@ def write_run_report(run: Run, out_dir: Path, *, log_name: str, problem: str = "
     """Write the report of a run that is in memory. Raises LogError when it can't be written."""
     metrics = evaluate(run)
     drawings = draw(run, metrics)
+    timing = draw_timing(run.timing, metrics.timing, run.zero_ns, "motion start")
     pngs = {drawing.name: drawing.png() for drawing in drawings if drawing.name in _PNG_FIGURES}
     report = Report(
         metrics=metrics,
@@ -106,7 +109,7 @@ def write_run_report(run: Run, out_dir: Path, *, log_name: str, problem: str = "
             (out_dir / f"{name}.png").write_bytes(png)
         text = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
         report.json_path.write_text(text + "\n", encoding="utf-8")
-        report.html_path.write_text(page(report, run, drawings), encoding="utf-8")
+        report.html_path.write_text(page(report, run, drawings, timing), encoding="utf-8")
     except OSError as error:
         raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
     return report
@@ -114,7 +117,7 @@ def write_run_report(run: Run, out_dir: Path, *, log_name: str, problem: str = "
 
 def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
     """Take what the metrics need out of a log and the emulator's own log. Raises LogError."""
-    scheme, cycle = log.scheme, log.cycle
+    scheme = log.scheme
     metadata = dict(log.metadata)
     if "arm.dbc" in log.attachments:
         metadata["dbc_sha256"] = hashlib.sha256(log.attachments["arm.dbc"]).hexdigest()
@@ -131,15 +134,7 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
         threshold=scheme["threshold"],
         quiet_s=scheme["quiet_s"],
         reports=tuple(entry.report for entry in log.contacts),
-        timing=Timing(
-            cycle=cycle["cycle"].astype(np.int64),
-            lateness_ns=cycle["lateness_ns"],
-            feedback_ns=cycle["feedback_ns"],
-            command_ns=cycle["command_ns"],
-            overruns=cycle["overruns"].astype(np.int64),
-            frames_missing=cycle["frames_missing"].astype(np.int64),
-            commands_late=cycle["commands_late"].astype(np.int64),
-        ),
+        timing=columns_of_series(log.cycle),
         finish_cycle=_finish_cycle(scheme),
         truth=_truth(truth_log),
         settings=_settings(log),
@@ -187,8 +182,6 @@ def _count(summary: Mapping[str, str], key: str) -> int | None:
 def _as_json(
     metrics: Metrics, metadata: Mapping[str, str], log_name: str, problem: str, is_complete: bool
 ) -> dict[str, Any]:
-    cycle = dataclasses.asdict(metrics.cycle)
-    latency = {"feedback": cycle.pop("feedback_us"), "command": cycle.pop("command_us")}
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
     plain: dict[str, Any] = _plain(
         {
@@ -211,7 +204,8 @@ def _as_json(
             "parameters": metrics.parameters,
             "payload_kg": metrics.payload_kg,
             "fault": fault,
-            "cycle": {**cycle, "latency_us": latency},
+            "cycle": dataclasses.asdict(metrics.cycle),
+            "timing": metrics.timing.as_json(),
             "log": {
                 "name": log_name,
                 "frames": metrics.frames,
@@ -237,29 +231,16 @@ def _plain(value: Any) -> Any:
     return value
 
 
-_NONE: Final = "–"
-_UNIT: Final = re.compile(r"(?<=\d) (?=(?:s|kg)\b)")
-"""The space between a number and its unit, where a line must not end."""
-
-
-def _number(value: float | None, digits: int, unit: str = "") -> str:
-    """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
-    if value is None or not math.isfinite(value):
-        return _NONE
-    text = f"{value:.{digits}f}".replace("-", "−")
-    return f"{text} {unit}" if unit else text
-
-
 def _pair(values: Sequence[float] | None, digits: int) -> str:
-    return _NONE if values is None else " / ".join(_number(value, digits) for value in values)
+    return NONE if values is None else " / ".join(number_text(value, digits) for value in values)
 
 
 def _yes(value: bool | None) -> str:
-    return _NONE if value is None else "yes" if value else "no"
+    return NONE if value is None else "yes" if value else "no"
 
 
 def _signs(direction: tuple[int, int] | None) -> str:
-    return _NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
+    return NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
 
 
 _CONTACT_HEAD: Final = (
@@ -269,24 +250,24 @@ _CONTACT_HEAD: Final = (
 
 
 def _contact_words(contact: Contact) -> tuple[str, ...]:
-    delay = _number(contact.delay_ms, 0)
+    delay = number_text(contact.delay_ms, 0)
     if contact.detected_s is None:
         delay = "missed" if contact.is_armed else "not armed"
     onset_s = contact.detected_s if contact.onset_s is None else contact.onset_s
     return (
         str(contact.number),
-        contact.section or _NONE,
-        _number(contact.link, 0),
-        _number(contact.link_detected, 0),
-        _number(contact.link_at_alarm, 0),
-        _number(onset_s, 3),
+        contact.section or NONE,
+        number_text(contact.link, 0),
+        number_text(contact.link_detected, 0),
+        number_text(contact.link_at_alarm, 0),
+        number_text(onset_s, 3),
         delay,
-        _number(contact.law_ms, 1),
-        _number(contact.ideal_ms, 0),
+        number_text(contact.law_ms, 1),
+        number_text(contact.ideal_ms, 0),
         _signs(contact.direction),
         _yes(contact.direction_ok),
         _pair(contact.tau_ext_Nm, 2),
-        _number(contact.torque_error_ratio, 2),
+        number_text(contact.torque_error_ratio, 2),
     )
 
 
@@ -296,35 +277,24 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def page(report: Report, run: Run, drawings: Sequence[Drawing]) -> str:
-    """Write the page."""
-    style = resources.files("adacd_hil.analysis").joinpath("report.css").read_text(encoding="utf-8").strip()
-    digest = b64encode(hashlib.sha256(f"\n{style}\n".encode()).digest()).decode()
-    policy = f"default-src 'none'; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
-    figures = {drawing.name: _figure(drawing) for drawing in drawings}
+def page(report: Report, run: Run, drawings: Sequence[Drawing], timing: Sequence[Drawing]) -> str:
+    """Write the page. drawings, timing: the figures of the run and of its times."""
+    figures = {drawing.name: embed(drawing) for drawing in drawings}
     metrics = report.metrics
     adaptations = "".join(figure for name, figure in figures.items() if name.removeprefix("fig") not in (name, "5"))
     parts = [
         _header(report),
         _tiles(metrics),
         figures.get("fig5", ""),
-        _section("Paper against measured", _paper_table(metrics)),
-        _section("Sections", _sections_table(metrics, run)),
-        _section("Contacts", figures.get("contacts", ""), _contacts_table(metrics)),
-        _section("Model identification", adaptations, _parameters_table(metrics, run)),
-        _section("Cycle", figures.get("cycle", ""), _cycle_table(metrics)),
-        _section("Run", _run_table(report)),
+        wrap_section("Paper against measured", _paper_table(metrics)),
+        wrap_section("Sections", _sections_table(metrics, run)),
+        wrap_section("Contacts", figures.get("contacts", ""), _contacts_table(metrics)),
+        wrap_section("Model identification", adaptations, _parameters_table(metrics, run)),
+        timing_section(metrics.timing, timing),
+        wrap_section("Run", _run_table(report)),
         _definitions(run),
     ]
-    body = "\n".join(part for part in parts if part)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(_name(report))} – run report</title>\n"
-        f"<style>\n{style}\n</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
-    )
+    return document(f"{_name(report)} – run report", parts)
 
 
 def _name(report: Report) -> str:
@@ -333,27 +303,23 @@ def _name(report: Report) -> str:
 
 
 def _header(report: Report) -> str:
-    tone = "good" if report.metrics.is_clean else "bad"
     meta = [
         ("configuration", "config"), ("profile", "profile"), ("clock", "clock"), ("interface", "interface"),
         ("version", "version"),
     ]  # fmt: skip
     words = [f"{label} {report.metadata[key]}" for label, key in meta if report.metadata.get(key)]
-    problem = f'<p class="problem">The log is not whole: {escape(report.problem)}</p>' if report.problem else ""
-    verdict = _UNIT.sub("&nbsp;", escape(report.metrics.verdict))
-    if not problem and report.metrics.dropped:
-        problem = f'<p class="problem">{report.metrics.dropped} packets are not in the log.</p>'
-    return (
-        f'<header class="{tone}">\n<p class="over">adacd-hil run report · {escape(" · ".join(words))}</p>\n'
-        f"<h1>{verdict}</h1>\n{problem}</header>"
-    )
+    problems = [f"The log is not whole: {report.problem}"] if report.problem else []
+    if not problems and report.metrics.dropped:
+        problems = [f"{report.metrics.dropped} packets are not in the log."]
+    over = f"adacd-hil run report · {' · '.join(words)}"
+    return heading(over, report.metrics.verdict, problems, report.metrics.is_clean)
 
 
 def _tiles(metrics: Metrics) -> str:
     """Write the handful of numbers to be read first."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
-    times_s = [_number(value, 2) for value in metrics.adaptation_s.values()]
+    times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]
     delays_ms = [contact.delay_ms for contact in seen if contact.delay_ms is not None]
     laws_ms = [contact.law_ms for contact in seen if contact.law_ms is not None]
     frozen = [max(r.identified) for r in metrics.frozen_residual_max_Nm.values() if r.identified is not None]
@@ -361,15 +327,15 @@ def _tiles(metrics: Metrics) -> str:
     right = sum(contact.link == contact.link_detected for contact in links)
     has_truth = metrics.missed is not None
     tiles = [
-        ("identified in", " · ".join(times_s) or _NONE, "s"),
+        ("identified in", " · ".join(times_s) or NONE, "s"),
         ("contacts detected", f"{len(seen)} of {len(armed)}", "") if has_truth else ("detections", str(len(seen)), ""),
-        ("false alarms", _NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
-        ("link right", f"{right} of {len(links)}" if links else _NONE, ""),
-        ("median delay", _number(float(np.median(delays_ms)), 1) if delays_ms else _NONE, "ms"),
-        ("of which by law", _number(float(np.median(laws_ms)), 1) if laws_ms else _NONE, "ms"),
-        ("largest frozen residual", _number(max(frozen), 3) if frozen else _NONE, "Nm"),
+        ("false alarms", NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
+        ("link right", f"{right} of {len(links)}" if links else NONE, ""),
+        ("median delay", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
+        ("of which by law", number_text(float(np.median(laws_ms)), 1) if laws_ms else NONE, "ms"),
+        ("largest frozen residual", number_text(max(frozen), 3) if frozen else NONE, "Nm"),
     ]
-    tiles = [tile for tile in tiles if tile[1] != _NONE]
+    tiles = [tile for tile in tiles if tile[1] != NONE]
     cells = "".join(
         f"<div><dt>{escape(label)}</dt><dd>{escape(value)}{f' <small>{unit}</small>' if unit else ''}</dd></div>"
         for label, value, unit in tiles
@@ -377,43 +343,9 @@ def _tiles(metrics: Metrics) -> str:
     return f'<dl class="tiles">{cells}</dl>'
 
 
-def _figure(drawing: Drawing) -> str:
-    caption = f"<b>{escape(drawing.title)}.</b> {escape(drawing.caption)}"
-    return (
-        f'<figure id="{drawing.name}">\n<div class="scroll">{drawing.svg()}</div>\n'
-        f"<figcaption>{caption}</figcaption>\n</figure>\n"
-    )
-
-
-def _section(title: str, *content: str) -> str:
-    inner = "\n".join(part for part in content if part)
-    return f"<section>\n<h2>{escape(title)}</h2>\n{inner}\n</section>" if inner else ""
-
-
-Cell = str | tuple[str, str]
-"""Text, already escaped, or the text and the class of its cell."""
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[Cell]], left: Sequence[int] = (0,)) -> str:
-    """Write a table; columns are aligned right but those of `left`."""
-
-    def cell(tag: str, content: Cell, column: int) -> str:
-        text, kind = content if isinstance(content, tuple) else (content, "")
-        names = " ".join(filter(None, ("l" if column in left else "", kind)))
-        kinds = f' class="{names}"' if names else ""
-        return f"<{tag}{kinds}>{text}</{tag}>"
-
-    def line(tag: str, cells: Sequence[Cell]) -> str:
-        return "<tr>" + "".join(cell(tag, content, column) for column, content in enumerate(cells)) + "</tr>"
-
-    body = "\n".join(line("td", row) for row in rows)
-    top = f"<thead>{line('th', head)}</thead>\n" if any(head) else ""
-    return f'<div class="scroll card"><table>\n{top}<tbody>\n{body}\n</tbody>\n</table></div>'
-
-
 def _paper_table(metrics: Metrics) -> str:
     rows = [(escape(row.quantity), escape(row.paper), (escape(row.measured), "strong")) for row in metrics.paper]
-    return _table(("quantity", "paper", "measured"), rows, left=(0, 1, 2))
+    return make_table(("quantity", "paper", "measured"), rows, left=(0, 1, 2))
 
 
 _KINDS: Final = {
@@ -434,24 +366,24 @@ def _sections_table(metrics: Metrics, run: Run) -> str:
                 (section.label, "strong"),
                 _KINDS[section.kind]
                 + ("" if section.is_complete or section.kind != "adaptation" else ", not finished"),
-                _number(section.start_s, 3),
-                _number(section.end_s, 3),
-                _number(section.duration_s, 3),
+                number_text(section.start_s, 3),
+                number_text(section.end_s, 3),
+                number_text(section.duration_s, 3),
                 _judged(residual.identified, threshold),
                 _judged(residual.cad, threshold),
-                str(residual.cycles) if residual.cycles else _NONE,
+                str(residual.cycles) if residual.cycles else NONE,
             )
         )
     head = (
         "section", "", "from, s", "to, s", "lasts, s", "largest residual, frozen, Nm", "with CAD, Nm", "over cycles",
     )  # fmt: skip
     note = "Residuals of joint 1 / joint 2 where nobody touches the arm; marked where over the threshold."
-    return _table(head, rows, left=(0, 1)) + f'<p class="note">{note}</p>'
+    return make_table(head, rows, left=(0, 1)) + f'<p class="note">{note}</p>'
 
 
 def _judged(values: tuple[float, float] | None, threshold: tuple[float, float]) -> Cell:
     if values is None:
-        return _NONE
+        return NONE
     is_over = any(value > bound for value, bound in zip(values, threshold, strict=True))
     return (_pair(values, 3), "bad" if is_over else "")
 
@@ -471,9 +403,9 @@ def _contacts_table(metrics: Metrics) -> str:
         rows.append(cells)
     note = ""
     if metrics.false_alarms_s:
-        times = ", ".join(_number(time_s, 3) for time_s in metrics.false_alarms_s)
+        times = ", ".join(number_text(time_s, 3) for time_s in metrics.false_alarms_s)
         note = f'<p class="note bad">False alarms at {times} s.</p>'
-    return _table(_CONTACT_HEAD, rows, left=()) + note
+    return make_table(_CONTACT_HEAD, rows, left=()) + note
 
 
 def _symbol(name: str) -> str:
@@ -491,52 +423,28 @@ def _parameters_table(metrics: Metrics, run: Run) -> str:
         head += [f"true ({label}{with_payload})", f"identified ({label})", "error"]
     rows = []
     for name in run.parameter_names:
-        cells: list[Cell] = [_symbol(name), escape(PARAMETER_UNITS[name]), _number(cad.get(name), 4)]
+        cells: list[Cell] = [_symbol(name), escape(PARAMETER_UNITS[name]), number_text(cad.get(name), 4)]
         for found in metrics.parameters.values():
             true, identified = found[name]
-            error = f"{_signed(100.0 * (identified - true) / true)} %" if true else _NONE
-            cells += [_number(true, 4), (_number(identified, 4), "strong"), error]
+            error = f"{_signed(100.0 * (identified - true) / true)} %" if true else NONE
+            cells += [number_text(true, 4), (number_text(identified, 4), "strong"), error]
         rows.append(cells)
     note = (
         '<p class="note">Least squares stops when the residual is small enough, not when the parameters are exact: '
         "what the motion hardly excites is hardly identified, and hardly matters to it.</p>"
     )
-    return _table(head, rows, left=(0, 1)) + note
+    return make_table(head, rows, left=(0, 1)) + note
 
 
 def _signed(value: float) -> str:
     return f"{value:+.1f}".replace("-", "−")
 
 
-def _cycle_table(metrics: Metrics) -> str:
-    cycle = metrics.cycle
-    facts = [
-        f"{cycle.count} cycles in {_number(cycle.duration_s, 1)} s",
-        f"{cycle.overruns} overruns",
-        f"{cycle.frames_missing} frames missing",
-        f"{cycle.commands_late} commands late",
-        f"clock {cycle.clock or _NONE}",
-        f"scheduler {cycle.scheduler or _NONE}",
-    ]
-    named: list[tuple[str, Percentiles | None]] = [
-        ("SYNC to last feedback decoded", cycle.feedback_us),
-        ("SYNC to last command sent", cycle.command_us),
-        ("wake-up after the grid point", cycle.lateness_us),
-    ]
-    rows = [
-        (label, *(_number(value, 0) for value in dataclasses.astuple(times)))
-        for label, times in named
-        if times is not None
-    ]
-    text = f"<p>{escape('; '.join(facts))}.</p>"
-    return text + (_table(("µs", "50 %", "99 %", "99.9 %", "largest"), rows) if rows else "")
-
-
 def _run_table(report: Report) -> str:
     log = [("log", report.log_name), ("frames", report.metrics.frames), ("packets dropped", report.metrics.dropped)]
-    rows = [(label, _NONE if value is None else str(value)) for label, value in log]
-    rows += [(key.replace("_", " "), value or _NONE) for key, value in sorted(report.metadata.items())]
-    return _table(("", ""), [(escape(key), escape(value)) for key, value in rows], left=(0, 1))
+    rows = [(label, NONE if value is None else str(value)) for label, value in log]
+    rows += [(key.replace("_", " "), value or NONE) for key, value in sorted(report.metadata.items())]
+    return make_table(("", ""), [(escape(key), escape(value)) for key, value in rows], left=(0, 1))
 
 
 def _definitions(run: Run) -> str:

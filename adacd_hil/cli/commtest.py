@@ -5,7 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.analysis.histogram import bar_chart, doubling_bins, percentiles
+from adacd_hil.analysis.histogram import bar_chart, doubling_bins
+from adacd_hil.analysis.timing import QUANTITIES, TimingEvidence, collect_evidence
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns
@@ -16,8 +17,9 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.log.channels import ChannelId, pack_cycle
+from adacd_hil.log.errors import LogError
 from adacd_hil.log.recorder import Recorder
-from adacd_hil.records import CycleRecord, FaultReason
+from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import RealtimeGrant, freeze_garbage, request_realtime
 from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import BusError
@@ -25,6 +27,7 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.tap import Tap
 
 LOG_NAME = "commtest.mcap"
+HTML_NAME = "commtest.html"
 _EXIT = {Verdict.GOOD: ExitCode.OK, Verdict.WARNING: ExitCode.OK, Verdict.NOT_SUFFICIENT: ExitCode.FAILURE}
 _FIRST_BIN_US = 10.0
 _BINS = 12
@@ -66,12 +69,14 @@ def run_commtest(
             if recorder is not None:
                 summary = recorder.close()
                 log_error = "" if summary.is_complete else summary.error or f"log lacks {summary.dropped} packets"
-    described = describe(test.report(), settings, grant.scheduler)
+    report = test.report()
+    described = describe(report, settings, grant.scheduler)
     described |= {"fault": fault.name, "is_interrupted": loop.is_interrupted, "device_faults": arm.describe_faults()}
     described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
     if recorder is not None:
         described |= {"log": str(recorder.path), "log_error": log_error}
-    return described, _exit_code(test.report(), fault, loop.is_interrupted, bool(log_error))
+        described |= {"pictures": [str(path) for path in write_pictures(recorder.path.parent, report, described)]}
+    return described, _exit_code(report, fault, loop.is_interrupted, bool(log_error))
 
 
 def _run(
@@ -80,9 +85,9 @@ def _run(
     freeze_garbage()
 
     def observe(cycle: ZeroTorqueCycle) -> None:
-        test.observe(cycle)
+        record = test.observe(cycle)
         if recorder is not None:
-            recorder.cycle(cycle.state.t_ns, [(ChannelId.CYCLE, pack_cycle(_record(cycle, loop)))], cycle.frames)
+            recorder.cycle(cycle.state.t_ns, [(ChannelId.CYCLE, pack_cycle(record))], cycle.frames)
 
     with on_interrupt(loop.interrupt):
         try:
@@ -92,19 +97,6 @@ def _run(
             raise CommandError(str(error), ExitCode.SAFETY_STOP) from None
         finally:
             master.stop()
-
-
-def _record(cycle: ZeroTorqueCycle, loop: ZeroTorqueLoop) -> CycleRecord:
-    state = cycle.state
-    return CycleRecord(
-        cycle=state.cycle,
-        lateness_ns=cycle.lateness_ns,
-        feedback_ns=cycle.feedback_ns,
-        command_ns=cycle.command_ns,
-        overruns=loop.pacer.overruns,
-        frames_missing=sum(age != 0 for age in (*state.age_q, *state.age_tau_J)),
-        commands_late=cycle.late_commands,
-    )
 
 
 def _exit_code(report: CommunicationReport, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
@@ -136,13 +128,35 @@ def _open_log(out: Path, settings: Settings, codec: Codec, connection: Connectio
         )
 
 
+def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
+    """Write commtest.html, the tables and figures of the times as in the report of a run, and its figures as PNG.
+
+    Returns what was written, the page first; nothing without a cycle. Raises LogError when it can't be written.
+    """
+    # Here and not above: plots take a second to import, and memory that the test itself has no use for.
+    from adacd_hil.analysis.page import document, heading
+    from adacd_hil.analysis.timing_figures import draw_timing
+    from adacd_hil.analysis.timing_page import timing_section
+
+    if not len(report.columns):
+        return []
+    evidence = _evidence(report, described["period_us"])
+    drawings = draw_timing(report.columns, evidence, int(report.columns.t_ns[0]))
+    findings = [line for line in _findings(described) if not line.startswith(("log: ", "pictures: "))]
+    head = heading("adacd-hil commtest", findings[-1], findings[:-1], report.verdict is Verdict.GOOD)
+    page = document("communication test", [head, timing_section(evidence, drawings)])
+    pictures = {HTML_NAME: page.encode()} | {f"{drawing.name}.png": drawing.png() for drawing in drawings}
+    try:
+        for name, data in pictures.items():
+            (out / name).write_bytes(data)
+    except OSError as error:
+        raise LogError(f"pictures in {out} can't be written: {error.strerror}") from None
+    return [out / name for name in pictures]
+
+
 def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
     """Put the report into plain values; times in µs."""
-    times_us = {
-        "sync_lateness": report.lateness_ns / 1000.0,
-        "sync_to_last_feedback": report.feedback_ns / 1000.0,
-        "sync_to_last_command": report.command_ns / 1000.0,
-    }
+    evidence = _evidence(report, settings.bus.period_us)
     return {
         "verdict": report.verdict.value,
         "share": round(report.share, 6),
@@ -154,17 +168,20 @@ def describe(report: CommunicationReport, settings: Settings, scheduler: str) ->
         "load_percent": round(report.load_percent, 2),
         "warnings": _warnings(report, scheduler),
         "devices": {name: dataclasses.asdict(device) for name, device in report.devices.items()},
-        "times_us": {
-            name: {
-                "percentiles": percentiles(values),
-                "bins": [
-                    {"below": None if bound == float("inf") else bound, "count": count}
-                    for bound, count in doubling_bins(values, _FIRST_BIN_US, _BINS)
-                ],
-            }
-            for name, values in times_us.items()
+        "timing": evidence.as_json(),
+        "bins_us": {
+            quantity.name: [
+                {"below": None if bound == float("inf") else bound, "count": count}
+                for bound, count in doubling_bins(values_us, _FIRST_BIN_US, _BINS)
+            ]
+            for quantity in QUANTITIES
+            if (values_us := report.columns.times_us(quantity)) is not None
         },
     }
+
+
+def _evidence(report: CommunicationReport, period_us: float) -> TimingEvidence:
+    return collect_evidence(report.columns, period_us, is_modelled=False)
 
 
 def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
@@ -197,15 +214,28 @@ def as_text(described: dict[str, Any]) -> str:
         labels = [f"{age}" if age < len(ages) - 1 else f">= {age}" for age in range(oldest + 1)]
         lines += ["", f"age of {name}, cycles"]
         lines += bar_chart([*labels, "never"], [*ages[: oldest + 1], device["never"]])
-    for name, times in described["times_us"].items():
-        lines += ["", f"{name.replace('_', ' ')}, µs: " + _percentile_text(times["percentiles"])]
-        previous, labels = 0.0, []
-        for entry in times["bins"]:
-            labels.append(f">= {previous:g}" if entry["below"] is None else f"< {entry['below']:g}")
-            previous = entry["below"] or previous
-        lines += bar_chart(labels, [entry["count"] for entry in times["bins"]])
+    lines += _timing_lines(described)
     lines += ["", *_findings(described)]
     return "\n".join(lines)
+
+
+def _timing_lines(described: dict[str, Any]) -> list[str]:
+    """Write percentiles and bars of each time, then the queues and what was lost."""
+    timing, lines = described["timing"], []
+    for quantity in QUANTITIES:
+        found = _percentile_text(timing["times_us"][quantity.name])
+        lines += ["", f"{quantity.title}, µs ({quantity.meaning}): {found}"]
+        previous = 0.0
+        rows: list[tuple[str, int]] = []
+        for entry in described["bins_us"][quantity.name]:
+            label = f">= {previous:g}" if entry["below"] is None else f"< {entry['below']:g}"
+            previous = entry["below"] or previous
+            if rows or entry["count"]:  # bins before the first value say nothing
+                rows.append((label, entry["count"]))
+        lines += bar_chart([label for label, _ in rows], [count for _, count in rows])
+    queues = "; ".join(f"{name} {_percentile_text(found)}" for name, found in timing["queues_bytes"].items())
+    counts = ", ".join(f"{name.replace('_', ' ')} {count['total']}" for name, count in timing["counts"].items())
+    return [*lines, "", f"queues, bytes: {queues}", f"{counts}, in {timing['cycles']} cycles"]
 
 
 def _percentile_text(found: dict[str, float]) -> str:
@@ -220,6 +250,7 @@ def _findings(described: dict[str, Any]) -> list[str]:
         lines.append(f"stopped: {described['fault']}")
     if described.get("log"):
         lines.append(f"log: {described['log']}" + (f" ({described['log_error']})" if described["log_error"] else ""))
+    lines += [f"pictures: {path}" for path in described.get("pictures", ())[:1]]
     verdict, share = described["verdict"], 100.0 * described["share"]
     lines.append(f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from 95 %)")
     return lines

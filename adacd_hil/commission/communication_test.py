@@ -12,12 +12,13 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.timing import CycleColumns, columns_of_records
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle
 from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.drive import Drive
 from adacd_hil.device.torque_sensor import TorqueSensor
-from adacd_hil.records import JOINTS
+from adacd_hil.records import JOINTS, CycleRecord
 from adacd_hil.wire.load import LoadMeter
 
 SUFFICIENT_SHARE = 0.90
@@ -59,15 +60,13 @@ class DeviceReport:
 
 @dataclass(frozen=True)
 class CommunicationReport:
-    """What the test measured. Times in ns, one per cycle; `feedback_ns` of complete cycles only. load: percent."""
+    """What the test measured. columns: /cycle's; feedback_ns is -1 where a cycle was not complete. load: percent."""
 
     cycles: int
     overruns: int
     complete: int
     devices: dict[str, DeviceReport]
-    lateness_ns: NDArray[np.int64]
-    feedback_ns: NDArray[np.int64]
-    command_ns: NDArray[np.int64]
+    columns: CycleColumns
     load_percent: float
 
     @property
@@ -94,24 +93,41 @@ class CommunicationTest:
     arm: Arm
     bitrate: int
     data_bitrate: int = 0
-    _lateness: list[int] = field(default_factory=list)
-    _feedback: list[int] = field(default_factory=list)
-    _command: list[int] = field(default_factory=list)
+    _t_ns: list[int] = field(default_factory=list)
+    _records: list[CycleRecord] = field(default_factory=list)
     _ages: list[tuple[int, ...]] = field(default_factory=list)
     _recent: deque[ZeroTorqueCycle] = field(default_factory=lambda: deque(maxlen=_LOAD_CYCLES))
     _overruns: int = 0
+    _complete: int = 0
 
-    def observe(self, cycle: ZeroTorqueCycle) -> None:
-        """Take in one cycle."""
+    def observe(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
+        """Take in one cycle; returns its record for the log."""
         state = cycle.state
-        self._lateness.append(cycle.lateness_ns)
-        self._command.append(cycle.command_ns)
-        if state.is_complete:
-            self._feedback.append(cycle.feedback_ns)
-        self._ages.append((*state.age_q, *state.age_tau_J))
-        if len(self._ages) > 1:  # what is skipped before the first cycle isn't the test's
+        ages = (*state.age_q, *state.age_tau_J)
+        if self._ages:  # what is skipped before the first cycle isn't the test's
             self._overruns += state.periods - 1
+        self._complete += state.is_complete
+        self._ages.append(ages)
         self._recent.append(cycle)
+        record = CycleRecord(
+            cycle=state.cycle,
+            lateness_ns=cycle.lateness_ns,
+            feedback_ns=cycle.feedback_ns,
+            command_ns=cycle.command_ns,
+            compute_ns=cycle.compute_ns,
+            slack_ns=cycle.slack_ns,
+            data_age=max(ages),
+            overruns=self._overruns,
+            frames_missing=sum(age != 0 for age in ages),
+            commands_late=cycle.late_commands,
+            frames_lost=cycle.frames_lost,
+            receive_queue_bytes=cycle.receive_queue_bytes,
+            transmit_queue_bytes=cycle.transmit_queue_bytes,
+            log_queue_bytes=log_queue_bytes,
+        )
+        self._t_ns.append(state.t_ns)
+        self._records.append(record)
+        return record
 
     def report(self) -> CommunicationReport:
         """Sum up what was observed."""
@@ -122,11 +138,9 @@ class CommunicationTest:
         return CommunicationReport(
             cycles=cycles,
             overruns=self._overruns,
-            complete=len(self._feedback),
+            complete=self._complete,
             devices={name: self._device(ages[:, place], periods, place) for place, name in enumerate(names)},
-            lateness_ns=np.array(self._lateness, dtype=np.int64),
-            feedback_ns=np.array(self._feedback, dtype=np.int64),
-            command_ns=np.array(self._command, dtype=np.int64),
+            columns=columns_of_records(self._t_ns, self._records),
             load_percent=self._load_percent(),
         )
 

@@ -21,7 +21,11 @@ DISABLE_CYCLES = 20
 
 
 class ZeroTorqueCycle(NamedTuple):
-    """How one cycle went; times in ns. feedback_ns: SYNC to the last cyclic frame, -1 when not all came."""
+    """How one cycle went; times in ns. feedback_ns: SYNC to the last cyclic frame, -1 when not all came.
+
+    compute_ns: last cyclic frame to last command handed to the bus. slack_ns: from there to the next grid point. The
+    rest as in records.CycleRecord.
+    """
 
     state: ArmState
     lateness_ns: int
@@ -29,6 +33,11 @@ class ZeroTorqueCycle(NamedTuple):
     command_ns: int
     frames: list[tuple[bool, Frame]]
     late_commands: int
+    compute_ns: int = 0
+    slack_ns: int = 0
+    frames_lost: int = 0
+    receive_queue_bytes: int = 0
+    transmit_queue_bytes: int = 0
 
 
 class ZeroTorqueLoop:
@@ -96,9 +105,16 @@ class ZeroTorqueLoop:
         self._gate.limit(self._tau_d, is_enabling and state.is_enabled, self._tau_c)
         bus.held_ns = self.pacer.spend(self._exchange.feedback_ns)
         arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
-        command_ns = clock.now_ns() - sync_ns
+        handed_ns = clock.now_ns()
         if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()
         return ZeroTorqueCycle(
-            state, tick.lateness_ns, feedback_ns, command_ns, bus.take(), self._exchange.late_commands.count
+            state=state,
+            lateness_ns=tick.lateness_ns,
+            feedback_ns=feedback_ns,
+            command_ns=handed_ns - sync_ns,
+            frames=bus.take(),
+            late_commands=self._exchange.late_commands.count,
+            compute_ns=handed_ns - self._exchange.feedback_ns,
+            slack_ns=tick.t_ns + self._period_ns - handed_ns,
         )

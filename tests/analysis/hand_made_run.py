@@ -4,10 +4,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adacd_hil.analysis.metrics import Run, Timing, Truth
+from adacd_hil.analysis.metrics import Run, Truth
+from adacd_hil.analysis.timing import CycleColumns
 from adacd_hil.config import Settings, parse
-from adacd_hil.records import ContactReport, SchemeState
+from adacd_hil.records import ContactReport, CycleRecord, SchemeState
 
 CAD_THETA = (0.18, 0.036, 0.019, 0.0, 0.0, 0.0, 0.0)
 THETA = (0.2, 0.04, 0.02, 0.03, 0.015, 0.0375, 0.025)
@@ -50,7 +52,9 @@ def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str
         threshold=threshold,
         quiet_s=np.zeros(count),
         reports=(),
-        timing=Timing(cycle, zeros, zeros, zeros, zeros, zeros, zeros),
+        timing=CycleColumns(
+            EPOCH_NS + cycle * 1_000_000, {**dict.fromkeys(CycleRecord._fields, zeros), "cycle": cycle}
+        ),
         truth=truth if has_truth else None,
         settings=parse(Settings, {"name": "hand-made", "arm": {"cad_theta": list(CAD_THETA)}}),
         metadata={"clock": clock, "scheduler": "SCHED_FIFO 80", "config": "hand-made", "profile": "P", "seed": "7"},
@@ -107,5 +111,24 @@ def touched_run() -> Run:
     run = react(run, 4004, link=2, direction=(-1, -1), tau_ext_peak=(-6.1, -3.0))
     run = react(run, 9000)
     spread = np.arange(len(run.cycle), dtype=np.int64)
-    timing = replace(run.timing, feedback_ns=400_000 + spread, command_ns=600_000 + spread, lateness_ns=spread)
-    return replace(run, timing=timing)
+    return with_columns(
+        run,
+        feedback_ns=400_000 + spread,
+        command_ns=600_000 + spread,
+        lateness_ns=spread,
+        compute_ns=200_000 + spread,
+        slack_ns=400_000 - 50 * spread,
+        overruns=np.maximum(0, spread - 9000),
+        log_queue_bytes=2 * spread,
+    )
+
+
+def with_columns(run: Run, **columns: NDArray[np.int64]) -> Run:
+    """Give the run other columns of /cycle."""
+    return replace(run, timing=replace(run.timing, columns={**run.timing.columns, **columns}))
+
+
+def like_an_old_log(run: Run) -> Run:
+    """Take away what /cycle did not have at first."""
+    names = ("cycle", "lateness_ns", "feedback_ns", "command_ns", "overruns", "frames_missing", "commands_late")
+    return replace(run, timing=replace(run.timing, columns={name: run.timing[name] for name in names}))

@@ -8,18 +8,22 @@ import matplotlib as mpl
 import pytest
 from hand_made_run import make_run, react, touch, touched_run
 
-from adacd_hil.analysis.figures import CLOSE_UPS, COLOURS, draw, parameter_label
+from adacd_hil.analysis.drawing import COLOURS
+from adacd_hil.analysis.figures import CLOSE_UPS, draw, parameter_label
 from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.records import SchemeState
 
 pytestmark = pytest.mark.slow
 
-NAMES = ["fig5", "fig6", "fig7", "contacts", "cycle"]
+NAMES = ["fig5", "fig6", "fig7", "contacts", "timing-distributions", "timing-line"]
 
 
 def draw_touched_run():
     run = touched_run()
-    return {drawing.name: drawing for drawing in draw(run, evaluate(run))}
+    metrics = evaluate(run)
+    drawings = [*draw(run, metrics), *draw_timing(run.timing, metrics.timing, run.zero_ns, "motion start")]
+    return {drawing.name: drawing for drawing in drawings}
 
 
 @pytest.fixture(scope="module")
@@ -27,16 +31,12 @@ def drawings():
     return draw_touched_run()
 
 
-def test_a_run_has_the_papers_figures_the_contacts_and_the_cycle(drawings):
+def test_a_run_has_the_papers_figures_the_contacts_and_the_times(drawings):
     assert list(drawings) == NAMES
 
 
 def names_of(run):
     return [drawing.name for drawing in draw(run, evaluate(run))]
-
-
-def test_lockstep_has_no_cycle_figure():
-    assert "cycle" not in names_of(make_run(clock="lockstep"))
 
 
 def test_a_run_without_contacts_has_no_close_ups():

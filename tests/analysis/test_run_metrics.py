@@ -1,7 +1,7 @@
 """What a run achieved, on runs made by hand whose answers are known."""
 
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,10 +27,10 @@ from adacd_hil.analysis.metrics import (
     detection_delay_s,
     evaluate,
     filtered,
-    percentiles,
     section_label,
     split_sections,
 )
+from adacd_hil.analysis.timing import columns_of_records
 from adacd_hil.records import FaultReason, SchemeState
 
 SETTLING_ROWS = 1000
@@ -508,37 +508,6 @@ def test_the_payload_is_that_of_each_adaptation():
     assert evaluate(run).payload_kg == {"A": 0.0, "D": 1.0}
 
 
-def test_percentiles_are_in_microseconds():
-    assert astuple(percentiles(np.arange(1001) * 1000)) == pytest.approx((500.0, 990.0, 999.0, 1000.0))
-
-
-def test_no_cycles_have_no_percentiles():
-    assert percentiles(np.array([])) is None
-
-
-def test_overruns_are_those_of_the_last_cycle():
-    run = make_run()
-    overruns = np.maximum(0, np.arange(len(run.cycle)) - 9000)
-    run = replace(run, timing=replace(run.timing, overruns=overruns))
-    assert evaluate(run).cycle.overruns == overruns[-1]
-
-
-def test_missing_frames_are_counted_over_all_cycles():
-    run = make_run()
-    missing = run.timing.frames_missing.copy()
-    missing[[3, 70]] = (1, 2)
-    run = replace(run, timing=replace(run.timing, frames_missing=missing))
-    assert evaluate(run).cycle.frames_missing == 3
-
-
-def test_lockstep_has_no_lateness():
-    assert evaluate(make_run(clock="lockstep")).cycle.lateness_us is None
-
-
-def test_real_time_has_a_lateness():
-    assert evaluate(make_run(clock="realtime")).cycle.lateness_us is not None
-
-
 def test_clock_and_scheduler_come_from_the_log():
     cycle = evaluate(make_run(clock="realtime")).cycle
     assert (cycle.clock, cycle.scheduler) == ("realtime", "SCHED_FIFO 80")
@@ -681,8 +650,7 @@ def test_a_missed_contact_alone_makes_a_run_unclean():
 def empty_run():
     run = make_run((A, 1))
     names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
-    timing = replace(run.timing, **{name: np.zeros(0, dtype=np.int64) for name in vars(run.timing)})
-    return replace(run, timing=timing, **{name: getattr(run, name)[:0] for name in names})
+    return replace(run, timing=columns_of_records([], []), **{name: getattr(run, name)[:0] for name in names})
 
 
 def test_a_log_without_cycles_has_no_sections():

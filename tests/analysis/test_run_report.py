@@ -11,9 +11,11 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, make_run, react, touched_run
+from hand_made_run import A, M, like_an_old_log, make_run, react, touched_run
 
+from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report import write_report, write_run_report
+from adacd_hil.analysis.timing_page import timing_section
 from adacd_hil.config import to_toml
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_scheme, pack_truth
 from adacd_hil.log.errors import LogError
@@ -51,16 +53,22 @@ def test_a_report_names_its_pictures(report):
 
 KEYS = {
     "": "schema verdict is_clean time_zero adaptation_s sections frozen_residual_max_Nm contacts false_alarms "
-    "false_alarms_s missed parameters payload_kg fault cycle log paper run",
+    "false_alarms_s missed parameters payload_kg fault cycle timing log paper run",
     "sections.A": "label kind start_s end_s is_complete duration_s",
     "frozen_residual_max_Nm.B": "identified cad cycles",
     "contacts.0": "number section link onset_s end_s is_armed detected_s delay_ms law_ms ideal_ms link_at_alarm "
     "link_detected direction direction_ok tau_ext_Nm tau_ext_peak_hat_Nm torque_error_ratio",
     "parameters.A": "a1 a2 a3 F_v1 F_v2 F_c1 F_c2",
-    "cycle": "count duration_s overruns frames_missing commands_late latency_us lateness_us clock scheduler",
-    "cycle.latency_us": "feedback command",
-    "cycle.latency_us.feedback": "p50 p99 p999 max",
-    "cycle.lateness_us": "p50 p99 p999 max",
+    "cycle": "count duration_s clock scheduler",
+    "timing": "is_modelled period_us cycles times_us reaction_us data_age_cycles queues_bytes counts histograms_us",
+    "timing.times_us": "lateness sync_to_feedback compute sync_to_command slack",
+    "timing.times_us.lateness": "p50 p99 p99.9 max",
+    "timing.times_us.slack": "p50 p1 p0.1 min",
+    "timing.reaction_us": "count p50 p99 p99.9 max",
+    "timing.queues_bytes": "receive transmit log",
+    "timing.counts": "overruns frames_lost frames_missing commands_late",
+    "timing.counts.overruns": "total per_100000",
+    "timing.histograms_us.slack": "edges counts below above",
     "log": "name frames dropped is_complete problem",
     "paper.0": "quantity paper measured",
 }
@@ -94,9 +102,14 @@ def test_the_table_has_the_documented_keys(table, path):
         ("payload_kg", {"A": 0.0, "D": 1.0}),
         ("fault", None),
         ("cycle.count", 9350),
-        ("cycle.latency_us.feedback.max", 409.349),
-        ("cycle.latency_us.command.max", 609.349),
-        ("cycle.lateness_us.p50", 4.6745),
+        ("timing.times_us.sync_to_feedback.max", 409.349),
+        ("timing.times_us.sync_to_command.max", 609.349),
+        ("timing.times_us.lateness.p50", 4.675),
+        ("timing.times_us.slack.min", -67.45),
+        ("timing.reaction_us", {"count": 3, "p50": 204.004, "p99": 209.0, "p99.9": 209.0, "max": 209.0}),
+        ("timing.queues_bytes.log.max", 18698.0),
+        ("timing.counts.overruns", {"total": 349, "per_100000": 3732.62}),
+        ("timing.data_age_cycles", [9350, *[0] * 10]),
         ("log", {"name": "run.mcap", "frames": 12, "dropped": 0, "is_complete": True, "problem": ""}),
         ("run.seed", "7"),
     ],
@@ -223,8 +236,52 @@ def test_a_run_without_fault_looks_good(tmp_path):
     assert '<header class="good">' in html
 
 
+TIMES = ("timing-distributions", "timing-line")
+
+
 def test_the_page_shows_every_figure(html):
-    assert re.findall(r'<figure id="([^"]*)"', html) == ["fig5", "contacts", "fig6", "fig7", "cycle"]
+    assert re.findall(r'<figure id="([^"]*)"', html) == ["fig5", "contacts", "fig6", "fig7", *TIMES]
+
+
+def row_of(html, title):
+    """Give the cells of the row of a table that begins with a title."""
+    row = re.search(rf"<tr><td[^>]*>(?:<b>)?{re.escape(title)}.*?</tr>", html)[0]
+    return re.findall(r"<td[^>]*>(.*?)</td>", row)[1:]
+
+
+@pytest.mark.parametrize(
+    ("title", "cells"),
+    [
+        ("Lateness", ["4.7", "9.3", "9.3", "9.3"]),
+        ("SYNC → command", ["604.7", "609.3", "609.3", "609.3"]),
+        ("Reaction", ["204.0", "209.0", "209.0", "209.0"]),
+        ("Slack", ["166.2", "−62.8", "−67.0", "−67.5"]),
+        ("periods skipped", ["349", "3732.6"]),
+        ("queue to the log", ["18512", "18698"]),
+        ("0", ["9350", "100.000 %"]),
+    ],
+)
+def test_the_page_tables_the_times(html, title, cells):
+    assert row_of(html, title) == cells
+
+
+def tables_of(run):
+    return timing_section(evaluate(run).timing, [])
+
+
+def test_lockstep_times_are_said_to_be_modelled():
+    assert "Lockstep: these are times of the model of bus and host" in tables_of(make_run())
+
+
+def test_an_old_log_is_tabled_with_what_it_lacks():
+    html = tables_of(like_an_old_log(touched_run()))
+    lacking = ("Compute", "Slack", "received frames dropped", "receive queue")
+    assert {row_of(html, title)[-1] for title in lacking} == {"not in this log"}
+    assert row_of(html, "Lateness") == ["4.7", "9.3", "9.3", "9.3"]
+
+
+def test_a_run_without_a_reaction_has_dashes_for_its_latency():
+    assert row_of(tables_of(make_run()), "Reaction") == ["–"] * 4
 
 
 def test_the_page_says_what_the_log_lacks(tmp_path):
@@ -301,7 +358,7 @@ def record_truth(path, run):
 
 def without_cycle_times(table):
     """Leave out what the recorded run doesn't have, and what describes the file."""
-    skipped = ("cycle", "log", "run")
+    skipped = ("cycle", "timing", "log", "run")
     return {key: value for key, value in table.items() if key not in skipped}
 
 

@@ -1,22 +1,29 @@
 """What `commtest` prints, from a test against the emulator in virtual time."""
 
 import json
+import re
+from pathlib import Path
 
 from bench_bus import BenchBus
 
-from adacd_hil.cli.commtest import as_text, describe
-from adacd_hil.commission.communication_test import CommunicationTest
+from adacd_hil.analysis.page import number_text
+from adacd_hil.cli.commtest import as_text, describe, write_pictures
+from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest
 from adacd_hil.commission.zero_torque import ZeroTorqueLoop
 
 
-def judged(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> dict:
+def played(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
     rig.start()
     rig.tap.take()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
     loop.run(0.2, test.observe)
     described = describe(test.report(), rig.settings, scheduler)
-    return described | {"fault": "NONE", "device_faults": [], "events": []}
+    return described | {"fault": "NONE", "device_faults": [], "events": []}, test.report()
+
+
+def judged(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> dict:
+    return played(rig, scheduler)[0]
 
 
 def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
@@ -24,9 +31,11 @@ def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
     assert lines[0].startswith("cycles 200, complete 200, overruns 0, period 1000 µs, SCHED_FIFO 80, bus load ")
     assert lines[1] == "Drive1: fresh in 100.00 % of the periods; unprotected, 0 implausible"
     assert lines[3].startswith("Sensor1: fresh in 100.00 % of the periods; 220 OK")
-    assert "sync lateness, µs: p50 0, p99 0, p99.9 0, max 0" in lines
+    assert "Lateness, µs (wake-up after the grid point): p50 0, p99 0, p99.9 0, max 0" in lines
     assert lines[-1] == "good: 100.00 % of the periods brought complete fresh data (good from 95 %)"
     assert not any(line.startswith("warning") for line in lines)
+    assert "Slack, µs (last command to the next grid point; negative: overrun): " in "\n".join(lines)
+    assert "overruns 0, frames lost 0, frames missing 0, commands late 0, in 200 cycles" in lines
 
 
 def test_the_load_is_that_of_the_cyclic_frames() -> None:
@@ -44,10 +53,28 @@ def test_a_silent_device_and_a_missing_priority_are_warned_of() -> None:
     ]
     lines = as_text(described).splitlines()
     assert lines[4].startswith("Sensor2: fresh in 0.00 % of the periods; ")
-    assert "sync to last feedback, µs: no value" in lines
+    assert "SYNC → feedback, µs (SYNC sent to last cyclic frame decoded): no value" in lines
     assert lines[-1].startswith("not sufficient: 0.00 %")
 
 
 def test_the_report_is_json() -> None:
     described = judged(BenchBus())
     assert json.loads(json.dumps(described)) == described
+
+
+def test_the_pictures_are_those_of_the_report_with_the_numbers_of_the_test(tmp_path: Path) -> None:
+    described, report = played(BenchBus())
+    paths = write_pictures(tmp_path, report, described)
+    assert [path.name for path in paths] == ["commtest.html", "timing-distributions.png", "timing-line.png"]
+    assert {path.read_bytes()[:4] for path in paths[1:]} == {b"\x89PNG"}
+    page = paths[0].read_text(encoding="utf-8")
+    slack = number_text(described["timing"]["times_us"]["slack"]["min"], 1)
+    assert re.search(rf"<b>Slack</b>.*?<td>{slack}</td></tr>", page)
+    assert re.findall(r'<figure id="([^"]*)"', page) == ["timing-distributions", "timing-line"]
+    assert "<h1>good: 100.00&nbsp;% of the periods" in page
+
+
+def test_a_test_without_a_cycle_has_no_pictures(tmp_path: Path) -> None:
+    rig = BenchBus()
+    report = CommunicationTest(rig.settings, rig.arm, 1_000_000).report()
+    assert write_pictures(tmp_path, report, {}) == []

@@ -1,0 +1,217 @@
+"""What all figures share: colours, style, curves of long series, and the drawing as PNG or as a fragment of a page.
+
+Drawn with matplotlib's object interface on a white ground; `svg` makes a fragment for a page instead, whose colours are
+the page's own CSS variables and which carries no style, script, date or reference to anything outside.
+"""
+
+import io
+import re
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from adacd_hil.records import Vector
+
+# Each colour is written once on paper and once as the page's variable of the same name.
+COLOURS: Final = {
+    "ink": "#1a2027",
+    "muted": "#5a6672",
+    "rule": "#c9d0d7",
+    "grid": "#e6eaee",
+    "identified": "#0067b1",
+    "cad": "#d9780a",
+    "joint1": "#00856a",
+    "joint2": "#8a4fa3",
+    "alarm": "#c4342d",
+    "bar": "#7d8a97",
+    "queue_receive": "#2a6f97",
+    "queue_transmit": "#b0611a",
+    "queue_log": "#6c5fb0",
+    "adaptation": "#dcebf8",
+    "detection": "#fdfdfe",
+    "payload": "#f3ebdb",
+    "fault": "#f7dedc",
+}
+PAPER: Final = "#ffffff"
+_DOTS_PER_INCH: Final = 150
+_FONT: Final = "DejaVu Sans"
+_ENVELOPE_BINS: Final = 1000
+"""Two points each: as fine as the widest screen on which the report is read."""
+PANEL_BINS: Final = 250
+"""The same for a panel of which four share the width."""
+
+_STYLE: Final[dict[Any, Any]] = {
+    "font.family": _FONT,
+    "font.size": 8.5,
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5.0,
+    "axes.labelsize": 8.5,
+    "axes.labelcolor": COLOURS["muted"],
+    "axes.edgecolor": COLOURS["rule"],
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.xmargin": 0.0,
+    "axes.unicode_minus": True,
+    "axes.titlecolor": COLOURS["ink"],
+    "grid.color": COLOURS["grid"],
+    "grid.linewidth": 0.6,
+    "text.color": COLOURS["ink"],
+    "xtick.color": COLOURS["rule"],
+    "ytick.color": COLOURS["rule"],
+    "xtick.labelcolor": COLOURS["muted"],
+    "ytick.labelcolor": COLOURS["muted"],
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "legend.borderpad": 0.0,
+    "legend.borderaxespad": 0.0,
+    "lines.solid_joinstyle": "round",
+    "path.simplify": False,
+    "svg.fonttype": "none",
+}
+
+
+def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
+    """Apply the figures' style for a while, whatever the user's own matplotlib configuration says."""
+    return mpl.rc_context({**mpl.rcParamsDefault, **_STYLE, **(more or {}), "backend": mpl.rcParams["backend"]})
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure with its name, its title and one sentence that says what to see."""
+
+    name: str
+    title: str
+    caption: str
+    figure: Figure
+
+    def png(self) -> bytes:
+        """Render on white, 150 dots per inch."""
+        out = io.BytesIO()
+        with style():
+            canvas: Any = FigureCanvasAgg(self.figure)
+            self.figure.dpi = _DOTS_PER_INCH
+            canvas.print_png(out, metadata={"Software": None})
+        return out.getvalue()
+
+    def svg(self) -> str:
+        """Render a fragment for a page, see the module's first lines. Its ids begin with the figure's name."""
+        out = io.StringIO()
+        with style({"svg.hashsalt": self.name}):
+            canvas: Any = FigureCanvasSVG(self.figure)
+            self.figure.patch.set_visible(False)
+            canvas.print_svg(out)
+            self.figure.patch.set_visible(True)
+        return _fragment(out.getvalue(), self.name, f"{self.title}. {self.caption}")
+
+
+def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
+    """Choose the rows that keep the smallest and the largest value of each of `bins` equal parts, and both ends.
+
+    Rows ascend. A series of at most two rows per part is kept whole. NaN is chosen only where a part has nothing else.
+    """
+    count = y.shape[0]
+    width = -(-count // bins)
+    if width <= 2:
+        return np.arange(count)
+    whole = count // width * width
+    low = np.where(np.isnan(y), np.inf, y)
+    high = np.where(np.isnan(y), -np.inf, y)
+    starts = np.arange(0, whole, width)
+    chosen = [starts + part[:whole].reshape(-1, width).argmin(axis=1) for part in (low, -high)]
+    if whole < count:
+        chosen += [[whole + part[whole:].argmin()] for part in (low, -high)]
+    return np.unique(np.concatenate([*chosen, [0, count - 1]]))
+
+
+def plot(axes: Axes, x: Vector, y: Vector, bins: int = _ENVELOPE_BINS, **look: Any) -> None:
+    """Draw a curve by the rows of its envelope."""
+    rows = envelope(y, bins)
+    axes.plot(x[rows], y[rows], **look)
+
+
+def note(axes: Axes, text: str) -> None:
+    """Write above the right end of a panel."""
+    axes.annotate(
+        text,
+        (1.0, 1.0),
+        xycoords="axes fraction",
+        xytext=(0, 5),
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        fontsize=7.8,
+        color=COLOURS["muted"],
+    )
+
+
+def label_below(figure: Figure, text: str) -> None:
+    """Write one label for the abscissae of all panels."""
+    figure.text(
+        0.5175, 0.08 / figure.get_figheight(), text, ha="center", va="bottom", fontsize=8.5, color=COLOURS["muted"]
+    )
+
+
+_VARIABLES: Final = {colour: f"var(--{name})" for name, colour in COLOURS.items()} | {PAPER: "var(--paper)"}
+_HEAD: Final = re.compile(r".*?<svg[^>]*viewBox=\"([^\"]*)\"[^>]*>", re.DOTALL)
+_UNWANTED: Final = re.compile(r"<metadata>.*?</metadata>|<style[^>]*>.*?</style>|<!--.*?-->", re.DOTALL)
+_STYLES: Final = re.compile(r' style="([^"]*)"')
+_COLOUR: Final = re.compile(r"#[0-9a-f]{6}")
+_ID: Final = re.compile(r' id="([^"]*)"')
+_USE: Final = re.compile(r'(?:xlink:)?href="#([^"]*)"')
+_URL: Final = re.compile(r"url\(#([^)]*)\)")
+
+
+def _fragment(text: str, name: str, description: str) -> str:
+    """Turn matplotlib's file into a fragment: attributes for styles, variables for colours, ids of its own."""
+    head = _HEAD.match(text)
+    assert head is not None
+    body = _UNWANTED.sub("", text[head.end() :])
+    body = _STYLES.sub(_attributes, body)
+    used = {found for pattern in (_USE, _URL) for found in pattern.findall(body)}
+    body = _ID.sub(lambda m: f' id="{name}-{m[1]}"' if m[1] in used else "", body)
+    body = _USE.sub(lambda m: f'href="#{name}-{m[1]}"', body)
+    body = _URL.sub(lambda m: f"url(#{name}-{m[1]})", body)
+    body = _COLOUR.sub(lambda m: _VARIABLES.get(m[0], m[0]), body)
+    body = re.sub(r"\n\s*", "\n", body)
+    label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    return f'<svg viewBox="{head[1]}" role="img" aria-label="{label}">{body.strip()}'
+
+
+def _attributes(match: re.Match[str]) -> str:
+    """Write a style as presentation attributes, so that a strict content policy need not allow inline styles."""
+    attributes = []
+    for declaration in match[1].replace("&quot;", "'").split(";"):
+        key, _, value = declaration.strip().partition(": ")
+        if key == "font":
+            attributes += _font(value)
+        elif key:
+            attributes.append((key, value.strip()))
+    return "".join(f' {key}="{value}"' for key, value in attributes)
+
+
+def _font(value: str) -> list[tuple[str, str]]:
+    """Split the shorthand `[italic] [bold] 8.5px family`; the family is the page's own."""
+    words = value.split("px", 1)[0].split()
+    attributes = [("font-size", words[-1])]
+    if "italic" in words or "oblique" in words:
+        attributes.append(("font-style", "italic"))
+    attributes += [("font-weight", word) for word in words[:-1] if word.isdigit() or word == "bold"]
+    return attributes

@@ -1,0 +1,213 @@
+"""Timing evidence: wake-up lateness, times within the cycle, slack, data age, queue depths and what was lost.
+
+All from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of what must be small p50,
+p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest. *Reaction latency* is the
+compute time of each cycle in which the state becomes REACT: from the data that decided to the first command that
+reacts.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.histogram import LogHistogram, log_histogram, low_percentiles, percentiles
+from adacd_hil.log.reader import Series
+from adacd_hil.records import CycleRecord, SchemeState, Vector
+
+Cycles = NDArray[np.int64]
+
+OLDEST_CYCLES: Final = 10
+"""Data ages from here on are counted as one."""
+PER_CYCLES: Final = 100_000
+"""Counts are given per so many cycles, too."""
+
+
+class Quantity(NamedTuple):
+    """A time of each cycle: its column in /cycle, ns. `is_reserve`: it must be large, not small."""
+
+    name: str
+    column: str
+    title: str
+    meaning: str
+    is_reserve: bool = False
+
+
+LATENESS: Final = Quantity("lateness", "lateness_ns", "Lateness", "wake-up after the grid point")
+COMPUTE: Final = Quantity("compute", "compute_ns", "Compute", "last cyclic frame received to last command handed over")
+SYNC_TO_COMMAND: Final = Quantity(
+    "sync_to_command", "command_ns", "SYNC → command", "SYNC sent to last command handed over"
+)
+SLACK: Final = Quantity(
+    "slack", "slack_ns", "Slack", "last command to the next grid point; negative: overrun", is_reserve=True
+)
+QUANTITIES: Final = (
+    LATENESS,
+    Quantity("sync_to_feedback", "feedback_ns", "SYNC → feedback", "SYNC sent to last cyclic frame decoded"),
+    COMPUTE,
+    SYNC_TO_COMMAND,
+    SLACK,
+)
+QUEUES: Final = {"receive": "receive_queue_bytes", "transmit": "transmit_queue_bytes", "log": "log_queue_bytes"}
+"""Queues and their columns."""
+_RUNNING: Final = ("overruns", "frames_lost")
+"""Columns that count since the run began."""
+_PER_CYCLE: Final = ("frames_missing", "commands_late")
+"""Columns that count within a cycle."""
+
+
+@dataclass(frozen=True)
+class CycleColumns:
+    """The columns of /cycle over n cycles, int64 (n,); a column that the log does not have is not in `columns`."""
+
+    t_ns: Cycles
+    columns: Mapping[str, Cycles]
+
+    def __len__(self) -> int:
+        return self.t_ns.size
+
+    def __getitem__(self, name: str) -> Cycles:
+        return self.columns[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def times_us(self, quantity: Quantity) -> Vector | None:
+        """Give a time of the cycles that have it, µs; None where the log does not have it."""
+        if quantity.column not in self:
+            return None
+        values_ns = self[quantity.column]
+        if quantity.column == "feedback_ns":
+            values_ns = values_ns[values_ns >= 0]  # a cycle of a test whose feedback was not complete has -1
+        return np.asarray(values_ns / 1000.0, dtype=np.float64)
+
+    def steps(self, name: str) -> Cycles:
+        """Give what each cycle added to a running count (n,); a count that began anew begins at 0."""
+        count = self[name]
+        added = np.diff(count, prepend=0)
+        return np.where(added < 0, count, added)
+
+
+def columns_of_series(series: Series) -> CycleColumns:
+    """Take the columns out of a log's /cycle; one of an older version lacks some."""
+    names = [name for name in CycleRecord._fields if name in series.fields]
+    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
+
+
+def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:
+    """Make the columns of records at times t_ns."""
+    table = np.array(records, dtype=np.int64).reshape(len(records), len(CycleRecord._fields))
+    columns = {name: table[:, place].copy() for place, name in enumerate(CycleRecord._fields)}
+    return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
+
+
+@dataclass(frozen=True)
+class TimeStatistics:
+    """Percentiles by name, µs, and the histogram of a time; both empty without a value."""
+
+    percentiles: Mapping[str, float]
+    histogram: LogHistogram
+
+
+class Count(NamedTuple):
+    """How often something happened, in all and per 100 000 cycles; None without a cycle."""
+
+    total: int
+    per_100000: float | None
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """Latency from the decision to the first command that reacts, over `count` reactions; percentiles in µs."""
+
+    count: int
+    percentiles: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class TimingEvidence:
+    """What the times of a run come to; None is what the log does not have, or what lockstep has no meaning for.
+
+    is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. data_age: cycles by
+    the age of the oldest value used; the last entry counts all from OLDEST_CYCLES on.
+    """
+
+    period_us: float
+    is_modelled: bool
+    cycles: int
+    times: Mapping[str, TimeStatistics | None]
+    reaction: Reaction | None
+    data_age: tuple[int, ...] | None
+    queues_bytes: Mapping[str, Mapping[str, float] | None]
+    counts: Mapping[str, Count | None]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give the evidence in plain values."""
+        times = {name: found for name, found in self.times.items() if found is not None}
+        absent = dict.fromkeys(self.times)
+        reaction = self.reaction
+        return {
+            "is_modelled": self.is_modelled,
+            "period_us": self.period_us,
+            "cycles": self.cycles,
+            "times_us": {**absent, **{name: dict(found.percentiles) for name, found in times.items()}},
+            "reaction_us": None if reaction is None else {"count": reaction.count, **reaction.percentiles},
+            "data_age_cycles": None if self.data_age is None else list(self.data_age),
+            "queues_bytes": {name: None if depth is None else dict(depth) for name, depth in self.queues_bytes.items()},
+            "counts": {name: None if count is None else count._asdict() for name, count in self.counts.items()},
+            "histograms_us": {**absent, **{name: found.histogram.as_json() for name, found in times.items()}},
+        }
+
+
+def collect_evidence(
+    columns: CycleColumns, period_us: float, is_modelled: bool, reactions: NDArray[np.bool_] | None = None
+) -> TimingEvidence:
+    """Sum up the columns. reactions: the cycles in which the state becomes REACT (n,); None where there is no state."""
+    cycles = len(columns)
+    times = {quantity.name: _statistics(quantity, columns, is_modelled) for quantity in QUANTITIES}
+    reaction = None
+    if reactions is not None and (compute_us := columns.times_us(COMPUTE)) is not None:
+        reaction = Reaction(int(reactions.sum()), percentiles(compute_us[reactions]))
+    ages = None
+    if "data_age" in columns:
+        counts = np.bincount(np.minimum(columns["data_age"], OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
+        ages = tuple(counts.tolist())
+    return TimingEvidence(
+        period_us=period_us,
+        is_modelled=is_modelled,
+        cycles=cycles,
+        times=times,
+        reaction=reaction,
+        data_age=ages,
+        queues_bytes={name: _depths(columns, column, is_modelled) for name, column in QUEUES.items()},
+        counts={name: _count(columns, name) for name in (*_RUNNING, *_PER_CYCLE)},
+    )
+
+
+def find_reactions(columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Mark the cycles of `columns` in which the state becomes REACT; cycle, state: those of /scheme (k,)."""
+    is_reacting = state == SchemeState.REACT
+    begins = is_reacting & ~np.concatenate(([False], is_reacting[:-1]))
+    return np.isin(columns["cycle"], cycle[begins])
+
+
+def _statistics(quantity: Quantity, columns: CycleColumns, is_modelled: bool) -> TimeStatistics | None:
+    values_us = columns.times_us(quantity)
+    if values_us is None or (is_modelled and quantity is LATENESS):  # lockstep has no grid to be late on
+        return None
+    found = low_percentiles(values_us) if quantity.is_reserve else percentiles(values_us)
+    return TimeStatistics(found, log_histogram(values_us))
+
+
+def _depths(columns: CycleColumns, column: str, is_modelled: bool) -> dict[str, float] | None:
+    """Give percentiles of a queue's depth, bytes; lockstep has no queues."""
+    return None if is_modelled or column not in columns else percentiles(columns[column])
+
+
+def _count(columns: CycleColumns, name: str) -> Count | None:
+    if name not in columns:
+        return None
+    total = int((columns.steps(name) if name in _RUNNING else columns[name]).sum())
+    return Count(total, total * PER_CYCLES / len(columns) if len(columns) else None)

@@ -1,0 +1,186 @@
+"""The timing evidence: numbers from columns made by hand, and what the figures show of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_made_run import A, M, R, S, like_an_old_log, make_run, with_columns
+
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.timing import (
+    COMPUTE,
+    OLDEST_CYCLES,
+    CycleColumns,
+    collect_evidence,
+    columns_of_records,
+    columns_of_series,
+    find_reactions,
+)
+from adacd_hil.analysis.timing_figures import draw_timing
+from adacd_hil.log.reader import Series
+from adacd_hil.records import CycleRecord
+
+
+def columns(**values: list[int]) -> CycleColumns:
+    count = len(next(iter(values.values())))
+    made = {name: np.array(column, dtype=np.int64) for name, column in values.items()}
+    return CycleColumns(np.arange(count) * 1_000_000, {"cycle": np.arange(count), **made})
+
+
+def evidence_of(**values: list[int]):
+    return collect_evidence(columns(**values), 1000, is_modelled=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [
+        ("lateness", "lateness_ns"),
+        ("sync_to_feedback", "feedback_ns"),
+        ("compute", "compute_ns"),
+        ("sync_to_command", "command_ns"),
+    ],
+)
+def test_of_what_must_be_small_the_high_percentiles_are_given_in_microseconds(name, column):
+    found = evidence_of(**{column: list(range(1000, 1_001_000, 1000))}).times[name]
+    assert found.percentiles == {"p50": 501.0, "p99": 991.0, "p99.9": 1000.0, "max": 1000.0}
+
+
+def test_of_slack_the_low_percentiles_are_given():
+    found = evidence_of(slack_ns=[-1000 * value for value in range(1, 1001)]).times["slack"]
+    assert found.percentiles == {"p50": -501.0, "p1": -991.0, "p0.1": -1000.0, "min": -1000.0}
+
+
+def test_a_cycle_without_complete_feedback_has_no_time_of_it():
+    found = evidence_of(feedback_ns=[5000, -1, 7000]).times["sync_to_feedback"]
+    assert (found.percentiles["max"], int(found.histogram.counts.sum()), found.histogram.below) == (7.0, 2, 0)
+
+
+def test_running_counts_end_with_their_last_value_and_others_are_summed():
+    found = evidence_of(overruns=[1, 1, 4, 4], frames_lost=[0, 2, 2, 3], frames_missing=[1, 0, 2, 0]).counts
+    assert [(found[name].total, found[name].per_100000) for name in ("overruns", "frames_lost", "frames_missing")] == [
+        (4, 100_000.0),
+        (3, 75_000.0),
+        (3, 75_000.0),
+    ]
+
+
+def test_a_running_count_that_began_anew_goes_on():
+    assert evidence_of(overruns=[0, 2, 2, 0, 1]).counts["overruns"].total == 3
+
+
+def test_ages_are_counted_and_the_oldest_together():
+    ages = evidence_of(data_age=[0, 0, 1, 3, OLDEST_CYCLES, 500]).data_age
+    assert ages == (2, 1, 0, 1, *[0] * (OLDEST_CYCLES - 4), 2)
+
+
+def test_queues_have_percentiles_in_bytes():
+    assert evidence_of(receive_queue_bytes=[0] * 99 + [144]).queues_bytes["receive"]["max"] == 144.0
+
+
+def test_what_the_log_does_not_have_is_none():
+    found = evidence_of(lateness_ns=[1, 2])
+    assert (found.times["slack"], found.data_age, found.queues_bytes["log"], found.counts["frames_lost"]) == (None,) * 4
+
+
+def test_lockstep_has_no_lateness_and_no_queues():
+    found = evaluate(make_run(clock="lockstep")).timing
+    assert (found.is_modelled, found.times["lateness"], set(found.queues_bytes.values())) == (True, None, {None})
+
+
+def test_real_time_has_a_lateness():
+    assert evaluate(make_run(clock="realtime")).timing.times["lateness"] is not None
+
+
+def test_a_reaction_takes_the_compute_time_of_the_cycle_in_which_the_state_becomes_react():
+    run = make_run((A, 10), (M, 10), (R, 5), (S, 5), (M, 10), (R, 5))
+    run = with_columns(run, compute_ns=1000 * np.arange(45, dtype=np.int64))
+    reaction = evaluate(run).timing.reaction
+    assert (reaction.count, reaction.percentiles["p50"], reaction.percentiles["max"]) == (2, 40.0, 40.0)
+    assert run.timing.times_us(COMPUTE)[find_reactions(run.timing, run.cycle, run.state)].tolist() == [20.0, 40.0]
+
+
+def test_a_reaction_is_found_by_the_number_of_its_cycle_where_cycles_are_lost():
+    run = make_run((M, 10), (R, 5))
+    cut = CycleColumns(run.timing.t_ns[4:], {name: column[4:] for name, column in run.timing.columns.items()})
+    assert np.flatnonzero(find_reactions(cut, run.cycle, run.state)).tolist() == [6]
+
+
+def test_a_run_that_begins_in_react_reacts_in_its_first_cycle():
+    run = make_run((R, 3), (M, 3))
+    assert np.flatnonzero(find_reactions(run.timing, run.cycle, run.state)).tolist() == [0]
+
+
+def test_columns_of_records_are_those_of_a_log():
+    made = columns_of_records([7, 8], [CycleRecord(0, 1, 2, 3, 4, -5), CycleRecord(1, 10, 20, 30, 40, 50, overruns=2)])
+    assert (made["slack_ns"].tolist(), made["overruns"].tolist(), made.t_ns.tolist()) == ([-5, 50], [0, 2], [7, 8])
+
+
+def test_columns_of_an_old_log_lack_what_it_lacks():
+    old = np.zeros(3, [("sec", "<u4"), ("nanosec", "<u4"), ("cycle", "<u8"), ("lateness_ns", "<i8")])
+    old["lateness_ns"] = (1, -2, 3)
+    made = columns_of_series(Series(old, 0))
+    assert (sorted(made.columns), made["lateness_ns"].tolist()) == (["cycle", "lateness_ns"], [1, -2, 3])
+
+
+def test_no_record_has_columns_without_values():
+    assert evidence_without_cycles().counts["overruns"].per_100000 is None
+
+
+def evidence_without_cycles():
+    return collect_evidence(columns_of_records([], []), 1000, is_modelled=False)
+
+
+def figures_of(run):
+    found = evaluate(run).timing
+    return {drawing.name: drawing.figure for drawing in draw_timing(run.timing, found, run.zero_ns, "motion start")}
+
+
+def titles(figure):
+    return [axes.get_title(loc="left").split(" — ")[0] for axes in figure.axes]
+
+
+def short_run(**changes):
+    run = make_run((M, 100), (R, 20), clock="realtime")
+    return with_columns(run, lateness_ns=np.arange(120) * 1000, **changes)
+
+
+def test_without_a_cycle_there_is_no_figure():
+    assert draw_timing(columns_of_records([], []), evidence_without_cycles(), 0) == []
+
+
+def test_the_figures_show_four_distributions_and_three_lines():
+    figures = figures_of(short_run())
+    assert titles(figures["timing-distributions"]) == ["Lateness", "Compute", "SYNC → command", "Slack"]
+    assert titles(figures["timing-line"]) == ["Lateness", "SYNC → command", "Queues"]
+
+
+def test_the_distribution_marks_its_percentiles_and_the_period():
+    axes = figures_of(short_run())["timing-distributions"].axes[0]
+    assert [line.get_xdata()[0] for line in axes.lines] == pytest.approx([60.0, 118.0, 119.0, 1000.0])
+
+
+def test_the_line_in_time_keeps_a_single_late_cycle():
+    run = make_run((M, 50_000), clock="realtime", has_truth=False)
+    lateness_ns = np.full(50_000, 5000)
+    lateness_ns[31_417] = 7_000_000
+    band = figures_of(with_columns(run, lateness_ns=lateness_ns))["timing-line"].axes[0].collections[0]
+    assert band.get_paths()[0].vertices[:, 1].max() == 7000.0
+
+
+def test_overruns_are_marked_where_they_happened():
+    overruns = np.zeros(120, dtype=np.int64)
+    overruns[70:] = 2
+    axes = figures_of(short_run(overruns=overruns))["timing-line"].axes[0]
+    (marks,) = (line for line in axes.lines if line.get_marker() == "v")
+    assert marks.get_xdata().tolist() == pytest.approx([0.07])
+
+
+def test_an_old_log_says_which_distribution_it_lacks():
+    axes = figures_of(like_an_old_log(short_run()))["timing-distributions"].axes
+    assert [[text.get_text() for text in axes[place].texts] for place in (1, 3)] == [["not in this log"]] * 2
+
+
+def test_lockstep_draws_neither_lateness_nor_queues():
+    run = short_run()
+    figures = figures_of(replace(run, metadata={**run.metadata, "clock": "lockstep"}))
+    assert titles(figures["timing-line"]) == ["SYNC → command"]
