@@ -141,6 +141,7 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
             commands_late=cycle["commands_late"].astype(np.int64),
         ),
         finish_cycle=_finish_cycle(scheme),
+        contact_joints=scheme["contact_joints"],
         truth=_truth(truth_log),
         settings=_settings(log),
         metadata=metadata,
