@@ -474,7 +474,7 @@ class LockstepSettings:
 
 @dataclass(frozen=True)
 class RealtimeSettings:
-    """How the process that runs the cycle gets on time."""
+    """How the process that runs the cycle gets on time, and what is done when it doesn't."""
 
     scheduler: str = setting(
         "fifo", choices=("fifo", "deadline", "other"), meaning="SCHED_FIFO, SCHED_DEADLINE, or none of real time"
@@ -484,6 +484,18 @@ class RealtimeSettings:
         ANY_CPU, meaning="processor to stay on: its number, 'isolated' for the first isolated one, or 'any'"
     )
     lock_memory: bool = setting(True, meaning="keep all memory in place, with a reserve")
+    spin_us: float = setting(
+        -1.0,
+        unit="µs",
+        low=-1.0,
+        high=1000.0,
+        meaning="how long to read the clock before SYNC is due; -1: by measurement",
+    )
+    misses: int = setting(10, low=1, high=1_000_000, meaning="skipped periods in the window that are too many")
+    misses_window_s: float = setting(1.0, unit="s", low=0.01, high=60.0, meaning="in which they are counted")
+    on_misses: str = setting(
+        "stop", choices=("stop", "hold"), meaning="FAULT; or, while detection is on, brake and hold until acknowledged"
+    )
 
     def __post_init__(self) -> None:
         if self.cpu not in (ANY_CPU, ISOLATED_CPU) and not self.cpu.isdecimal():

@@ -13,6 +13,7 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
+from adacd_hil.control.deadline import DeadlineWatch
 from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate, GateFlag
@@ -86,6 +87,7 @@ class Cycle:
         self._pacer, self._operator = pacer, operator
         self._exchange = Exchange(settings, bus, arm, master, clock)
         self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
+        self._deadline = DeadlineWatch(settings)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
         self._controller = Controller(settings)
@@ -138,12 +140,12 @@ class Cycle:
         return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
 
     def _watch(self, arm: ArmState) -> ArmState:
-        """Take a device that has fallen silent or left Operational for a fault of the arm."""
+        """Take for a fault of the arm a device that has fallen silent or left Operational, or a host that is late."""
         if self._looks_at_nodes.is_due(arm.cycle):
             self._lost = self._master.watch(arm.t_ns)
         if self._lost and arm.fault is FaultReason.NONE:
-            return arm._replace(fault=FaultReason.HEARTBEAT)
-        return arm
+            arm = arm._replace(fault=FaultReason.HEARTBEAT)
+        return self._deadline.judge(arm)
 
     def _request(self, tick: Tick) -> Request:
         """Ask the operator; what concerns the end of the run stays here."""
@@ -210,10 +212,13 @@ class Cycle:
 
     def _transition(self, output: SchemeOutput) -> Event:
         text = f"{output.previous_state.name} -> {output.state.name}"
+        if output.state is SchemeState.REACT and output.contact is None:
+            return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {self._deadline.describe()}")
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
         excess = self._arm.describe_excess() if output.fault is FaultReason.LIMIT else []
-        causes = [*excess, *self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
+        late = [self._deadline.describe()] if output.fault is FaultReason.DEADLINE else []
+        causes = [*late, *excess, *self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
         details = "; ".join([output.fault.name, *causes])
         return Event("error", "supervisor", f"{text}: {details}")
 

@@ -12,7 +12,7 @@ from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import Pacer, make_pacer
+from adacd_hil.control.realtime import Pacer, make_pacer, prepare_spin
 from adacd_hil.control.recovery import Recovery
 from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
@@ -109,7 +109,8 @@ class Session:
         grant = self._request_realtime()
         for line in grant.missing:
             self.progress(f"not granted: {line}")
-        recorder = self._open_log(grant)
+        spin = prepare_spin(pacer, self.settings, self.clock, grant)
+        recorder = self._open_log(grant, spin)
         for refusal in grant.missing:
             recorder.event(self.clock.now_ns(), Event("warning", "realtime", f"not granted: {refusal}"))
         recovery = Recovery(tap, self.clock, self.operator, recorder, self.progress, lambda: self._is_interrupted)
@@ -193,7 +194,7 @@ class Session:
             recorder.event(self.clock.now_ns(), Event("error", "run", f"devices were not stopped: {error}"))
         recorder.cycle(self.clock.now_ns(), [], tap.take())
 
-    def _open_log(self, grant: RealtimeGrant) -> Recorder:
+    def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
         attachments = {path.name: path.read_bytes() for path in sorted(contract_folder().glob("*.eds"))}
@@ -207,7 +208,7 @@ class Session:
                 codec_path=self.codec.path,
                 parameter_count=len(self.settings.estimator.parameter_names),
                 attachments=attachments,
-                metadata=self._metadata(grant),
+                metadata={**self._metadata(grant), **spin},
                 epoch_ns=0 if is_lockstep else wall_ns() - MonotonicClock().now_ns(),
                 blocking=is_lockstep,
             )
