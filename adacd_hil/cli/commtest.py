@@ -132,6 +132,7 @@ def _open_log(out: Path, settings: Settings, codec: Codec, connection: Connectio
             "period_us": str(settings.bus.period_us),
         },
         epoch_ns=wall_ns() - MonotonicClock().now_ns(),
+        settings=settings.log,
     )
 
 
