@@ -48,6 +48,12 @@ COMPRESSION_LEVEL = 3
 """1 saves 1 µs per cycle of a run and makes its file 1 % larger; lz4 saves 2 µs and makes it 31 % larger."""
 RUN_METADATA = "run"
 SUMMARY_METADATA = "summary"
+PART_KEY = "part"
+"""Of the metadata `run`: number of the part, from 0."""
+ENDING_KEY = "ending"
+"""Of the summary: why the part ended."""
+CONTINUED = "continued"
+"""The ending of a part that another follows."""
 FIELDS_KEY = "fields"
 """Channel metadata: our names of the fields, which ROS would have in lower case."""
 _MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}

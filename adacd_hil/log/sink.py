@@ -1,7 +1,7 @@
 """The files of a log, written by a thread of its own, so that a slow disk doesn't stop the writer from taking packets.
 
-What waits for the disk is bounded: beyond WAITING_BYTES `is_behind` says so until half of it is written, and whoever
-must lose nothing lets `write` wait. The first failure (disk full) ends a file at the last whole write; what comes after
+What waits for the disk is bounded: when it is more, `is_behind` says so until half of that is written, and whoever must
+lose nothing lets `write` wait. The first failure (disk full) ends a file at the last whole write; what comes after
 is swallowed and its packets are counted, until another file is begun.
 """
 
@@ -24,8 +24,8 @@ class _Write(NamedTuple):
 class Sink:
     """What `McapFile` needs of a stream, over a file descriptor that it closes."""
 
-    def __init__(self, descriptor: int, waits: bool = True) -> None:
-        """Write to `descriptor`; `waits`: `write` waits rather than let more than WAITING_BYTES wait."""
+    def __init__(self, descriptor: int, waits: bool = True, most_waiting: int = WAITING_BYTES) -> None:
+        """Write to `descriptor`; `waits`: `write` waits rather than let more than `most_waiting` bytes wait."""
         self.error = ""
         """Why the file in progress ended early."""
         self.first_error = ""
@@ -35,6 +35,7 @@ class Sink:
         self._descriptor = descriptor
         self._name = ""  # of a later file
         self._waits = waits
+        self._most_waiting = most_waiting
         self._position = 0
         self._tasks: deque[_Write | Path | None] = deque()
         self._waiting = 0  # bytes
@@ -50,7 +51,7 @@ class Sink:
         self._position += len(data)
         if data:
             with self._changed:
-                self._changed.wait_for(lambda: not self._waits or self._waiting < WAITING_BYTES)
+                self._changed.wait_for(lambda: not self._waits or self._waiting < self._most_waiting)
                 self._waiting += len(data)
                 self._tasks.append(_Write(data, packets))
                 self._changed.notify_all()
@@ -68,9 +69,14 @@ class Sink:
         return self._position
 
     @property
+    def waiting(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._waiting
+
+    @property
     def is_behind(self) -> bool:
         """Whether so much waits for the disk that nothing should be added."""
-        self._is_behind = self._waiting > (WAITING_BYTES // 2 if self._is_behind else WAITING_BYTES)
+        self._is_behind = self._waiting > (self._most_waiting // 2 if self._is_behind else self._most_waiting)
         return self._is_behind
 
     def take_lost(self) -> int:

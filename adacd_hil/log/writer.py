@@ -21,11 +21,11 @@ import sys
 
 import numpy as np
 
-from adacd_hil.clock import MonotonicClock
+from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.log import packet, words
 from adacd_hil.log.channels import MessageLike, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_file import McapFile
+from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, McapFile
 from adacd_hil.log.packet_writer import Numbers, PacketWriter, Rows
 from adacd_hil.log.parts import part_path
 from adacd_hil.log.ring import RingReader, split
@@ -44,7 +44,9 @@ BATCH_BYTES = 256 * 1024
 class WriterProcess:
     """The loop around a PacketWriter."""
 
-    def __init__(self, connection: socket.socket, ring: RingReader, sink: Sink, setup: Setup) -> None:
+    def __init__(
+        self, connection: socket.socket, ring: RingReader, sink: Sink, setup: Setup, clock: Clock | None = None
+    ) -> None:
         messages = () if setup.is_truth else _dbc_messages(setup)
         self._channels = truth_channels() if setup.is_truth else run_channels(setup.parameter_count, messages)
         self._connection = connection
@@ -57,7 +59,7 @@ class WriterProcess:
         self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count)
         self._gathered: list[bytes] = []
         self._gathered_bytes = 0
-        self._clock = MonotonicClock()
+        self._clock = clock or MonotonicClock()
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
         self._failed_ns: int | None = None  # when the disk was seen to fail, or was last tried
         self._part_ns: tuple[int, int] | None = None  # t_ns of the first and the last packet of the part
@@ -138,7 +140,7 @@ class WriterProcess:
         self._file.flush()
         self._flushed_ns = now_ns
         if self._is_part_full() and not self._sink.error and not self._sink.is_behind:
-            self._finish("continued")
+            self._finish(CONTINUED)
             self._begin_part(is_next=True)
 
     def _is_part_full(self) -> bool:
@@ -162,19 +164,19 @@ class WriterProcess:
 
     def _begin_file(self) -> McapFile:
         setup = self._setup
-        metadata = {**setup.metadata, "part": str(self._part)}
+        metadata = {**setup.metadata, PART_KEY: str(self._part)}
         return McapFile(self._sink, self._channels, setup.attachments, metadata)
 
     def _finish(self, ending: str) -> dict[str, str]:
         """End the part in progress; return the summary of all parts so far."""
         self._note_lost()
-        dropped = self._ring.dropped if ending != "continued" else self._packets.dropped
+        dropped = self._ring.dropped if ending != CONTINUED else self._packets.dropped
         dropped += self._lost
         summary = {
             "frames": str(self._packets.frames),
             "messages": str(self._file.messages),
             "dropped": str(dropped - self._dropped),
-            "ending": ending,
+            ENDING_KEY: ending,
         }
         self._dropped = dropped
         self._file.finish(summary)

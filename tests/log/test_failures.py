@@ -153,13 +153,13 @@ def test_in_lockstep_a_writer_that_is_behind_is_waited_for(tmp_path):
 
     def send():
         while not has_continued.is_set() or len(sent) < 10:
-            recorder.event(len(sent), Event("info", "n", ""))
+            recorder.event(len(sent), Event("info", "n", 4000 * "x"))
             sent.append(len(sent))
 
     os.kill(recorder.pid, signal.SIGSTOP)
     sender = threading.Thread(target=send)
     sender.start()
-    while recorder._ring.capacity - recorder._ring.waiting > 40:
+    while recorder._ring.capacity - recorder._ring.waiting > 4100:
         os.sched_yield()
     for _ in range(1000):  # lets the sender run against it
         os.sched_yield()
