@@ -508,6 +508,19 @@ class RealtimeSettings:
 
 
 @dataclass(frozen=True)
+class LogSettings:
+    """The log: what may wait for its writer, and when a part of it ends and the next one begins."""
+
+    buffer_MiB: int = setting(
+        4, unit="MiB", low=1, high=256, meaning="memory between control process and writer; 6 s of cycles at 1 kHz"
+    )
+    part_MiB: int = setting(
+        512, unit="MiB", low=0, high=1_000_000, meaning="largest part, before compression; 0: parts of any size"
+    )
+    part_min: float = setting(30.0, unit="min", low=0.0, high=1e6, meaning="longest part; 0: parts of any length")
+
+
+@dataclass(frozen=True)
 class SafetySettings:
     """Checks before torque."""
 
@@ -584,6 +597,7 @@ class Settings:
     realtime: RealtimeSettings = setting(RealtimeSettings, meaning="being on time")
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
+    log: LogSettings = setting(LogSettings, meaning="the log")
 
     @property
     def cad_theta(self) -> Vector:

@@ -129,6 +129,7 @@ def _open_log(
             "period_us": str(settings.bus.period_us),
         },
         epoch_ns=wall_ns() - MonotonicClock().now_ns(),
+        settings=settings.log,
     )
 
 

@@ -211,6 +211,7 @@ class Session:
                 metadata={**self._metadata(grant), **spin},
                 epoch_ns=0 if is_lockstep else wall_ns() - MonotonicClock().now_ns(),
                 blocking=is_lockstep,
+                settings=self.settings.log,
             )
 
     def _metadata(self, grant: RealtimeGrant) -> dict[str, str]:
