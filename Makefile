@@ -11,7 +11,7 @@ help:
 	@echo "make demo   the paper's experiment with an emulated arm; report in runs/demo/report.html"
 	@echo "make test   all checks and tests, SocketCAN included"
 	@echo "make check  format, lint, types, direction of imports"
-	@echo "make bench  percentiles of a step, a cycle over vcan, codec, plant, log hand-off"
+	@echo "make bench  codec, step, plant, log hand-off; the cycle over vcan beside a C yardstick and a straightforward loop"
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

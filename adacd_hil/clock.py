@@ -3,8 +3,21 @@
 `t_ns` is always a value of one of these clocks. Wall-clock time appears once, in the log's header.
 """
 
+import ctypes
+import os
 import time
 from typing import Protocol
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+_EINTR = 4
+_NS_PER_S = 1_000_000_000
+
+
+class _Timespec(ctypes.Structure):
+    """struct timespec of Linux on 64 bits."""
+
+    _fields_ = (("seconds", ctypes.c_int64), ("nanoseconds", ctypes.c_int64))
 
 
 class Clock(Protocol):
@@ -20,16 +33,26 @@ class Clock(Protocol):
 class MonotonicClock:
     """The host's monotonic clock."""
 
+    def __init__(self) -> None:
+        self._due = _Timespec()
+        self._due_reference = ctypes.byref(self._due)
+        self._sleep = ctypes.CDLL(None).clock_nanosleep
+
     def now_ns(self) -> int:
         """Return CLOCK_MONOTONIC in ns."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Sleep until `t_ns`; the kernel may wake us later, never much earlier."""
-        remaining_ns = t_ns - time.monotonic_ns()
-        while remaining_ns > 0:
-            time.sleep(remaining_ns * 1e-9)
-            remaining_ns = t_ns - time.monotonic_ns()
+        """Sleep until `t_ns` in one system call; the kernel may wake us later, never earlier.
+
+        A signal's handler runs when the signal comes, and the sleep goes on after it. Raises OSError.
+        """
+        due = self._due
+        due.seconds, due.nanoseconds = divmod(max(t_ns, 0), _NS_PER_S)
+        while number := self._sleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, self._due_reference, None):
+            if number != _EINTR:
+                raise OSError(number, os.strerror(number))
+            due.seconds, due.nanoseconds = divmod(max(t_ns, 0), _NS_PER_S)  # a handler may have slept, too
 
 
 class VirtualClock:
@@ -50,3 +73,14 @@ class VirtualClock:
 def wall_ns() -> int:
     """Return the wall clock, ns since 1970; for log headers only."""
     return time.time_ns()
+
+
+def wall_offset_ns() -> int:
+    """Return the wall clock minus CLOCK_MONOTONIC, ns; of three readings the one that was interrupted least."""
+    offsets = []
+    for _ in range(3):
+        before_ns = time.monotonic_ns()
+        now_ns = time.time_ns()
+        after_ns = time.monotonic_ns()
+        offsets.append((after_ns - before_ns, now_ns - (before_ns + after_ns) // 2))
+    return min(offsets)[1]

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES, Vector
+from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
 
 
 class ConfigError(ValueError):
@@ -238,6 +239,11 @@ class BusSettings:
     sync: str = setting(
         "produce", choices=("produce", "follow"), meaning="send SYNC, or begin each cycle with that of another host"
     )
+    schedule: str = setting(
+        "same_cycle",
+        choices=("same_cycle", "pipelined"),
+        meaning="commands leave when they are ready, to act at the next SYNC; or behind that one, to act one later",
+    )
     sync_timeout_ms: int = setting(
         100, unit="ms", low=1, high=60_000, meaning="follow: longest wait for SYNC; the drives have stopped before"
     )
@@ -255,6 +261,11 @@ class BusSettings:
     def follows(self) -> bool:
         """Whether another host sends SYNC."""
         return self.sync == "follow"
+
+    @property
+    def is_pipelined(self) -> bool:
+        """Whether the commands of a cycle leave behind the SYNC of the next."""
+        return self.schedule == "pipelined"
 
     @property
     def period_s(self) -> float:
@@ -462,6 +473,54 @@ class LockstepSettings:
 
 
 @dataclass(frozen=True)
+class RealtimeSettings:
+    """How the process that runs the cycle gets on time, and what is done when it doesn't."""
+
+    scheduler: str = setting(
+        "fifo", choices=("fifo", "deadline", "other"), meaning="SCHED_FIFO, SCHED_DEADLINE, or none of real time"
+    )
+    priority: int = setting(80, low=1, high=98, meaning="of SCHED_FIFO; threaded interrupts have 50, the kernel 99")
+    cpu: str = setting(
+        ANY_CPU, meaning="processor to stay on: its number, 'isolated' for the first isolated one, or 'any'"
+    )
+    lock_memory: bool = setting(True, meaning="keep all memory in place, with a reserve")
+    spin_us: float = setting(
+        -1.0,
+        unit="µs",
+        low=-1.0,
+        high=1000.0,
+        meaning="how long to read the clock before SYNC is due; -1: by measurement",
+    )
+    misses: int = setting(10, low=1, high=1_000_000, meaning="skipped periods in the window that are too many")
+    misses_window_s: float = setting(1.0, unit="s", low=0.01, high=60.0, meaning="in which they are counted")
+    on_misses: str = setting(
+        "stop", choices=("stop", "hold"), meaning="FAULT; or, while detection is on, brake and hold until acknowledged"
+    )
+
+    def __post_init__(self) -> None:
+        if self.cpu not in (ANY_CPU, ISOLATED_CPU) and not self.cpu.isdecimal():
+            raise ConfigError(f"`realtime.cpu` = {self.cpu!r} must be a processor's number, 'isolated' or 'any'")
+        if self.scheduler == "deadline" and self.cpu != ANY_CPU:
+            raise ConfigError(
+                f"`realtime.cpu` = {self.cpu!r} can't be had with `realtime.scheduler` = 'deadline', which the kernel "
+                "refuses to a process that is pinned; start it in an exclusive cpuset instead"
+            )
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """The log: what may wait for its writer, and when a part of it ends and the next one begins."""
+
+    buffer_MiB: int = setting(
+        4, unit="MiB", low=1, high=256, meaning="memory between control process and writer; 6 s of cycles at 1 kHz"
+    )
+    part_MiB: int = setting(
+        512, unit="MiB", low=0, high=1_000_000, meaning="largest part, before compression; 0: parts of any size"
+    )
+    part_min: float = setting(30.0, unit="min", low=0.0, high=1e6, meaning="longest part; 0: parts of any length")
+
+
+@dataclass(frozen=True)
 class SafetySettings:
     """Checks before torque."""
 
@@ -535,13 +594,21 @@ class Settings:
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
     operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
     lockstep: LockstepSettings = setting(LockstepSettings, meaning="modelled time of the host")
+    realtime: RealtimeSettings = setting(RealtimeSettings, meaning="being on time")
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
+    log: LogSettings = setting(LogSettings, meaning="the log")
 
     @property
     def cad_theta(self) -> Vector:
         """The CAD model's parameters (p,)."""
         return np.array(self.arm.cad_theta, dtype=np.float64)
+
+    @property
+    def realtime_request(self) -> RealtimeRequest:
+        """What the control process asks of the operating system."""
+        wish = self.realtime
+        return RealtimeRequest(wish.scheduler, wish.priority, wish.cpu, wish.lock_memory, self.bus.period_ns)
 
     def __post_init__(self) -> None:
         count = len(self.estimator.parameter_names)

@@ -161,13 +161,15 @@ class FaultReason(IntEnum):
     ENABLE_TIMEOUT = 7
     ADAPT_TIMEOUT = 8
     HEARTBEAT = 9  # a device has fallen silent or left Operational
+    DEADLINE = 10  # the host has skipped too many periods
 
 
 class ArmState(NamedTuple):
     """What the arm reported in one cycle.
 
     Ages count cycles since the value was sampled: 0 is this cycle's SYNC. `periods` is how many periods have passed
-    since the previous ArmState, 1 unless the cycle overran.
+    since the previous ArmState, 1 unless the cycle overran. `is_late`: the host has skipped so many that the arm is to
+    be held.
     """
 
     cycle: int
@@ -181,6 +183,7 @@ class ArmState(NamedTuple):
     is_enabled: bool
     is_complete: bool
     fault: FaultReason
+    is_late: bool = False
 
 
 class ArmCommand(NamedTuple):

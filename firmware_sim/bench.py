@@ -68,13 +68,15 @@ class Bench:
         on_truth: Callable[[int, int, Vector], None] | None = None,
         contract: Contract | None = None,
         on_event: OnEvent | None = None,
+        on_answer: Callable[[], None] = lambda: None,
     ) -> None:
         """Build and compile everything; nothing is sent before `boot`.
 
-        send: called with (identifier, data). seed: outweighs the scenario's. on_truth: called each cycle with (cycle,
-        t_ns of the SYNC frame, block by TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS
-        files the devices have; default: those that go with the codec's DBC. on_event: called with t_ns, level, name and
-        text when a fault begins or ends.
+        send: called with (identifier, data). on_answer: called when all that answers a SYNC has been sent. seed:
+        outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
+        TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS files the devices have; default:
+        those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault begins or
+        ends.
         Raises ConfigError when a fault is about a frame that the contract hasn't, CodecError when the DBC lacks a
         message, OSError when an EDS can't be read.
         """
@@ -92,6 +94,7 @@ class Bench:
         self._seed = seed
         self._is_wall = clock_mode == "wall"
         self.on_truth = on_truth
+        self._on_answer = on_answer
         self._truth = np.zeros(TRUTH_LAYOUT.size)
         self._counter = 0  # of the last SYNC, 0: none since boot-up
         self._has_moved = False
@@ -322,6 +325,7 @@ class Bench:
             self._sample_and_send(data)
             self._outbox.close(sync_ns, sync_ns + self._period_ns)
         self._granted = self._outbox.sent
+        self._on_answer()
         self._tell_truth(t_ns)
         if not self._is_wall:
             self._has_moved = True

@@ -14,7 +14,7 @@ DEFAULT_LENGTH = 10
 MAX_LENGTH = 512
 
 
-class QueuedBus:
+class QueuedBus(Bus):
     """Wraps one end of a bus. Nothing waits: a queue that is full fails at once, where SocketCAN fails after 50 ms."""
 
     def __init__(self, bus: Bus, length: int = DEFAULT_LENGTH) -> None:

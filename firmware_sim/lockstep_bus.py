@@ -40,7 +40,7 @@ Offer = tuple[int, int, int, bytes]
 """A frame that waits for the bus; the smaller one wins: identifier, order among all, when it was handed over, data."""
 
 
-class LockstepBus:
+class LockstepBus(Bus):
     """The host's end of a modelled bus. Single-threaded."""
 
     def __init__(

@@ -16,13 +16,14 @@ from adacd_hil.clock import Clock, MonotonicClock, wall_ns
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
 from adacd_hil.records import Vector
-from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.scheduling import RealtimeRequest, freeze_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from adacd_hil.wire.node_offset import HOST_NODE, move_contract
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
 from firmware_sim.contracts import CONTRACTS, is_fd
+from firmware_sim.departure import Departure
 from firmware_sim.injector import OnEvent
 from firmware_sim.pdo_record import LAST_NODE, LISTENED_IDS
 from firmware_sim.scenario import Scenario, load_scenario
@@ -33,6 +34,7 @@ from firmware_sim.truth import TRUTH_NAME, TruthLog
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
 _LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus
 _DEVICES = 4
+_PRIORITY = 70  # below a host's 80, whose commands must not wait on a shared processor for the arm to be integrated
 _SILENCE_NS = 2_000_000_000  # a host that says nothing for this long has gone
 
 
@@ -76,11 +78,22 @@ class Service:
     """Carries frames and time to a bench until a stop is requested."""
 
     def __init__(
-        self, bench: Bench, bus: Bus, clock: Clock, clock_mode: ClockMode, stop: StopRequest, is_once: bool = False
+        self,
+        bench: Bench,
+        bus: Bus,
+        departure: Departure,
+        clock: Clock,
+        clock_mode: ClockMode,
+        stop: StopRequest,
+        is_once: bool = False,
     ) -> None:
-        """Prepare. `is_once`: also end when the host that started the nodes stops or resets them or falls silent."""
+        """Prepare. `departure`: where the bench puts its frames.
+
+        `is_once`: also end when the host that started the nodes stops or resets them or falls silent.
+        """
         self._bench = bench
         self._bus = bus
+        self._departure = departure
         self._clock = clock
         self._is_wall = clock_mode == "wall"
         self._stop = stop
@@ -95,6 +108,7 @@ class Service:
             pass
         self._time_ns = self._heard_ns = self._clock.now_ns()
         self._bench.boot(self._time_ns)
+        self._departure.go()
 
     def run(self) -> None:
         """Serve; an interface that goes down is awaited, as by a device whose cable is pulled. Raises BusError."""
@@ -120,6 +134,7 @@ class Service:
             self._time_ns = self._heard_ns
         else:
             self._pass_time(self._clock.now_ns() if frame is None else frame.t_ns, frame is None)
+        self._departure.go()
         return frame
 
     def _await_interface(self) -> None:
@@ -244,13 +259,14 @@ def run(
             # By SYNC, time waits for the log; by wall clock nothing may.
             truth = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
             stack.enter_context(truth)
-        bench = Bench(resolved, codec, bus.send, clock_mode=clock_mode)
+        departure = Departure(bus)
+        bench = Bench(resolved, codec, departure.send, clock_mode=clock_mode, on_answer=departure.go)
         if truth is not None:
             epoch_ns = wall_ns() - clock.now_ns()
             bench.on_truth = _stamp_truth(truth, bench, epoch_ns)
             bench.on_event = _stamp_events(truth, bench, epoch_ns)
-        service = Service(bench, bus, clock, clock_mode, stop, is_once)
-        for line in request_realtime().missing:
+        service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
+        for line in request_realtime(RealtimeRequest(priority=_PRIORITY)).missing:
             _complain(f"not granted: {line}")
         freeze_garbage()
         service.boot()

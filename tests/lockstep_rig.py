@@ -5,7 +5,7 @@ from pathlib import Path
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import LockstepSettings, OperatorSettings, load_settings
+from adacd_hil.config import BusSettings, LockstepSettings, OperatorSettings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.log.reader import RunLog, read_log
@@ -18,10 +18,14 @@ CODEC = load_codec()
 
 
 def play(
-    folder: Path, operator: OperatorSettings, lockstep: LockstepSettings, scenario: Scenario | None = None
+    folder: Path,
+    operator: OperatorSettings,
+    lockstep: LockstepSettings,
+    scenario: Scenario | None = None,
+    bus: BusSettings | None = None,
 ) -> tuple[RunLog, list[Frame]]:
     """Run to the end; give the log, and the host's frames as they reach the devices."""
-    settings = dataclasses.replace(load_settings(), operator=operator, lockstep=lockstep)
+    settings = dataclasses.replace(load_settings(), operator=operator, lockstep=lockstep, bus=bus or BusSettings())
     clock = VirtualClock()
     embedded = EmbeddedBus(clock)
     bench = Bench(scenario or load_scenario("idle"), CODEC, embedded.deliver)
@@ -33,6 +37,6 @@ def play(
 
     embedded.attach(on_frame)
     bench.boot()
-    bus = model_time(embedded, clock, CODEC, settings)
-    summary = Session(settings, CODEC, bus, clock, ScriptedOperator(operator), folder, "embedded").run()
+    modelled = model_time(embedded, clock, CODEC, settings)
+    summary = Session(settings, CODEC, modelled, clock, ScriptedOperator(operator), folder, "embedded").run()
     return read_log(summary.log.path), arrived

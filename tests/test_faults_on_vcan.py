@@ -34,6 +34,8 @@ max_age_cycles = {AGE_CYCLES}
 command_patience_cycles = 25
 sync_patience_periods = 25.0
 
+[realtime]
+misses = 1000000
 
 [safety]
 commission_cycles = 20

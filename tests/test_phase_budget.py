@@ -10,14 +10,15 @@ import lockstep_rig
 import numpy as np
 import pytest
 
-from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings
+from adacd_hil.config import BusSettings, LockstepSettings, OperatorSettings, RequestSettings
 from adacd_hil.log.reader import RunLog
 
 
-def play(folder: Path, **lockstep: Any) -> tuple[RunLog, list[int]]:
+def play(folder: Path, schedule: str = "same_cycle", **lockstep: Any) -> tuple[RunLog, list[int]]:
     """Run an idle arm for half a second with frames as long as can be; give log, and identifiers as they arrive."""
     operator = OperatorSettings(script=(RequestSettings(at_s=0.5, request="finish"),))
-    log, arrived = lockstep_rig.play(folder, operator, LockstepSettings(**({"stuffing": "worst"} | lockstep)))
+    settings = LockstepSettings(**({"stuffing": "worst"} | lockstep))
+    log, arrived = lockstep_rig.play(folder, operator, settings, bus=BusSettings(schedule=schedule))
     return log, [frame.can_id for frame in arrived]
 
 
@@ -79,3 +80,18 @@ def test_a_host_that_stalls_for_periods_skips_them_and_keeps_the_grid(tmp_path: 
     log, _ = play(tmp_path, latency="constant", stall_us=3_000.0, stall_every_s=0.1)
     assert log.cycle["overruns"][-1] >= 3
     assert usual(log.cycle["lateness_ns"]) == 0
+
+
+@pytest.mark.parametrize(("latency_us", "growth_ns"), [(435.0, 0), (436.0, 1_000)])
+def test_pipelined_commands_leave_the_host_all_of_the_period_but_sync_and_feedback(
+    tmp_path: Path, latency_us: float, growth_ns: int
+) -> None:
+    log, _ = play(tmp_path, "pipelined", latency_us=latency_us)
+    assert usual(np.diff(log.cycle["lateness_ns"])) == growth_ns
+
+
+def test_pipelined_commands_leave_behind_sync_and_are_never_late(tmp_path: Path) -> None:
+    log, arrived = play(tmp_path, "pipelined", latency_us=400.0)
+    first = next(index for index, can_id in enumerate(arrived) if can_id == 0x201)
+    assert log.cycle["commands_late"].max() == 0
+    assert [can_id for can_id in arrived[first - 1 : first + 5] if can_id != 0x77F] == [0x080, 0x201, 0x202] * 2

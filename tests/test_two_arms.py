@@ -24,7 +24,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import ArmCommand, FaultReason, SchemeState
-from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame
+from adacd_hil.wire.bus import Bus, BusError, EmbeddedBus, Frame
 from adacd_hil.wire.tap import Tap
 from firmware_sim.bench import Bench
 from firmware_sim.lockstep_bus import make_lockstep_bus
@@ -57,7 +57,7 @@ def settings_of(arm: int, finish_s: float = 0.4) -> Settings:
     )
 
 
-class End:
+class End(Bus):
     """One host's end of the bus. `on_wait`: lets time pass until something may have come, False at the limit."""
 
     waiting_frames = ()

@@ -31,6 +31,8 @@ Kd = [4.0, 0.3]
 [safety]
 commission_cycles = 50
 phase_timeout_s = 60.0
+[realtime]
+misses = 1000000
 [bus]
 period_us = 10000
 heartbeat_ms = 2000

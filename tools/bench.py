@@ -1,13 +1,16 @@
 """Prints what one step, one cycle, the codec, the plant and the log hand-off cost: percentiles in µs, no verdict.
 
-    python tools/bench.py           in this process, then the cycle over vcan through tools/with-vcan
-    python tools/bench.py --vcan    the cycle over vcan0 only: emulator and host as two processes
+    python tools/bench.py                   all; what needs a bus through tools/with-vcan
+    python tools/bench.py --side-by-side    only the cycle over vcan, beside the C yardstick's and a straightforward
+                                            loop's
+    python tools/bench.py --vcan            only what needs a bus, on an interface vcan0 that is up
 
 Absolute figures are this machine's; compare ratios of one run. numpy's percentiles, linear interpolation.
 """
 
 import argparse
 import dataclasses
+import json
 import os
 import platform
 import subprocess
@@ -22,6 +25,7 @@ from unittest.mock import patch
 import cantools
 import numpy as np
 from numpy.typing import NDArray
+from side_by_side import BIN, ENVIRONMENT, ROOT, TimingError, as_text, compare, emulator
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
@@ -41,8 +45,6 @@ from firmware_sim.body import Body, DriveMode
 from firmware_sim.mechanics_settings import MechanicsSettings
 from firmware_sim.scenario import load_scenario
 
-ROOT = Path(__file__).resolve().parent.parent
-BIN = Path(sys.executable).parent
 SYNC_ID = 0x080
 REPEATS = 20_000
 EVERYTHING = MechanicsSettings(
@@ -73,20 +75,30 @@ script = [{ at_s = 10.0, request = "finish" }]
 [bus]  # a machine that stalls is to be measured, not to fault the arm
 command_patience_cycles = 250
 max_age_cycles = 100
+
+[realtime]
+misses = 1000000
 """
 
 
 def main() -> int:
     """Run what was asked for."""
     parser = argparse.ArgumentParser(description="Benchmarks; prints percentiles in µs.")
-    parser.add_argument("--vcan", action="store_true", help="the cycle over vcan0 only")
-    if parser.parse_args().vcan:
-        return bench_vcan()
+    parser.add_argument("--rounds", type=int, default=4, help="of yardstick, host, straightforward loop; default 4")
+    parser.add_argument("--seconds", type=float, default=8.0, help="of each block of a round; default 8")
+    parser.add_argument("--side-by-side", action="store_true", help="the cycle beside the yardstick's only")
+    parser.add_argument("--vcan", action="store_true", help="what runs on vcan only, on an interface vcan0 that is up")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures of the cycles to a file")
+    chosen = parser.parse_args()
+    if chosen.vcan:
+        return bench_vcan(chosen)
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}")
-    print(f"{'µs':44} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}")
-    bench_in_process()
-    sys.stdout.flush()
-    return subprocess.run([ROOT / "tools/with-vcan", "--", sys.executable, __file__, "--vcan"], check=False).returncode
+    if not chosen.side_by_side:
+        print(f"{'µs':44} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}")
+        bench_in_process()
+        sys.stdout.flush()
+    again = [sys.executable, __file__, "--vcan", *sys.argv[1:]]
+    return subprocess.run([ROOT / "tools/with-vcan", "--", *again], check=False).returncode
 
 
 def show(name: str, times_us: NDArray[np.float64]) -> None:
@@ -220,61 +232,40 @@ def bench_embedded() -> None:
         print(f"  {played_s:.1f} s played in {summary.elapsed_s:.1f} s: {played_s / summary.elapsed_s:.1f} x real time")
 
 
-def bench_vcan() -> int:
-    """Run host and emulator as two processes on vcan0, in lockstep and in real time."""
-    for clock in ("lockstep", "realtime"):
-        with tempfile.TemporaryDirectory() as folder:
-            (Path(folder) / "short.toml").write_text(SHORT_RUN)
-            where = ["-i", "socketcan", "-c", "vcan0"]
-            emulator = subprocess.Popen(
-                [BIN / "firmware-sim", "run", *where, "--scenario", "idle"], stderr=subprocess.PIPE, text=True
-            )
-            assert emulator.stderr is not None
-            emulator.stderr.readline()
-            start_s = time.perf_counter()
-            host = subprocess.run(
-                [
-                    BIN / "adacd-hil",
-                    "run",
-                    *where,
-                    "--config",
-                    f"{folder}/short.toml",
-                    "--clock",
-                    clock,
-                    "--out",
-                    folder,
-                ],
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-            elapsed_s = time.perf_counter() - start_s
-            emulator.terminate()
-            emulator.communicate()
-            if host.returncode not in (0, 3):  # 3: the log lacks what the machine had no time to write
-                print(host.stderr, file=sys.stderr)
-                return host.returncode
-            show_log(f"vcan, {clock}", Path(folder) / "run.mcap", elapsed_s)
+def bench_vcan(chosen: argparse.Namespace) -> int:
+    """Run host and emulator as two processes on vcan0: in lockstep, then in real time beside the yardstick."""
+    if not chosen.side_by_side and (status := bench_lockstep()):
+        return status
+    try:
+        described = compare("vcan0", chosen.rounds, chosen.seconds)
+    except TimingError as error:
+        print(f"bench: {error}", file=sys.stderr)
+        return 1
+    print(as_text(described))
+    if chosen.json is not None:
+        chosen.json.write_text(json.dumps(described, indent=2) + "\n")
     return 0
 
 
-def show_log(name: str, path: Path, elapsed_s: float) -> None:
-    """Print the cycle's percentiles from a log."""
-    log = read_log(path)
-    cycle = log.cycle
-    if name.endswith("lockstep"):
-        print(f"{name}: {len(cycle)} cycles in {elapsed_s:.1f} s with start-up")
-        return
-    feedback_us = np.asarray(cycle["feedback_ns"]) * 1e-3
-    command_us = np.asarray(cycle["command_ns"]) * 1e-3
-    scheduler = log.metadata.get("scheduler", "")
-    count = len(feedback_us)
-    overruns = int(cycle["overruns"][-1])
-    print(f"{name}: {count} cycles in {elapsed_s:.1f} s with start-up, {scheduler}, {overruns} overruns")
-    show("  SYNC out to last frame decoded", feedback_us)
-    show("  last frame in to last command out", command_us - feedback_us)
-    show("  SYNC out to last command out", command_us)
-    show("  lateness of wake-up", np.asarray(cycle["lateness_ns"]) * 1e-3)
+def bench_lockstep() -> int:
+    """Print how long a run of ten seconds takes in lockstep; return the exit status."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "short.toml").write_text(SHORT_RUN)
+        where = ["-i", "socketcan", "-c", "vcan0"]
+        command = [BIN / "adacd-hil", "run", *where, "--config", folder / "short.toml", "--clock", "lockstep"]
+        with emulator("vcan0", "--scenario", "idle", folder=folder):
+            start_s = time.perf_counter()
+            done = subprocess.run(
+                [*command, "--out", folder], capture_output=True, text=True, check=False, env=ENVIRONMENT
+            )
+            elapsed_s = time.perf_counter() - start_s
+        if done.returncode:
+            print(done.stderr, file=sys.stderr)
+            return done.returncode
+        count = len(read_log(folder / "run.mcap", ("/cycle",)).cycle)
+        print(f"vcan, lockstep: {count} cycles in {elapsed_s:.1f} s with start-up", flush=True)
+        return 0
 
 
 if __name__ == "__main__":

@@ -72,6 +72,7 @@ class Run:
     frames: int | None
     dropped: int | None
     finish_cycle: int | None = None  # in which the user asked to finish; None if nobody did
+    contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -343,7 +344,10 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
     for row in rows:
         cycle = int(run.cycle[row])
         final = finals.get(cycle)
-        detections.append(Detection(int(row), float(time_s[row]), alarms.get(cycle, final), final))
+        alarm = alarms.get(cycle, final)
+        if alarm is None and run.contact_joints is not None and not run.contact_joints[row]:
+            continue  # held because the host was late
+        detections.append(Detection(int(row), float(time_s[row]), alarm, final))
     return tuple(detections)
 
 

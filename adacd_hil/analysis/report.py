@@ -136,6 +136,7 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
         reports=tuple(entry.report for entry in log.contacts),
         timing=columns_of_series(log.cycle),
         finish_cycle=_finish_cycle(scheme),
+        contact_joints=scheme["contact_joints"],
         truth=_truth(truth_log),
         settings=_settings(log),
         metadata=metadata,

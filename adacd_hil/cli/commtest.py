@@ -13,6 +13,7 @@ from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.config import Settings, to_toml
+from adacd_hil.control.realtime import prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
@@ -20,7 +21,7 @@ from adacd_hil.log.channels import ChannelId, pack_cycle
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import FaultReason
-from adacd_hil.scheduling import RealtimeGrant, freeze_garbage, request_realtime
+from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import BusError
 from adacd_hil.wire.codec import Codec
@@ -53,15 +54,17 @@ def run_commtest(
         except DeviceError as error:
             raise CommandError(str(error), ExitCode.BUS_MISSING) from None
         boot_frames = tap.take()
-        grant = request_realtime()
+        grant = request_realtime(settings.realtime_request)
         for line in grant.missing:
             _progress(f"not granted: {line}")
-        recorder = None if out is None else _open_log(out, settings, codec, connection, grant)
+        loop = ZeroTorqueLoop(settings, tap, clock, arm, master, is_enabling)
+        achieved = {**grant.describe(), **prepare_spin(loop.pacer, settings, clock, grant)}
+        with grant.unpinned():
+            recorder = None if out is None else _open_log(out, settings, codec, connection, achieved)
         log_error = ""
         try:
             if recorder is not None:
                 recorder.cycle(clock.now_ns(), [], boot_frames)
-            loop = ZeroTorqueLoop(settings, tap, clock, arm, master, is_enabling)
             test = CommunicationTest(settings, arm, *read_bitrates(codec))
             _progress(f"testing for {seconds:g} s, drives {'enabled, torque zero' if is_enabling else 'not enabled'}")
             fault = _run(loop, master, test, recorder, seconds)
@@ -108,7 +111,9 @@ def _exit_code(report: CommunicationReport, fault: FaultReason, is_interrupted: 
     return ExitCode.PARTIAL if code is ExitCode.OK and has_lost_log else code
 
 
-def _open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, grant: RealtimeGrant) -> Recorder:
+def _open_log(
+    out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]
+) -> Recorder:
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(
         out / LOG_NAME,
@@ -120,10 +125,11 @@ def _open_log(out: Path, settings: Settings, codec: Codec, connection: Connectio
             "interface": connection.interface,
             "channel": connection.channel,
             "clock": "realtime",
-            "scheduler": grant.scheduler,
+            **achieved,
             "period_us": str(settings.bus.period_us),
         },
         epoch_ns=wall_ns() - MonotonicClock().now_ns(),
+        settings=settings.log,
     )
 
 
@@ -186,7 +192,7 @@ def _evidence(report: CommunicationReport, period_us: float) -> TimingEvidence:
 def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
     """Say what makes the figures worth less."""
     warnings = []
-    if not scheduler.startswith("SCHED_FIFO"):
+    if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
         warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
     silent = [name for name, device in report.devices.items() if not any(device.ages)]
     if silent:

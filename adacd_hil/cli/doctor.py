@@ -30,7 +30,15 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
     def link() -> Link | None:
         return read_link(connection.channel) if connection.interface == "socketcan" else None
 
-    host = Host(connection.interface, connection.channel, link(), bitrate, data_bitrate, request_realtime)
+    host = Host(
+        connection.interface,
+        connection.channel,
+        link(),
+        bitrate,
+        data_bitrate,
+        lambda: request_realtime(settings.realtime_request),
+        settings.realtime.cpu,
+    )
     findings = diagnose(HOST_CHECKS, host, _report)
     patient = ArmExamination(
         settings,

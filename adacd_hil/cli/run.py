@@ -91,4 +91,11 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
             "recoveries": summary.recoveries,
         }
     log = summary.log
-    return described | {"frames": log.frames, "messages": log.messages, "dropped": log.dropped, "log_error": log.error}
+    return described | {
+        "frames": log.frames,
+        "messages": log.messages,
+        "dropped": log.dropped,
+        "log_error": log.error,
+        "log_parts": log.parts,
+        "log_queue_peak_bytes": log.queue_peak_bytes,
+    }

@@ -103,6 +103,7 @@ class ZeroTorqueLoop:
         sync_ns = self._exchange.sync_ns
         feedback_ns = self._exchange.feedback_ns - sync_ns if arm.is_complete else -1
         self._gate.limit(self._tau_d, is_enabling and state.is_enabled, self._tau_c)
+        bus.held_ns = self.pacer.spend(self._exchange.feedback_ns)
         arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
         handed_ns = clock.now_ns()
         if self._heartbeats.is_due(tick.cycle):

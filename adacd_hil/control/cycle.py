@@ -13,6 +13,8 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
+from adacd_hil.control.deadline import DeadlineWatch
+from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
@@ -83,8 +85,9 @@ class Cycle:
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
-        self._clock = clock
         self._exchange = Exchange(settings, bus, arm, master, clock)
+        self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
+        self._deadline = DeadlineWatch(settings)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = Pipeline(settings)
         self._controller = Controller(settings)
@@ -124,23 +127,25 @@ class Cycle:
             request = self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
+            self._follow(arm, output)
             self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
-            command, flags = self._control(arm, output)
+            command, flags = self._limit(arm, output, self._bus.held_ns)
             self._arm.write(command)
+            record = self._evidence.record(tick, arm, self._pacer.overruns, recorder)
             if self._heartbeats.is_due(tick.cycle):
                 self._master.send_heartbeat()
-            self._record(recorder, tick, arm, request, output, command, flags)
+            self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
 
     def _watch(self, arm: ArmState) -> ArmState:
-        """Take a device that has fallen silent or left Operational for a fault of the arm."""
+        """Take for a fault of the arm a device that has fallen silent or left Operational, or a host that is late."""
         if self._looks_at_nodes.is_due(arm.cycle):
             self._lost = self._master.watch(arm.t_ns)
         if self._lost and arm.fault is FaultReason.NONE:
-            return arm._replace(fault=FaultReason.HEARTBEAT)
-        return arm
+            arm = arm._replace(fault=FaultReason.HEARTBEAT)
+        return self._deadline.judge(arm)
 
     def _request(self, tick: Tick) -> Request:
         """Ask the operator; what concerns the end of the run stays here."""
@@ -156,24 +161,27 @@ class Cycle:
             self._reference.park()
         return Request.FINISH
 
-    def _control(self, arm: ArmState, output: SchemeOutput) -> tuple[ArmCommand, GateFlag]:
-        """Turn the decision into a limited command."""
+    def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
+        """Turn the desired motion into a desired torque."""
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
         self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
-        is_open = output.state in _POWERED and arm.is_enabled and not self._is_stale()
+
+    def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
+        """Turn the desired torque into a limited command, to be sent now.
+
+        A cycle that took so long, as when the process was stopped, that its torque belongs to the past has none.
+        """
+        is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
+        is_open = output.state in _POWERED and arm.is_enabled and not is_stale
         flags = self._gate.limit(self._tau_d, is_open, self._tau_c)
         quick_stop = output.state is SchemeState.FAULT or (bool(flags) and GateFlag.NOT_A_NUMBER in flags)
         return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
 
-    def _is_stale(self) -> bool:
-        """Whether this cycle took so long, as when the process was stopped, that its torque belongs to the past."""
-        return self._clock.now_ns() - self._exchange.sync_ns > self._stale_ns
-
-    def _record(
+    def _log(
         self,
         recorder: Recorder,
-        tick: Tick,
+        record: CycleRecord,
         arm: ArmState,
         request: Request,
         output: SchemeOutput,
@@ -182,21 +190,12 @@ class Cycle:
     ) -> None:
         """Hand the cycle to the logger and remember where the scheme stands."""
         t_ns = arm.t_ns
-        record = CycleRecord(
-            cycle=tick.cycle,
-            lateness_ns=tick.lateness_ns,
-            feedback_ns=self._exchange.feedback_ns - self._exchange.sync_ns,
-            command_ns=self._clock.now_ns() - self._exchange.sync_ns,
-            overruns=self._pacer.overruns,
-            frames_missing=self._arm.missing_frames,
-            commands_late=self._exchange.late_commands.count,
-        )
         messages = [
             (ChannelId.SCHEME, pack_scheme(output, request)),
-            (ChannelId.CONTROL, pack_control(tick.cycle, self._block, flags, command.enable, command.quick_stop)),
+            (ChannelId.CONTROL, pack_control(arm.cycle, self._block, flags, command.enable, command.quick_stop)),
             (ChannelId.CYCLE, pack_cycle(record)),
         ]
-        if self._frame_checks.is_due(tick.cycle):
+        if self._frame_checks.is_due(arm.cycle):
             messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
@@ -208,15 +207,18 @@ class Cycle:
         if output.state is not self._state:
             event = self._transition(output)
             recorder.event(t_ns, event)
-            self._follow_state(output.state, tick.cycle)
-            self._progress(f"{tick.cycle * self._period_s:9.3f} s  {event.message}")
+            self._follow_state(output.state, arm.cycle)
+            self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
 
     def _transition(self, output: SchemeOutput) -> Event:
         text = f"{output.previous_state.name} -> {output.state.name}"
+        if output.state is SchemeState.REACT and output.contact is None:
+            return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {self._deadline.describe()}")
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
         excess = self._arm.describe_excess() if output.fault is FaultReason.LIMIT else []
-        causes = [*excess, *self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
+        late = [self._deadline.describe()] if output.fault is FaultReason.DEADLINE else []
+        causes = [*late, *excess, *self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
         details = "; ".join([output.fault.name, *causes])
         return Event("error", "supervisor", f"{text}: {details}")
 

@@ -4,12 +4,14 @@ Where another host on the bus sends SYNC, with that.
 """
 
 import statistics
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock, VirtualClock
 from adacd_hil.config import Settings
 from adacd_hil.control.host_latency import HostLatency
 from adacd_hil.device.arm import SYNC_OVERFLOW
+from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import BusError, Frame
 from adacd_hil.wire.tap import Tap
 
@@ -18,6 +20,12 @@ _MOST_FRAMES = 1000
 _JUDGED_SYNCS = 101
 """SYNCs after which their period is judged. The median of so many doesn't mind that a host stalls."""
 _PERIOD_TOLERANCE = 0.1
+_CALIBRATION_SLEEPS = 50
+_CALIBRATION_LOW_NS, _CALIBRATION_HIGH_NS = 200_000, 1_000_000
+_SPIN_SHARE = 0.95
+"""Of the measured sleeps, how many the spin makes up for: what comes later than that is not the timer's doing."""
+_MOST_SPIN_NS = 100_000
+_MOST_SPIN_SHARE = 0.1
 
 
 class Tick(NamedTuple):
@@ -34,16 +42,27 @@ class Tick(NamedTuple):
     ahead: tuple[Frame, ...] = ()
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """How late sleeps were woken, ns, and how long the pacer spins because of it."""
+
+    p50_ns: int
+    p99_ns: int
+    max_ns: int
+    spin_ns: int
+
+
 class Pacer(Protocol):
-    """Decides when the next cycle begins."""
+    """Decides when the next cycle begins. `spin_ns`: how long before that it reads the clock instead of sleeping."""
 
     overruns: int
+    spin_ns: int
 
     def next(self) -> Tick:
         """Wait for the next cycle and return its beginning."""
 
     def spend(self, feedback_ns: int) -> int:
-        """Let the host's work after the feedback take its time; return when its commands leave."""
+        """Let the host's work after the feedback take its time; return the time at which its commands leave."""
 
     def resume(self) -> None:
         """Go on after a pause that was meant: its periods are passed over and not counted as overruns."""
@@ -73,6 +92,7 @@ class GridPacer:
     def __init__(self, clock: Clock, period_ns: int, latency: HostLatency | None = None) -> None:
         """`latency`: how long the host's work takes by a clock that doesn't go on while it works."""
         self.overruns = 0
+        self.spin_ns = 0
         self._latency = latency
         self._clock = clock
         self._period_ns = period_ns
@@ -86,8 +106,11 @@ class GridPacer:
         previous = self._cycle
         self._cycle += 1
         due_ns = self._start_ns + self._cycle * self._period_ns
-        self._clock.sleep_until_ns(due_ns)
-        now_ns = self._clock.now_ns()
+        clock = self._clock
+        clock.sleep_until_ns(due_ns - self.spin_ns)
+        now_ns = clock.now_ns()
+        while now_ns < due_ns:
+            now_ns = clock.now_ns()
         skipped = (now_ns - due_ns) // self._period_ns
         if skipped > 0:
             self.overruns += skipped
@@ -96,11 +119,10 @@ class GridPacer:
         return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)
 
     def spend(self, feedback_ns: int) -> int:
-        """Move a virtual clock by the modelled latency; in real time the commands carry the feedback's stamp."""
+        """Move a virtual clock by the modelled latency; in real time, read the clock."""
         if self._latency is not None:
-            feedback_ns += self._latency.draw_ns()
-            self._clock.sleep_until_ns(feedback_ns)
-        return feedback_ns
+            self._clock.sleep_until_ns(feedback_ns + self._latency.draw_ns())
+        return self._clock.now_ns()
 
     def resume(self) -> None:
         """Let the next cycle begin on the next grid point that is ahead."""
@@ -117,6 +139,7 @@ class FollowingPacer:
 
     def __init__(self, bus: Tap, clock: Clock, period_ns: int, sync_id: int, timeout_ns: int) -> None:
         self.overruns = 0
+        self.spin_ns = 0
         self._bus = bus
         self._clock = clock
         self._period_ns = period_ns
@@ -140,9 +163,9 @@ class FollowingPacer:
         lateness_ns = self._clock.now_ns() - sync.t_ns
         return Tick(self._cycle, sync.t_ns, 1 + skipped, lateness_ns, tuple(frames[:place]), tuple(frames[place + 1 :]))
 
-    def spend(self, feedback_ns: int) -> int:
-        """Let the commands carry the feedback's stamp."""
-        return feedback_ns
+    def spend(self, feedback_ns: int) -> int:  # noqa: ARG002 (the protocol's signature)
+        """Read the clock."""
+        return self._clock.now_ns()
 
     def resume(self) -> None:
         """Count no overruns for what was passed over."""
@@ -204,6 +227,44 @@ class FollowingPacer:
                 f"SYNC on {self._bus.channel} comes every {found_ns / 1000:.0f} µs, but `bus.period_us` = "
                 f"{self._period_ns // 1000} µs"
             )
+
+
+def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> Calibration:
+    """Measure how late this process wakes up from sleeps of 0.2 to 1 ms, and choose how long to spin; takes 30 ms.
+
+    cpu_count: processors that others can use while this process spins. With one, nothing else would run meanwhile, not
+    even the kernel's threads that hand over received frames: what spinning gains at SYNC it would cost at the feedback.
+    """
+    step_ns = (_CALIBRATION_HIGH_NS - _CALIBRATION_LOW_NS) // (_CALIBRATION_SLEEPS - 1)
+    lateness_ns = []
+    now_ns = clock.now_ns()
+    for index in range(_CALIBRATION_SLEEPS):
+        due_ns = now_ns + _CALIBRATION_LOW_NS + index * step_ns
+        clock.sleep_until_ns(due_ns)
+        now_ns = clock.now_ns()
+        lateness_ns.append(now_ns - due_ns)
+    lateness_ns.sort()
+    p50_ns, spin_ns, p99_ns = (
+        lateness_ns[min(int(share * _CALIBRATION_SLEEPS), _CALIBRATION_SLEEPS - 1)]
+        for share in (0.5, _SPIN_SHARE, 0.99)
+    )
+    spin_ns = min(spin_ns, _MOST_SPIN_NS, round(_MOST_SPIN_SHARE * period_ns)) if cpu_count > 1 else 0
+    return Calibration(p50_ns, p99_ns, lateness_ns[-1], spin_ns)
+
+
+def prepare_spin(pacer: Pacer, settings: Settings, clock: Clock, grant: RealtimeGrant) -> dict[str, str]:
+    """Let the pacer spin for as long as the settings or a measurement say; return both in words for a log's metadata.
+
+    To be called once real-time priority has been granted. Nothing is measured in virtual time, nor where SYNC is
+    followed.
+    """
+    if isinstance(clock, VirtualClock) or settings.bus.follows:
+        return {}
+    measured = calibrate(clock, settings.bus.period_ns, len(grant.cpus))
+    wish_us = settings.realtime.spin_us
+    pacer.spin_ns = measured.spin_ns if wish_us < 0.0 else round(wish_us * 1000.0)
+    times_us = "/".join(f"{t_ns / 1000:.0f}" for t_ns in (measured.p50_ns, measured.p99_ns, measured.max_ns))
+    return {"spin_us": f"{pacer.spin_ns / 1000:.0f}", "wakeup_us": f"{times_us} (p50/p99/max of {_CALIBRATION_SLEEPS})"}
 
 
 def make_pacer(settings: Settings, clock: Clock, tap: Tap, sync_id: int) -> Pacer:

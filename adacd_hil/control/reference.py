@@ -1,7 +1,8 @@
 """Where the arm should be: the desired motion in each state of the scheme.
 
-ADAPT and MONITOR follow the trajectory, approached from wherever the arm is; REACT withdraws; STOPPED holds; PAYLOAD
-and the end of a run park the arm in the trajectory's start corner; elsewhere the desired motion is the measured place.
+ADAPT and MONITOR follow the trajectory, approached from wherever the arm is; REACT withdraws, or brakes; STOPPED holds;
+PAYLOAD and the end of a run park the arm in the trajectory's start corner; elsewhere the desired motion is the measured
+place.
 """
 
 from collections.abc import Callable
@@ -10,7 +11,7 @@ import numpy as np
 
 from adacd_hil.config import Settings
 from adacd_hil.control.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
-from adacd_hil.records import ArmState, SchemeOutput, SchemeState, Vector
+from adacd_hil.records import JOINTS, ArmState, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.reaction import Withdrawal
 
 SHORTEST_APPROACH_S = 0.6
@@ -94,7 +95,9 @@ class Reference:
         elif state is SchemeState.PAYLOAD:
             self._approach(cycle)
         elif state is SchemeState.REACT:
-            self._withdraw(Withdrawal(self._settings, self._q_d, self._dq_d, output.tau_ext_hat), cycle)
+            # Without a contact there is nothing to withdraw from: the arm brakes to rest.
+            tau_ext = np.zeros(JOINTS) if output.contact is None else output.tau_ext_hat
+            self._withdraw(Withdrawal(self._settings, self._q_d, self._dq_d, tau_ext), cycle)
         elif state is not SchemeState.STOPPED:
             self._segment = None
 

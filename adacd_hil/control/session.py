@@ -12,7 +12,7 @@ from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import Pacer, make_pacer
+from adacd_hil.control.realtime import Pacer, make_pacer, prepare_spin
 from adacd_hil.control.recovery import Recovery
 from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
@@ -106,10 +106,13 @@ class Session:
         self.progress("compiling")
         attempt = self._prepare(tap, pacer)
         # After compiling: a second of work at real-time priority would be paid back by 50 ms of throttling later.
-        grant = RealtimeGrant(scheduler_name(), ()) if self.is_lockstep else request_realtime()
+        grant = self._request_realtime()
         for line in grant.missing:
             self.progress(f"not granted: {line}")
-        recorder = self._open_log(grant)
+        spin = prepare_spin(pacer, self.settings, self.clock, grant)
+        recorder = self._open_log(grant, spin)
+        for refusal in grant.missing:
+            recorder.event(self.clock.now_ns(), Event("warning", "realtime", f"not granted: {refusal}"))
         recovery = Recovery(tap, self.clock, self.operator, recorder, self.progress, lambda: self._is_interrupted)
         stopwatch = MonotonicClock()
         start_ns = stopwatch.now_ns()
@@ -127,6 +130,11 @@ class Session:
             log = recorder.close()
         elapsed_s = (stopwatch.now_ns() - start_ns) * 1e-9
         return SessionSummary(ending.result, log, grant, ending.error, self._has_started, recoveries, elapsed_s)
+
+    def _request_realtime(self) -> RealtimeGrant:
+        if self.is_lockstep:
+            return RealtimeGrant(scheduler_name())
+        return request_realtime(self.settings.realtime_request)
 
     def _prepare(self, tap: Tap, pacer: Pacer) -> Attempt:
         """Build and compile everything that must know nothing of an attempt before."""
@@ -186,7 +194,7 @@ class Session:
             recorder.event(self.clock.now_ns(), Event("error", "run", f"devices were not stopped: {error}"))
         recorder.cycle(self.clock.now_ns(), [], tap.take())
 
-    def _open_log(self, grant: RealtimeGrant) -> Recorder:
+    def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
         attachments = {path.name: path.read_bytes() for path in sorted(contract_folder().glob("*.eds"))}
@@ -194,15 +202,17 @@ class Session:
         attachments["config.toml"] = to_toml(self.settings).encode()
         if self.tare is not None:
             attachments[TARE_NAME] = self.tare.text
-        return Recorder(
-            self.out / LOG_NAME,
-            codec_path=self.codec.path,
-            parameter_count=len(self.settings.estimator.parameter_names),
-            attachments=attachments,
-            metadata=self._metadata(grant),
-            epoch_ns=0 if is_lockstep else wall_ns() - MonotonicClock().now_ns(),
-            blocking=is_lockstep,
-        )
+        with grant.unpinned():
+            return Recorder(
+                self.out / LOG_NAME,
+                codec_path=self.codec.path,
+                parameter_count=len(self.settings.estimator.parameter_names),
+                attachments=attachments,
+                metadata={**self._metadata(grant), **spin},
+                epoch_ns=0 if is_lockstep else wall_ns() - MonotonicClock().now_ns(),
+                blocking=is_lockstep,
+                settings=self.settings.log,
+            )
 
     def _metadata(self, grant: RealtimeGrant) -> dict[str, str]:
         settings = self.settings
@@ -216,7 +226,7 @@ class Session:
             "interface": self.interface,
             "channel": self.bus.channel,
             "clock": "lockstep" if self.is_lockstep else "realtime",
-            "scheduler": grant.scheduler,
+            **grant.describe(),
             "period_us": str(settings.bus.period_us),
             "python": platform.python_version(),
             "machine": f"{platform.system()} {platform.release()} {platform.machine()}",

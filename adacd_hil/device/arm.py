@@ -23,6 +23,10 @@ from adacd_hil.wire.e2e import E2eStatus
 SYNC_OVERFLOW = 240
 """0x1019: the SYNC counter runs 1…240."""
 
+_Take = Callable[[bytes, int], bool]
+"""What takes a frame's data and its cycle, and says whether something cyclic came of it."""
+_Command = tuple[list[float], bool, bool]
+"""Commanded torque of each joint, Nm; whether the drives are to be enabled; whether they are to stop quickly."""
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
 
 
@@ -56,6 +60,8 @@ class Arm:
         self._bus = bus
         self.sync_id = codec.message("Sync").can_id
         self._is_following = settings.bus.follows
+        self._is_pipelined = settings.bus.is_pipelined
+        self._pending: _Command | None = None
         self._sign = settings.arm.sign
         self._offset_Nm = settings.arm.torque_offset_Nm
         self._position_limit_deg = settings.arm.position_limit_deg
@@ -73,15 +79,15 @@ class Arm:
         self._seen = 0
         self._was_enabled = False
 
-    def _build_handlers(self) -> dict[int, tuple[Callable[[bytes], bool], int]]:
-        handlers: dict[int, tuple[Callable[[bytes], bool], int]] = {}
+    def _build_handlers(self) -> dict[int, tuple[_Take, int]]:
+        handlers: dict[int, tuple[_Take, int]] = {}
         for joint, (drive, sensor) in enumerate(zip(self.drives, self.sensors, strict=True)):
-            handlers[drive.feedback_message.can_id] = (_at_cycle(self, drive.accept_feedback), 1 << joint)
-            handlers[sensor.torque_message.can_id] = (_at_cycle(self, sensor.accept_torque), 4 << joint)
+            handlers[drive.feedback_message.can_id] = (drive.accept_feedback, 1 << joint)
+            handlers[sensor.torque_message.can_id] = (sensor.accept_torque, 4 << joint)
             if drive.status_message is not None:
-                handlers[drive.status_message.can_id] = (_drive_status(self, drive), 0)
+                handlers[drive.status_message.can_id] = (drive.accept_status, 0)
             if sensor.status_message is not None:
-                handlers[sensor.status_message.can_id] = (_without_cycle(sensor.accept_status), 0)
+                handlers[sensor.status_message.can_id] = (sensor.accept_status, 0)
         return handlers
 
     @property
@@ -92,7 +98,7 @@ class Arm:
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
         """Begin a cycle: every device samples on this SYNC, every drive takes its last command. Raises BusError.
 
-        SYNC is sent here, unless another host sends it.
+        SYNC is sent here, unless another host sends it; pipelined commands leave behind it.
         """
         if self._cycle >= 0 and self._seen != _COMPLETE:
             self._miss()
@@ -101,8 +107,15 @@ class Arm:
         self._periods = periods
         self._received = 0
         self._seen = 0
-        if not self._is_following:
-            self._bus.send(self.sync_id, bytes((1 + cycle % SYNC_OVERFLOW,)))
+        frames: tuple[tuple[int, bytes], ...] = (
+            () if self._is_following else ((self.sync_id, bytes((1 + cycle % SYNC_OVERFLOW,))),)
+        )
+        if self._pending is not None:
+            tau_c, enable, quick_stop = self._pending
+            is_stale = periods > self._max_age
+            frames += self._encode([0.0] * JOINTS if is_stale else tau_c, enable, quick_stop)
+            self._pending = None
+        self._bus.send_all(frames)
 
     def _miss(self) -> None:
         """Let every device note that its frame of the cycle that ends now did not come."""
@@ -110,14 +123,20 @@ class Arm:
             if not self._seen & (1 << bit):
                 device.miss()
 
-    def accept(self, frame: Frame) -> bool:
-        """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing."""
+    def accept(self, frame: Frame, is_late: bool = False) -> bool:
+        """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing.
+
+        `is_late`: it belongs to the cycle before.
+        """
         handler = self._handlers.get(frame.can_id)
         if handler is None or frame.is_error:
             return False
         take, bit = handler
+        if is_late:
+            take(frame.data, self._cycle - 1)
+            return True
         self._seen |= bit
-        if take(frame.data):
+        if take(frame.data, self._cycle):
             self._received |= bit
         return True
 
@@ -188,10 +207,22 @@ class Arm:
         return ages
 
     def write(self, command: ArmCommand) -> None:
-        """Send the commands of this cycle; they act at the next SYNC. Raises BusError."""
-        for drive, tau_c, ratio in zip(self.drives, command.tau_c.tolist(), self._permille_per_Nm, strict=True):
-            frame = drive.command(round(tau_c * ratio), command.enable, command.quick_stop)
-            self._bus.send(drive.command_id, frame)
+        """Send the commands of this cycle, to act at the next SYNC; pipelined, keep them until then. Raises BusError.
+
+        What has been kept for longer than a value may be old carries no torque.
+        """
+        values = command.tau_c.tolist(), command.enable, command.quick_stop
+        if self._is_pipelined:
+            self._pending = values
+        else:
+            self._bus.send_all(self._encode(*values))
+
+    def _encode(self, tau_c: list[float], enable: bool, quick_stop: bool) -> tuple[tuple[int, bytes], ...]:
+        (drive1, drive2), (ratio1, ratio2), (tau1, tau2) = self.drives, self._permille_per_Nm, tau_c
+        return (
+            (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
+            (drive2.command_id, drive2.command(round(tau2 * ratio2), enable, quick_stop)),
+        )
 
     def frame_checks(self) -> FrameChecks:
         """Return what the checks have said of all cyclic frames so far."""
@@ -285,23 +316,3 @@ def _describe_status(status: SensorStatus) -> str:
         (SensorStatus.NOT_VALID, "not valid"),
     )
     return ", ".join(text for bit, text in words if status & bit)
-
-
-def _at_cycle(arm: Arm, accept: Callable[[bytes, int], bool]) -> Callable[[bytes], bool]:
-    return lambda data: accept(data, arm.cycle)
-
-
-def _drive_status(arm: Arm, drive: Drive) -> Callable[[bytes], bool]:
-    def take(data: bytes) -> bool:
-        drive.accept_status(data, arm.cycle)
-        return False
-
-    return take
-
-
-def _without_cycle(accept: Callable[[bytes], None]) -> Callable[[bytes], bool]:
-    def take(data: bytes) -> bool:
-        accept(data)
-        return False
-
-    return take

@@ -275,13 +275,15 @@ class Drive:
         """Note a cycle in which no feedback came."""
         self.end_to_end.miss()
 
-    def accept_status(self, data: bytes, cycle: int) -> None:
-        """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
+    def accept_status(self, data: bytes, cycle: int) -> bool:
+        """Take one status frame of `cycle`; False when its length or check is wrong and it changes nothing."""
         message, receiver = self.status_message, self._status_receiver
         if message is None or receiver is None or len(data) != message.length:
-            return
-        if receiver.check(data).is_valid:
+            return False
+        is_valid = receiver.check(data).is_valid
+        if is_valid:
             self._take_status(message.decode_values(data), self._status_places, cycle)
+        return is_valid
 
     def _take_status(self, values: tuple[float, ...], places: list[tuple[str, int]], cycle: int) -> None:
         found = {name: int(values[at]) for name, at in places}

@@ -112,13 +112,15 @@ class TorqueSensor:
         """Note a cycle in which no torque came."""
         self.end_to_end.miss()
 
-    def accept_status(self, data: bytes) -> None:
-        """Take one status frame; one of the wrong length, or that fails its check, changes nothing."""
+    def accept_status(self, data: bytes, cycle: int) -> bool:  # noqa: ARG002 (as of all frames)
+        """Take one status frame; False when it has the wrong length or fails its check and changes nothing."""
         message, receiver, at = self.status_message, self._status_receiver, self._slow_status_at
         if message is None or receiver is None or at is None or len(data) != message.length:
-            return
-        if receiver.check(data).is_valid:
+            return False
+        is_valid = receiver.check(data).is_valid
+        if is_valid:
             self.status = _STATUSES[int(message.decode_values(data)[at]) & _STATUS_BITS]
+        return is_valid
 
     @property
     def is_overloaded(self) -> bool:

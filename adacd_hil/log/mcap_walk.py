@@ -87,6 +87,15 @@ class Topic:
         records: NDArray[Any] = np.concatenate(self.pieces).view(self.dtype)[:, 0]
         return records
 
+    def join(self, other: "Topic", bytes_before: int) -> bool:
+        """Add what comes after, in another file, whose places count from `bytes_before`; False for another type."""
+        if (other.type_name, other.dtype) != (self.type_name, self.dtype):
+            return False
+        self.pieces += other.pieces
+        self.places += [places + bytes_before for places in other.places]
+        self.payloads += other.payloads
+        return True
+
     def place(self) -> NDArray[np.int64]:
         """Return the place of each record (n,)."""
         return np.concatenate(self.places) if self.places else np.empty(0, np.int64)
@@ -108,7 +117,8 @@ class Walk:
         self._wanted = topics
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Topic | None] = {}  # None: not wanted
-        self._bytes_before = 0
+        self.record_bytes = 0
+        """Bytes of the chunks so far: the places of their records are counted by it."""
         self._is_undefined_used = False
         try:
             with path.open("rb") as file:
@@ -190,7 +200,7 @@ class Walk:
             topic = self._channels.get(channel_id)
             if topic is not None:
                 self._gather(topic, data, np.array(places))
-        self._bytes_before += len(data)
+        self.record_bytes += len(data)
 
     def _take_definition(self, opcode: int, body: bytes) -> None:
         stream = ReadDataStream(io.BytesIO(body))
@@ -216,7 +226,7 @@ class Walk:
             _rows_with_tail(topic.dtype, data, places) if topic.has_tail else _rows(topic.dtype, data, places)
         )
         topic.pieces.append(rows[is_right])
-        topic.places.append(places[: len(rows)][is_right] + self._bytes_before)
+        topic.places.append(places[: len(rows)][is_right] + self.record_bytes)
         if len(places) != len(topic.pieces[-1]):
             self._note("a message is not as long as its schema says")
 

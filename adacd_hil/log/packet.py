@@ -1,4 +1,4 @@
-"""Packets between the control process and the writer: one per cycle, one per event, one to end; see outbox.py too.
+"""Packets from the control process to the writer: one per cycle and one per event; they go through ring.py.
 
 A cycle's packet: kind, count of messages, count of frames, packets dropped so far, t_ns; then per frame identifier,
 count of data bytes, flags, the first 8 of them, t_ns; then per message channel and size; then the bodies; then what FD
@@ -21,8 +21,6 @@ from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, Frame
 
 CYCLE = 1
 EVENT = 2
-END = 3
-BATCH = 4
 
 _HEAD_FORMAT = "BBHIq"
 _FRAME_FORMAT = "IBB2x8sq"
@@ -83,11 +81,6 @@ def pack_event(t_ns: int, dropped: int, event: Event) -> bytes:
     return _EVENT.pack(EVENT, dropped, t_ns, *map(len, texts)) + b"".join(texts)
 
 
-def pack_end(dropped: int) -> bytes:
-    """Pack the last packet."""
-    return HEAD.pack(END, 0, 0, dropped, 0)
-
-
 class Columns(NamedTuple):
     """What many packets hold, as arrays; rows are in the order of the packets and, within a packet, as packed."""
 
@@ -101,6 +94,18 @@ class Columns(NamedTuple):
     messages: NDArray[Any]  # (m,) of MESSAGE_DTYPE
     message_counts: NDArray[np.int64]  # (n,)
     body_starts: NDArray[np.int64]  # (m,)
+
+
+def is_whole(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Say which packets have a whole head of a known kind (n,); `data` has ROOM bytes after the last packet."""
+    kinds = data[starts]
+    return np.asarray((sizes >= HEAD.size) & ((kinds == CYCLE) | (kinds == EVENT)))
+
+
+def times_ns(data: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return t_ns of the packets whose heads are whole (n,)."""
+    heads: NDArray[Any] = gather(data, starts, HEAD.size).view(HEAD_DTYPE)
+    return np.asarray(heads["t_ns"])
 
 
 def unpack(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> Columns:

@@ -81,6 +81,7 @@ class PacketWriter:
     def __init__(self, file: McapFile, messages: tuple[MessageLike, ...], epoch_ns: int, parameter_count: int) -> None:
         self.frames = 0
         self.dropped = 0  # packets that didn't reach the writer
+        self._lost = 0  # packets that did, and whose loss is to be said
         self._file = file
         self._epoch_ns = epoch_ns
         self._latest_ns = np.zeros(1 + max(file.ids.values()), np.int64)
@@ -97,6 +98,14 @@ class PacketWriter:
             for name in ("q", "dq", "tau_J")
         }
         self._least_scheme = max(place.stop for place in self._joint_slices.values()) - _BODY
+
+    def begin(self, file: McapFile) -> None:
+        """Go on with another file of the same topics."""
+        self._file = file
+
+    def lose(self, count: int) -> None:
+        """Take notice of packets that can't be written: the next one says so."""
+        self._lost += count
 
     def write(self, data: Rows, starts: Numbers, sizes: Numbers) -> int:
         """Write what the packets of `data` hold; return how many of them make no sense, of which nothing is written.
@@ -134,6 +143,8 @@ class PacketWriter:
         dropped = heads["dropped"].astype(np.int64)
         missing = np.diff(dropped, prepend=self.dropped)
         self.dropped = int(dropped[-1])
+        missing[0] += self._lost
+        self._lost = 0
         self.frames += len(frames)
 
         decoders = self._decoders_of(frames)
@@ -160,7 +171,7 @@ class PacketWriter:
         for index in np.flatnonzero(is_event).tolist():
             event = unpack_event(packets, index)
             groups.append(self._event_group(event, firsts[index] + has_notice[index], time_ns[index]))
-        self._lay_down(groups, int(slot_counts.sum()))
+        self._lay_down(groups, int(slot_counts.sum()), firsts + slot_counts)
 
     def _decoders_of(self, frames: NDArray[Any]) -> Numbers:
         """Find the number of the decoder of each frame (f,); -1 where there is none."""
@@ -248,8 +259,11 @@ class PacketWriter:
         rows = _rows(pack_log(_NO_STAMP, event), 1)
         return _Group(rows, np.array([slot]), self._file.ids[ChannelId.EVENTS], times_ns, times_ns)
 
-    def _lay_down(self, groups: list[_Group], count: int) -> None:
-        """Complete the `count` records of the groups and hand them to the file in the order of their slots."""
+    def _lay_down(self, groups: list[_Group], count: int, packet_ends: Numbers) -> None:
+        """Complete the `count` records of the groups and hand them to the file in the order of their slots.
+
+        packet_ends: the slot behind the last one of each packet.
+        """
         channels = np.empty(count, np.uint16)
         log_ns = np.empty(count, np.int64)
         sizes = np.empty(count, np.int64)
@@ -269,7 +283,7 @@ class PacketWriter:
             stamps = rows[:, _STAMP].view(np.uint32)
             stamps[:, 0], stamps[:, 1] = np.divmod(group.t_ns, 1_000_000_000)
             windows(records, size)[ends[group.slots] - size] = rows.view(f"V{size}")[:, 0]
-        self._file.add(records, channels, log_ns, ends)
+        self._file.add(records, channels, log_ns, ends, packet_ends)
 
     def _move_up(self, log_ns: Numbers, channels: NDArray[np.uint16]) -> None:
         """Move log times up where they would run backwards in their topic, which readers don't expect."""

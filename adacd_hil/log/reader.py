@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from adacd_hil.log.cdr import MessageType
 from adacd_hil.log.channels import DECODED, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_file import FIELDS_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.mcap_walk import MESSAGE_HEAD, RECORD_HEAD_BYTES, Payload, Topic, Walk
+from adacd_hil.log.joined import JoinedWalk
+from adacd_hil.log.mcap_file import FIELDS_KEY
+from adacd_hil.log.mcap_walk import MESSAGE_HEAD, RECORD_HEAD_BYTES, Payload, Topic
 from adacd_hil.log.ros_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
@@ -129,18 +130,19 @@ class Series:
 
 @dataclass(frozen=True)
 class RunLog:
-    """A log. Topics that the file lacks are empty."""
+    """A log, all its parts as one. Topics that it lacks are empty."""
 
     path: Path
     problem: str  # what is missing, one line; "" for a whole file
     metadata: dict[str, str]  # of the run
-    summary: dict[str, str]  # frames, messages, dropped, ending; empty for a cut file
+    summary: dict[str, str]  # frames, messages, dropped, ending, as far as the parts have their ends
     attachments: dict[str, bytes]
     topics: Mapping[str, Series]
     decoded: Mapping[str, Series]  # by DBC message
     frames: NDArray[Any]  # (n,) of FRAME_DTYPE or LONG_FRAME_DTYPE, both ways, in the order of the bus
     events: list[LoggedEvent]
     contacts: list[LoggedContact]
+    parts: int  # files that it was read from
 
     @property
     def is_complete(self) -> bool:
@@ -174,25 +176,26 @@ class RunLog:
 
 
 def read_log(path: Path, topics: Collection[str] | None = None) -> RunLog:
-    """Read a log, of the messages only those of `topics` when given.
+    """Read the log whose first part is `path`, with all its parts, of the messages only those of `topics` when given.
 
     Raises LogError when the file doesn't exist or isn't MCAP.
     """
-    walk = Walk(path, _payload_layout, topics)
-    metadata = walk.metadata.get(RUN_METADATA, {})
+    walk = JoinedWalk(path, _payload_layout, topics)
+    metadata = walk.metadata
     epoch_ns = _number(metadata, EPOCH_KEY, 0)
     series = _all_series(walk.topics, metadata, epoch_ns)
     return RunLog(
         path=path,
         problem=walk.problem,
         metadata=metadata,
-        summary=walk.metadata.get(SUMMARY_METADATA, {}),
+        summary=walk.summary,
         attachments=walk.attachments,
         topics=series,
         decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
         frames=_frames(walk.topics, series, epoch_ns),
         events=_events(walk.topics.get("/events"), epoch_ns),
         contacts=_contacts(series["/contact"]),
+        parts=walk.parts,
     )
 
 
@@ -201,7 +204,7 @@ def topic_bytes(path: Path, topic: str) -> bytes:
 
     Raises LogError when the file can't be read or lacks the topic.
     """
-    found = Walk(path, _payload_layout, (topic,)).topics.get(topic)
+    found = JoinedWalk(path, _payload_layout, (topic,)).topics.get(topic)
     if found is None:
         raise LogError(f"log {path} has no topic {topic}")
     return b"".join(found.payloads) if found.dtype is None else Series(found.records(), 0).payloads()

@@ -1,7 +1,8 @@
 """The control side of the log: hands each cycle to the writer process in one packet, and never waits in real time.
 
-A full socket (the writer is behind) or a dead writer costs packets, never time and never an exception: `dropped`
-counts. In lockstep (`blocking`) it waits instead, and nothing is lost; the packets of some cycles go together.
+In real time a packet costs no system call: it goes into memory that the writer looks into by itself. A full ring (the
+writer is behind, stopped or dead) costs packets, never time and never an exception: `dropped` counts. In lockstep
+(`blocking`) the writer is woken now and then, a full ring is waited for, and nothing is lost.
 """
 
 import contextlib
@@ -16,31 +17,38 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
-from adacd_hil.log import packet
+from adacd_hil.config import LogSettings
+from adacd_hil.log import packet, words
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
-from adacd_hil.log.outbox import Outbox
+from adacd_hil.log.parts import find_parts
+from adacd_hil.log.ring import Ring
 from adacd_hil.log.setup import Setup
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.wire.bus import Frame
 
 START_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 60.0
-BUFFER_BYTES = 4 * 1024 * 1024
-"""Room for packets while the writer is busy: about 1 s at 1 kHz, where the kernel grants it (net.core.wmem_max)."""
-_SO_SNDBUFFORCE = 32
+DEATH_TIMEOUT_S = 1.0
+"""Longest from the end of the writer's socket to the end of its process."""
+WAKE_BYTES = 64 * 1024
+"""So many bytes, about 100 cycles, go to the writer together in lockstep: the system calls of each are then cheap."""
+_MIB = 1024 * 1024
+_MINUTE_NS = 60_000_000_000
 _FORMAT_VERSION = "1"
 
 
 class LogSummary(NamedTuple):
     """How a log ended. `frames` and `messages` are 0 when the writer died; `error` says what went wrong."""
 
-    path: Path
+    path: Path  # of the first part
     frames: int
     messages: int
-    dropped: int  # packets (cycles and events) that are not in the file
+    dropped: int  # packets (cycles and events) that are not in the log
     is_complete: bool
     error: str = ""
+    parts: int = 1
+    queue_peak_bytes: int = 0  # most that the writer found waiting for it
 
 
 class Recorder:
@@ -57,12 +65,14 @@ class Recorder:
         epoch_ns: int = 0,
         blocking: bool = False,
         is_truth: bool = False,
+        settings: LogSettings | None = None,
     ) -> None:
-        """Create the file, replacing what is there, and start the writer.
+        """Create the file, replacing the log that is there with all its parts, and start the writer.
 
         codec_path: the DBC, default the one that comes with the package. epoch_ns: added to t_ns for the log's times;
         0 in lockstep. is_truth: the emulator's own log, /truth and /events only. Raises LogError.
         """
+        settings = settings or LogSettings()
         own = {
             "format_version": _FORMAT_VERSION,
             "epoch_ns": str(epoch_ns),
@@ -70,45 +80,48 @@ class Recorder:
             "mode": "lockstep" if blocking else "realtime",
         }
         layout = {} if is_truth else {LAYOUT_NAME: viewer_layout()}
+        self.path = path
+        self.dropped = 0
+        self._summary: LogSummary | None = None
+        self._is_blocking = blocking
+        self._unannounced = 0  # bytes in the ring that the writer was not woken for
+        file = _create(path)
         setup = Setup(
+            path=path.absolute(),
             is_truth=is_truth,
             is_blocking=blocking,
             codec_path=codec_path,
             parameter_count=parameter_count,
             epoch_ns=epoch_ns,
+            part_bytes=settings.part_MiB * _MIB,
+            part_ns=round(settings.part_min * _MINUTE_NS),
+            may_rotate=stat.S_ISREG(os.fstat(file).st_mode),
             attachments={**(attachments or {}), **layout},
             metadata={**(metadata or {}), **own},
         )
-        self.path = path
-        self.dropped = 0
-        self._summary: LogSummary | None = None
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        _enlarge_buffer(self._socket)
-        self._outbox = Outbox() if blocking else None
-        with theirs:
-            self._process = self._start(theirs, setup)
-        self._wait_until_ready()
-        self._socket.setblocking(blocking)
-
-    def _start(self, theirs: socket.socket, setup: Setup) -> "subprocess.Popen[bytes]":
         try:
-            file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+            self._ring = Ring(settings.buffer_MiB * _MIB)
+            self._process = self._start((theirs.fileno(), file, self._ring.descriptor), setup)
         except OSError as error:
-            self._release()
-            raise LogError(f"log {self.path} can't be created: {error.strerror}") from None
-        descriptors = (theirs.fileno(), file, *([self._outbox.descriptor] if self._outbox else []))
-        try:
-            # A session of its own: Ctrl-C is for the control process. No folder but ours is searched for modules.
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "adacd_hil.log.writer", *map(str, descriptors)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                pass_fds=descriptors,
-                start_new_session=True,
-                env={**os.environ, "PYTHONPATH": _module_path()},
-            )
+            self._socket.close()
+            raise LogError(f"log {path}: no writer with a buffer of {settings.buffer_MiB} MiB: {error}") from None
         finally:
+            theirs.close()
             os.close(file)
+        self._wait_until_ready()
+        self._socket.setblocking(True)
+
+    def _start(self, descriptors: tuple[int, ...], setup: Setup) -> "subprocess.Popen[bytes]":
+        # A session of its own: Ctrl-C is for the control process. No folder but ours is searched for modules.
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "adacd_hil.log.writer", *map(str, descriptors)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            pass_fds=descriptors,
+            start_new_session=True,
+            env={**os.environ, "PYTHONPATH": _module_path()},
+        )
         assert process.stdin is not None
         with contextlib.suppress(BrokenPipeError), process.stdin:  # a writer that died says so below
             process.stdin.write(setup.to_json())
@@ -131,69 +144,86 @@ class Recorder:
         """Process id of the writer."""
         return self._process.pid
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that wait for the writer; 0 in lockstep, where they say nothing of the run. Costs no system call."""
+        return 0 if self._is_blocking or self._summary else self._ring.waiting
+
     def cycle(
         self, t_ns: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]] = ()
     ) -> None:
         """Log a cycle: messages as (ChannelId, body), and its frames, oldest first, True for sent."""
-        self._send(packet.pack_cycle(t_ns, self.dropped, messages, frames))
+        self._put(packet.pack_cycle(t_ns, self.dropped, messages, frames))
 
     def event(self, t_ns: int, event: Event) -> None:
         """Log an event."""
-        self._send(packet.pack_event(t_ns, self.dropped, event))
+        self._put(packet.pack_event(t_ns, self.dropped, event))
 
     def flush(self) -> None:
-        """Hand over what waits to be handed over together."""
-        if self._outbox is not None and self._outbox.count:
-            self._hand_over(self._outbox.batch(), self._outbox.count)
-            self._outbox.clear()
+        """Wake the writer for what waits in the ring."""
+        self._unannounced = 0
+        with contextlib.suppress(OSError):  # words that it hasn't heard yet will do, and the dead hear nothing
+            self._socket.send(words.WAKE, socket.MSG_DONTWAIT)
 
-    def _send(self, data: bytes) -> None:
-        if self._outbox is None:
-            self._hand_over(data, 1)
-        elif not self._outbox.put(data):
-            self.flush()
-            if not self._outbox.put(data):
-                self._hand_over(data, 1)
+    def _put(self, data: bytes) -> None:
+        if not self._ring.put(data) and not (self._is_blocking and self._put_patiently(data)):
+            self.dropped += 1
+            self._ring.count_dropped(self.dropped)
+        elif self._is_blocking:
+            self._unannounced += len(data)
+            if self._unannounced >= WAKE_BYTES:
+                self.flush()
 
-    def _hand_over(self, data: bytes, count: int) -> None:
+    def _put_patiently(self, data: bytes) -> bool:
+        """Add a packet once the writer has made room; False when it is dead, or the packet larger than the ring."""
         try:
-            self._socket.send(data)
-        except OSError:  # no room, or nobody there
-            self.dropped += count
+            self._socket.send(words.ROOM)
+            return bool(self._socket.recv(words.MOST_BYTES)) and self._ring.put(data)
+        except OSError:
+            return False
 
     def close(self) -> LogSummary:
-        """End the file and say how it went; never raises, twice is once."""
+        """End the log and say how it went; never raises, twice is once."""
         if self._summary is None:
-            self.flush()
             self._socket.settimeout(END_TIMEOUT_S)
             with contextlib.suppress(OSError):
-                self._socket.send(packet.pack_end(self.dropped))
-            word = self._hear(END_TIMEOUT_S)
+                self._socket.send(words.END)
+            self._summary = self._summarise(self._hear(END_TIMEOUT_S))
             self._release()
-            if word is None:
-                self._process.kill()
-            self._process.wait()
-            self._summary = self._summarise(word)
         return self._summary
 
     def _release(self) -> None:
         self._socket.close()
-        if self._outbox is not None:
-            self._outbox.close()
+        self._ring.close()
 
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
+        """Tell how it went, by the writer's last word if there is one, and wait for the end of the writer."""
+        error = ""
         if word is None:
-            error = f"the writer died (exit status {self._process.returncode})"
-            return LogSummary(self.path, 0, 0, self.dropped, False, error)
-        dropped = self.dropped + int(word["lost"])
-        is_complete = not word["error"] and dropped == 0
-        return LogSummary(self.path, int(word["frames"]), int(word["messages"]), dropped, is_complete, word["error"])
+            error = self._end_writer()
+        self._process.wait()
+        peak = self._ring.peak
+        if word is not None:
+            dropped = self.dropped + int(word["lost"])
+            counts = int(word["frames"]), int(word["messages"]), dropped
+            is_complete = not word["error"] and dropped == 0
+            return LogSummary(self.path, *counts, is_complete, word["error"], int(word["parts"]), peak)
+        self.dropped += self._ring.waiting_packets()
+        return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
+
+    def _end_writer(self) -> str:
+        """End a writer that says nothing; return what was wrong with it."""
+        try:
+            return f"the writer died (exit status {self._process.wait(DEATH_TIMEOUT_S)})"
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return f"the writer did not end within {END_TIMEOUT_S:g} s"
 
     def _hear(self, timeout_s: float) -> dict[str, str] | None:
         """Receive the writer's word; None when it died or stays silent."""
         self._socket.settimeout(timeout_s)
         try:
-            received = self._socket.recv(65536)
+            received = self._socket.recv(words.MOST_BYTES)
         except OSError:
             return None
         word: dict[str, str] = json.loads(received) if received else {}
@@ -208,10 +238,20 @@ class Recorder:
         self.close()
 
 
-def _enlarge_buffer(connection: socket.socket) -> None:
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
-    with contextlib.suppress(OSError):  # beyond the limit with CAP_NET_ADMIN only
-        connection.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, BUFFER_BYTES)
+def _create(path: Path) -> int:
+    """Create the first part, and remove the others of the log that it replaces. Raises LogError."""
+    try:
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+    except OSError as error:
+        raise LogError(f"log {path} can't be created: {error.strerror}") from None
+    try:
+        for number, part in find_parts(path).items():
+            if number:
+                part.unlink()
+    except OSError as error:
+        os.close(file)
+        raise LogError(f"log {path}: a part of the log before can't be removed: {error}") from None
+    return file
 
 
 def _module_path() -> str:

@@ -1,70 +1,154 @@
-"""A file that is written by a thread of its own, so that a slow disk doesn't stop the writer from taking packets.
+"""The files of a log, written by a thread of its own, so that a slow disk doesn't stop the writer from taking packets.
 
-The first failure (disk full) ends the file at the last whole write; what comes after is swallowed, and `error` says so.
+What waits for the disk is bounded: when it is more, `is_behind` says so until half of that is written, and whoever must
+lose nothing lets `write` wait. The first failure (disk full) ends a file at the last whole write; what comes after
+is swallowed and its packets are counted, until another file is begun.
 """
 
 import contextlib
 import os
-import queue
 import threading
+from collections import deque
+from pathlib import Path
+from typing import NamedTuple
 
-_MAX_WAITING = 512
-"""Writes that may wait for the disk; four per chunk of 256 KiB, so at most 32 MiB."""
+WAITING_BYTES = 32 * 1024 * 1024
+"""What may wait for the disk: about 45 s of a run at 1 kHz, compressed."""
+
+
+class _Write(NamedTuple):
+    data: bytes
+    packets: int
 
 
 class Sink:
-    """What `mcap.writer.Writer` needs of a stream, over a file descriptor that it closes."""
+    """What `McapFile` needs of a stream, over a file descriptor that it closes."""
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, waits: bool = True, most_waiting: int = WAITING_BYTES) -> None:
+        """Write to `descriptor`; `waits`: `write` waits rather than let more than `most_waiting` bytes wait."""
         self.error = ""
+        """Why the file in progress ended early."""
+        self.first_error = ""
+        """Why the first of all files that did ended early."""
+        self.written = 0
+        """Bytes of the file in progress that are on the disk."""
         self._descriptor = descriptor
+        self._name = ""  # of a later file
+        self._waits = waits
+        self._most_waiting = most_waiting
         self._position = 0
-        self._queue: queue.Queue[bytes | None] = queue.Queue(_MAX_WAITING)
-        self._thread = threading.Thread(target=self._write_all, name="log sink", daemon=True)
+        self._tasks: deque[_Write | Path | None] = deque()
+        self._waiting = 0  # bytes
+        self._is_idle = True
+        self._is_behind = False
+        self._lost = 0
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="log sink", daemon=True)
         self._thread.start()
 
-    def write(self, data: bytes) -> int:
-        """Queue `data`; waits when the disk is 32 MiB behind."""
+    def write(self, data: bytes, packets: int = 0) -> int:
+        """Queue `data`, which completes so many packets."""
         self._position += len(data)
         if data:
-            self._queue.put(data)
+            with self._changed:
+                self._changed.wait_for(lambda: not self._waits or self._waiting < self._most_waiting)
+                self._waiting += len(data)
+                self._tasks.append(_Write(data, packets))
+                self._changed.notify_all()
         return len(data)
 
+    def begin(self, path: Path) -> None:
+        """Go on with another file, replacing what is there, once everything before is written or has failed."""
+        self._position = 0
+        with self._changed:
+            self._tasks.append(path)
+            self._changed.notify_all()
+
     def tell(self) -> int:
-        """Return how many bytes have been handed over."""
+        """Return how many bytes of the file have been handed over."""
         return self._position
 
-    def flush(self) -> None:
-        """Do nothing: the thread writes as soon as it can."""
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._waiting
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether so much waits for the disk that nothing should be added."""
+        self._is_behind = self._waiting > (self._most_waiting // 2 if self._is_behind else self._most_waiting)
+        return self._is_behind
+
+    def take_lost(self) -> int:
+        """Count the packets that were swallowed since this was last asked."""
+        with self._changed:
+            lost, self._lost = self._lost, 0
+        return lost
 
     def settle(self) -> None:
         """Wait until everything handed over is written or has failed."""
-        self._queue.join()
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_idle and not self._tasks)
 
     def close(self) -> None:
         """Write what is waiting, then close the file."""
-        self._queue.put(None)
+        with self._changed:
+            self._tasks.append(None)
+            self._changed.notify_all()
         self._thread.join()
 
-    def _write_all(self) -> None:
-        written = 0
-        while (data := self._queue.get()) is not None:
-            if not self.error:
-                try:
-                    _write(self._descriptor, data)
-                    written += len(data)
-                except OSError as error:
-                    self.error = f"{error.strerror} after {written} bytes"
-                    with contextlib.suppress(OSError):  # not everything that can be written can be cut
-                        os.ftruncate(self._descriptor, written)
-            self._queue.task_done()
+    def _work(self) -> None:
+        while (task := self._next()) is not None:
+            if isinstance(task, Path):
+                self._open(task)
+            else:
+                self._write(task)
+        self._close()
+
+    def _next(self) -> _Write | Path | None:
+        with self._changed:
+            self._is_idle = True
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._tasks)
+            self._is_idle = False
+            return self._tasks.popleft()
+
+    def _write(self, task: _Write) -> None:
+        if not self.error:
+            try:
+                _write_all(self._descriptor, task.data)
+                self.written += len(task.data)
+            except OSError as error:
+                self._fail(error)
+                with contextlib.suppress(OSError):  # not everything that can be written can be cut
+                    os.ftruncate(self._descriptor, self.written)
+        with self._changed:
+            self._waiting -= len(task.data)
+            self._lost += task.packets if self.error else 0
+
+    def _open(self, path: Path) -> None:
+        self._close()
+        self.error, self.written, self._name = "", 0, f"{path.name}: "
+        try:
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            self._fail(error)
+
+    def _close(self) -> None:
+        if self._descriptor < 0:
+            return
         try:
             os.close(self._descriptor)
         except OSError as error:  # network file systems report their failures here
-            self.error = self.error or f"{error.strerror} after {written} bytes"
+            self._fail(error)
+        self._descriptor = -1
+
+    def _fail(self, error: OSError) -> None:
+        self.error = self.error or f"{self._name}{error.strerror} after {self.written} bytes"
+        self.first_error = self.first_error or self.error
 
 
-def _write(descriptor: int, data: bytes) -> None:
+def _write_all(descriptor: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
         view = view[os.write(descriptor, view) :]

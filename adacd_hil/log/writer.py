@@ -1,13 +1,15 @@
-"""The writer process: packets from a socket in, one MCAP file out. Run by `Recorder`, never by hand.
+"""The writer process: packets from a ring in, the files of one log out. Run by `Recorder`, never by hand.
 
-It shares nothing with the control process but the socket: neither its CAN sockets nor its scheduling, nor its session,
-so that Ctrl-C reaches only the control process. It ends the file when it is told to or when the control process dies.
-A disk that fails doesn't stop it from taking packets; they are counted as dropped.
+It shares nothing with the control process but the ring and a socket for words: neither its CAN sockets nor its
+scheduling, nor its session, so that Ctrl-C reaches only the control process. It ends the log when it is told to or when
+the control process dies, after it has taken what that left in the ring.
 
 Packets are gathered and written many at a time, at the latest when a chunk has to end: see packet_writer.py.
 
-In lockstep the file depends on the packets only, bit for bit; so its chunks end by log time. Otherwise they end by the
-clock, so that silence doesn't keep data from the disk.
+In lockstep the files depend on the packets only, bit for bit; so chunks end by log time there, and nothing is lost but
+to a full disk. Otherwise they end by the clock, so that silence doesn't keep data from the disk; and a disk that is too
+slow or full costs packets, which are counted, while the ring is emptied as ever. A full disk is tried again with
+another part.
 """
 
 import contextlib
@@ -19,23 +21,22 @@ import sys
 
 import numpy as np
 
-from adacd_hil.clock import MonotonicClock
-from adacd_hil.log import packet
+from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.log import packet, words
 from adacd_hil.log.channels import MessageLike, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_file import McapFile
-from adacd_hil.log.outbox import read_outbox, split
-from adacd_hil.log.packet_writer import PacketWriter
+from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, McapFile
+from adacd_hil.log.packet_writer import Numbers, PacketWriter, Rows
+from adacd_hil.log.parts import part_path
+from adacd_hil.log.ring import RingReader, split
 from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
 
 FLUSH_PERIOD_NS = 250_000_000
-POLL_PERIOD_NS = 10_000_000
+POLL_PERIOD_US = 10_000
 """A writer asleep in the socket would have to be woken by the control process, which costs more than the packet."""
-PACKETS_PER_CLOCK = 32
-"""How many packets are taken between two looks at the clock while the writer is behind."""
-RECEIVE_BYTES = 4 * 1024 * 1024
-"""No packet is longer: the kernel's limit of a socket's buffer."""
+RETRY_PERIOD_NS = 5_000_000_000
+"""How long a disk that failed is left alone."""
 BATCH_BYTES = 256 * 1024
 """Packets that are gathered at most, about 400 cycles: more would be no cheaper, each."""
 
@@ -43,119 +44,194 @@ BATCH_BYTES = 256 * 1024
 class WriterProcess:
     """The loop around a PacketWriter."""
 
-    def __init__(self, connection: socket.socket, sink: Sink, setup: Setup, outbox: int | None) -> None:
+    def __init__(
+        self, connection: socket.socket, ring: RingReader, sink: Sink, setup: Setup, clock: Clock | None = None
+    ) -> None:
         messages = () if setup.is_truth else _dbc_messages(setup)
-        channels = truth_channels() if setup.is_truth else run_channels(setup.parameter_count, messages)
+        self._channels = truth_channels() if setup.is_truth else run_channels(setup.parameter_count, messages)
         self._connection = connection
+        self._ring = ring
         self._sink = sink
-        self._outbox = outbox
-        self._file = McapFile(sink, channels, setup.attachments, setup.metadata)
+        self._setup = setup
+        self._part = 0
+        self._parts = 1
+        self._file = self._begin_file()
         self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count)
-        self._is_blocking = setup.is_blocking
-        connection.setblocking(False)
-        self._buffer = bytearray(RECEIVE_BYTES)
         self._gathered: list[bytes] = []
         self._gathered_bytes = 0
-        self._batch = 0  # number of the latest one
-        self._packets_unclocked = 0
-        self._clock = MonotonicClock()
+        self._clock = clock or MonotonicClock()
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
-        self._lost = 0  # packets that reached the writer but not the file
+        self._failed_ns: int | None = None  # when the disk was seen to fail, or was last tried
+        self._part_ns: tuple[int, int] | None = None  # t_ns of the first and the last packet of the part
+        self._lost = 0  # packets that were taken but are in no file
+        self._frames = self._messages = self._dropped = 0  # of the parts before
+        if not setup.is_blocking:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
 
     def run(self) -> None:
         """Write until the end, then answer with the last word."""
-        ending = "control process died"
-        while received := self._receive():
-            if received[0] == packet.END:
-                ending = "closed"
+        while True:
+            word = self._hear()
+            self._take()
+            if word == words.ROOM:
+                _send(self._connection, words.ROOM)
+            elif word in (words.END, words.NOTHING):
                 break
-            self._take(received)
-        else:
-            self._take_what_is_left()
         self._write()
+        self._end(self._finish("closed" if word == words.END else "control process died"))
+
+    def _end(self, summary: dict[str, str]) -> None:
+        """Close the last file and say how it went."""
+        self._sink.close()
+        if self._part and self._sink.error and not self._has_chunks:
+            with contextlib.suppress(OSError):
+                part_path(self._setup.path, self._part).unlink()
+        lost = self._lost + self._sink.take_lost()
+        last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
+        _send(self._connection, json.dumps({**summary, **last}).encode())
+
+    def _hear(self) -> bytes | None:
+        """Receive a word, NOTHING when the control process is dead; None when there is none for a while."""
+        try:
+            return self._connection.recv(words.MOST_BYTES)
+        except BlockingIOError:
+            return None
+        except ConnectionResetError:
+            return words.NOTHING
+
+    def _take(self) -> None:
+        """Take all that waits in the ring; in real time, flush by the clock."""
+        while True:
+            if data := self._ring.take(BATCH_BYTES):
+                self._gathered.append(data)
+                self._gathered_bytes += len(data)
+                if self._gathered_bytes >= BATCH_BYTES:
+                    self._write()
+            if not self._setup.is_blocking:
+                self._look_at_clock()
+            if not self._ring.waiting:
+                return
+
+    def _look_at_clock(self) -> None:
+        """Flush if it is time, and see to a disk that has failed."""
+        now_ns = self._clock.now_ns()
+        if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
+            self._write()
+            self._flush(now_ns)
+            self._look_at_disk(now_ns)
+
+    def _look_at_disk(self, now_ns: int) -> None:
+        """Begin another part where the disk has failed some time ago."""
+        if not self._sink.error:
+            self._failed_ns = None
+        elif self._failed_ns is None:
+            self._failed_ns = now_ns
+        elif now_ns - self._failed_ns >= RETRY_PERIOD_NS and self._setup.may_rotate:
+            self._failed_ns = now_ns
+            self._begin_part(is_next=self._has_chunks)
+
+    @property
+    def _has_chunks(self) -> bool:
+        """Whether a chunk of the part is on the disk."""
+        return self._sink.written > self._file.head_bytes
+
+    def _flush(self, now_ns: int) -> None:
+        """End the chunk in progress, and the part where it is time."""
+        self._file.flush()
+        self._flushed_ns = now_ns
+        if self._is_part_full() and not self._sink.error and not self._sink.is_behind:
+            self._finish(CONTINUED)
+            self._begin_part(is_next=True)
+
+    def _is_part_full(self) -> bool:
+        if not self._setup.may_rotate or self._part_ns is None:
+            return False
+        first_ns, last_ns = self._part_ns
+        part_bytes, part_ns = self._setup.part_bytes, self._setup.part_ns
+        return 0 < part_bytes <= self._file.record_bytes or 0 < part_ns <= last_ns - first_ns
+
+    def _begin_part(self, is_next: bool) -> None:
+        """Begin the next part, or the present one again."""
+        self._part += is_next
+        self._parts += is_next
+        self._frames += self._packets.frames
+        self._messages += self._file.messages
+        self._packets.frames = 0
+        self._part_ns = None
+        self._sink.begin(part_path(self._setup.path, self._part))
+        self._file = self._begin_file()
+        self._packets.begin(self._file)
+
+    def _begin_file(self) -> McapFile:
+        setup = self._setup
+        metadata = {**setup.metadata, PART_KEY: str(self._part)}
+        return McapFile(self._sink, self._channels, setup.attachments, metadata)
+
+    def _finish(self, ending: str) -> dict[str, str]:
+        """End the part in progress; return the summary of all parts so far."""
+        self._note_lost()
+        dropped = self._ring.dropped if ending != CONTINUED else self._packets.dropped
+        dropped += self._lost
         summary = {
             "frames": str(self._packets.frames),
             "messages": str(self._file.messages),
-            "dropped": str(self._packets.dropped + self._lost),
-            "ending": ending,
+            "dropped": str(dropped - self._dropped),
+            ENDING_KEY: ending,
         }
+        self._dropped = dropped
         self._file.finish(summary)
-        self._sink.close()
-        _send_word(self._connection, {**summary, "lost": str(self._lost), "error": self._sink.error})
-
-    def _receive(self) -> bytes:
-        """Return the next packet, b"" when there will be none; in real time, flushes by the clock as time passes."""
-        self._packets_unclocked += 1
-        if self._packets_unclocked >= PACKETS_PER_CLOCK:
-            self._look_at_clock()
-        while True:
-            try:
-                count = self._connection.recv_into(self._buffer)
-                return bytes(memoryview(self._buffer)[:count])
-            except ConnectionResetError:
-                return b""
-            except BlockingIOError:
-                self._clock.sleep_until_ns(self._look_at_clock() + POLL_PERIOD_NS)
-
-    def _look_at_clock(self) -> int:
-        """Flush if it is time, and return the time."""
-        self._packets_unclocked = 0
-        now_ns = self._clock.now_ns()
-        if not self._is_blocking and now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
-            self._flush()
-            self._flushed_ns = now_ns
-        return now_ns
-
-    def _take(self, received: bytes) -> None:
-        """Keep the packet that was just received, or the packets of a batch."""
-        if received[0] != packet.BATCH:
-            self._keep(received)
-            return
-        try:
-            self._batch, packets = split(received)
-        except struct.error:
-            self._lost += 1
-            return
-        for each in packets:
-            self._keep(each)
-
-    def _take_what_is_left(self) -> None:
-        """Keep the batch that the control process had not sent when it died."""
-        if self._outbox is not None:
-            batch = read_outbox(self._outbox)
-            if split(batch)[0] != self._batch:
-                self._take(batch)
-
-    def _keep(self, received: bytes) -> None:
-        """Keep a packet until it is written with others; in lockstep, flushes by its time."""
-        if len(received) < packet.HEAD.size or received[0] not in (packet.CYCLE, packet.EVENT):
-            self._lost += 1
-            return
-        if self._is_blocking:
-            _, _, _, _, t_ns = packet.HEAD.unpack_from(received)
-            if t_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
-                self._flush()
-                self._flushed_ns = t_ns
-        self._gathered.append(received)
-        self._gathered_bytes += len(received)
-        if self._gathered_bytes >= BATCH_BYTES:
-            self._write()
-
-    def _flush(self) -> None:
-        """Write what has been gathered and end the chunk in progress."""
-        self._write()
-        self._file.flush()
+        return {
+            "frames": str(self._frames + self._packets.frames),
+            "messages": str(self._messages + self._file.messages),
+        }
 
     def _write(self) -> None:
-        """Write what has been gathered."""
-        if self._sink.error:
-            self._lost += len(self._gathered)
-        elif self._gathered:
-            edges = np.cumsum([0, *map(len, self._gathered)])
-            data = np.frombuffer(b"".join((*self._gathered, bytes(packet.ROOM))), np.uint8)
-            self._lost += self._packets.write(data, edges[:-1], np.diff(edges))
+        """Write what has been gathered, in lockstep with an end of the chunk where its log time says so."""
+        data = b"".join(self._gathered)
+        starts, sizes = split(data)
         self._gathered = []
         self._gathered_bytes = 0
+        if not len(starts):
+            return
+        if self._sink.error or (not self._setup.is_blocking and self._sink.is_behind):
+            self._lose(len(starts))
+            return
+        self._note_lost()
+        block = np.frombuffer(data + bytes(packet.ROOM), np.uint8)
+        is_whole = packet.is_whole(block, starts, sizes)
+        self._lost += int(np.count_nonzero(~is_whole))
+        starts, sizes = starts[is_whole], sizes[is_whole]
+        times_ns = packet.times_ns(block, starts)
+        if self._setup.is_blocking:
+            self._write_by_log_time(block, starts, sizes, times_ns)
+        else:
+            self._write_packets(block, starts, sizes, times_ns)
+
+    def _write_by_log_time(self, block: Rows, starts: Numbers, sizes: Numbers, times_ns: Numbers) -> None:
+        first = 0
+        while first < len(starts):
+            is_due = times_ns[first:] - self._flushed_ns >= FLUSH_PERIOD_NS
+            if is_due[0]:
+                self._flush(int(times_ns[first]))
+                is_due[0] = False
+            stop = first + int(np.argmax(is_due)) if is_due.any() else len(starts)
+            self._write_packets(block, starts[first:stop], sizes[first:stop], times_ns[first:stop])
+            first = stop
+
+    def _write_packets(self, block: Rows, starts: Numbers, sizes: Numbers, times_ns: Numbers) -> None:
+        if not len(starts):
+            return
+        first_ns = int(times_ns[0]) if self._part_ns is None else self._part_ns[0]
+        self._part_ns = first_ns, int(times_ns[-1])
+        self._lost += self._packets.write(block, starts, sizes)
+
+    def _note_lost(self) -> None:
+        """Take in what the sink has swallowed."""
+        self._lose(self._sink.take_lost())
+
+    def _lose(self, count: int) -> None:
+        self._lost += count
+        self._packets.lose(count)
 
 
 def _dbc_messages(setup: Setup) -> tuple[MessageLike, ...]:
@@ -165,9 +241,9 @@ def _dbc_messages(setup: Setup) -> tuple[MessageLike, ...]:
     return tuple(load_codec(setup.codec_path).messages.values())
 
 
-def _send_word(connection: socket.socket, word: dict[str, str]) -> None:
+def _send(connection: socket.socket, word: bytes) -> None:
     with contextlib.suppress(OSError):  # nobody is left to hear it
-        connection.send(json.dumps(word).encode())
+        connection.send(word)
 
 
 def _schedule_plainly() -> None:
@@ -176,22 +252,22 @@ def _schedule_plainly() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def main(socket_descriptor: int, file_descriptor: int, outbox_descriptor: int | None = None) -> None:
+def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> None:
     """Write a log: say when ready, take packets until the end, say how it went."""
     _schedule_plainly()
     connection = socket.socket(fileno=socket_descriptor)
-    sink = Sink(file_descriptor)
+    error = ""
     try:
         setup = Setup.from_json(sys.stdin.buffer.read())
-        process = WriterProcess(connection, sink, setup, outbox_descriptor)
+        sink = Sink(file_descriptor, waits=setup.is_blocking)
+        process = WriterProcess(connection, RingReader(ring_descriptor), sink, setup)
         sink.settle()
-        if sink.error:
-            raise LogError(sink.error)
-    except (LogError, OSError, ValueError) as error:
-        _send_word(connection, {"error": " ".join(str(error).split())})
-        return
-    _send_word(connection, {"error": ""})
-    process.run()
+        error = sink.error
+    except (LogError, OSError, ValueError) as reason:
+        error = " ".join(str(reason).split())
+    _send(connection, json.dumps({"error": error}).encode())
+    if not error:
+        process.run()
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ class Pipeline:
         joints = observation >> kernel.CONTACT_SHIFT
         block = self._values.copy()
         if state is not previous:
-            self._enter(state, previous, arm.cycle)
+            self._enter(state, previous, arm.cycle, joints)
         contact = self._report(arm.cycle, joints) if isolation.is_open else None
         return SchemeOutput(
             cycle=arm.cycle,
@@ -85,14 +85,14 @@ class Pipeline:
             block=block,
         )
 
-    def _enter(self, state: SchemeState, previous: SchemeState, cycle: int) -> None:
+    def _enter(self, state: SchemeState, previous: SchemeState, cycle: int, joints: int) -> None:
         """Do what a new state begins with, and what the previous one ends with."""
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
             self._theta_ff = self._values[self._theta_hat].copy()
             self._is_model_valid = has_positive_definite_mass(self._theta_ff)
         if state is SchemeState.ADAPT:
             kernel.begin_adaptation(self._constants, self._memory, self._block)
-        elif state is SchemeState.REACT:
+        elif state is SchemeState.REACT and joints:  # without one, the arm is only held
             self._isolation.begin(cycle)
         elif state is SchemeState.FAULT:
             self._isolation.cancel()

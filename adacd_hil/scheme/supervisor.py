@@ -30,10 +30,11 @@ class SchemeEvent(IntEnum):
     ENABLED = 4  # both drives report Operation enabled
     ADAPTED = 5  # eq. (15) with the evidence for it
     COLLISION = 6  # eq. (14) on any joint
-    AT_REST = 7  # the arm has come to rest and the collision's report is final
-    ACKNOWLEDGED = 8  # the user has acknowledged and no joint is over its threshold
-    PAYLOAD_ANNOUNCED = 9  # the user wants to change the payload
-    PAYLOAD_CHANGED = 10  # the user has changed the payload and the arm is at rest
+    LATE = 7  # the host has missed so many deadlines that the arm is to be held
+    AT_REST = 8  # the arm has come to rest and the collision's report is final
+    ACKNOWLEDGED = 9  # the user has acknowledged, no joint is over its threshold and the host is on time
+    PAYLOAD_ANNOUNCED = 10  # the user wants to change the payload
+    PAYLOAD_CHANGED = 11  # the user has changed the payload and the arm is at rest
 
 
 TRANSITIONS = MappingProxyType(
@@ -58,13 +59,14 @@ TRANSITIONS = MappingProxyType(
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.ADAPTED: SchemeState.MONITOR,
         },
-        # Moves, detection armed. Out: a collision; the announcement of a payload change.
+        # Moves, detection armed. Out: a collision; a host that is late; the announcement of a payload change.
         SchemeState.MONITOR: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.LATE: SchemeState.REACT,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
         },
-        # Withdraws. Out: at rest, and the link is final.
+        # Withdraws, or brakes when nothing pushes. Out: at rest, and the link is final.
         SchemeState.REACT: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.AT_REST: SchemeState.STOPPED,
@@ -102,6 +104,8 @@ _POWERED = frozenset(
     (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
 )
 _CHECKED = _POWERED | {SchemeState.ENABLE}
+_HELD_FROM = frozenset((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
+"""Where a host that is late holds the arm, or does so already; elsewhere there is no way to, and it is a fault."""
 
 _KEPT_IN = MappingProxyType(
     {
@@ -193,10 +197,13 @@ class Supervisor:
         match self._state:
             case SchemeState.MONITOR if observation & _CONTACT:
                 event = SchemeEvent.COLLISION
+            case SchemeState.MONITOR if arm.is_late:
+                event = SchemeEvent.LATE
             case SchemeState.MONITOR | SchemeState.STOPPED if self._pending is Request.PAYLOAD:
                 event = SchemeEvent.PAYLOAD_ANNOUNCED
-            case SchemeState.STOPPED if self._pending is Request.ACKNOWLEDGE and not observation & _CONTACT:
-                event = SchemeEvent.ACKNOWLEDGED
+            case SchemeState.STOPPED if self._pending is Request.ACKNOWLEDGE:
+                if not (observation & _CONTACT or arm.is_late):
+                    event = SchemeEvent.ACKNOWLEDGED
             case SchemeState.ADAPT if observation & _ADAPTED:
                 event = SchemeEvent.ADAPTED
             case SchemeState.REACT if is_still and not is_reporting:
@@ -240,4 +247,4 @@ class Supervisor:
             return FaultReason.LIMIT
         if self._state in _POWERED and not arm.is_enabled:
             return FaultReason.DRIVE
-        return FaultReason.NONE
+        return FaultReason.DEADLINE if arm.is_late and self._state not in _HELD_FROM else FaultReason.NONE

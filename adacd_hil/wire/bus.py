@@ -6,7 +6,7 @@ returns.
 
 import contextlib
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -46,8 +46,20 @@ class BusOffError(BusError):
 
 MAX_CLASSIC_BYTES = 8
 """A frame with more data is CAN FD with bit rate switch; one with less is classic, on an FD bus too."""
+MAX_STANDARD_ID = 0x7FF
+"""Identifiers beyond it are 29-bit ones."""
 FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 """Counts of data bytes that an FD frame can have beyond those of a classic one. Source: ISO 11898-1, table of DLC."""
+
+
+class QueueBytes(NamedTuple):
+    """What waits in a bus end's queues, in bytes of the kernel's memory: about 700 a frame."""
+
+    received: int
+    sent: int
+
+
+NOTHING_QUEUED = QueueBytes(0, 0)
 
 
 class Frame(NamedTuple):
@@ -63,7 +75,7 @@ class Frame(NamedTuple):
 
 
 class Bus(Protocol):
-    """One end of a CAN bus."""
+    """One end of a CAN bus. Those that derive from it may leave what has a body here."""
 
     channel: str
 
@@ -71,8 +83,22 @@ class Bus(Protocol):
     def waiting_frames(self) -> tuple[int, ...]:
         """Identifiers of what was sent and would be overtaken by SYNC now, as far as this end can know."""
 
+    @property
+    def frames_lost(self) -> int:
+        """Count of received frames that were dropped because this end didn't read them in time, as far as it knows."""
+        return 0
+
+    def queue_bytes(self) -> QueueBytes:
+        """Look at how much waits to be read and to be sent; where the kernel keeps the queues, a system call."""
+        return NOTHING_QUEUED
+
     def send(self, can_id: int, data: bytes) -> None:
         """Hand a frame to the bus. Raises BusError, of it TransmitQueueError and InterfaceDownError."""
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Hand some frames to the bus, in this order and at once where that is possible. Raises as `send`."""
+        for can_id, data in frames:
+            self.send(can_id, data)
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, or None when none came within `timeout_s`.
@@ -90,7 +116,7 @@ class Bus(Protocol):
         """Release the bus; twice is once."""
 
 
-class EmbeddedBus:
+class EmbeddedBus(Bus):
     """The host's end of a bus within one process; the device's end is `attach` and `deliver`.
 
     Frames that the device sends from within the host's `send` are in the host's queue when `send` returns. Waiting is

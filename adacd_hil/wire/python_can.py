@@ -7,13 +7,12 @@ from typing import Any
 import can
 
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, BusError, BusMissingError, Frame
+from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, MAX_STANDARD_ID, Bus, BusError, BusMissingError, Frame
 
 _ECHOING_INTERFACES = ("udp_multicast",)
-_MAX_STANDARD_ID = 0x7FF
 
 
-class PythonCanBus:
+class PythonCanBus(Bus):
     """Any other python-can interface. How CAN FD's second bit rate is set, python-can leaves to its own settings."""
 
     def __init__(
@@ -57,7 +56,7 @@ class PythonCanBus:
                 can.Message(
                     arbitration_id=can_id,
                     data=data,
-                    is_extended_id=can_id > _MAX_STANDARD_ID,
+                    is_extended_id=can_id > MAX_STANDARD_ID,
                     is_fd=is_long,
                     bitrate_switch=is_long,
                 )
@@ -76,7 +75,7 @@ class PythonCanBus:
             if message is None:
                 return None
             can_id = message.arbitration_id
-            is_ambiguous = message.is_extended_id and can_id <= _MAX_STANDARD_ID and not message.is_error_frame
+            is_ambiguous = message.is_extended_id and can_id <= MAX_STANDARD_ID and not message.is_error_frame
             if not message.is_remote_frame and not is_ambiguous:
                 return Frame(can_id, bytes(message.data), self._clock.now_ns(), message.is_error_frame)
             timeout_s = max(deadline_ns - self._waiting.now_ns(), 0) * 1e-9

@@ -12,36 +12,39 @@ import errno
 import select
 import socket
 import struct
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Sequence
 from typing import NoReturn
 
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.wire.bus import (
     FD_LENGTHS,
     MAX_CLASSIC_BYTES,
+    MAX_STANDARD_ID,
+    NOTHING_QUEUED,
+    Bus,
     BusError,
     BusMissingError,
     BusOffError,
     Frame,
     InterfaceDownError,
+    QueueBytes,
     TransmitQueueError,
 )
-from adacd_hil.wire.can_interface import CAN_MTU, CANFD_MTU, CanInterface
+from adacd_hil.wire.can_interface import CanInterface
 from adacd_hil.wire.error_frames import ERROR_CLASS_MASK, is_bus_off
+from adacd_hil.wire.frame_batch import CAN_ID_MASK, FrameReceiver, FrameSender
 
-CAN_ERR_FLAG = 0x20000000
 CAN_RTR_FLAG = 0x40000000
 CAN_EFF_FLAG = 0x80000000
-CAN_ID_MASK = 0x1FFFFFFF
 CANFD_BRS = 0x01
-_MAX_STANDARD_ID = 0x7FF
 _FRAME = struct.Struct("=IB3x8s")
 _FD_FRAME = struct.Struct("=IBB2x64s")
 _FILTER = struct.Struct("=II")
 _CAN_RAW_ERR_FILTER = 2
 _SO_MEMINFO = 55
 _MEMINFO = struct.Struct("=9I")
-_MEMINFO_DROPS = 8
+_RECEIVED, _SENT, _DROPS = 0, 2, 8  # of its numbers
 _DOWN = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 _LIVE_S = 0.25
 """Longest silence of a bus with two arms: 2.5 of the usual heartbeat periods."""
@@ -49,12 +52,8 @@ _SEND_PATIENCE_S = 0.05
 """Longest wait for room in the transmit queue: over 300 frames at 1 Mbit/s, so a live bus has drained by then."""
 
 
-class SocketCanBus:
-    """A SocketCAN interface.
-
-    Frames that are found waiting carry one stamp, that of the first of them: a reading of the clock costs as much as a
-    frame where it is a system call.
-    """
+class SocketCanBus(Bus):
+    """A SocketCAN interface. What waits is taken at once; each frame carries the kernel's stamp of its reception."""
 
     def __init__(
         self,
@@ -70,10 +69,9 @@ class SocketCanBus:
         self._clock = clock
         self._filters = _pack_filters(can_ids)
         self._is_fd = is_fd
-        self._mtu = CANFD_MTU if is_fd else CAN_MTU
         self._interface = CanInterface(channel)
         self._patience = MonotonicClock()
-        self._dropped_before = 0  # by the sockets before this one
+        self._lost_before = 0  # by the sockets before this one
         self._is_down = False
         self._is_closed = False
         _require_socketcan(channel)
@@ -94,9 +92,10 @@ class SocketCanBus:
             opened.close()
             raise BusMissingError(f"CAN interface {self.channel}: {error.strerror}") from None
         self._socket = opened
+        self._receiver = FrameReceiver(opened, self._clock)
+        self._sender = FrameSender(opened)
+        self._received: deque[Frame] = deque()
         self._is_down = False
-        self._is_drained = True  # the last look found nothing, so waiting comes before looking
-        self._stamp_ns: int | None = None
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
@@ -108,16 +107,26 @@ class SocketCanBus:
 
         Raises TransmitQueueError, InterfaceDownError, and BusError for data that the bus can't carry.
         """
-        length = len(data)
-        if can_id > _MAX_STANDARD_ID:
-            can_id |= CAN_EFF_FLAG
-        packed = _FRAME.pack(can_id, length, data) if length <= MAX_CLASSIC_BYTES else self._pack_fd(can_id, data)
+        packed = self._pack(can_id, data)
         try:
             self._socket.send(packed)
         except OSError as error:
             if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
                 self._fail("sending", error)
             self._send_patiently(packed)
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Queue some frames in one system call. Raises as `send`."""
+        packed = [self._pack(can_id, data) for can_id, data in frames]
+        sent = 0 if self._socket.fileno() < 0 else self._sender.send(packed)
+        for can_id, data in frames[sent:]:  # no room for all, or a failure that is said then
+            self.send(can_id, data)
+
+    def _pack(self, can_id: int, data: bytes) -> bytes:
+        if can_id > MAX_STANDARD_ID:
+            can_id |= CAN_EFF_FLAG
+        length = len(data)
+        return _FRAME.pack(can_id, length, data) if length <= MAX_CLASSIC_BYTES else self._pack_fd(can_id, data)
 
     def _pack_fd(self, can_id: int, data: bytes) -> bytes:
         if not self._is_fd:
@@ -146,29 +155,14 @@ class SocketCanBus:
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, or None after `timeout_s`. Raises BusOffError, InterfaceDownError, BusError."""
-        packed = None if self._is_drained and timeout_s > 0.0 else self._look()
-        if packed is None:
-            if timeout_s <= 0.0 or not self._wait(timeout_s):
+        received = self._received
+        if not received:
+            if self._socket.fileno() < 0:
+                self._fail("receiving", OSError(errno.EBADF, "closed"))
+            self._take(timeout_s)
+            if not received:
                 return None
-            packed = self._look()
-            if packed is None:
-                return None
-        if self._stamp_ns is None:
-            self._stamp_ns = self._clock.now_ns()
-        can_id, length, data = _FRAME.unpack(packed) if len(packed) == CAN_MTU else _unpack_fd(packed)
-        if can_id > _MAX_STANDARD_ID:
-            return self._take_unusual(can_id, data[:length], self._stamp_ns)
-        return Frame(can_id, data[:length], self._stamp_ns)
-
-    def _wait(self, timeout_s: float) -> bool:
-        """Wait until there is something to read; False after `timeout_s`."""
-        if self._socket.fileno() < 0:
-            self._fail("receiving", OSError(errno.EBADF, "closed"))
-        return bool(select.select([self._socket], [], [], timeout_s)[0])
-
-    def _take_unusual(self, can_id: int, data: bytes, t_ns: int) -> Frame:
-        """Take an error frame or a 29-bit identifier."""
-        frame = Frame(can_id & CAN_ID_MASK, data, t_ns, bool(can_id & CAN_ERR_FLAG))
+        frame = received.popleft()
         if frame.is_error and is_bus_off(frame):
             raise BusOffError(
                 f"{self.channel} is bus-off: its controller has left the bus after too many errors (wiring, "
@@ -178,20 +172,15 @@ class SocketCanBus:
             )
         return frame
 
-    def _look(self) -> bytes | None:
-        """Take a frame that waits, None when there is none."""
+    def _take(self, timeout_s: float) -> None:
+        """Take what waits, or what comes within `timeout_s`."""
         try:
-            packed = self._socket.recv(self._mtu)
+            if timeout_s <= 0.0 or self._receiver.wait(timeout_s):
+                self._received.extend(self._receiver.take())
         except BlockingIOError:
-            self._is_drained = True
-            self._stamp_ns = None
-            return None
+            return
         except OSError as error:
             self._fail("receiving", error)
-        if self._is_drained:
-            self._is_drained = False
-            self._stamp_ns = None
-        return packed
 
     def _fail(self, doing: str, error: OSError) -> NoReturn:
         if error.errno in _DOWN:
@@ -203,12 +192,20 @@ class SocketCanBus:
         raise BusError(f"{doing} on {self.channel}: {'closed' if self._is_closed else error.strerror}") from None
 
     @property
-    def dropped_frames(self) -> int:
+    def frames_lost(self) -> int:
         """Count of received frames that the kernel dropped because this end didn't read them in time.
 
-        Asked of the socket here (SO_MEMINFO), so that receiving pays nothing for it, as it would for SO_RXQ_OVFL.
+        Known from the first frame that came after them, or from `queue_bytes`.
         """
-        return self._dropped_before + (0 if self._socket.fileno() < 0 else _socket_drops(self._socket))
+        return self._lost_before + self._receiver.frames_lost
+
+    def queue_bytes(self) -> QueueBytes:
+        """Look at what waits: a system call. What was sent waits until the interface has sent it."""
+        if self._socket.fileno() < 0:
+            return NOTHING_QUEUED
+        info = _MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))
+        self._receiver.frames_lost = info[_DROPS]
+        return QueueBytes(info[_RECEIVED], info[_SENT])
 
     def recover(self) -> None:
         """Open the socket anew, and empty the interface's transmit queue by taking it down and up where need be.
@@ -240,8 +237,11 @@ class SocketCanBus:
             return bool(select.select([listener], [], [], _LIVE_S)[0])
 
     def _retire_socket(self) -> None:
-        """Close the socket, keeping its count of drops."""
-        self._dropped_before = self.dropped_frames
+        """Close the socket, keeping its count of drops; what it had received is dropped, too."""
+        self.queue_bytes()
+        self._lost_before = self.frames_lost
+        self._receiver.frames_lost = 0
+        self._received.clear()
         self._socket.close()
 
     def close(self) -> None:
@@ -258,23 +258,13 @@ def _pack_filters(can_ids: Iterable[int] | None) -> bytes:
     flags = CAN_EFF_FLAG | CAN_RTR_FLAG
     if can_ids is not None:
         return b"".join(
-            _FILTER.pack(can_id, _MAX_STANDARD_ID | flags)
-            if can_id <= _MAX_STANDARD_ID
+            _FILTER.pack(can_id, MAX_STANDARD_ID | flags)
+            if can_id <= MAX_STANDARD_ID
             else _FILTER.pack(can_id | CAN_EFF_FLAG, CAN_ID_MASK | flags)
             for can_id in can_ids
         )
     extended = (_FILTER.pack(CAN_EFF_FLAG | 1 << bit, flags | 1 << bit) for bit in range(11, 29))
     return b"".join((_FILTER.pack(0, flags), *extended))
-
-
-def _unpack_fd(packed: bytes) -> tuple[int, int, bytes]:
-    can_id, length, _, data = _FD_FRAME.unpack(packed)
-    return can_id, length, data
-
-
-def _socket_drops(opened: socket.socket) -> int:
-    drops: int = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))[_MEMINFO_DROPS]
-    return drops
 
 
 def _require_socketcan(channel: str) -> None:

@@ -1,10 +1,12 @@
 """A bus end that remembers what passed, so that the log holds every frame both ways."""
 
+from collections.abc import Sequence
+
 from adacd_hil.clock import Clock
-from adacd_hil.wire.bus import Bus, BusOffError, Frame
+from adacd_hil.wire.bus import Bus, BusOffError, Frame, QueueBytes
 
 
-class Tap:
+class Tap(Bus):
     """Wraps a bus; `take` returns and forgets the frames since the last call, oldest first, True for sent.
 
     `held_ns` stamps sent frames instead of the clock when it is set: the cycle has just read the clock itself.
@@ -23,12 +25,27 @@ class Tap:
         """Identifiers of what was sent and would be overtaken by SYNC, as far as the bus behind it knows."""
         return self._bus.waiting_frames
 
+    @property
+    def frames_lost(self) -> int:
+        """Count of received frames that the bus behind it knows to have dropped."""
+        return self._bus.frames_lost
+
+    def queue_bytes(self) -> QueueBytes:
+        """Look at how much waits in the bus behind it."""
+        return self._bus.queue_bytes()
+
     def send(self, can_id: int, data: bytes) -> None:
         """Send and remember a frame. Raises BusError."""
         # Remembered first: on the embedded bus the answers come while `send` runs.
         t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
         self._passed.append((True, Frame(can_id, data, t_ns)))
         self._bus.send(can_id, data)
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Send and remember some frames. Raises BusError."""
+        t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
+        self._passed += [(True, Frame(can_id, data, t_ns)) for can_id, data in frames]
+        self._bus.send_all(frames)
 
     def receive(self, timeout_s: float) -> Frame | None:
         """Receive and remember a frame. Raises BusError."""

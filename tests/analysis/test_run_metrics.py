@@ -262,6 +262,14 @@ def test_a_detection_without_contact_is_a_false_alarm():
     assert evaluate(react(make_run(), 2000)).false_alarms == 1
 
 
+def test_an_arm_that_is_held_because_its_host_is_late_is_no_false_alarm():
+    run = react(make_run(), 2000)
+    joints = np.zeros(run.cycle.size, np.uint8)
+    assert evaluate(replace(run, contact_joints=joints)).false_alarms == 0
+    joints[2000] = 1
+    assert evaluate(replace(run, contact_joints=joints)).false_alarms == 1
+
+
 def test_a_false_alarm_has_its_time():
     assert evaluate(react(make_run(), 2000)).false_alarms_s == pytest.approx([1.95])
 

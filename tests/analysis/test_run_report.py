@@ -335,8 +335,9 @@ def record(path, run, attachments):
             block[layout.slices["theta_hat"]] = run.theta_hat[row]
             block[layout.slices["threshold"]] = run.threshold[row]
             state = SchemeState(run.state[row])
+            joints = int(state is SchemeState.REACT)
             output = SchemeOutput(
-                cycle, state, state, FaultReason.NONE, 0, False, run.theta_hat[row], run.theta_hat[row],
+                cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row], run.theta_hat[row],
                 run.tau_ext_hat[row], None, block,
             )  # fmt: skip
             messages = [(ChannelId.SCHEME, pack_scheme(output, Request.NONE))]

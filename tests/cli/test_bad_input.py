@@ -135,7 +135,7 @@ def test_an_emulator_that_stops_mid_run_is_a_latched_fault_in_real_time(tmp_path
     with emulator(tmp_path, "--scenario", "idle") as process:
         played = run_while_killing(tmp_path, process, "--clock", "realtime")
     assert played.status == SAFETY_STOP
-    assert played.json["fault"] in ("DATA_AGE", "DRIVE")  # on a machine that stalls the drives may trip first
+    assert played.json["fault"] in ("DATA_AGE", "DRIVE", "DEADLINE")  # on a machine that stalls others may trip first
     log = read_log(played.log)
     assert log.is_complete
     assert log.scheme["state"][-1] == SchemeState.FAULT

@@ -8,10 +8,10 @@ import pytest
 
 from adacd_hil.commission.diagnosis import Status
 from adacd_hil.commission.host_checks import HOST_CHECKS, Host
-from adacd_hil.scheduling import RealtimeGrant
+from adacd_hil.scheduling import RealtimeGrant, Refusal
 from adacd_hil.wire.link import Link, parse_ip_link
 
-GRANTED = RealtimeGrant("SCHED_FIFO 80", ())
+GRANTED = RealtimeGrant("SCHED_FIFO 80", cpu=3, is_memory_locked=True, is_awake=True)
 CAN0 = Link(
     name="can0",
     is_up=True,
@@ -28,6 +28,13 @@ CAN0 = Link(
     tx_errors=0,
     bus_offs=0,
 )
+THROTTLED_AT = {
+    runtime_us: {
+        "proc/sys/kernel/sched_rt_runtime_us": f"{runtime_us}\n",
+        "proc/sys/kernel/sched_rt_period_us": "1000000\n",
+    }
+    for runtime_us in (-1, 500_000, 950_000)
+}
 RUN = {check.name: check.run for check in HOST_CHECKS}
 
 
@@ -100,10 +107,37 @@ def test_python_cans_own_interfaces_have_no_kernel_to_look_at(check: str) -> Non
 
 
 def test_what_is_not_granted_is_told_with_its_remedy() -> None:
-    grant = RealtimeGrant("SCHED_OTHER", ("SCHED_FIFO: no; allow it", "locked memory: no; allow that"))
+    refusals = (Refusal("SCHED_FIFO: no", "allow it"), Refusal("locked memory: no", "allow that"))
+    grant = RealtimeGrant("SCHED_OTHER", refusals)
     outcome = RUN["scheduler"](host(request_realtime=lambda: grant))
     assert outcome.reason == "not granted: SCHED_FIFO: no, locked memory: no"
     assert outcome.remedy == "allow it; allow that"
+
+
+def test_what_is_granted_is_told() -> None:
+    reason = RUN["scheduler"](host()).reason
+    assert reason == "scheduler SCHED_FIFO 80, cpu 3, memory locked, idle states shallow"
+
+
+@pytest.mark.parametrize(
+    ("cpu", "isolated", "status", "text"),
+    [
+        ("any", "", Status.OK, "not asked for"),
+        ("any", "2-3", Status.WARNING, "isolated processors: 2, 3, not used"),
+        ("isolated", "", Status.WARNING, "isolated processors: none"),
+        ("isolated", "2-3", Status.OK, "isolated processors: 2, 3"),
+        ("3", "2-3", Status.OK, "`realtime.cpu` = 3"),
+        ("1", "2-3", Status.WARNING, "processor 1 is shared"),
+    ],
+)
+def test_a_processor_of_its_own_is_judged(tmp_path: Path, cpu: str, isolated: str, status: Status, text: str) -> None:
+    folder = tmp_path / "sys/devices/system/cpu"
+    folder.mkdir(parents=True)
+    (folder / "isolated").write_text(f"{isolated}\n")
+    outcome = RUN["isolation"](host(root=tmp_path, cpu=cpu))
+    assert outcome.status is status
+    assert text in outcome.reason
+    assert bool(outcome.remedy) is (status is Status.WARNING)
 
 
 @pytest.mark.parametrize(
@@ -117,13 +151,10 @@ def test_what_is_not_granted_is_told_with_its_remedy() -> None:
         ({"proc/version": "Linux #1 SMP PREEMPT_DYNAMIC"}, "preemption", Status.WARNING, "PREEMPT: single"),
         ({"proc/version": "Linux #1 SMP"}, "preemption", Status.WARNING, "no preemption named"),
         (
-            {
-                "sys/devices/system/cpu/isolated": "2-3\n",
-                "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance\n",
-            },
+            {"sys/devices/system/cpu/cpu0/cpufreq/scaling_governor": "performance\n"},
             "processor",
             Status.OK,
-            "isolated processors: 2-3",
+            "governor performance",
         ),
         (
             {
@@ -135,6 +166,10 @@ def test_what_is_not_granted_is_told_with_its_remedy() -> None:
             "governor performance, powersave",
         ),
         ({}, "processor", Status.SKIPPED, "no frequency scaling"),
+        (THROTTLED_AT[-1], "throttling", Status.OK, "off"),
+        (THROTTLED_AT[950_000], "throttling", Status.OK, "95% of 1000 ms"),
+        (THROTTLED_AT[500_000], "throttling", Status.WARNING, "50% of 1000 ms"),
+        ({}, "throttling", Status.SKIPPED, "/proc"),
     ],
 )
 def test_the_machine_is_judged_by_its_files(

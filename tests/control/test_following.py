@@ -6,7 +6,7 @@ import pytest
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.realtime import FollowingPacer
-from adacd_hil.wire.bus import BusError, Frame
+from adacd_hil.wire.bus import Bus, BusError, Frame
 from adacd_hil.wire.tap import Tap
 
 SYNC, FEEDBACK = 0x080, 0x185
@@ -14,7 +14,7 @@ PERIOD_NS = 2_000_000
 TIMEOUT_NS = 50_000_000
 
 
-class TimedBus:
+class TimedBus(Bus):
     """Frames that come at their time; waiting for one makes time pass. Read late, they carry the time of the read."""
 
     channel = "timed"

@@ -3,9 +3,12 @@
 import dataclasses
 from typing import Any
 
+import pytest
+
 from adacd_hil.clock import MonotonicClock, VirtualClock
 from adacd_hil.config import LockstepSettings, load_settings
-from adacd_hil.control.realtime import GridPacer, Pacer, Recurrence, Tick, make_pacer
+from adacd_hil.control.realtime import GridPacer, Pacer, Recurrence, Tick, calibrate, make_pacer, prepare_spin
+from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.tap import Tap
 
@@ -75,6 +78,73 @@ def test_the_grid_is_that_of_the_clocks_whole_periods() -> None:
     assert GridPacer(clock, PERIOD_NS).next() == Tick(0, 6_000_000, 1, 0)
 
 
+class CountingClock(LateClock):
+    """A clock that moves on by 1 µs whenever it is read, and remembers what it was asked to sleep for."""
+
+    def __init__(self, lateness_ns: list[int]) -> None:
+        super().__init__(lateness_ns)
+        self.slept_until_ns: list[int] = []
+        self.readings = 0
+
+    def now_ns(self) -> int:
+        now_ns = super().now_ns()
+        self.readings += 1
+        VirtualClock.sleep_until_ns(self, now_ns + 1_000)
+        return now_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        self.slept_until_ns.append(t_ns)
+        super().sleep_until_ns(t_ns)
+
+
+def test_a_pacer_that_spins_sleeps_shorter_and_is_on_time_where_the_wakeup_is_late() -> None:
+    clock = CountingClock([0, 20_000, 60_000])
+    pacer = GridPacer(clock, PERIOD_NS)
+    pacer.spin_ns = 50_000
+    assert [pacer.next().lateness_ns for _ in range(3)] == [1_000, 0, 10_000]
+    assert clock.slept_until_ns == [-50_000, 950_000, 1_950_000]
+
+
+def test_a_tick_without_spin_reads_the_clock_once() -> None:
+    clock = CountingClock([])
+    pacer = GridPacer(clock, PERIOD_NS)
+    pacer.next()
+    before = clock.readings
+    pacer.next()
+    assert clock.readings == before + 1
+
+
+LATENESS_NS = [1_000 * (index % 25) for index in range(49)] + [900_000]
+
+
+@pytest.mark.parametrize(
+    ("lateness_ns", "period_ns", "cpu_count", "spin_ns"),
+    [
+        (LATENESS_NS, PERIOD_NS, 2, 23_000),
+        (LATENESS_NS, PERIOD_NS, 1, 0),
+        ([80_000] * 50, PERIOD_NS, 2, 80_000),
+        ([300_000] * 50, PERIOD_NS, 2, 100_000),
+        ([300_000] * 50, 500_000, 2, 50_000),
+        ([0] * 50, PERIOD_NS, 2, 0),
+    ],
+)
+def test_the_spin_is_as_long_as_sleeps_are_late_within_bounds(
+    lateness_ns: list[int], period_ns: int, cpu_count: int, spin_ns: int
+) -> None:
+    assert calibrate(LateClock(list(lateness_ns)), period_ns, cpu_count).spin_ns == spin_ns
+
+
+def test_a_measurement_tells_how_late_sleeps_were() -> None:
+    measured = calibrate(LateClock(list(LATENESS_NS)), PERIOD_NS, 2)
+    assert (measured.p50_ns, measured.p99_ns, measured.max_ns) == (12_000, 900_000, 900_000)
+
+
+def test_in_virtual_time_nothing_is_measured() -> None:
+    clock, pacer = paced()
+    assert prepare_spin(pacer, load_settings(), clock, RealtimeGrant("SCHED_FIFO 80")) == {}
+    assert (pacer.spin_ns, clock.now_ns()) == (0, 0)
+
+
 def paced(**lockstep: Any) -> tuple[VirtualClock, Pacer]:
     clock = VirtualClock()
     settings = dataclasses.replace(load_settings(), lockstep=LockstepSettings(**lockstep))
@@ -87,9 +157,12 @@ def test_in_lockstep_the_hosts_work_takes_its_modelled_time() -> None:
     assert (pacer.spend(500_000), clock.now_ns()) == (580_000, 580_000)
 
 
-def test_in_real_time_nothing_is_added_to_the_time_that_the_work_takes() -> None:
+def test_in_real_time_the_work_takes_what_it_takes() -> None:
     clock = MonotonicClock()
-    assert make_pacer(load_settings(), clock, Tap(EmbeddedBus(clock), clock), 0x080).spend(500_000) == 500_000
+    pacer = make_pacer(load_settings(), clock, Tap(EmbeddedBus(clock), clock), 0x080)
+    before_ns = clock.now_ns()
+    leaving_ns = pacer.spend(500_000)
+    assert before_ns <= leaving_ns <= clock.now_ns()
 
 
 def test_a_modelled_host_that_is_slower_than_a_period_skips_periods() -> None:

@@ -17,11 +17,12 @@ CODEC = load_codec()
 class Devices:
     """Answers with what a test wants, and keeps what the host sent."""
 
-    def __init__(self, arm_table: dict[str, object] | None = None) -> None:
+    def __init__(self, arm_table: dict[str, object] | None = None, schedule: str = "same_cycle") -> None:
         self.sent: list[Frame] = []
         bus = EmbeddedBus(VirtualClock())
         bus.attach(self.sent.append)
-        self.arm = Arm(parse(Settings, {"arm": arm_table or {}}), CODEC, bus)
+        settings = parse(Settings, {"arm": arm_table or {}, "bus": {"schedule": schedule}})
+        self.arm = Arm(settings, CODEC, bus)
         self._senders: dict[str, E2eSender] = {n: CODEC.message(n).sender() for n in ("Sensor1Torque", "Sensor2Torque")}
 
     def send(self, name: str, *values: float) -> None:
@@ -251,3 +252,62 @@ def test_the_raw_torque_stays_beside_the_tared_one() -> None:
     devices.answer()
     devices.arm.state()
     assert [sensor.torque_Nm for sensor in devices.arm.sensors] == [1.5, -2.5]
+
+
+def test_a_late_frame_is_of_the_cycle_before_and_leaves_the_present_one_open() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.arm.synchronise(1, 0, 1)
+    feedback = CODEC.message("Drive1Feedback")
+    devices.arm.accept(Frame(feedback.can_id, bytes(feedback.encode(0.1, 0.01)), 0), is_late=True)
+    assert devices.arm.drives[0].sample_cycle == 0
+    assert devices.arm.missing_frames == 4
+    assert not devices.arm.has_all_frames
+
+
+COMMANDED = ArmCommand(np.array((1.2, -0.6)), enable=True, quick_stop=False)
+TORQUES = (100, -100)
+"""Per mille of the rated 12 and 6 Nm."""
+
+
+def enabled_devices(schedule: str) -> Devices:
+    devices = Devices(schedule=schedule)
+    devices.arm.synchronise(0, 0, 1)
+    devices.enable()
+    devices.sent.clear()
+    return devices
+
+
+def sent_torques(devices: Devices) -> tuple[int, ...]:
+    command = CODEC.message("Drive1Command")
+    return tuple(int(command.decode_values(frame.data)[-1]) for frame in devices.sent if frame.can_id != 0x080)
+
+
+def test_commands_of_the_same_cycle_leave_at_once_and_once() -> None:
+    devices = enabled_devices("same_cycle")
+    devices.arm.write(COMMANDED)
+    assert [frame.can_id for frame in devices.sent] == [0x201, 0x202]
+    assert sent_torques(devices) == TORQUES
+    devices.arm.synchronise(1, 0, 1)
+    assert [frame.can_id for frame in devices.sent] == [0x201, 0x202, 0x080]
+
+
+def test_pipelined_commands_leave_behind_the_next_sync_and_once() -> None:
+    devices = enabled_devices("pipelined")
+    devices.arm.write(COMMANDED)
+    assert devices.sent == []
+    devices.arm.synchronise(1, 0, 1)
+    assert [frame.can_id for frame in devices.sent] == [0x080, 0x201, 0x202]
+    assert sent_torques(devices) == TORQUES
+    devices.arm.synchronise(2, 0, 1)
+    assert [frame.can_id for frame in devices.sent] == [0x080, 0x201, 0x202, 0x080]
+
+
+@pytest.mark.parametrize(("periods", "torques"), [(3, TORQUES), (4, (0, 0))])
+def test_a_pipelined_command_kept_for_longer_than_the_age_budget_carries_no_torque(
+    periods: int, torques: tuple[int, ...]
+) -> None:
+    devices = enabled_devices("pipelined")
+    devices.arm.write(COMMANDED)
+    devices.arm.synchronise(periods, 0, periods)
+    assert sent_torques(devices) == torques

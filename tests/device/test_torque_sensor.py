@@ -107,5 +107,5 @@ def test_the_end_of_its_range_is_the_overload_of_a_sensor_without_status() -> No
 def test_a_frame_of_the_wrong_length_changes_nothing() -> None:
     sensor = unprotected()
     assert not sensor.accept_torque(bytes(3), 0)
-    sensor.accept_status(bytes(2))  # this sensor has no status frame
+    sensor.accept_status(bytes(2), 0)  # this sensor has no status frame
     assert (sensor.sample_cycle, sensor.implausible_frames, sensor.status) == (-1, 1, 0)

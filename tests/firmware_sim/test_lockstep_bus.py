@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.wire.bus import Frame, SilenceError, TransmitQueueError
+from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
 from firmware_sim.lockstep_bus import LockstepBus
 from firmware_sim.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 
@@ -14,7 +14,7 @@ SYNC, PERIOD_NS = 0x080, 1_000_000
 FRAME_NS = 100_000  # every frame of these tests takes so long
 
 
-class Devices:
+class Devices(Bus):
     """The devices' end, without time of its own: `on_frame` says what they send when they get something."""
 
     channel = "devices"

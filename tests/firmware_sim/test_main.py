@@ -15,8 +15,9 @@ from bench_host import CODEC, ENABLE, RESET_COMMUNICATION, START, STOP, BenchHos
 from adacd_hil.clock import VirtualClock
 from adacd_hil.log.reader import read_log
 from adacd_hil.scheduling import RealtimeGrant
-from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench import Bench
+from firmware_sim.departure import Departure
 from firmware_sim.main import EPILOG, Service, StopRequest, main
 
 SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
@@ -92,7 +93,7 @@ def test_no_arguments_show_the_help_as_wrong_usage(capsys):
     assert "Usage: firmware-sim" in capsys.readouterr().err
 
 
-class ScriptedBus:
+class ScriptedBus(Bus):
     """A bus whose frames come at scripted times of a virtual clock; the end of the script stops the service."""
 
     channel = "scripted"
@@ -137,8 +138,9 @@ def serve(
 ) -> tuple[ScriptedBus, Bench, VirtualClock]:
     clock, stop = VirtualClock(), StopRequest()
     bus = ScriptedBus(clock, stop, end_ms * MS)
-    bench = Bench(quiet_scenario(), CODEC, bus.send, clock_mode=clock_mode)
-    service = Service(bench, bus, clock, clock_mode, stop, is_once)
+    departure = Departure(bus)
+    bench = Bench(quiet_scenario(), CODEC, departure.send, clock_mode=clock_mode, on_answer=departure.go)
+    service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
     service.boot()
     bus.stall_at_ns = stall_at_ms * MS
     bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in script)
@@ -210,7 +212,7 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
     monkeypatch.setattr("firmware_sim.main.MonotonicClock", lambda: clock)
     monkeypatch.setattr("firmware_sim.main.wall_ns", lambda: 10**18)
     monkeypatch.setattr("firmware_sim.main._open_bus", lambda *_: bus)
-    monkeypatch.setattr("firmware_sim.main.request_realtime", lambda: RealtimeGrant("SCHED_OTHER", ()))
+    monkeypatch.setattr("firmware_sim.main.request_realtime", lambda request: RealtimeGrant("SCHED_OTHER"))
     monkeypatch.setattr("firmware_sim.main.freeze_garbage", lambda: None)
     scenario = tmp_path / "scenario.toml"
     scenario.write_text(LOST_TORQUE)
@@ -228,9 +230,10 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
 def test_frames_that_waited_since_before_power_on_are_dropped():
     clock, stop = VirtualClock(), StopRequest()
     bus = ScriptedBus(clock, stop, 50 * MS)
-    bench = Bench(quiet_scenario(), CODEC, bus.send)
+    departure = Departure(bus)
+    bench = Bench(quiet_scenario(), CODEC, departure.send, on_answer=departure.go)
     bus.script.extend([(0, 0x080, b"\x05"), (0, *START_ALL)])
-    service = Service(bench, bus, clock, "sync", stop)
+    service = Service(bench, bus, departure, clock, "sync", stop)
     service.boot()
     service.run()
     assert bench.cycle == -1

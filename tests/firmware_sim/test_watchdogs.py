@@ -19,6 +19,7 @@ from test_main import ScriptedBus, enabling_script
 
 from adacd_hil.clock import VirtualClock
 from firmware_sim.bench import Bench
+from firmware_sim.departure import Departure
 from firmware_sim.main import Service, StopRequest
 
 SYNC, COMMAND, HEARTBEAT, OPERATIONAL, LENGTH = 1, 2, 3, 4, 5
@@ -206,8 +207,9 @@ def serve_dying_host(deadline: tuple[int, bytes] | None, reaction: int, end_ms: 
     """Enable and turn both drives by SYNC, then let the host die at 50 ms."""
     clock, stop = VirtualClock(), StopRequest()
     bus = ScriptedBus(clock, stop, end_ms * MS)
-    bench = Bench(quiet_scenario(), CODEC, bus.send)
-    service = Service(bench, bus, clock, "sync", stop)
+    departure = Departure(bus)
+    bench = Bench(quiet_scenario(), CODEC, departure.send, on_answer=departure.go)
+    service = Service(bench, bus, departure, clock, "sync", stop)
     service.boot()
     script = []
     for joint in (1, 2):

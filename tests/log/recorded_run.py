@@ -1,9 +1,6 @@
 """A run made of random numbers, and a recorder that is fed with it; every field has a value of its own."""
 
-import fcntl
 import os
-import struct
-import termios
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -184,14 +181,8 @@ def record(path: Path, run: Run, **options) -> LogSummary:
     return recorder.close()
 
 
-def waiting_bytes(recorder: Recorder) -> int:
-    """Count what the writer hasn't taken from the socket yet, as the kernel accounts for it; 0 when it is dead."""
-    (waiting,) = struct.unpack("i", fcntl.ioctl(recorder._socket, termios.TIOCOUTQ, bytes(4)))
-    return waiting
-
-
 def wait_until_taken(recorder: Recorder) -> None:
-    """Wait until the writer has taken every packet from the socket, or is dead."""
+    """Wait until the writer has taken every packet from the ring."""
     recorder.flush()
-    while waiting_bytes(recorder) > 0:
+    while recorder._ring.waiting:
         os.sched_yield()

@@ -19,6 +19,12 @@ from adacd_hil.records import Event, scheme_layout
 class MemorySink(io.BytesIO):
     """A sink that can be looked into; mcap's writer takes it too."""
 
+    packets = 0
+
+    def write(self, data, packets=0):
+        self.packets += packets
+        return super().write(data)
+
 
 class ReferenceWriter:
     def __init__(self, sink, channels, attachments, metadata, messages, epoch_ns, parameter_count):

@@ -5,7 +5,6 @@ import re
 import resource
 import select
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -16,8 +15,9 @@ import pytest
 import zstandard
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
-from recorded_run import feed, make_run, record, start, wait_until_taken, waiting_bytes
+from recorded_run import feed, make_run, record, start, wait_until_taken
 
+from adacd_hil.config import LogSettings
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
@@ -80,6 +80,8 @@ def test_a_killed_writer_costs_the_log_its_end_and_the_control_process_nothing(b
     recorder = start(tmp_path / "run.mcap", run, blocking=blocking)
     feed(recorder, run.cycles[:1500])
     wait_until_taken(recorder)
+    while len(read_log(tmp_path / "run.mcap").scheme) <= 1000:  # the test's time limit ends it
+        os.sched_yield()
     os.kill(recorder.pid, signal.SIGKILL)
     assert wait_for_end(recorder.pid)
     feed(recorder, run.cycles[1500:])
@@ -110,6 +112,10 @@ def test_what_is_logged_reaches_the_disk_though_nothing_follows(tmp_path):
     assert read_log(tmp_path / "run.mcap").scheme.block.tobytes() == run.blocks.tobytes()
 
 
+def missing_by(notice):
+    return int(re.fullmatch(r"(\d+) packets are missing before this", notice)[1])
+
+
 @pytest.mark.slow
 def test_a_writer_that_is_behind_costs_packets_not_time(tmp_path):
     run = make_run(50)
@@ -133,26 +139,27 @@ def test_a_writer_that_is_behind_costs_packets_not_time(tmp_path):
     assert not log.is_complete
     assert log.summary["dropped"] == str(dropped)
     notices = [event.message for _, event in log.events if event.name == "log"]
-    assert notices == [f"{dropped} packets are missing before this"]
+    # More than one: an event still fits where a cycle doesn't.
+    assert 1 <= len(notices) <= 4
+    assert sum(missing_by(notice) for notice in notices) == dropped
     assert len(log.scheme) + len(log.events) - len(notices) + dropped == sent
 
 
 @pytest.mark.slow
 def test_in_lockstep_a_writer_that_is_behind_is_waited_for(tmp_path):
-    recorder = start(tmp_path / "run.mcap", make_run(0))
+    recorder = start(tmp_path / "run.mcap", make_run(0), settings=LogSettings(buffer_MiB=1))
     has_continued = threading.Event()
     sent = []
 
     def send():
         while not has_continued.is_set() or len(sent) < 10:
-            recorder.event(len(sent), Event("info", "n", ""))
+            recorder.event(len(sent), Event("info", "n", 4000 * "x"))
             sent.append(len(sent))
 
     os.kill(recorder.pid, signal.SIGSTOP)
     sender = threading.Thread(target=send)
     sender.start()
-    room = recorder._socket.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
-    while waiting_bytes(recorder) < room:
+    while recorder._ring.capacity - recorder._ring.waiting > 4100:
         os.sched_yield()
     for _ in range(1000):  # lets the sender run against it
         os.sched_yield()
@@ -172,7 +179,7 @@ def test_a_disk_that_fails_at_the_very_end_is_reported(tmp_path):
     feed(recorder, run.cycles)
     summary = recorder.close()
     assert summary.error == f"File too large after {written} bytes"
-    assert summary.dropped == 0
+    assert summary.dropped == 20 + sum(cycle.event is not None for cycle in run.cycles)
     assert not summary.is_complete
 
 
@@ -228,7 +235,7 @@ def test_a_packet_that_makes_no_sense_is_dropped_alone(tmp_path):
     feed(recorder, run.cycles[:5])
     recorder.cycle(1, [], [(True, Frame(1, bytes(65), 0))])
     recorder.cycle(1, [(9999, b"no such channel")])
-    recorder._send(b"\x01")
+    recorder._put(b"\x01")
     feed(recorder, run.cycles[5:])
     summary = recorder.close()
     assert (summary.dropped, summary.is_complete) == (3, False)

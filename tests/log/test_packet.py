@@ -6,17 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adacd_hil.log.packet import (
-    CYCLE,
-    END,
     EVENT,
     IS_ERROR,
     IS_TX,
     ROOM,
     Columns,
+    is_whole,
     long_data,
     pack_cycle,
-    pack_end,
     pack_event,
+    times_ns,
     unpack,
     unpack_event,
 )
@@ -118,7 +117,11 @@ def test_classic_frames_are_packed_without_room_for_more():
     assert mixed - classic == 24 + 16
 
 
-def test_the_end_is_known_by_its_first_byte():
-    packets = (pack_cycle(0, 0, [], []), pack_event(0, 0, Event("", "", "")), pack_end(3))
-    assert [packet[0] for packet in packets] == [CYCLE, EVENT, END]
-    assert len({CYCLE, EVENT, END}) == 3
+def test_a_packet_without_a_whole_head_of_a_known_kind_is_told_apart():
+    packets = (GOOD, b"", b"\x01", GOOD[:15], pack_event(-3, 0, Event("", "", "")), b"\x09" + GOOD[1:], GOOD)
+    sizes = np.array([len(packet) for packet in packets])
+    starts = np.cumsum(sizes) - sizes
+    data = np.frombuffer(b"".join(packets) + bytes(ROOM), np.uint8)
+    is_right = is_whole(data, starts, sizes)
+    assert is_right.tolist() == [True, False, False, False, True, False, True]
+    assert times_ns(data, starts[is_right]).tolist() == [5, -3, 5]

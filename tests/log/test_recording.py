@@ -69,7 +69,8 @@ def test_the_summary_counts_what_was_written(run, recorded):
     contacts = sum(cycle.contact is not None for cycle in run.cycles)
     events = sum(cycle.event is not None for cycle in run.cycles)
     messages = len(run.frames) + len(decodable(run)) + 4 * len(run.cycles) + contacts + events
-    assert recorded[1]._replace(path=None) == (None, len(run.frames), messages, 0, True, "")
+    assert recorded[1][1:-1] == (len(run.frames), messages, 0, True, "", 1)
+    assert 0 < recorded[1].queue_peak_bytes < 4 * 2**20
 
 
 def test_a_log_that_was_closed_is_complete(log):
@@ -334,7 +335,7 @@ def test_the_truth_has_a_log_of_its_own(tmp_path):
 def test_a_run_without_a_cycle_is_a_complete_log(tmp_path):
     summary = record(tmp_path / "run.mcap", make_run(0))
     log = read_log(tmp_path / "run.mcap")
-    assert summary[1:] == (0, 0, 0, True, "")
+    assert summary[1:] == (0, 0, 0, True, "", 1, 0)
     assert log.is_complete
     assert log.scheme.block.shape[0] == 0
     assert log.frames.shape == (0,)

@@ -11,17 +11,19 @@ from adacd_hil.scheme.kernel import Observation
 from adacd_hil.scheme.supervisor import REST_HOLD_S, SchemeEvent, Supervisor, next_state
 
 # What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens.
-EVENTS = "FAULT COMPLETE COMMISSIONED ENABLED ADAPTED COLLISION AT_REST ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED"
+EVENTS = (
+    "FAULT COMPLETE COMMISSIONED ENABLED ADAPTED COLLISION LATE AT_REST ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED"
+)
 EXPECTED = """
-INIT        FAULT  COMMISSION  .       .      .        .      .        .        .        .
-COMMISSION  FAULT  .           ENABLE  .      .        .      .        .        .        .
-ENABLE      FAULT  .           .       ADAPT  .        .      .        .        .        .
-ADAPT       FAULT  .           .       .      MONITOR  .      .        .        .        .
-MONITOR     FAULT  .           .       .      .        REACT  .        .        PAYLOAD  .
-REACT       FAULT  .           .       .      .        .      STOPPED  .        .        .
-STOPPED     FAULT  .           .       .      .        .      .        MONITOR  PAYLOAD  .
-PAYLOAD     FAULT  .           .       .      .        .      .        .        .        ADAPT
-FAULT       .      .           .       .      .        .      .        .        .        .
+INIT        FAULT  COMMISSION  .       .      .        .      .      .        .        .        .
+COMMISSION  FAULT  .           ENABLE  .      .        .      .      .        .        .        .
+ENABLE      FAULT  .           .       ADAPT  .        .      .      .        .        .        .
+ADAPT       FAULT  .           .       .      MONITOR  .      .      .        .        .        .
+MONITOR     FAULT  .           .       .      .        REACT  REACT  .        .        PAYLOAD  .
+REACT       FAULT  .           .       .      .        .      .      STOPPED  .        .        .
+STOPPED     FAULT  .           .       .      .        .      .      .        MONITOR  PAYLOAD  .
+PAYLOAD     FAULT  .           .       .      .        .      .      .        .        .        ADAPT
+FAULT       .      .           .       .      .        .      .      .        .        .        .
 """
 
 
@@ -132,6 +134,7 @@ BAD = [
     (GOOD._replace(age_tau_J=(4, 0)), Observation.NONE, FaultReason.DATA_AGE),
     (GOOD._replace(age_tau_J=(0, 4)), Observation.NONE, FaultReason.DATA_AGE),
 ]
+LATE = GOOD._replace(is_late=True)
 
 
 @pytest.mark.parametrize("state", POWERED)
@@ -202,6 +205,7 @@ def test_commissioning_takes_as_many_good_cycles_as_asked():
         (DISABLED._replace(age_tau_J=(9, 0)), RESTING),
         (DISABLED, RESTING | Observation.NOT_A_NUMBER),
         (DISABLED, RESTING | Observation.OVER_LIMIT),
+        (DISABLED._replace(is_late=True), RESTING),
     ],
 )
 def test_one_bad_cycle_begins_commissioning_anew(arm, observation):
@@ -306,6 +310,45 @@ def test_the_arm_is_not_stopped_before_the_report_is_final():
     run = run_in(SchemeState.REACT)
     assert run.step(observation=Observation.AT_REST, is_reporting=True, cycles=500) is SchemeState.REACT
     assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [
+        (SchemeState.INIT, SchemeState.COMMISSION),
+        (SchemeState.COMMISSION, SchemeState.COMMISSION),
+        (SchemeState.ENABLE, SchemeState.FAULT),
+        (SchemeState.ADAPT, SchemeState.FAULT),
+        (SchemeState.MONITOR, SchemeState.REACT),
+        (SchemeState.REACT, SchemeState.REACT),
+        (SchemeState.STOPPED, SchemeState.STOPPED),
+        (SchemeState.PAYLOAD, SchemeState.FAULT),
+    ],
+)
+def test_a_host_that_is_late_holds_the_arm_or_faults(state, expected):
+    run = run_in(state)
+    assert run.step(LATE) is expected
+    assert (run.supervisor.fault is FaultReason.DEADLINE) == (expected is SchemeState.FAULT)
+
+
+def test_an_arm_that_is_held_rests_and_waits_for_an_acknowledgement():
+    run = run_in(SchemeState.MONITOR)
+    run.step(LATE)
+    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
+    assert run.step(cycles=100) is SchemeState.STOPPED
+    assert run.step(request=Request.ACKNOWLEDGE) is SchemeState.MONITOR
+
+
+def test_an_acknowledgement_waits_until_the_host_is_on_time():
+    run = run_in(SchemeState.STOPPED)
+    assert run.step(LATE, request=Request.ACKNOWLEDGE) is SchemeState.STOPPED
+    assert run.step(LATE, cycles=300) is SchemeState.STOPPED
+    assert run.step() is SchemeState.MONITOR
+
+
+def test_a_late_host_that_was_to_change_the_payload_holds_the_arm_first():
+    run = run_in(SchemeState.MONITOR)
+    assert run.step(LATE, request=Request.PAYLOAD) is SchemeState.REACT
 
 
 def test_an_acknowledged_stop_goes_on():

@@ -32,6 +32,10 @@ CLASSIC = struct.Struct("=IB3x8s")
 OLD_DATA, NEW_DATA = b"old", b"new"
 
 
+STAMP_ERROR_NS = 500_000
+"""The wall clock, by which the kernel stamps, is compared with the monotonic one; a busy machine may get in between."""
+
+
 def open_end(can_ids: list[int] | None = None, is_fd: bool = False) -> SocketCanBus:
     return SocketCanBus(CHANNEL, MonotonicClock(), can_ids, is_fd)
 
@@ -252,13 +256,73 @@ def test_frames_that_the_kernel_dropped_are_counted_over_a_recovery_too(raw: soc
     kept = 0
     while bus.receive(0.1) is not None:
         kept += 1
-    dropped = bus.dropped_frames
+    raw.send(CLASSIC.pack(0x181, 0, b""))
+    assert bus.receive(1.0) is not None
+    dropped = bus.frames_lost
     bus.recover()
-    after = bus.dropped_frames
+    after = bus.frames_lost
     bus.close()
     assert 0 < kept < sent
     assert dropped == sent - kept
     assert after == dropped
+
+
+def test_drops_are_known_without_another_frame_once_somebody_looks_at_the_queues(raw: socket.socket) -> None:
+    bus = open_end([0x181])
+    for _ in range(2000):
+        raw.send(CLASSIC.pack(0x181, 0, b""))
+    waiting = bus.queue_bytes()
+    kept = 0
+    while bus.receive(0.1) is not None:
+        kept += 1
+    emptied, lost = bus.queue_bytes(), bus.frames_lost
+    bus.close()
+    assert waiting.received > 100_000
+    assert emptied == (0, 0)
+    assert lost == 2000 - kept
+
+
+def test_what_waits_to_be_sent_shows_in_the_queue(ends: tuple[SocketCanBus, SocketCanBus]) -> None:
+    near, _ = ends
+    with plugged(frames=10):
+        near.send_all([(0x201, OLD_DATA)] * 4)
+        few = near.queue_bytes().sent
+        near.send_all([(0x201, OLD_DATA)] * 4)
+        many = near.queue_bytes().sent
+    assert few > 0
+    assert many == 2 * few
+
+
+def test_a_frame_carries_the_kernels_stamp_however_late_it_is_read(ends: tuple[SocketCanBus, SocketCanBus]) -> None:
+    near, far = ends
+    clock = MonotonicClock()
+    before_ns = clock.now_ns()
+    near.send(0x201, OLD_DATA)
+    after_ns = clock.now_ns()
+    while clock.now_ns() < after_ns + 5_000_000:
+        pass
+    frame = far.receive(1.0)
+    assert frame is not None
+    assert before_ns - STAMP_ERROR_NS <= frame.t_ns <= after_ns + STAMP_ERROR_NS
+
+
+def test_frames_handed_over_together_arrive_in_their_order(ends: tuple[SocketCanBus, SocketCanBus]) -> None:
+    near, far = ends
+    frames = [(0x100 + index, bytes([index]) * (index % 9)) for index in range(100)]
+    near.send_all(frames)
+    assert received(far, 100) == frames
+
+
+def test_of_frames_handed_over_together_those_without_room_are_waited_for(
+    ends: tuple[SocketCanBus, SocketCanBus],
+) -> None:
+    near, _ = ends
+    with plugged(frames=3), pytest.raises(TransmitQueueError):
+        near.send_all([(0x201, OLD_DATA)] * 5)
+    with plugged(frames=3):
+        near.send_all([(0x201, OLD_DATA)] * 3)
+        waiting = CanInterface(CHANNEL).waiting_frames()
+    assert waiting == 3
 
 
 @pytest.mark.slow

@@ -1,0 +1,46 @@
+"""How each cycle went, for the log: lateness, ages, what the work took, what was left of the period, what waits."""
+
+from adacd_hil.clock import Clock
+from adacd_hil.config import Settings
+from adacd_hil.control.exchange import Exchange
+from adacd_hil.control.realtime import Tick
+from adacd_hil.device.arm import Arm
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import ArmState, CycleRecord
+from adacd_hil.wire.tap import Tap
+
+
+class Evidence:
+    """Makes the record of each cycle."""
+
+    def __init__(self, settings: Settings, bus: Tap, arm: Arm, exchange: Exchange, clock: Clock) -> None:
+        self._bus, self._arm, self._exchange = bus, arm, exchange
+        self._clock = clock
+        self._period_ns = settings.bus.period_ns
+        self._is_following = settings.bus.follows
+
+    def record(self, tick: Tick, arm: ArmState, overruns: int, recorder: Recorder) -> CycleRecord:
+        """Sum up the cycle that began with `tick`, whose commands have just been handed to the bus.
+
+        `overruns`: periods skipped since the run began.
+        """
+        exchange = self._exchange
+        command_ns = self._clock.now_ns()
+        # Where SYNC is followed, it is the grid point itself, however late this host woke up for it.
+        late_ns = 0 if self._is_following else tick.lateness_ns
+        return CycleRecord(
+            cycle=tick.cycle,
+            lateness_ns=tick.lateness_ns,
+            feedback_ns=exchange.feedback_ns - exchange.sync_ns,
+            command_ns=command_ns - exchange.sync_ns,
+            compute_ns=command_ns - exchange.feedback_ns,
+            slack_ns=exchange.sync_ns - late_ns + self._period_ns - command_ns,
+            data_age=max(*arm.age_q, *arm.age_tau_J),
+            overruns=overruns,
+            frames_missing=self._arm.missing_frames,
+            commands_late=exchange.late_commands.count,
+            frames_lost=self._bus.frames_lost,
+            receive_queue_bytes=exchange.queues.received,
+            transmit_queue_bytes=exchange.queues.sent,
+            log_queue_bytes=recorder.waiting_bytes,
+        )

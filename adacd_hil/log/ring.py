@@ -1,0 +1,160 @@
+"""Packets on their way to the writer, in memory that both processes share: one side puts, the other takes.
+
+Neither side calls the system for it, and neither waits for the other. The memory begins with a page of counts, each an
+aligned uint64 that one side alone writes: HEAD, bytes ever put; TAIL, bytes ever taken; DROPPED, packets that were not
+put; PEAK, most bytes that were found waiting. Then the ring: a packet is its size in 4 bytes, its bytes, and what fills
+up to 8; one that reaches the end goes on at the beginning.
+
+HEAD moves last: a process that is killed in between leaves whole packets only. That the other side sees the bytes
+before it sees HEAD is left to the processor, which on x86-64 keeps the order of what it writes; elsewhere some 10 ns
+pass in which it may not, and a packet that was read too early is one that makes no sense, and is counted as such.
+"""
+
+import mmap
+import os
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+_HEAD, _TAIL, _DROPPED, _PEAK = range(4)
+_COUNTS_BYTES = mmap.PAGESIZE
+_SIZE = struct.Struct("<I")
+_GRAIN = 8
+"""Packets begin at multiples of this, so that no size is split by the end of the ring."""
+LEAST_BYTES = mmap.PAGESIZE
+
+
+def room_of(size: int) -> int:
+    """Count what a packet of `size` bytes takes up."""
+    return (_SIZE.size + size + _GRAIN - 1) & -_GRAIN
+
+
+class _SharedRing:
+    """Both sides' view."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
+        self._counts = memoryview(self._memory)[:_COUNTS_BYTES].cast("Q")
+        self.capacity = len(self._memory) - _COUNTS_BYTES
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that have been put and not taken."""
+        return self._counts[_HEAD] - self._counts[_TAIL]
+
+    @property
+    def peak(self) -> int:
+        """Most bytes that the reader found waiting."""
+        return self._counts[_PEAK]
+
+    def _copy(self, start: int, size: int) -> bytes:
+        place = start % self.capacity
+        data = self._memory[_COUNTS_BYTES + place : _COUNTS_BYTES + min(place + size, self.capacity)]
+        return data if len(data) == size else data + self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - len(data)]
+
+    def close(self) -> None:
+        """Release the memory."""
+        self._counts.release()
+        self._memory.close()
+
+
+class Ring(_SharedRing):
+    """The side that puts."""
+
+    def __init__(self, capacity: int) -> None:
+        """Make a ring of `capacity` bytes, at least LEAST_BYTES. Raises OSError, as when that much can't be locked."""
+        self.descriptor = os.memfd_create("adacd-hil log")
+        capacity = max(capacity, LEAST_BYTES) & -_GRAIN
+        try:
+            os.ftruncate(self.descriptor, _COUNTS_BYTES + capacity)
+            super().__init__(self.descriptor)
+        except OSError:
+            os.close(self.descriptor)
+            raise
+        # Each page once, so that the cycle meets none for the first time.
+        for place in range(0, len(self._memory), mmap.PAGESIZE):
+            self._memory[place] = 0
+        self._head = 0
+        self._room_until = self.capacity  # HEAD can go so far by the TAIL that was last looked at
+
+    def put(self, packet: bytes) -> bool:
+        """Add a packet; False when there is no room for it."""
+        size = len(packet)
+        head = self._head
+        end = head + room_of(size)
+        if end > self._room_until:
+            self._room_until = self._counts[_TAIL] + self.capacity
+            if end > self._room_until:
+                return False
+        place = head % self.capacity
+        start = _COUNTS_BYTES + place + _SIZE.size
+        _SIZE.pack_into(self._memory, start - _SIZE.size, size)
+        room = self.capacity - place - _SIZE.size
+        if size <= room:
+            self._memory[start : start + size] = packet
+        else:
+            self._memory[start:] = packet[:room]
+            self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - room] = packet[room:]
+        self._head = self._counts[_HEAD] = end
+        return True
+
+    def count_dropped(self, dropped: int) -> None:
+        """Say how many packets were not put."""
+        self._counts[_DROPPED] = dropped
+
+    def waiting_packets(self) -> int:
+        """Count the packets that were not taken."""
+        tail = self._counts[_TAIL]
+        return len(split(self._copy(tail, self._head - tail))[0])
+
+    def close(self) -> None:
+        """Release the memory."""
+        super().close()
+        os.close(self.descriptor)
+
+
+class RingReader(_SharedRing):
+    """The side that takes."""
+
+    @property
+    def dropped(self) -> int:
+        """Packets that were not put."""
+        return self._counts[_DROPPED]
+
+    def take(self, most: int) -> bytes:
+        """Take whole packets of up to `most` bytes in all, or a longer one by itself; b"" when none is waiting."""
+        tail = self._counts[_TAIL]
+        waiting = self._counts[_HEAD] - tail
+        self._counts[_PEAK] = max(self._counts[_PEAK], waiting)
+        data = self._copy(tail, min(waiting, most))
+        if waiting > most:
+            data = data[: _whole_bytes(data)] or self._copy(tail, self._first_bytes(tail))
+        self._counts[_TAIL] = tail + len(data)
+        return data
+
+    def _first_bytes(self, start: int) -> int:
+        return room_of(_SIZE.unpack(self._copy(start, _SIZE.size))[0])
+
+
+def split(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find where the packets of taken data begin, and their sizes (n,)."""
+    starts, sizes = [], []
+    place = 0
+    while place < len(data):
+        (size,) = _SIZE.unpack_from(data, place)
+        starts.append(place + _SIZE.size)
+        sizes.append(size)
+        place += room_of(size)
+    return np.array(starts, np.int64), np.array(sizes, np.int64)
+
+
+def _whole_bytes(data: bytes) -> int:
+    """Count the bytes of the whole packets that data begins with."""
+    place = 0
+    while place + _SIZE.size <= len(data):
+        end = place + room_of(_SIZE.unpack_from(data, place)[0])
+        if end > len(data):
+            break
+        place = end
+    return place

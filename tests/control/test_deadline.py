@@ -1,0 +1,130 @@
+"""What becomes of a run whose host misses too many periods."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from session_rig import Rig
+
+from adacd_hil.config import RealtimeSettings, load_settings
+from adacd_hil.control.deadline import DeadlineWatch
+from adacd_hil.log.reader import RunLog
+from adacd_hil.records import ArmState, FaultReason, SchemeState
+
+STALL_CYCLE = 600
+ON_TIME = ArmState(
+    0, 0, 1, np.zeros(2), np.zeros(2), np.zeros(2), (0, 0), (0, 0), is_enabled=True, is_complete=True,
+    fault=FaultReason.NONE,
+)  # fmt: skip
+
+
+class Watched:
+    """A watch at 1 kHz that is told of each cycle by the periods since the one before."""
+
+    def __init__(self, **realtime: Any) -> None:
+        settings = RealtimeSettings(**({"misses": 3, "misses_window_s": 0.1} | realtime))
+        self.watch = DeadlineWatch(dataclasses.replace(load_settings(), realtime=settings))
+        self.cycle = 0
+
+    def after(self, periods: int, count: int = 1) -> ArmState:
+        for _ in range(count):
+            self.cycle += periods
+            arm = self.watch.judge(ON_TIME._replace(cycle=self.cycle, periods=periods))
+        return arm
+
+
+def test_a_host_on_time_is_left_alone() -> None:
+    watched = Watched(misses=1)
+    assert [watched.after(1).fault for _ in range(300)] == [FaultReason.NONE] * 300
+
+
+@pytest.mark.parametrize(("periods", "fault"), [(3, FaultReason.NONE), (4, FaultReason.DEADLINE)])
+def test_one_stall_of_as_many_periods_as_are_too_many_faults(periods: int, fault: FaultReason) -> None:
+    assert Watched().after(periods).fault is fault
+
+
+def test_single_misses_add_up_within_the_window() -> None:
+    watched = Watched()
+    watched.after(2)
+    watched.after(1, 40)
+    watched.after(2)
+    watched.after(1, 40)
+    assert watched.after(2).fault is FaultReason.DEADLINE
+    assert watched.watch.describe() == "3 periods missed within 0.1 s; 3 are too many"
+
+
+def test_misses_further_apart_than_the_window_never_add_up() -> None:
+    watched = Watched()
+    for _ in range(20):
+        assert watched.after(2).fault is FaultReason.NONE
+        watched.after(1, 49)
+
+
+def test_a_window_later_the_host_counts_as_on_time_again() -> None:
+    watched = Watched(on_misses="hold")
+    assert watched.after(4).is_late
+    assert watched.after(1, 99).is_late
+    assert not watched.after(1).is_late
+
+
+def test_many_misses_that_leave_the_window_at_once_are_all_forgotten() -> None:
+    watched = Watched(misses=5, on_misses="hold")
+    watched.after(2, 4)
+    watched.after(1, 200)
+    assert not watched.after(5).is_late
+
+
+def test_an_arm_that_is_held_has_no_fault() -> None:
+    assert Watched(on_misses="hold").after(9).fault is FaultReason.NONE
+
+
+def test_a_fault_of_the_arm_keeps_its_name() -> None:
+    watched = Watched()
+    late = watched.watch.judge(ON_TIME._replace(periods=9, cycle=9, fault=FaultReason.SENSOR))
+    assert late.fault is FaultReason.SENSOR
+
+
+def play(folder: Path, on_misses: str) -> RunLog:
+    """Let an arm that is soon adapted move, and its host stall for 5 ms in the middle of it."""
+    rig = Rig(folder, finish_s=0.7)
+    settings = rig.session.settings
+    rig.session.settings = dataclasses.replace(
+        settings,
+        bus=dataclasses.replace(settings.bus, command_patience_cycles=250, sync_patience_periods=25.0),
+        termination=dataclasses.replace(
+            settings.termination, hold_s=0.1, beta_Nm=100.0, travel_deg=0.0, velocity_deg_s=0.0, excitation_Nm2s=0.0
+        ),
+        detector=dataclasses.replace(settings.detector, threshold_Nm=(50.0, 50.0)),
+        operator=dataclasses.replace(settings.operator, acknowledge_after_s=0.0),
+        realtime=RealtimeSettings(misses=3, on_misses=on_misses),
+    )
+    clock = rig.session.clock
+    rig.in_cycle[STALL_CYCLE] = lambda: clock.sleep_until_ns(clock.now_ns() + 5_100_000)
+    return rig.run()[1]
+
+
+@pytest.mark.slow
+def test_a_host_that_stalls_faults_with_a_quick_stop_and_says_how_many_it_missed(tmp_path: Path) -> None:
+    log = play(tmp_path, "stop")
+    assert FaultReason(int(log.scheme["fault"][-1])) is FaultReason.DEADLINE
+    (line,) = [entry.event.message for entry in log.events if "-> FAULT" in entry.event.message]
+    assert line == "MONITOR -> FAULT: DEADLINE; 4 periods missed within 1 s; 3 are too many"
+    assert log.control["quick_stop"][-1]
+
+
+@pytest.mark.slow
+def test_a_host_that_stalls_brakes_the_arm_and_holds_it_and_reports_no_contact(tmp_path: Path) -> None:
+    log = play(tmp_path, "hold")
+    state = log.scheme["state"]
+    (began,) = np.flatnonzero((state[1:] == SchemeState.REACT) & (state[:-1] == SchemeState.MONITOR)) + 1
+    is_held = state[began:] == SchemeState.STOPPED
+    assert is_held.any()
+    speed = np.abs(log.control["dq_d"][began:][: np.argmax(is_held) + 1])
+    assert speed[0].max() > 0.1
+    assert np.all(speed[-1] == 0.0)
+    assert np.all(np.diff(speed, axis=0) <= 0.0)  # it brakes, and goes nowhere first
+    assert not log.contacts
+    (line,) = [entry.event.message for entry in log.events if "-> REACT" in entry.event.message]
+    assert line == "MONITOR -> REACT: DEADLINE; 4 periods missed within 1 s; 3 are too many"

@@ -1,0 +1,218 @@
+"""A slow disk and a full one: the ring is emptied all the same, memory is bounded, and what is lost is counted."""
+
+import errno
+import json
+import os
+import re
+import socket
+import threading
+from dataclasses import replace
+
+import pytest
+from recorded_run import CODEC, make_run
+
+from adacd_hil.log import sink as sink_module
+from adacd_hil.log import words
+from adacd_hil.log.packet import pack_cycle, pack_event
+from adacd_hil.log.parts import find_parts
+from adacd_hil.log.reader import read_log
+from adacd_hil.log.ring import Ring, RingReader
+from adacd_hil.log.setup import Setup
+from adacd_hil.log.sink import Sink
+from adacd_hil.log.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
+
+pytestmark = pytest.mark.slow
+
+MOST_WAITING = 300_000
+STEP_NS = 4 * FLUSH_PERIOD_NS
+
+
+class HastyClock:
+    """Time enough to flush passes between any two looks at it."""
+
+    def __init__(self):
+        self.now = 0
+
+    def now_ns(self):
+        self.now += STEP_NS
+        return self.now
+
+
+class Writer:
+    """The writer in a thread of this process, fed through its ring as by a control process in real time."""
+
+    def __init__(self, path, descriptor, may_rotate=True):
+        self.ring = Ring(4 * 2**20)
+        self.dropped = 0
+        self.clock = HastyClock()
+        self.sink = Sink(descriptor, waits=False, most_waiting=MOST_WAITING)
+        self._reader = RingReader(self.ring.descriptor)
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        setup = Setup(
+            path=path,
+            is_truth=False,
+            is_blocking=False,
+            codec_path=CODEC.path,
+            parameter_count=7,
+            epoch_ns=0,
+            part_bytes=0,
+            part_ns=0,
+            may_rotate=may_rotate,
+            attachments={},
+            metadata={},
+        )
+        process = WriterProcess(theirs, self._reader, self.sink, setup, self.clock)
+        self._theirs = theirs
+        self._thread = threading.Thread(target=process.run)
+        self._thread.start()
+
+    def feed(self, cycles):
+        for cycle in cycles:
+            self.put(pack_cycle(cycle.t_ns, self.dropped, cycle.messages(), cycle.frames))
+            if cycle.event is not None:
+                self.put(pack_event(cycle.t_ns, self.dropped, cycle.event))
+
+    def put(self, packet):
+        while not self.ring.put(packet):
+            os.sched_yield()
+
+    def wait(self, condition):
+        while not condition():  # the test's time limit ends it
+            os.sched_yield()
+
+    def wait_until_taken(self):
+        self.wait(lambda: not self.ring.waiting)
+        seen = self.clock.now
+        self.wait(lambda: self.clock.now > seen + STEP_NS)
+
+    def end(self):
+        self._socket.send(words.END)
+        self._thread.join()
+        word = json.loads(self._socket.recv(words.MOST_BYTES))
+        self._reader.close()
+        self.ring.close()
+        self._socket.close()
+        self._theirs.close()
+        return word
+
+
+def packets_of(cycles):
+    return len(cycles) + sum(cycle.event is not None for cycle in cycles)
+
+
+def missing_in(log):
+    notices = [event.message for _, event in log.events if event.name == "log"]
+    return [int(re.fullmatch(r"(\d+) packets are missing before this", notice)[1]) for notice in notices]
+
+
+def assert_accounts_for(log, cycles, lost):
+    """Every packet is in the log, or missed by it."""
+    missing = missing_in(log)
+    assert sum(missing) == lost > 0
+    assert len(log.scheme) + len(log.events) - len(missing) == packets_of(cycles) - lost
+
+
+def test_a_slow_disk_costs_packets_and_bounded_memory(tmp_path):
+    run = make_run(2000)
+    left, right = os.pipe()
+    written = bytearray()
+
+    def read_all():
+        while data := os.read(left, 65536):
+            written.extend(data)
+
+    writer = Writer(tmp_path / "run.mcap", right, may_rotate=False)
+    for start in range(0, 1900, 100):
+        writer.feed(run.cycles[start : start + 100])
+        writer.wait_until_taken()
+        assert writer.sink.waiting < MOST_WAITING + 300_000
+    assert writer.sink.is_behind
+    disk = threading.Thread(target=read_all)
+    disk.start()
+    writer.wait(lambda: writer.sink.waiting < MOST_WAITING // 4)
+    writer.feed(run.cycles[1900:])
+    word = writer.end()
+    disk.join()
+    os.close(left)
+    (tmp_path / "copy.mcap").write_bytes(written)
+    log = read_log(tmp_path / "copy.mcap")
+    assert log.problem == ""
+    assert word["error"] == ""
+    assert log.summary["dropped"] == word["lost"]
+    assert_accounts_for(log, run.cycles, int(word["lost"]))
+    assert int(word["lost"]) > 1000
+    assert log.scheme.block[-100:].tobytes() == run.blocks[-100:].tobytes()
+
+
+class Disk:
+    """The disk of the sink; takes `room` more bytes."""
+
+    def __init__(self, monkeypatch):
+        self.room = 2**40
+        self._write_all = sink_module._write_all
+        monkeypatch.setattr(sink_module, "_write_all", self.write_all)
+
+    def write_all(self, descriptor, data):
+        self._write_all(descriptor, data[: max(self.room, 0)])
+        self.room -= len(data)
+        if self.room < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def create(path):
+    return os.open(path, os.O_WRONLY | os.O_CREAT)
+
+
+def test_a_full_disk_is_tried_again_with_another_part(tmp_path, monkeypatch):
+    run = make_run(1200)
+    disk = Disk(monkeypatch)
+    path = tmp_path / "run.mcap"
+    writer = Writer(path, create(path))
+    writer.feed(run.cycles[:300])
+    writer.wait_until_taken()
+    disk.room = 1000
+    writer.feed(run.cycles[300:900])
+    writer.wait_until_taken()
+    disk.room = 2**40
+    failed = writer.clock.now
+    writer.wait(lambda: writer.clock.now > failed + 2 * RETRY_PERIOD_NS)
+    writer.feed(run.cycles[900:])
+    word = writer.end()
+    assert re.fullmatch(r"No space left on device after \d+ bytes", word["error"])
+    assert (word["lost"], word["parts"]) == (str(packets_of(run.cycles[300:900])), "2")
+    log = read_log(path)
+    assert list(find_parts(path)) == [0, 1]
+    assert re.fullmatch(r"run.mcap: cut after \d+ bytes", log.problem)
+    assert not log.is_complete
+    assert log.summary["dropped"] == word["lost"]
+    assert log.scheme.block[:300].tobytes() == run.blocks[:300].tobytes()
+    assert log.scheme.block[300:].tobytes() == run.blocks[900:].tobytes()
+    assert_accounts_for(log, run.cycles, int(word["lost"]))
+
+
+@pytest.mark.parametrize("has_chunk", [False, True])
+def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path, monkeypatch):
+    run = make_run(400)
+    disk = Disk(monkeypatch)
+    path = tmp_path / "run.mcap"
+    writer = Writer(path, create(path))
+    if has_chunk:
+        writer.feed(run.cycles[:200])
+        writer.wait_until_taken()
+    disk.room = 0
+    writer.feed(run.cycles[200:])
+    writer.wait_until_taken()
+    failed = writer.clock.now
+    writer.wait(lambda: writer.clock.now > failed + 4 * RETRY_PERIOD_NS)
+    word = writer.end()
+    assert word["lost"] == str(packets_of(run.cycles[200:]))
+    assert [file.name for file in tmp_path.iterdir()] == ["run.mcap"]
+    assert len(read_log(path).scheme) == 200 * has_chunk
+    assert word["error"].startswith("No space left on device")
+
+
+def test_the_setup_arrives_as_it_was_sent(tmp_path):
+    setup = Setup(tmp_path, True, False, None, 7, 5, 1, 2, True, {"a": b"\xff"}, {"b": "c"})
+    assert Setup.from_json(setup.to_json()) == setup
+    with_codec = replace(setup, codec_path=tmp_path)
+    assert Setup.from_json(with_codec.to_json()) == with_codec

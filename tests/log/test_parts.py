@@ -1,0 +1,210 @@
+"""A log in parts: each is a file of its own, and together they are the log that one file would have been."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from recorded_run import feed, make_run, record, start, wait_until_taken
+
+from adacd_hil.config import LogSettings
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.parts import find_parts, part_path
+from adacd_hil.log.reader import read_log, topic_bytes
+from adacd_hil.log.recorder import Recorder
+
+pytestmark = pytest.mark.slow  # each log starts a process
+
+BY_SIZE = LogSettings(part_MiB=1, part_min=0.0)
+COUNT = 1800
+
+
+@pytest.fixture(scope="module")
+def run():
+    return make_run(COUNT)
+
+
+@pytest.fixture(scope="module")
+def whole(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "run.mcap"
+    record(path, run, settings=LogSettings(part_MiB=0, part_min=0.0))
+    return read_log(path)
+
+
+@pytest.fixture(scope="module")
+def recorded(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("parts") / "run.mcap"
+    return path, record(path, run, settings=BY_SIZE)
+
+
+@pytest.fixture
+def log_path(recorded, tmp_path):
+    """A copy to spoil."""
+    shutil.copytree(recorded[0].parent, tmp_path / "copy")
+    return tmp_path / "copy" / "run.mcap"
+
+
+def assert_same_log(log, whole):
+    assert log.problem == ""
+    assert log.is_complete
+    assert log.metadata == whole.metadata
+    assert log.summary == whole.summary
+    assert log.attachments == whole.attachments
+    assert log.topics.keys() == whole.topics.keys()
+    for topic, series in whole.topics.items():
+        assert log.topics[topic].payloads() == series.payloads(), topic
+    assert log.frames.tobytes() == whole.frames.tobytes()
+    assert log.events == whole.events
+    assert log.contacts == whole.contacts
+
+
+def test_the_parts_together_are_the_log_that_one_file_would_have_been(recorded, whole):
+    path, summary = recorded
+    log = read_log(path)
+    assert [part.name for part in find_parts(path).values()] == ["run.mcap", "run_001.mcap", "run_002.mcap"]
+    assert log.parts == summary.parts == 3
+    assert (summary.frames, summary.dropped, summary.is_complete) == (int(whole.summary["frames"]), 0, True)
+    assert whole.parts == 1
+    assert_same_log(log, whole)
+    assert topic_bytes(path, "/events") == topic_bytes(whole.path, "/events")
+
+
+def test_others_read_each_part_by_itself(recorded, whole):
+    messages = []
+    for number, part in find_parts(recorded[0]).items():
+        with part.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            assert [attachment.name for attachment in reader.iter_attachments()] == list(whole.attachments)
+            metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+            messages.append(sum(1 for _ in reader.iter_messages()))
+            assert reader.get_summary().statistics.message_count == messages[-1]
+        assert metadata["run"] == {**whole.metadata, "part": str(number)}
+        assert metadata["summary"]["messages"] == str(messages[-1])
+        assert metadata["summary"]["ending"] == ("closed" if number == 2 else "continued")
+    assert sum(messages) == int(whole.summary["messages"])
+
+
+def test_a_part_ends_after_its_size_before_compression_with_a_chunk(recorded):
+    for part in list(find_parts(recorded[0]).values())[:-1]:
+        with part.open("rb") as file:
+            chunks = make_reader(file).get_summary().chunk_indexes
+        size = sum(chunk.uncompressed_size for chunk in chunks)
+        assert 2**20 <= size < 2**20 + 600_000  # a quarter of a second more
+
+
+def test_two_runs_in_lockstep_give_the_same_parts(run, recorded, tmp_path):
+    record(tmp_path / "run.mcap", run, settings=BY_SIZE)
+    for number, part in find_parts(tmp_path / "run.mcap").items():
+        assert part.read_bytes() == part_path(recorded[0], number).read_bytes()
+
+
+def test_a_part_ends_by_log_time(run, whole, tmp_path):
+    path = tmp_path / "run.mcap"
+    record(path, run, settings=LogSettings(part_MiB=0, part_min=0.4 / 60.0))
+    assert_same_log(read_log(path), whole)
+    starts_ns = [read_one(part).scheme.t_ns[0] for part in find_parts(path).values()]
+    assert np.diff(starts_ns).tolist() == [500_000_000] * 3
+
+
+def read_one(part):
+    """Read a part by itself."""
+    copy = part.parent / f"{part.stem}_alone" / "run.mcap"
+    copy.parent.mkdir()
+    return read_log(shutil.copy(part, copy))
+
+
+def test_a_part_ends_in_real_time(run, whole, tmp_path):
+    path = tmp_path / "run.mcap"
+    recorder = start(path, run, blocking=False, settings=LogSettings(part_MiB=1, part_min=0.0))
+    feed(recorder, run.cycles[:900])
+    while not part_path(path, 1).exists():  # the test's time limit ends it
+        os.sched_yield()
+    feed(recorder, run.cycles[900:])
+    wait_until_taken(recorder)
+    summary = recorder.close()
+    log = read_log(path)
+    assert (summary.parts, summary.dropped, summary.is_complete) == (log.parts, 0, True)
+    assert log.parts in (2, 3)
+    assert log.is_complete
+    assert log.scheme.block.tobytes() == run.blocks.tobytes()
+    assert log.frames.tobytes() == whole.frames.tobytes()
+
+
+def test_the_parts_of_the_log_before_are_removed_and_nothing_else(tmp_path):
+    keep = ["run_1.mcap", "run_abc.mcap", "walk_001.mcap", "run_001.txt", "run_001_001.mcap"]
+    for name in ("run_001.mcap", "run_002.mcap", "run_1000.mcap", *keep):
+        (tmp_path / name).touch()
+    record(tmp_path / "run.mcap", make_run(3))
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["run.mcap", *keep])
+    assert read_log(tmp_path / "run.mcap").is_complete
+
+
+def test_a_part_of_before_that_can_not_be_removed_is_an_error_before_the_run(tmp_path):
+    (tmp_path / "run_001.mcap").mkdir()
+    with pytest.raises(LogError, match="a part of the log before can't be removed"):
+        Recorder(tmp_path / "run.mcap")
+
+
+def times_of(path):
+    return set(read_one(path).scheme.t_ns.tolist())
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_part_that_is_missing_costs_only_itself(number, log_path, whole):
+    missing = times_of(part_path(log_path, number))
+    part_path(log_path, number).unlink()
+    log = read_log(log_path)
+    assert log.problem == f"{part_path(log_path, number).name} is missing"
+    assert not log.is_complete
+    assert set(log.scheme.t_ns.tolist()) == set(whole.scheme.t_ns.tolist()) - missing
+    assert log.attachments == whole.attachments
+
+
+def test_a_part_that_is_damaged_costs_only_what_is_damaged(log_path, whole):
+    part = part_path(log_path, 1)
+    lost = times_of(part)
+    data = part.read_bytes()
+    part.write_bytes(data[: len(data) // 2])
+    log = read_log(log_path)
+    assert log.problem == f"run_001.mcap: cut after {len(data) // 2} bytes"
+    assert not log.is_complete
+    missing = set(whole.scheme.t_ns.tolist()) - set(log.scheme.t_ns.tolist())
+    assert missing < lost
+    assert missing
+
+
+def test_a_last_part_that_is_cut_is_not_taken_for_one_that_another_follows(log_path):
+    part = part_path(log_path, 2)
+    part.write_bytes(part.read_bytes()[:100_000])
+    log = read_log(log_path)
+    assert log.problem.startswith("run_002.mcap: cut after ")
+    assert "missing" not in log.problem
+    assert "ending" not in log.summary
+
+
+def test_a_part_that_is_not_mcap_is_left_out(log_path):
+    part_path(log_path, 1).write_text("notes")
+    log = read_log(log_path)
+    assert log.problem == f"{part_path(log_path, 1)} is not an MCAP file"
+    assert 0 < len(log.scheme) < COUNT
+
+
+def test_a_part_of_another_log_is_not_taken_for_ours(log_path, tmp_path):
+    other = make_run(5)
+    other.metadata = {"interface": "another"}
+    record(tmp_path / "other.mcap", other)
+    shutil.copy(tmp_path / "other.mcap", part_path(log_path, 1))
+    shutil.copy(tmp_path / "other.mcap", part_path(log_path, 900))
+    log = read_log(log_path)
+    assert log.problem == (
+        "run_001.mcap is a part of another log; run_003.mcap to run_899.mcap are missing; "
+        "run_900.mcap is a part of another log"
+    )
+    assert not log.is_complete
+
+
+def test_a_part_by_itself_says_that_it_is_one(log_path):
+    log = read_log(part_path(log_path, 1))
+    assert log.problem == "run_001.mcap is part 1 of a log"
+    assert len(log.scheme) > 0

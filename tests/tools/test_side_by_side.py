@@ -1,0 +1,62 @@
+"""tools/side_by_side.py: CPU time by window, overruns by the grid, ratios by round."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import side_by_side
+from side_by_side import Block, Window
+
+from adacd_hil.config import load_settings
+
+
+def block(name: str, cpu_us: list[float], overruns: int = 0, compute_ns: int = 50_000) -> Block:
+    due_ns = np.arange(100, dtype=np.int64) * 1_000_000
+    times_ns = {key: np.full(100, compute_ns, np.int64) for key in side_by_side.TIMES}
+    return Block(name, 1000, due_ns, times_ns, {name: np.array(cpu_us)}, overruns, 0)
+
+
+def test_overruns_are_the_periods_missing_from_the_grid() -> None:
+    due_ns = np.array([0, 1, 2, 5, 6, 8], np.int64) * 500_000
+    assert side_by_side.count_overruns(due_ns, 500) == 3
+    assert side_by_side.count_overruns(due_ns[:1], 500) == 0
+
+
+def test_cpu_time_goes_to_the_cycles_that_began_in_its_window() -> None:
+    windows = [Window(0, {"host": 0}), Window(1000, {"host": 8000}), Window(2000, {"host": 9000}), Window(3000, {})]
+    due_ns = np.array([0, 500, 999, 1000, 1500, 2500], np.int64)
+    np.testing.assert_allclose(side_by_side.cpu_per_cycle(windows, due_ns, "host"), [8 / 3, 0.5])
+
+
+def test_a_process_is_seen_to_use_its_cpu() -> None:
+    before_ns = side_by_side.cpu_clock_ns(os.getpid())
+    used_ns = time.process_time_ns()
+    sum(range(100_000))
+    used_ns = time.process_time_ns() - used_ns
+    assert side_by_side.cpu_clock_ns(os.getpid()) - before_ns >= used_ns
+
+
+def test_ratios_compare_within_a_round() -> None:
+    yardsticks = [block("yardstick", [50.0]), block("yardstick", [100.0])]
+    hosts = [block("host", [100.0, 120.0, 900.0]), block("host", [300.0])]
+    described = side_by_side.summarise({"yardstick": yardsticks, "host": hosts})
+    np.testing.assert_allclose(described["ratios"]["host/yardstick"]["cpu"], [2.7, 2.4, 3.0])
+    assert described["host"]["cpu_us"] == pytest.approx(210.0)
+    assert "host/yardstick, cpu" in side_by_side.as_text(described)
+
+
+def test_overruns_are_counted_against_all_periods() -> None:
+    assert side_by_side.per_100_000([block("host", [1.0], overruns=100), block("host", [1.0])]) == pytest.approx(
+        1e5 / 3
+    )
+
+
+def test_the_configuration_of_a_measured_run_can_be_used(tmp_path: Path) -> None:
+    settings = load_settings(str(side_by_side.patient_config(tmp_path, "fd_500us", 500)), "P")
+    assert settings.devices.contract == "arm_fd_500us"
+    assert (settings.bus.period_us, settings.bus.max_age_cycles, settings.operator.script) == (500, 100, ())

@@ -1,0 +1,69 @@
+"""tools/yardstick.c and .py: it compiles without a warning, checks its arguments, and gets frames that devices take."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.e2e import E2eStatus
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import yardstick
+
+GOOD = ["-i", "none0", "-s", "080", "-r", "181", "-c", "201#0011"]
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    built, reason = yardstick.build(tmp_path_factory.mktemp("yardstick"))
+    if built is None:
+        pytest.skip(reason)
+    return built
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (GOOD[2:], "missing: -i, -s, -r or -c"),
+        ([*GOOD, "-p", "fast"], "not a number in range: fast"),
+        ([*GOOD, "-p", "10"], "not a number in range: 10"),
+        ([*GOOD, "-r", "800"], "not an 11-bit identifier: 800"),
+        ([*GOOD, "-c", "202"], "not ID#DATA: 202"),
+        ([*GOOD, "-c", "202#001"], "not the data of a frame: 001"),
+        ([*GOOD, "-c", "202#0g"], "not hexadecimal: 0g"),
+        ([*GOOD, "-c", "202#00,01"], "commands: as many for each identifier"),
+        ([*GOOD, "-e", "77F#05"], "not N:ID#DATA: 77F#05"),
+        ([*GOOD, "more"], "not an option: more"),
+    ],
+)
+def test_a_wrong_argument_is_named(program: Path, arguments: list[str], complaint: str) -> None:
+    done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[0] == f"yardstick: {complaint}"
+
+
+def test_a_bus_that_is_not_there_has_a_status_of_its_own(program: Path) -> None:
+    done = subprocess.run([program, *GOOD], capture_output=True, text=True, check=False)
+    assert done.returncode == 5
+    assert done.stderr.startswith("yardstick: ")
+
+
+@pytest.mark.parametrize(("contract", "count"), [("arm", 16), ("arm_fd", 256), ("arm_fd_500us", 256)])
+def test_a_drive_takes_its_commands_one_after_the_other_and_over_again(contract: str, count: int) -> None:
+    codec = load_codec(contract_folder() / f"{contract}.dbc")
+    for name in yardstick.COMMANDS:
+        frames = yardstick.command_frames(codec, name)
+        assert len(set(frames)) == count
+        receiver = codec.message(name).receiver()
+        assert {receiver.check(frame) for frame in frames * 2} == {E2eStatus.OK}
+
+
+def test_its_arguments_name_the_four_answers_and_nothing_of_the_host(tmp_path: Path) -> None:
+    arguments = yardstick.arguments(load_codec(), "vcan0", 500, 4.0, 0.5, tmp_path / "samples")
+    pairs = list(zip(arguments[::2], arguments[1::2], strict=True))
+    assert [value for option, value in pairs if option == "-r"] == ["181", "182", "183", "184"]
+    assert [value for option, value in pairs if option == "-n"] == ["000#8200", "000#0100"]
+    assert ("-e", "200:77F#05") in pairs
+    assert not {"080", "201", "202", "77F"} & {value for option, value in pairs if option == "-x"}

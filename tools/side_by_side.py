@@ -1,0 +1,448 @@
+"""The cycle of the host beside the C yardstick's and the straightforward loop's: in turn, on one bus, in one run.
+
+A *block* is one of them for some seconds against the emulator. Blocks alternate, so that what the machine does
+besides hits all alike. Each process writes down its own times; its CPU time is read from outside, from its CPU clock,
+at the ends of windows of a fifth of a second, start-up and end left out. A window's CPU time is divided by the cycles
+that began in it. What is compared is the median of the windows, and their tenth percentile: a machine that takes the
+processor away counts that time as used, and few windows of a busy one are free of it.
+"""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yardstick
+from numpy.typing import NDArray
+
+from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.wire.codec import contract_folder, load_codec
+
+ROOT = Path(__file__).resolve().parent.parent
+BIN = Path(sys.executable).parent
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+HOST, YARDSTICK, STRAIGHTFORWARD = "host", "yardstick", "straightforward"
+SETTLE_S = 1.0
+WINDOW_S = 0.2
+QUIET_PERCENT = 10.0
+START_LIMIT_S = 120.0
+END_LIMIT_S = 30.0
+ENDED_WELL = (0, 3, 130)
+"""3: the log lacks what the machine had no time to write; 130: SIGINT, as asked."""
+TIMES = ("lateness", "feedback", "compute", "command")
+TITLES = {
+    "lateness": "lateness of wake-up",
+    "feedback": "SYNC out to last frame read",
+    "compute": "last frame in to last command out",
+    "command": "SYNC out to last command out",
+}
+SHARES = (50.0, 99.0, 99.9, 100.0)
+PATIENT = """
+extends = "{base}"
+
+[bus]  # a machine that stalls is to be measured, not to fault the arm
+period_us = {period_us}
+command_patience_cycles = 250
+max_age_cycles = 100
+heartbeat_ms = 1000
+
+[operator]
+script = []
+acknowledge_after_s = 0.4
+acknowledge_faults = 1000
+acknowledge_fault_after_s = 0.1
+"""
+"""Configuration of a measured run. Settings of [realtime] and [log] that a measurement needs go here."""
+
+
+class TimingError(Exception):
+    """A process that is measured did not run; one line."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """CPU time in ns that each process had used at some time `t_ns` of the monotonic clock."""
+
+    t_ns: int
+    cpu_ns: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Block:
+    """One process for some seconds. Arrays (n,) of the cycles of the measured part, int64 ns.
+
+    cpu_us: µs per cycle by process, a value per window. overruns: periods skipped within the measured part.
+    """
+
+    name: str
+    period_us: int
+    due_ns: NDArray[np.int64]
+    times_ns: dict[str, NDArray[np.int64]]
+    cpu_us: dict[str, NDArray[np.float64]]
+    overruns: int
+    frames_lost: int
+    scheduler: str = ""
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def cycles(self) -> int:
+        """Count the measured cycles."""
+        return len(self.due_ns)
+
+    def cpu_per_cycle_us(self, process: str, percent: float = 50.0) -> float:
+        """Return a percentile of the CPU time per cycle of a process, µs; NaN when it was not seen."""
+        values = self.cpu_us.get(process, np.empty(0))
+        return float(np.percentile(values, percent)) if values.size else float("nan")
+
+
+@dataclass(frozen=True)
+class Run:
+    """How to run one of the three, and how to read what it wrote: dues, times, the rest."""
+
+    name: str
+    command: list[str | Path]
+    read: Callable[[str], tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]]
+    has_logger: bool = False
+
+
+def count_overruns(due_ns: NDArray[np.int64], period_us: int) -> int:
+    """Count the periods that are missing between cycles."""
+    return int(np.sum(np.rint(np.diff(due_ns) / (period_us * 1000.0)).astype(np.int64) - 1)) if len(due_ns) > 1 else 0
+
+
+def cpu_per_cycle(windows: Sequence[Window], due_ns: NDArray[np.int64], process: str) -> NDArray[np.float64]:
+    """Divide the CPU time of each window by the cycles that began in it, µs; windows without a cycle are left out."""
+    values = []
+    for before, after in itertools.pairwise(windows):
+        count = int(np.count_nonzero((due_ns >= before.t_ns) & (due_ns < after.t_ns)))
+        if count > 0 and process in before.cpu_ns and process in after.cpu_ns:
+            values.append((after.cpu_ns[process] - before.cpu_ns[process]) * 1e-3 / count)
+    return np.array(values, np.float64)
+
+
+def cpu_clock_ns(pid: int) -> int:
+    """Read the CPU time of all threads of another process, ns (clock_getcpuclockid). Raises OSError when it is gone."""
+    return time.clock_gettime_ns((~pid << 3) | 2)
+
+
+def children_of(pid: int) -> list[int]:
+    """List the child processes of a process, as /proc shows them."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+            except OSError:
+                continue
+            if int(fields[1]) == pid:
+                found.append(int(entry.name))
+    return found
+
+
+@contextmanager
+def emulator(channel: str, *options: str, folder: Path) -> Any:
+    """Run the emulated arm while the block lasts. Raises TimingError when it doesn't begin."""
+    complaints = folder / "emulator.stderr"
+    with complaints.open("w") as stderr, (folder / "emulator.json").open("w") as stdout:
+        command = [BIN / "firmware-sim", "run", "-i", "socketcan", "-c", channel, "--json", *options]
+        process = subprocess.Popen(command, stdout=stdout, stderr=stderr, env=ENVIRONMENT)
+        try:
+            wait_for("ready", process, complaints)
+            yield process
+        finally:
+            process.terminate()
+            process.wait(END_LIMIT_S)
+
+
+def wait_for(word: str, process: "subprocess.Popen[Any]", complaints: Path) -> None:
+    """Wait until a line on stderr is `word`. Raises TimingError with what it says when the process ends before."""
+    limit_s = time.monotonic() + START_LIMIT_S
+    while word not in complaints.read_text().splitlines():
+        if process.poll() is not None or time.monotonic() > limit_s:
+            text = " | ".join(complaints.read_text().split("\n")).strip(" |")
+            raise TimingError(f"{Path(str(process.args[0])).name} did not get to {word!r}: {text}")  # type: ignore[index]
+        time.sleep(0.05)
+
+
+def take_window(pids: dict[str, int]) -> Window:
+    """Read the CPU clocks of some processes; one that has gone is left out."""
+    used = {}
+    t_ns = time.monotonic_ns()
+    for name, pid in pids.items():
+        try:
+            used[name] = cpu_clock_ns(pid)
+        except OSError:
+            continue
+    return Window(t_ns, used)
+
+
+def run_block(
+    run: Run,
+    seconds: float,
+    period_us: int,
+    emulator_pid: int,
+    folder: Path,
+    act: Callable[["subprocess.Popen[str]", dict[str, int]], dict[str, Any]] | None = None,
+) -> Block:
+    """Run one block and read what it says. Raises TimingError.
+
+    `act` is called in place of waiting, with the process and the ids of all; it returns notes.
+    """
+    complaints = folder / f"{run.name}.stderr"
+    with complaints.open("w") as stderr:
+        process = subprocess.Popen(run.command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=ENVIRONMENT)
+    try:
+        wait_for("running", process, complaints)
+        time.sleep(SETTLE_S)
+        pids = {run.name: process.pid, "emulator": emulator_pid}
+        if run.has_logger:
+            pids["logger"] = children_of(process.pid)[0]
+        windows = [take_window(pids)]
+        notes = act(process, pids) if act is not None else {}
+        begin_s = time.monotonic()
+        while act is None and time.monotonic() - begin_s < seconds and process.poll() is None:
+            time.sleep(WINDOW_S)
+            windows.append(take_window(pids))
+        if act is not None:
+            windows.append(take_window(pids))
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=END_LIMIT_S)
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+    if process.returncode not in ENDED_WELL:
+        raise TimingError(f"{run.name} ended with status {process.returncode}: {complaints.read_text().strip()[-400:]}")
+    due_ns, times_ns, rest = run.read(said)
+    measured = (due_ns >= windows[0].t_ns) & (due_ns < windows[-1].t_ns)
+    due_ns = due_ns[measured]
+    if not len(due_ns):
+        raise TimingError(f"{run.name} made no cycle in the measured part")
+    return Block(
+        name=run.name,
+        period_us=period_us,
+        due_ns=due_ns,
+        times_ns={name: values[measured] for name, values in times_ns.items()},
+        cpu_us={name: cpu_per_cycle(windows, due_ns, name) for name in pids},
+        overruns=count_overruns(due_ns, period_us),
+        frames_lost=rest.pop("frames_lost", 0),
+        scheduler=rest.pop("scheduler", ""),
+        notes=rest | notes,
+    )
+
+
+def read_samples(path: Path, columns: Sequence[str]) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]]]:
+    """Read the samples of the yardstick or the straightforward loop."""
+    rows = np.fromfile(path, np.int64).reshape(-1, len(columns))
+    return rows[:, 0], {name: rows[:, place] for place, name in enumerate(columns) if name in (*TIMES, "answer")}
+
+
+def yardstick_run(program: Path, channel: str, folder: Path, period_us: int, contract: str = "arm") -> Run:
+    """Say how the yardstick is run."""
+    samples = folder / "yardstick.samples"
+    codec = load_codec(contract_folder() / f"{contract}.dbc")
+    longest_s = 1200.0
+
+    def read(said: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]:
+        described = json.loads(said)
+        kept = ("frames_lost", "scheduler", "cycles_incomplete", "cycles_unsent")
+        return *read_samples(samples, yardstick.COLUMNS), {name: described[name] for name in kept}
+
+    arguments = yardstick.arguments(codec, channel, period_us, longest_s, 0.0, samples)
+    return Run(YARDSTICK, [program, *arguments], read)
+
+
+def straightforward_run(channel: str, folder: Path) -> Run:
+    """Say how the straightforward loop is run."""
+    samples, log = folder / "straightforward.samples", folder / "straightforward.mcap"
+    program = ROOT / "tools" / "straightforward.py"
+
+    def read(said: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]:
+        described = json.loads(said)
+        kept = ("scheduler", "cycles_incomplete", "frames_rejected")
+        return *read_samples(samples, yardstick.COLUMNS), {name: described[name] for name in kept}
+
+    command = [sys.executable, program, "-c", channel, "--log", log, "--samples", samples]
+    return Run(STRAIGHTFORWARD, command, read)
+
+
+def host_run(channel: str, folder: Path, config: Path, *options: str) -> Run:
+    """Say how the host is run; its log is in folder/host."""
+    out = folder / "host"
+
+    def read(said: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]:
+        described = json.loads(said) if said.strip() else {}
+        logs = [read_log(path, ("/cycle",)) for path in log_parts(out)]
+        due_ns, times_ns, rest = read_cycles(logs)
+        kept = ("dropped", "fault", "recoveries", "log_error")
+        return due_ns, times_ns, rest | {name: described[name] for name in kept if name in described}
+
+    command = [BIN / "adacd-hil", "run", "-i", "socketcan", "-c", channel, "--config", config, "--clock", "realtime"]
+    return Run(HOST, [*command, "--out", out, "--json", *options], read, has_logger=True)
+
+
+def log_parts(folder: Path) -> list[Path]:
+    """List the parts of a run's log, oldest first."""
+    return sorted(folder.glob("run*.mcap"))
+
+
+def read_cycles(logs: Sequence[RunLog]) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]:
+    """Take the times of the cycles from the parts of a log."""
+    cycle: dict[str, list[NDArray[np.int64]]] = {}
+    for log in logs:
+        for name in log.cycle.fields:
+            cycle.setdefault(name, []).append(np.asarray(log.cycle[name], np.int64))
+        cycle.setdefault("t_ns", []).append(log.cycle.t_ns)
+    joined = {name: np.concatenate(values) for name, values in cycle.items()}
+    if "t_ns" not in joined:
+        raise TimingError("the host left no log")
+    feedback_ns, command_ns = joined["feedback_ns"], joined["command_ns"]
+    times_ns = {
+        "lateness": joined["lateness_ns"],
+        "feedback": feedback_ns,
+        "compute": joined.get("compute_ns", command_ns - feedback_ns),
+        "command": command_ns,
+    }
+    scheduler = logs[0].metadata.get("scheduler", "")
+    lost = int(joined["frames_lost"][-1]) if "frames_lost" in joined else 0
+    return joined["t_ns"] - joined["lateness_ns"], times_ns, {"frames_lost": lost, "scheduler": scheduler}
+
+
+def patient_config(folder: Path, base: str = "paper", period_us: int = 1000, more: str = "") -> Path:
+    """Write the configuration of a measured run."""
+    path = folder / "measured.toml"
+    path.write_text(PATIENT.format(base=base, period_us=period_us) + more)
+    return path
+
+
+def measure(
+    runs: Sequence[Run], rounds: int, seconds: float, period_us: int, emulator_pid: int, folder: Path
+) -> dict[str, list[Block]]:
+    """Run the blocks in turn, each of `seconds`; progress on stderr. Raises TimingError."""
+    blocks: dict[str, list[Block]] = {run.name: [] for run in runs}
+    for number in range(rounds):
+        for run in runs:
+            block = run_block(run, seconds, period_us, emulator_pid, folder)
+            blocks[run.name].append(block)
+            print(
+                f"round {number + 1}/{rounds}  {run.name:16} {block.cycles} cycles, {block.overruns} overruns, "
+                f"{block.cpu_per_cycle_us(run.name):.0f} µs CPU per cycle",
+                file=sys.stderr,
+                flush=True,
+            )
+    return blocks
+
+
+def percentiles_us(blocks: Sequence[Block], name: str) -> list[float]:
+    """Return p50, p99, p99.9 and the maximum of a time over all blocks, µs."""
+    values = np.concatenate([block.times_ns[name] for block in blocks])
+    return [float(value) * 1e-3 for value in np.percentile(values, SHARES)]
+
+
+def ratios(above: Sequence[Block], below: Sequence[Block], value: Callable[[Block], float]) -> list[float]:
+    """Divide round by round: the median of the rounds, the lowest, the highest."""
+    each = [value(a) / value(b) for a, b in zip(above, below, strict=True)]
+    return [float(np.median(each)), min(each), max(each)]
+
+
+def per_100_000(blocks: Sequence[Block]) -> float:
+    """Return the periods skipped per 100,000 periods of the measured parts."""
+    overruns = sum(block.overruns for block in blocks)
+    return overruns * 1e5 / max(sum(block.cycles for block in blocks) + overruns, 1)
+
+
+def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
+    """Put the figures of all blocks together, for people and machines."""
+    described: dict[str, Any] = {}
+    for name, each in blocks.items():
+        described[name] = {
+            "scheduler": each[0].scheduler,
+            "period_us": each[0].period_us,
+            "blocks": len(each),
+            "cycles": sum(block.cycles for block in each),
+            "overruns": sum(block.overruns for block in each),
+            "overruns_per_100000": per_100_000(each),
+            "frames_lost": sum(block.frames_lost for block in each),
+            "cpu_us": float(np.median([block.cpu_per_cycle_us(name) for block in each])),
+            "cpu_quiet_us": float(np.median([block.cpu_per_cycle_us(name, QUIET_PERCENT) for block in each])),
+            "cpu_of_others_us": {
+                other: float(np.median([block.cpu_per_cycle_us(other) for block in each]))
+                for other in each[0].cpu_us
+                if other != name
+            },
+            "times_us": {time_name: percentiles_us(each, time_name) for time_name in TIMES},
+            "notes": [block.notes for block in each],
+        }
+    pairs = [(HOST, YARDSTICK), (STRAIGHTFORWARD, HOST)]
+    described["ratios"] = {
+        f"{above}/{below}": {
+            "cpu": ratios(blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(block.name)),
+            "cpu_quiet": ratios(
+                blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(block.name, QUIET_PERCENT)
+            ),
+            "command_p50": ratios(
+                blocks[above], blocks[below], lambda block: float(np.median(block.times_ns["command"]))
+            ),
+            "compute_p50": ratios(
+                blocks[above], blocks[below], lambda block: float(np.median(block.times_ns["compute"]))
+            ),
+        }
+        for above, below in pairs
+        if blocks.get(above) and blocks.get(below)
+    }
+    return described
+
+
+def as_text(described: dict[str, Any]) -> str:
+    """Lay the figures out as a table."""
+    lines = [f"{'µs':50} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}"]
+    names = [name for name in (YARDSTICK, HOST, STRAIGHTFORWARD) if name in described]
+    for time_name in TIMES:
+        for name in names:
+            values = " ".join(f"{value:8.1f}" for value in described[name]["times_us"][time_name])
+            title = TITLES[time_name] if name == names[0] else ""
+            lines.append(f"{title:34} {name:>15} {values}")
+    lines.append("")
+    lines.append(
+        f"{'':20} {'CPU µs/cycle':>13} {'quiet':>8} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}  scheduler"
+    )
+    for name in names:
+        row = described[name]
+        lines.append(
+            f"{name:20} {row['cpu_us']:13.1f} {row['cpu_quiet_us']:8.1f} {row['overruns']:9d} {row['overruns_per_100000']:9.1f} "
+            f"{row['cycles']:9d} {row['frames_lost']:5d}  {row['scheduler']}"
+        )
+        lines += [f"{f'  its {other}':20} {value:13.1f}" for other, value in row["cpu_of_others_us"].items()]
+    lines.append("")
+    for pair, each in described["ratios"].items():
+        for what, (middle, low, high) in each.items():
+            lines.append(f"{pair + ', ' + what:44} {middle:8.2f} ({low:.2f} to {high:.2f} by round)")
+    return "\n".join(lines)
+
+
+def prepare(channel: str, folder: Path, program: Path | None, period_us: int = 1000) -> list[Run]:
+    """Say how all three are run at one period; without the yardstick where there is no compiler."""
+    runs = [] if program is None else [yardstick_run(program, channel, folder, period_us)]
+    return [*runs, host_run(channel, folder, patient_config(folder)), straightforward_run(channel, folder)]
+
+
+def compare(channel: str, rounds: int, seconds: float) -> dict[str, Any]:
+    """Run all three beside each other on an interface at 1 kHz and return the figures. Raises TimingError."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        program, reason = yardstick.build(folder)
+        if reason:
+            print(reason, file=sys.stderr)
+        with emulator(channel, "--scenario", "idle", folder=folder) as devices:
+            blocks = measure(prepare(channel, folder, program), rounds, seconds, 1000, devices.pid, folder)
+        return summarise(blocks)
