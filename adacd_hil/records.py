@@ -232,16 +232,16 @@ class CycleRecord(NamedTuple):
     lateness_ns: int  # wake-up after the grid point
     feedback_ns: int  # SYNC sent to last frame decoded
     command_ns: int  # SYNC sent to last command handed to the bus
-    compute_ns: int = 0  # last cyclic frame received to last command handed to the bus
-    slack_ns: int = 0  # last command handed to the bus to the next grid point; negative: overrun
-    data_age: int = 0  # cycles, of the oldest value that was used
-    overruns: int = 0  # periods skipped since the run began
-    frames_missing: int = 0  # cyclic frames of this cycle that did not arrive or failed their checks
-    commands_late: int = 0  # commands of the cycle before that were not on the bus at this SYNC: they act at the next
-    frames_lost: int = 0  # received frames that the kernel dropped since the run began
-    receive_queue_bytes: int = 0  # frames that wait in the socket to be received
-    transmit_queue_bytes: int = 0  # frames that wait in the socket to be sent
-    log_queue_bytes: int = 0  # what waits for the log's writer
+    compute_ns: int  # last cyclic frame received to last command handed to the bus
+    slack_ns: int  # last command handed to the bus to the next grid point; negative: overrun
+    data_age: int  # cycles, of the oldest value that was used
+    overruns: int  # periods skipped since the run began
+    frames_missing: int  # cyclic frames of this cycle that did not arrive or failed their checks
+    commands_late: int  # commands of the cycle before that were not on the bus at this SYNC: they act at the next
+    frames_lost: int  # received frames that the kernel dropped since the run began
+    receive_queue_bytes: int  # what waits to be received, in memory of the kernel
+    transmit_queue_bytes: int  # what waits to be sent, in memory of the kernel
+    log_queue_bytes: int  # what waits for the log's writer
 
 
 class FrameChecks(NamedTuple):

@@ -243,7 +243,7 @@ def _queue_panel(axes: Axes, columns: CycleColumns, time_s: Vector) -> None:
     axes.set_ylim(-0.08 * _QUEUE_LINEAR_BYTES, top)
     _label_levels(axes, [0.0, *(10.0**power for power in range(2, round(np.log10(top)) + 1))])
     axes.set_ylabel("bytes")
-    axes.set_title("Queues — of the socket, to be received and to be sent, and to the log's writer")
+    axes.set_title("Queues — of the bus, to be received and to be sent, and to the log's writer")
     axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.035), ncols=len(handles), columnspacing=1.6)
 
 

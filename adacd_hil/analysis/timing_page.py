@@ -17,8 +17,8 @@ _COUNTS: Final = {
     "frames_lost": "received frames dropped by the kernel",
 }
 _QUEUES: Final = {
-    "receive": "receive queue of the socket",
-    "transmit": "transmit queue of the socket",
+    "receive": "receive queue of the bus",
+    "transmit": "transmit queue of the bus",
     "log": "queue to the log's writer",
 }
 

@@ -33,11 +33,11 @@ class ZeroTorqueCycle(NamedTuple):
     command_ns: int
     frames: list[tuple[bool, Frame]]
     late_commands: int
-    compute_ns: int = 0
-    slack_ns: int = 0
-    frames_lost: int = 0
-    receive_queue_bytes: int = 0
-    transmit_queue_bytes: int = 0
+    compute_ns: int
+    slack_ns: int
+    frames_lost: int
+    receive_queue_bytes: int
+    transmit_queue_bytes: int
 
 
 class ZeroTorqueLoop:
@@ -117,4 +117,7 @@ class ZeroTorqueLoop:
             late_commands=self._exchange.late_commands.count,
             compute_ns=handed_ns - self._exchange.feedback_ns,
             slack_ns=tick.t_ns + self._period_ns - handed_ns,
+            frames_lost=bus.frames_lost,
+            receive_queue_bytes=self._exchange.queues.received,
+            transmit_queue_bytes=self._exchange.queues.sent,
         )

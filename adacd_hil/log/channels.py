@@ -177,8 +177,8 @@ _CYCLE = (
     Member("frames_missing", "uint64", meaning="cyclic frames that did not arrive or failed their checks"),
     Member("commands_late", "uint64", meaning="commands of the cycle before that missed this SYNC and act at the next"),
     Member("frames_lost", "uint64", meaning="received frames that the kernel dropped since the run began"),
-    Member("receive_queue_bytes", "uint64", meaning="waits in the socket to be received, bytes"),
-    Member("transmit_queue_bytes", "uint64", meaning="waits in the socket to be sent, bytes"),
+    Member("receive_queue_bytes", "uint64", meaning="waits to be received, bytes of the kernel's memory"),
+    Member("transmit_queue_bytes", "uint64", meaning="waits to be sent, bytes of the kernel's memory"),
     Member("log_queue_bytes", "uint64", meaning="waits for the log's writer, bytes"),
 )
 _DEVICES = ("drive1", "drive2", "sensor1", "sensor2")

@@ -111,7 +111,9 @@ def test_a_run_that_begins_in_react_reacts_in_its_first_cycle():
 
 
 def test_columns_of_records_are_those_of_a_log():
-    made = columns_of_records([7, 8], [CycleRecord(0, 1, 2, 3, 4, -5), CycleRecord(1, 10, 20, 30, 40, 50, overruns=2)])
+    made = columns_of_records(
+        [7, 8], [CycleRecord(0, 1, 2, 3, 4, -5, *[0] * 8), CycleRecord(1, 10, 20, 30, 40, 50, 0, 2, *[0] * 6)]
+    )
     assert (made["slack_ns"].tolist(), made["overruns"].tolist(), made.t_ns.tolist()) == ([-5, 50], [0, 2], [7, 8])
 
 

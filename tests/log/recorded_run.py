@@ -104,7 +104,20 @@ def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123, has_fd=Fa
             control=generator.normal(size=CONTROL_LAYOUT.size),
             gate_flags=number % 251,
             record=CycleRecord(
-                number, -number, 3 * number, 2**40 + number, number, -7, 2, 7, number % 5, number % 3, 4
+                number,
+                -number,
+                3 * number,
+                2**40 + number,
+                number,
+                -7,
+                2,
+                7,
+                number % 5,
+                number % 3,
+                4,
+                number % 11,
+                9,
+                8,
             ),
             frames=_frames(generator, t_ns, number),
         )
