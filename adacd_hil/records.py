@@ -239,8 +239,8 @@ class CycleRecord(NamedTuple):
     frames_missing: int  # cyclic frames of this cycle that did not arrive or failed their checks
     commands_late: int  # commands of the cycle before that were not on the bus at this SYNC: they act at the next
     frames_lost: int  # received frames that the kernel dropped since the run began
-    receive_queue_bytes: int  # what waits to be received, in memory of the kernel
-    transmit_queue_bytes: int  # what waits to be sent, in memory of the kernel
+    receive_queue_bytes: int  # waits to be received when last looked, memory of the kernel
+    transmit_queue_bytes: int  # waits to be sent when last looked, memory of the kernel
     log_queue_bytes: int  # what waits for the log's writer
 
 

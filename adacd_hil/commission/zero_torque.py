@@ -48,6 +48,7 @@ class ZeroTorqueLoop:
     ) -> None:
         self.pacer = make_pacer(settings, clock, bus, arm.sync_id)
         self._period_ns = settings.bus.period_ns
+        self._is_following = settings.bus.follows
         self._clock = clock
         self._bus, self._arm, self._master = bus, arm, master
         self._is_enabling = is_enabling
@@ -106,6 +107,8 @@ class ZeroTorqueLoop:
         bus.held_ns = self.pacer.spend(self._exchange.feedback_ns)
         arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
         handed_ns = clock.now_ns()
+        # Where SYNC is followed, it is the grid point itself, however late this host woke up for it.
+        late_ns = 0 if self._is_following else tick.lateness_ns
         if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()
         return ZeroTorqueCycle(
@@ -116,7 +119,7 @@ class ZeroTorqueLoop:
             frames=bus.take(),
             late_commands=self._exchange.late_commands.count,
             compute_ns=handed_ns - self._exchange.feedback_ns,
-            slack_ns=tick.t_ns + self._period_ns - handed_ns,
+            slack_ns=tick.t_ns - late_ns + self._period_ns - handed_ns,
             frames_lost=bus.frames_lost,
             receive_queue_bytes=self._exchange.queues.received,
             transmit_queue_bytes=self._exchange.queues.sent,

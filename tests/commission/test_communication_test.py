@@ -7,6 +7,7 @@ from bench_bus import PERIOD_NS, BenchBus
 from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict, judge
 from adacd_hil.commission.zero_torque import DISABLE_CYCLES, ZeroTorqueLoop
 from adacd_hil.records import FaultReason
+from adacd_hil.wire.bus import QueueBytes
 from adacd_hil.wire.codec import load_codec
 
 COMMAND = load_codec().message("Drive1Command")
@@ -105,6 +106,22 @@ def test_skipped_periods_count_as_without_data() -> None:
     assert (report.overruns, report.cycles, report.periods) == (20, 180, 200)
     assert (report.share, report.verdict) == (0.9, Verdict.WARNING)
     assert report.columns["lateness_ns"].max() == 5_000
+    assert np.median(report.columns["slack_ns"]) - report.columns["slack_ns"].min() == 5_000
+    assert report.columns["overruns"][[49, 51, -1]].tolist() == [0, 20, 20]
+
+
+def test_the_record_of_a_cycle_has_its_queues_and_what_was_lost(monkeypatch) -> None:
+    rig = BenchBus()
+    monkeypatch.setattr(type(rig.bus), "queue_bytes", lambda bus: QueueBytes(700, 1400))
+    monkeypatch.setattr(type(rig.bus), "frames_lost", 3, raising=False)
+    rig.start()
+    loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
+    test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
+    records = []
+    loop.run(0.02, lambda cycle: records.append(test.observe(cycle, log_queue_bytes=99)))
+    last = records[-1]
+    assert (last.receive_queue_bytes, last.transmit_queue_bytes, last.log_queue_bytes) == (700, 1400, 99)
+    assert (last.frames_lost, last.data_age) == (3, 0)
 
 
 @pytest.mark.parametrize(
