@@ -491,6 +491,12 @@ class RealtimeSettings:
         high=1000.0,
         meaning="how long to read the clock before SYNC is due; -1: by measurement",
     )
+    sample_period: str = setting(
+        "measured",
+        choices=("measured", "nominal"),
+        meaning="interval that the scheme integrates over: between SYNCs, or `bus.period_us` as for a simulated arm "
+        "that moves by whole periods; lockstep is nominal",
+    )
     misses: int = setting(10, low=1, high=1_000_000, meaning="skipped periods in the window that are too many")
     misses_window_s: float = setting(1.0, unit="s", low=0.01, high=60.0, meaning="in which they are counted")
     on_misses: str = setting(

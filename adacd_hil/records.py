@@ -86,6 +86,7 @@ def scheme_layout(parameter_count: int) -> Layout:
             Field("threshold", JOINTS, "Nm", "detection threshold in force, inf while detection is off"),
             Field("quiet_s", 1, "s", "how long eq. (15) has held"),
             Field("excitation", 1, "Nm² s", "smallest eigenvalue of the scaled information matrix of this adaptation"),
+            Field("period_s", 1, "s", "measured time since the sample before"),
         )
     )
 

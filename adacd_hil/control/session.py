@@ -3,7 +3,7 @@
 import platform
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,6 +101,9 @@ class Session:
 
         Raises LogError when the log can't be created.
         """
+        if self.is_lockstep:  # a simulated arm moves by whole periods, however late the modelled host sends SYNC
+            realtime = replace(self.settings.realtime, sample_period="nominal")
+            self.settings = replace(self.settings, realtime=realtime)
         tap = Tap(self.bus, self.clock)
         pacer = make_pacer(self.settings, self.clock, tap, self.codec.message("Sync").can_id)
         self.progress("compiling")

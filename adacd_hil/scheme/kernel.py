@@ -4,10 +4,16 @@ Three structured arrays of one element each carry everything, so that fields hav
 
 - constants: what the settings say, never written here;
 - memory: what lasts from one cycle to the next and is nobody's business outside;
-- block: `records.scheme_layout`, filled in every cycle. q, dq and tau_J are put there by the caller.
+- block: `records.scheme_layout`, filled in every cycle. q, dq, tau_J and the measured period_s are put there by the
+  caller; a period_s of 0 was not measured.
 
 A cycle without fresh data (a lost frame, a value that is not a number) leaves filters and estimate as they were and
-makes a gap; the next fresh sample resumes as `filters` says.
+makes a gap; the next fresh sample resumes as `filters` says. So does one after skipped periods, or after an interval
+that is not near the nominal one.
+
+The measured interval goes into what integrates: filters, estimator, information, impulse. It does not go into what only
+counts: T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period. Nor does it into
+`contact.undo_filter`: of the mean of five derivatives only the ends count, and the five periods between them.
 """
 
 from enum import IntFlag
@@ -46,6 +52,11 @@ _AT_REST = int(Observation.AT_REST)
 _UNLOADED = int(Observation.UNLOADED)
 _ADAPTED = int(Observation.ADAPTED)
 _CONTACT = int(Observation.CONTACT)
+
+# Shares of the nominal period: the shortest and the longest interval of two samples that follow each other.
+_SHORTEST_SHARE = 0.5
+_LONGEST_SHARE = 1.5
+
 CONTACT_SHIFT = 8
 """The joints over their threshold are the bits of `Observation` from here on."""
 
@@ -70,7 +81,6 @@ def constants_of(settings: Settings) -> Structured:
         "decay": hold.decay,
         "weight_old": hold.weight_old,
         "weight_new": hold.weight_new,
-        "R": 1.0 / period_s,
         "is_least_squares": float(settings.estimator.law == "least_squares"),
         "P0": settings.estimator.P0,
         "theta_cad": settings.cad_theta if settings.arm.cad_theta else np.zeros(count),
@@ -169,18 +179,21 @@ def step(
     is_complete: 1 if all values are this cycle's. periods: since the previous step. mode: LEARN, ARMED, REPORTING.
     """
     c, m, out = constants[0], memory[0], block[0]
+    if out["period_s"][0] == 0.0:
+        out["period_s"][0] = c["period_s"]
+    period_s = c["period_s"]
     observation = _observe(c, out)
     is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
     if is_fresh:
-        _filter(c, m, out, periods)
+        period_s = _filter(c, m, out, periods)
         if mode & LEARN:
-            observation |= _learn(c, m, out)
+            observation |= _learn(c, m, out, period_s)
         if not (np.all(np.isfinite(out["tau_ext_hat"])) and np.all(np.isfinite(out["theta_hat"]))):
             observation |= _NOT_A_NUMBER
     else:
         m["has_gap"] = 1.0
     if mode & ARMED:
-        return observation | _watch(c, m, out, is_fresh, mode & REPORTING != 0)
+        return observation | _watch(c, m, out, period_s, is_fresh, mode & REPORTING != 0)
     out["threshold"][:] = np.inf
     m["integral"][:] = 0.0
     m["peak"][:] = 0.0
@@ -205,32 +218,42 @@ def _observe(c: Any, out: Any) -> int:
 
 
 @compiled
-def _filter(c: Any, m: Any, out: Any, periods: int) -> None:
-    """Take the filters to this sample and estimate the external torque with both models."""
+def _filter(c: Any, m: Any, out: Any, periods: int) -> float:
+    """Take the filters to this sample and estimate the external torque with both models.
+
+    Return the time that the sample stands for: the measured interval, or after a gap the nominal one.
+    """
     regressor.fill_momentum(out["q"], out["dq"], m["Y_p"])
     regressor.fill_remainder(out["q"], out["dq"], m["Y_h"])
     a, b = c["a_rad_s"], c["b_rad_s"]
-    if m["has_gap"] != 0.0 or periods != 1:
+    nominal_s: float = c["period_s"]
+    period_s: float = out["period_s"][0]
+    decay, old, new = c["decay"], c["weight_old"], c["weight_new"]
+    is_near = _SHORTEST_SHARE * nominal_s <= period_s <= _LONGEST_SHARE * nominal_s
+    if m["has_gap"] != 0.0 or periods != 1 or not is_near:
+        period_s = nominal_s
         filters.resume(a, b, m["Y_p"], m["Y_h"], out["tau_J"], m["input_old"], m["tau_old"], m["S"], m["W_f"])
         m["has_gap"] = 0.0
     else:
-        decay, old, new = c["decay"], c["weight_old"], c["weight_new"]
+        if period_s != nominal_s:
+            decay, old, new = filters.first_order_hold(a, b, period_s)
         filters.advance_torque(decay, old, new, m["tau_old"], out["tau_J"], out["tau_f"])
         filters.advance_regressor(decay, old, new, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
-    detector.follow_standstill(out["dq"], c["standstill_rad_s"], c["decay"], m["standstill"])
+    detector.follow_standstill(out["dq"], c["standstill_rad_s"], decay, m["standstill"])
     detector.predict(m["W_f"], out["theta_hat"], out["tau_f_hat"])
     detector.predict(m["W_f"], c["theta_cad"], out["tau_f_cad"])
     detector.estimate_external(out["tau_f"], out["tau_f_hat"], c["dc_gain"], out["tau_ext_hat"])
     detector.estimate_external(out["tau_f"], out["tau_f_cad"], c["dc_gain"], out["tau_ext_hat_cad"])
     contact.undo_filter(out["tau_ext_hat"], c["decay"], m["history"], out["tau_ext_wide_hat"])
+    return period_s
 
 
 @compiled
-def _learn(c: Any, m: Any, out: Any) -> int:
+def _learn(c: Any, m: Any, out: Any, period_s: float) -> int:
     """Judge the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
     termination.widen(out["q"], m["q_low"], m["q_high"])
     termination.widen(out["dq"], m["dq_low"], m["dq_high"])
-    termination.add_information(m["W_f"], c["period_s"], m["information"])
+    termination.add_information(m["W_f"], period_s, m["information"])
     if m["samples"] % termination.EXCITATION_EVERY == termination.EXCITATION_EVERY - 1:
         out["excitation"][0] = termination.smallest_eigenvalue(m["information"], c["scale"], m["scratch"])
     m["samples"] += 1.0
@@ -243,14 +266,13 @@ def _learn(c: Any, m: Any, out: Any) -> int:
             m["q_low"], m["q_high"], m["dq_low"], m["dq_high"], c["travel_rad"], c["velocity_rad_s"]
         )
     )
-    estimator.update(
-        m["W_f"], out["tau_f"], c["R"], c["is_least_squares"] != 0.0, out["theta_hat"], m["P"], m["v"], m["K"]
-    )
+    R = 1.0 / period_s
+    estimator.update(m["W_f"], out["tau_f"], R, c["is_least_squares"] != 0.0, out["theta_hat"], m["P"], m["v"], m["K"])
     return _ADAPTED if is_over else 0
 
 
 @compiled
-def _watch(c: Any, m: Any, out: Any, is_fresh: bool, is_reporting: bool) -> int:
+def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
     """Compare with the thresholds; return CONTACT and the joints that are over, if any."""
     F_c = out["theta_hat"][regressor.F_C1 : regressor.F_C2 + 1]
     detector.fill_threshold(c["threshold_Nm"], m["standstill"], F_c, out["threshold"])
@@ -259,7 +281,7 @@ def _watch(c: Any, m: Any, out: Any, is_fresh: bool, is_reporting: bool) -> int:
             out["tau_ext_hat"],
             out["tau_ext_wide_hat"],
             out["threshold"],
-            c["period_s"],
+            period_s,
             is_reporting,
             m["integral"],
             m["peak"],
@@ -277,10 +299,13 @@ def step_record(
     tau_J: Vector,
     is_complete: Vector,
     periods: Vector,
+    period_s: Vector,
     mode: int,
     blocks: Structured,
 ) -> None:
-    """Run `step` over n samples in one mode: q, dq, tau_J (n, 2); is_complete, periods (n,) int64; fills blocks (n,).
+    """Run `step` over n samples in one mode; fills blocks (n,).
+
+    q, dq, tau_J (n, 2); is_complete, periods (n,) int64; period_s (n,), 0 where it was not measured.
 
     blocks[0] must hold the theta_hat to begin with.
     """
@@ -291,4 +316,5 @@ def step_record(
         block[0]["q"][:] = q[k]
         block[0]["dq"][:] = dq[k]
         block[0]["tau_J"][:] = tau_J[k]
+        block[0]["period_s"][0] = period_s[k]
         step(constants, memory, block, is_complete[k], periods[k], mode)

@@ -37,6 +37,9 @@ class Pipeline:
         self._q = self._values[places["q"]]
         self._dq = self._values[places["dq"]]
         self._tau_J = self._values[places["tau_J"]]
+        self._period_s = self._values[places["period_s"]]
+        self._is_measuring = settings.realtime.sample_period == "measured"
+        self._t_ns: int | None = None
         self._theta_hat = places["theta_hat"]
         self._tau_ext_hat = places["tau_ext_hat"]
         self._integral = self._memory[0]["integral"]
@@ -61,6 +64,7 @@ class Pipeline:
         self._q[:] = arm.q
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
+        self._period_s[0] = self._measure(arm.t_ns)
         mode = _MODES[previous] | (kernel.REPORTING if isolation.is_open else 0)
         observation = kernel.step(
             self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), mode
@@ -84,6 +88,14 @@ class Pipeline:
             contact=contact,
             block=block,
         )
+
+    def _measure(self, t_ns: int) -> float:
+        """Return the time since the cycle before, s; 0 where that is unknown or not to be used."""
+        if not self._is_measuring:
+            return 0.0
+        period_s = 0.0 if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
+        self._t_ns = t_ns
+        return period_s
 
     def _enter(self, state: SchemeState, previous: SchemeState, cycle: int, joints: int) -> None:
         """Do what a new state begins with, and what the previous one ends with."""

@@ -34,7 +34,7 @@ def torque_of(q, dq, ddq, theta, tau_ext=None):
     return tau if tau_ext is None else tau - tau_ext
 
 
-def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, periods=None):
+def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, periods=None, period_s=None):
     """Run the compiled step over a record; return blocks (n, size)."""
     count = q.shape[0]
     ones = np.ones(count, dtype=np.int64)
@@ -51,6 +51,7 @@ def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, period
         np.ascontiguousarray(tau_J),
         ones if is_complete is None else is_complete,
         ones if periods is None else periods,
+        np.zeros(count) if period_s is None else period_s,
         mode,
         blocks,
     )

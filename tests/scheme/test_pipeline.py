@@ -467,3 +467,48 @@ def test_nothing_compiles_in_the_cycle():
 
 def compiled_versions():
     return [len(getattr(function, "signatures", ())) for function in (kernel.step, kernel.begin_adaptation)]
+
+
+def residuals_at(lateness_ns, epoch_ns=0, sample_period="measured"):
+    """Run the pipeline over a motion whose SYNCs are late; return the CAD model's residual and the periods."""
+    theta = THETA["M"] * [1, 1, 1, 1, 1, 0, 0]
+    settings = settings_with(arm={"cad_theta": theta.tolist()}, realtime={"sample_period": sample_period})
+    pipeline = Pipeline(settings)
+    t_ns = [cycle * 1_000_000 + late for cycle, late in enumerate(lateness_ns)]
+    q, dq, ddq = smooth_motion(np.array(t_ns) * 1e-9)
+    tau_J = torque_of(q, dq, ddq, theta)
+    blocks = []
+    for cycle, stamp_ns in enumerate(t_ns):
+        arm = ArmState(
+            cycle, epoch_ns + stamp_ns, 1, q[cycle], dq[cycle], tau_J[cycle], (0, 0), (0, 0), is_enabled=False,
+            is_complete=True, fault=FaultReason.NONE,
+        )  # fmt: skip
+        blocks.append(pipeline.step(arm).block)
+    places = scheme_layout(7).slices
+    return tuple(np.array(blocks)[:, places[name]] for name in ("tau_ext_hat_cad", "period_s"))
+
+
+LATENESS_NS = np.random.default_rng(5).integers(0, 300_000, 400).tolist()
+
+
+def test_the_interval_is_that_of_the_stamps():
+    residual, period_s = residuals_at(LATENESS_NS)
+    np.testing.assert_array_equal(period_s[1:, 0], (1_000_000 + np.diff(LATENESS_NS)) * 1e-9)
+    assert period_s[0] == 1e-3
+    assert np.max(np.abs(residual)) < 2e-5
+
+
+def test_an_arm_that_moves_by_whole_periods_is_counted_by_whole_periods():
+    residual, period_s = residuals_at(LATENESS_NS, sample_period="nominal")
+    assert np.all(period_s == 1e-3)
+    assert np.max(np.abs(residual)) > 1e-4  # this arm does not
+
+
+def test_the_stamps_of_a_log_give_the_same_bits_whenever_it_was_recorded():
+    here, later = (residuals_at(LATENESS_NS, epoch_ns) for epoch_ns in (0, 1_790_000_000_123_456_789))
+    assert (here[0].tobytes(), here[1].tobytes()) == (later[0].tobytes(), later[1].tobytes())
+
+
+def test_samples_that_are_on_time_are_those_of_the_nominal_period():
+    measured, nominal = (residuals_at([0] * 100, sample_period=name) for name in ("measured", "nominal"))
+    assert (measured[0].tobytes(), measured[1].tobytes()) == (nominal[0].tobytes(), nominal[1].tobytes())
