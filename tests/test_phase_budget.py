@@ -95,3 +95,15 @@ def test_pipelined_commands_leave_behind_sync_and_are_never_late(tmp_path: Path)
     first = next(index for index, can_id in enumerate(arrived) if can_id == 0x201)
     assert log.cycle["commands_late"].max() == 0
     assert [can_id for can_id in arrived[first - 1 : first + 5] if can_id != 0x77F] == [0x080, 0x201, 0x202] * 2
+
+
+def test_the_record_of_a_cycle_says_what_the_work_took_and_what_was_left(tmp_path: Path) -> None:
+    log, _ = play(tmp_path, latency_us=120.0)
+    cycle = log.cycle
+    assert usual(cycle["compute_ns"]) == 120_000
+    assert usual(cycle["command_ns"]) == 565_000 + 120_000
+    assert usual(cycle["slack_ns"]) == 1_000_000 - 685_000
+    assert np.array_equal(
+        cycle["lateness_ns"] + cycle["command_ns"] + cycle["slack_ns"], np.full(len(cycle), 1_000_000)
+    )
+    assert usual(cycle["data_age"]) == 0

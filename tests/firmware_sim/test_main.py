@@ -148,6 +148,13 @@ def serve(
     return bus, bench, clock
 
 
+def test_all_that_answers_a_sync_is_handed_over_at_once(monkeypatch):
+    handed_over = []
+    monkeypatch.setattr(ScriptedBus, "send_all", lambda _, frames: handed_over.append([can_id for can_id, _ in frames]))
+    serve([(0, *START_ALL), (1, 0x080, b"\x01"), (2, 0x080, b"\x02")], 3)
+    assert handed_over[-1] == [0x181, 0x182, 0x183, 0x184]
+
+
 HEARTBEAT_100_MS = (0x601, bytes([0x2B, 0x17, 0x10, 0, 100, 0, 0, 0]))
 START_ALL = (0x000, bytes([START, 0]))
 
