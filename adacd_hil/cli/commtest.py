@@ -120,7 +120,7 @@ def _open_log(out: Path, settings: Settings, codec: Codec, connection: Connectio
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(
         out / LOG_NAME,
-        codec_path=codec.path,
+        messages=codec.messages.values(),
         attachments={codec.path.name: codec.text, "config.toml": to_toml(settings).encode()},
         metadata={
             "command": "commtest",

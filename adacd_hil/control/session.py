@@ -196,7 +196,7 @@ class Session:
             attachments[TARE_NAME] = self.tare.text
         return Recorder(
             self.out / LOG_NAME,
-            codec_path=self.codec.path,
+            messages=self.codec.messages.values(),
             parameter_count=len(self.settings.estimator.parameter_names),
             attachments=attachments,
             metadata=self._metadata(grant),
