@@ -117,7 +117,7 @@ def _open_log(
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(
         out / LOG_NAME,
-        codec_path=codec.path,
+        messages=codec.messages.values(),
         attachments={codec.path.name: codec.text, "config.toml": to_toml(settings).encode()},
         metadata={
             "command": "commtest",

@@ -208,7 +208,7 @@ class Session:
         with grant.unpinned():
             return Recorder(
                 self.out / LOG_NAME,
-                codec_path=self.codec.path,
+                messages=self.codec.messages.values(),
                 parameter_count=len(self.settings.estimator.parameter_names),
                 attachments=attachments,
                 metadata={**self._metadata(grant), **spin},

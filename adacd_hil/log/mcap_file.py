@@ -171,7 +171,8 @@ class McapFile:
             entries["offset"] = starts[first:stop] + (len(self._chunk) - start)
             self._entries.append((channels[first:stop], entries))
             self._chunk += records[start : starts[stop]].data
-            self._packets += int(np.diff(np.searchsorted(packet_ends, (first, stop), side="right"))[0])
+            done = np.searchsorted(packet_ends, (first, stop), side="right")
+            self._packets += int(done[1] - (done[0] if first else 0))
             if last < len(ends):
                 self._end_chunk()
             first = stop

@@ -12,18 +12,19 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
 from adacd_hil.config import LogSettings
 from adacd_hil.log import packet, words
+from adacd_hil.log.channels import MessageLike
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.ring import Ring
-from adacd_hil.log.setup import Setup
+from adacd_hil.log.setup import Setup, tell_messages
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.wire.bus import Frame
 
@@ -58,7 +59,7 @@ class Recorder:
         self,
         path: Path,
         *,
-        codec_path: Path | None = None,
+        messages: Iterable[MessageLike] | None = None,
         parameter_count: int = len(PARAMETER_NAMES),
         attachments: Mapping[str, bytes] | None = None,
         metadata: Mapping[str, str] | None = None,
@@ -69,8 +70,8 @@ class Recorder:
     ) -> None:
         """Create the file, replacing the log that is there with all its parts, and start the writer.
 
-        codec_path: the DBC, default the one that comes with the package. epoch_ns: added to t_ns for the log's times;
-        0 in lockstep. is_truth: the emulator's own log, /truth and /events only. Raises LogError.
+        messages: of the DBC, default those of the one that comes with the package. epoch_ns: added to t_ns for the
+        log's times; 0 in lockstep. is_truth: the emulator's own log, /truth and /events only. Raises LogError.
         """
         settings = settings or LogSettings()
         own = {
@@ -90,7 +91,7 @@ class Recorder:
             path=path.absolute(),
             is_truth=is_truth,
             is_blocking=blocking,
-            codec_path=codec_path,
+            messages=() if is_truth else tell_messages(_own_messages() if messages is None else messages),
             parameter_count=parameter_count,
             epoch_ns=epoch_ns,
             part_bytes=settings.part_MiB * _MIB,
@@ -208,7 +209,7 @@ class Recorder:
             counts = int(word["frames"]), int(word["messages"]), dropped
             is_complete = not word["error"] and dropped == 0
             return LogSummary(self.path, *counts, is_complete, word["error"], int(word["parts"]), peak)
-        self.dropped += self._ring.waiting_packets()
+        self.dropped += self._ring.packets - self._ring.written
         return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
@@ -252,6 +253,13 @@ def _create(path: Path) -> int:
         os.close(file)
         raise LogError(f"log {path}: a part of the log before can't be removed: {error}") from None
     return file
+
+
+def _own_messages() -> Iterable[MessageLike]:
+    # Takes 0.2 s, which whoever has a codec can spare.
+    from adacd_hil.wire.codec import load_codec
+
+    return load_codec().messages.values()
 
 
 def _module_path() -> str:

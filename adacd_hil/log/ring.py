@@ -2,8 +2,8 @@
 
 Neither side calls the system for it, and neither waits for the other. The memory begins with a page of counts, each an
 aligned uint64 that one side alone writes: HEAD, bytes ever put; TAIL, bytes ever taken; DROPPED, packets that were not
-put; PEAK, most bytes that were found waiting. Then the ring: a packet is its size in 4 bytes, its bytes, and what fills
-up to 8; one that reaches the end goes on at the beginning.
+put; PEAK, most bytes that were found waiting; WRITTEN, packets that are on the disk. Then the ring: a packet is its
+size in 4 bytes, its bytes, and what fills up to 8; one that reaches the end goes on at the beginning.
 
 HEAD moves last: a process that is killed in between leaves whole packets only. That the other side sees the bytes
 before it sees HEAD is left to the processor, which on x86-64 keeps the order of what it writes; elsewhere some 10 ns
@@ -17,7 +17,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-_HEAD, _TAIL, _DROPPED, _PEAK = range(4)
+_HEAD, _TAIL, _DROPPED, _PEAK, _WRITTEN = range(5)
 _COUNTS_BYTES = mmap.PAGESIZE
 _SIZE = struct.Struct("<I")
 _GRAIN = 8
@@ -75,6 +75,8 @@ class Ring(_SharedRing):
         # Each page once, so that the cycle meets none for the first time.
         for place in range(0, len(self._memory), mmap.PAGESIZE):
             self._memory[place] = 0
+        self.packets = 0
+        """Packets that were put."""
         self._head = 0
         self._room_until = self.capacity  # HEAD can go so far by the TAIL that was last looked at
 
@@ -97,16 +99,17 @@ class Ring(_SharedRing):
             self._memory[start:] = packet[:room]
             self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - room] = packet[room:]
         self._head = self._counts[_HEAD] = end
+        self.packets += 1
         return True
 
     def count_dropped(self, dropped: int) -> None:
         """Say how many packets were not put."""
         self._counts[_DROPPED] = dropped
 
-    def waiting_packets(self) -> int:
-        """Count the packets that were not taken."""
-        tail = self._counts[_TAIL]
-        return len(split(self._copy(tail, self._head - tail))[0])
+    @property
+    def written(self) -> int:
+        """Packets that are on the disk."""
+        return self._counts[_WRITTEN]
 
     def close(self) -> None:
         """Release the memory."""
@@ -121,6 +124,10 @@ class RingReader(_SharedRing):
     def dropped(self) -> int:
         """Packets that were not put."""
         return self._counts[_DROPPED]
+
+    def count_written(self, packets: int) -> None:
+        """Say that so many more packets are on the disk."""
+        self._counts[_WRITTEN] += packets
 
     def take(self, most: int) -> bytes:
         """Take whole packets of up to `most` bytes in all, or a longer one by itself; b"" when none is waiting."""

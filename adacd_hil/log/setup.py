@@ -1,15 +1,47 @@
-"""What the writer is told at its start, as JSON on its standard input."""
+"""What the writer is told at its start, as JSON on its standard input.
+
+The messages of the DBC are told too, as far as frames are decoded by them: to read a DBC takes longer than all else
+that the writer does before it is ready.
+"""
 
 import base64
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+
+from adacd_hil.log.channels import MessageLike
+
+
+@dataclass(frozen=True)
+class ToldSignal:
+    """A signal of a DBC message; the fields are those of `SignalLike`."""
+
+    name: str
+    unit: str
+    scale: float
+    offset: float
+    container: int
+    shift: int
+    mask: int
+    raw_low: int
+    raw_high: int
+
+
+@dataclass(frozen=True)
+class ToldMessage:
+    """A message of a DBC."""
+
+    name: str
+    can_id: int
+    length: int
+    signals: tuple[ToldSignal, ...]
 
 
 @dataclass(frozen=True)
 class Setup:
-    """`codec_path` None is the DBC that comes with the package; `is_truth` makes the emulator's own log.
+    """`messages`: of the DBC; `is_truth` makes the emulator's own log, which has none.
 
     `path`: absolute, of the first part. A part ends after `part_bytes` before compression or `part_ns` of log time,
     never where these are 0. `may_rotate`: the log is a file, which others can follow.
@@ -18,7 +50,7 @@ class Setup:
     path: Path
     is_truth: bool
     is_blocking: bool
-    codec_path: Path | None
+    messages: tuple[ToldMessage, ...]
     parameter_count: int
     epoch_ns: int
     part_bytes: int
@@ -31,7 +63,6 @@ class Setup:
         """Write it."""
         table: dict[str, Any] = asdict(self)
         table["path"] = str(self.path)
-        table["codec_path"] = None if self.codec_path is None else str(self.codec_path)
         table["attachments"] = {name: base64.b64encode(data).decode() for name, data in self.attachments.items()}
         return json.dumps(table).encode()
 
@@ -40,6 +71,23 @@ class Setup:
         """Read it."""
         table = json.loads(text)
         table["path"] = Path(table["path"])
-        table["codec_path"] = None if table["codec_path"] is None else Path(table["codec_path"])
+        table["messages"] = tuple(
+            ToldMessage(**{**message, "signals": tuple(ToldSignal(**signal) for signal in message["signals"])})
+            for message in table["messages"]
+        )
         table["attachments"] = {name: base64.b64decode(data) for name, data in table["attachments"].items()}
         return Setup(**table)
+
+
+def tell_messages(messages: Iterable[MessageLike]) -> tuple[ToldMessage, ...]:
+    """Put messages of a DBC into a form that can be told."""
+    names = [field.name for field in fields(ToldSignal)]
+    return tuple(
+        ToldMessage(
+            name=message.name,
+            can_id=message.can_id,
+            length=message.length,
+            signals=tuple(ToldSignal(*(getattr(signal, name) for name in names)) for signal in message.signals),
+        )
+        for message in messages
+    )

@@ -9,6 +9,7 @@ import contextlib
 import os
 import threading
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,8 +25,18 @@ class _Write(NamedTuple):
 class Sink:
     """What `McapFile` needs of a stream, over a file descriptor that it closes."""
 
-    def __init__(self, descriptor: int, waits: bool = True, most_waiting: int = WAITING_BYTES) -> None:
-        """Write to `descriptor`; `waits`: `write` waits rather than let more than `most_waiting` bytes wait."""
+    def __init__(
+        self,
+        descriptor: int,
+        waits: bool = True,
+        most_waiting: int = WAITING_BYTES,
+        on_written: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        """Write to `descriptor`.
+
+        waits: `write` waits rather than let more than `most_waiting` bytes wait. on_written: is told, by the thread,
+        how many packets each write has brought to the disk.
+        """
         self.error = ""
         """Why the file in progress ended early."""
         self.first_error = ""
@@ -36,6 +47,7 @@ class Sink:
         self._name = ""  # of a later file
         self._waits = waits
         self._most_waiting = most_waiting
+        self._on_written = on_written
         self._position = 0
         self._tasks: deque[_Write | Path | None] = deque()
         self._waiting = 0  # bytes
@@ -118,6 +130,7 @@ class Sink:
             try:
                 _write_all(self._descriptor, task.data)
                 self.written += len(task.data)
+                self._on_written(task.packets)
             except OSError as error:
                 self._fail(error)
                 with contextlib.suppress(OSError):  # not everything that can be written can be cut

@@ -23,7 +23,7 @@ import numpy as np
 
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.log import packet, words
-from adacd_hil.log.channels import MessageLike, run_channels, truth_channels
+from adacd_hil.log.channels import run_channels, truth_channels
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, McapFile
 from adacd_hil.log.packet_writer import Numbers, PacketWriter, Rows
@@ -33,8 +33,9 @@ from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
 
 FLUSH_PERIOD_NS = 250_000_000
-POLL_PERIOD_US = 10_000
-"""A writer asleep in the socket would have to be woken by the control process, which costs more than the packet."""
+POLL_PERIOD_US = 25_000
+"""How often the ring is looked into in real time. To be woken would cost the control process more than the packet does;
+to look costs the writer as much as to write two cycles."""
 RETRY_PERIOD_NS = 5_000_000_000
 """How long a disk that failed is left alone."""
 BATCH_BYTES = 256 * 1024
@@ -47,7 +48,7 @@ class WriterProcess:
     def __init__(
         self, connection: socket.socket, ring: RingReader, sink: Sink, setup: Setup, clock: Clock | None = None
     ) -> None:
-        messages = () if setup.is_truth else _dbc_messages(setup)
+        messages = setup.messages
         self._channels = truth_channels() if setup.is_truth else run_channels(setup.parameter_count, messages)
         self._connection = connection
         self._ring = ring
@@ -234,13 +235,6 @@ class WriterProcess:
         self._packets.lose(count)
 
 
-def _dbc_messages(setup: Setup) -> tuple[MessageLike, ...]:
-    # Takes 0.2 s, and the emulator's log does without.
-    from adacd_hil.wire.codec import load_codec
-
-    return tuple(load_codec(setup.codec_path).messages.values())
-
-
 def _send(connection: socket.socket, word: bytes) -> None:
     with contextlib.suppress(OSError):  # nobody is left to hear it
         connection.send(word)
@@ -259,8 +253,9 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
     error = ""
     try:
         setup = Setup.from_json(sys.stdin.buffer.read())
-        sink = Sink(file_descriptor, waits=setup.is_blocking)
-        process = WriterProcess(connection, RingReader(ring_descriptor), sink, setup)
+        ring = RingReader(ring_descriptor)
+        sink = Sink(file_descriptor, waits=setup.is_blocking, on_written=ring.count_written)
+        process = WriterProcess(connection, ring, sink, setup)
         sink.settle()
         error = sink.error
     except (LogError, OSError, ValueError) as reason:

@@ -171,7 +171,7 @@ def fd_contract(folder: Path) -> Path:
 
 
 def start(path: Path, run: Run, **options) -> Recorder:
-    options = {"blocking": True, **options}
+    options = {"blocking": True, "messages": CODEC.messages.values(), **options}
     return Recorder(
         path,
         parameter_count=run.parameter_count,

@@ -6,7 +6,6 @@ import os
 import re
 import socket
 import threading
-from dataclasses import replace
 
 import pytest
 from recorded_run import CODEC, make_run
@@ -17,7 +16,7 @@ from adacd_hil.log.packet import pack_cycle, pack_event
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.ring import Ring, RingReader
-from adacd_hil.log.setup import Setup
+from adacd_hil.log.setup import Setup, tell_messages
 from adacd_hil.log.sink import Sink
 from adacd_hil.log.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
 
@@ -52,7 +51,7 @@ class Writer:
             path=path,
             is_truth=False,
             is_blocking=False,
-            codec_path=CODEC.path,
+            messages=(),
             parameter_count=7,
             epoch_ns=0,
             part_bytes=0,
@@ -212,7 +211,7 @@ def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path,
 
 
 def test_the_setup_arrives_as_it_was_sent(tmp_path):
-    setup = Setup(tmp_path, True, False, None, 7, 5, 1, 2, True, {"a": b"\xff"}, {"b": "c"})
+    messages = tell_messages(CODEC.messages.values())
+    setup = Setup(tmp_path, True, False, messages, 7, 5, 1, 2, True, {"a": b"\xff"}, {"b": "c"})
     assert Setup.from_json(setup.to_json()) == setup
-    with_codec = replace(setup, codec_path=tmp_path)
-    assert Setup.from_json(with_codec.to_json()) == with_codec
+    assert len(messages) == len(CODEC.messages)

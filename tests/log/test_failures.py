@@ -21,6 +21,7 @@ from adacd_hil.config import LogSettings
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.setup import ToldMessage
 from adacd_hil.records import Event
 from adacd_hil.wire.bus import Frame
 
@@ -85,16 +86,16 @@ def test_a_killed_writer_costs_the_log_its_end_and_the_control_process_nothing(b
     os.kill(recorder.pid, signal.SIGKILL)
     assert wait_for_end(recorder.pid)
     feed(recorder, run.cycles[1500:])
-    lost = 500 + sum(cycle.event is not None for cycle in run.cycles[1500:])
     summary = recorder.close()
-    assert summary.dropped == recorder.dropped == lost
     assert not summary.is_complete
     assert summary.error == "the writer died (exit status -9)"
     log = read_log(tmp_path / "run.mcap")
     assert re.fullmatch(r"cut after \d+ bytes", log.problem)
     assert not log.is_complete
     count = len(log.scheme)
-    assert 1000 < count < 1500
+    assert 1000 < count <= 1500
+    lost = 2000 - count + sum(cycle.event is not None for cycle in run.cycles) - len(log.events)
+    assert lost <= summary.dropped <= lost + 300  # a chunk may be on the disk and not yet be counted
     assert log.scheme.block.tobytes() == run.blocks[:count].tobytes()
     assert log.attachments["run.toml"] == run.attachments["run.toml"]
 
@@ -221,11 +222,11 @@ def test_a_path_that_can_not_be_created_is_an_error_before_the_run(name, reason,
 
 
 @pytest.mark.slow
-def test_a_dbc_that_can_not_be_read_is_an_error_before_the_run_and_leaves_no_file(tmp_path):
-    dbc = tmp_path / "bad.dbc"
-    with pytest.raises(LogError, match=f"can't be written: DBC {dbc}: No such file"):
-        Recorder(tmp_path / "run.mcap", codec_path=dbc)
-    assert not (tmp_path / "run.mcap").exists()
+def test_messages_that_have_no_topic_are_an_error_before_the_run_and_leave_no_file(tmp_path):
+    path = tmp_path / "run.mcap"
+    with pytest.raises(LogError, match=f"^log {path} can't be written: .*adacd_hil_msgs/msg/Scheme is taken$"):
+        Recorder(path, messages=[ToldMessage("Scheme", 1, 0, ())])
+    assert not path.exists()
 
 
 @pytest.mark.slow

@@ -25,7 +25,8 @@ def run():
 def recorded(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fd")
     path = folder / "run.mcap"
-    return path, record(path, run, codec_path=fd_contract(folder)), load_codec(folder / "fd.dbc")
+    codec = load_codec(fd_contract(folder))
+    return path, record(path, run, messages=codec.messages.values()), codec
 
 
 @pytest.fixture(scope="module")
