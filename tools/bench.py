@@ -76,6 +76,7 @@ max_age_cycles = 100
 
 [realtime]
 misses = 1000000
+sample_period = "nominal"
 """
 
 
