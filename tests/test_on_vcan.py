@@ -80,6 +80,7 @@ command_patience_cycles = 250
 max_age_cycles = 100
 [realtime]
 misses = 1000000
+sample_period = "nominal"
 """
 
 

@@ -78,6 +78,7 @@ max_age_cycles = 100
 
 [realtime]
 misses = 1000000
+sample_period = "nominal"
 """
 
 

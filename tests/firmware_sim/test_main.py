@@ -219,7 +219,7 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
     monkeypatch.setattr("firmware_sim.main.MonotonicClock", lambda: clock)
     monkeypatch.setattr("firmware_sim.main.wall_ns", lambda: 10**18)
     monkeypatch.setattr("firmware_sim.main._open_bus", lambda *_: bus)
-    monkeypatch.setattr("firmware_sim.main.request_realtime", lambda request: RealtimeGrant("SCHED_OTHER"))
+    monkeypatch.setattr("firmware_sim.main.request_realtime", lambda: RealtimeGrant("SCHED_OTHER"))
     monkeypatch.setattr("firmware_sim.main.freeze_garbage", lambda: None)
     scenario = tmp_path / "scenario.toml"
     scenario.write_text(LOST_TORQUE)
