@@ -25,7 +25,7 @@ from unittest.mock import patch
 import cantools
 import numpy as np
 from numpy.typing import NDArray
-from side_by_side import BIN, ENVIRONMENT, ROOT, TimingError, as_text, compare, emulator
+from side_by_side import BIN, CHANNEL, ENVIRONMENT, ROOT, TimingError, as_text, compare, emulator
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
@@ -85,7 +85,7 @@ sample_period = "nominal"
 def main() -> int:
     """Run what was asked for."""
     parser = argparse.ArgumentParser(description="Benchmarks; prints percentiles in µs.")
-    parser.add_argument("--rounds", type=int, default=4, help="of yardstick, host, straightforward loop; default 4")
+    parser.add_argument("--rounds", type=int, default=3, help="of yardstick, host, straightforward loop; default 3")
     parser.add_argument("--seconds", type=float, default=8.0, help="of each block of a round; default 8")
     parser.add_argument("--side-by-side", action="store_true", help="the cycle beside the yardstick's only")
     parser.add_argument("--vcan", action="store_true", help="what runs on vcan only, on an interface vcan0 that is up")
@@ -238,7 +238,7 @@ def bench_vcan(chosen: argparse.Namespace) -> int:
     if not chosen.side_by_side and (status := bench_lockstep()):
         return status
     try:
-        described = compare("vcan0", chosen.rounds, chosen.seconds)
+        described = compare(chosen.rounds, chosen.seconds)
     except TimingError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 1
@@ -253,9 +253,9 @@ def bench_lockstep() -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "short.toml").write_text(SHORT_RUN)
-        where = ["-i", "socketcan", "-c", "vcan0"]
+        where = ["-i", "socketcan", "-c", CHANNEL]
         command = [BIN / "adacd-hil", "run", *where, "--config", folder / "short.toml", "--clock", "lockstep"]
-        with emulator("vcan0", "--scenario", "idle", folder=folder):
+        with emulator(CHANNEL, "--scenario", "idle", folder=folder):
             start_s = time.perf_counter()
             done = subprocess.run(
                 [*command, "--out", folder], capture_output=True, text=True, check=False, env=ENVIRONMENT

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +31,7 @@ from adacd_hil.wire.codec import contract_folder, load_codec
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+CHANNEL = "vcan0"
 HOST, YARDSTICK, STRAIGHTFORWARD = "host", "yardstick", "straightforward"
 SETTLE_S = 1.0
 WINDOW_S = 0.2
@@ -53,6 +54,7 @@ extends = "{base}"
 [bus]  # a machine that stalls is to be measured, not to fault the arm
 period_us = {period_us}
 command_patience_cycles = 250
+sync_patience_periods = 25.5
 max_age_cycles = 100
 heartbeat_ms = 1000
 
@@ -150,7 +152,7 @@ def children_of(pid: int) -> list[int]:
 
 
 @contextmanager
-def emulator(channel: str, *options: str, folder: Path) -> Any:
+def emulator(channel: str, *options: str, folder: Path) -> Iterator["subprocess.Popen[Any]"]:
     """Run the emulated arm while the block lasts. Raises TimingError when it doesn't begin."""
     complaints = folder / "emulator.stderr"
     with complaints.open("w") as stderr, (folder / "emulator.json").open("w") as stdout:
@@ -186,44 +188,53 @@ def take_window(pids: dict[str, int]) -> Window:
     return Window(t_ns, used)
 
 
-def run_block(
-    run: Run,
-    seconds: float,
-    period_us: int,
-    emulator_pid: int,
-    folder: Path,
-    act: Callable[["subprocess.Popen[str]", dict[str, int]], dict[str, Any]] | None = None,
-) -> Block:
-    """Run one block and read what it says. Raises TimingError.
+class Running:
+    """A process that has begun its cycles. `complaints`: what it says on stderr."""
 
-    `act` is called in place of waiting, with the process and the ids of all; it returns notes.
-    """
+    def __init__(self, process: "subprocess.Popen[str]", complaints: Path, has_logger: bool) -> None:
+        self.process = process
+        self.complaints = complaints
+        self.logger_pid = children_of(process.pid)[0] if has_logger else None
+        self.said = ""
+
+    def end(self) -> int:
+        """Send SIGINT, wait and return the exit status; what was printed is in `said`."""
+        self.process.send_signal(signal.SIGINT)
+        self.said, _ = self.process.communicate(timeout=END_LIMIT_S)
+        return self.process.returncode
+
+
+@contextmanager
+def running(run: Run, folder: Path) -> Iterator[Running]:
+    """Run one of the three while the block lasts. Raises TimingError when it doesn't begin its cycles."""
     complaints = folder / f"{run.name}.stderr"
     with complaints.open("w") as stderr:
         process = subprocess.Popen(run.command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=ENVIRONMENT)
     try:
         wait_for("running", process, complaints)
-        time.sleep(SETTLE_S)
-        pids = {run.name: process.pid, "emulator": emulator_pid}
-        if run.has_logger:
-            pids["logger"] = children_of(process.pid)[0]
-        windows = [take_window(pids)]
-        notes = act(process, pids) if act is not None else {}
-        begin_s = time.monotonic()
-        while act is None and time.monotonic() - begin_s < seconds and process.poll() is None:
-            time.sleep(WINDOW_S)
-            windows.append(take_window(pids))
-        if act is not None:
-            windows.append(take_window(pids))
-        process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=END_LIMIT_S)
+        yield Running(process, complaints, run.has_logger)
     finally:
         if process.poll() is None:
             process.kill()
             process.wait()
-    if process.returncode not in ENDED_WELL:
-        raise TimingError(f"{run.name} ended with status {process.returncode}: {complaints.read_text().strip()[-400:]}")
-    due_ns, times_ns, rest = run.read(said)
+
+
+def run_block(run: Run, seconds: float, period_us: int, emulator_pid: int, folder: Path) -> Block:
+    """Run one block and read what it says. Raises TimingError."""
+    with running(run, folder) as begun:
+        time.sleep(SETTLE_S)
+        pids = {run.name: begun.process.pid, "emulator": emulator_pid}
+        if begun.logger_pid is not None:
+            pids["logger"] = begun.logger_pid
+        windows = [take_window(pids)]
+        begin_s = time.monotonic()
+        while time.monotonic() - begin_s < seconds and begun.process.poll() is None:
+            time.sleep(WINDOW_S)
+            windows.append(take_window(pids))
+        status = begun.end()
+        if status not in ENDED_WELL:
+            raise TimingError(f"{run.name} ended with status {status}: {begun.complaints.read_text().strip()[-400:]}")
+    due_ns, times_ns, rest = run.read(begun.said)
     measured = (due_ns >= windows[0].t_ns) & (due_ns < windows[-1].t_ns)
     due_ns = due_ns[measured]
     if not len(due_ns):
@@ -237,7 +248,7 @@ def run_block(
         overruns=count_overruns(due_ns, period_us),
         frames_lost=rest.pop("frames_lost", 0),
         scheduler=rest.pop("scheduler", ""),
-        notes=rest | notes,
+        notes=rest,
     )
 
 
@@ -326,13 +337,17 @@ def patient_config(folder: Path, base: str = "paper", period_us: int = 1000, mor
 
 
 def measure(
-    runs: Sequence[Run], rounds: int, seconds: float, period_us: int, emulator_pid: int, folder: Path
+    runs: Sequence[Run], rounds: int, seconds: float, period_us: int, folder: Path, *devices: str
 ) -> dict[str, list[Block]]:
-    """Run the blocks in turn, each of `seconds`; progress on stderr. Raises TimingError."""
+    """Run the blocks in turn, each of `seconds` and with an emulator of its own; progress on stderr.
+
+    `devices`: options of the emulator. Raises TimingError.
+    """
     blocks: dict[str, list[Block]] = {run.name: [] for run in runs}
     for number in range(rounds):
         for run in runs:
-            block = run_block(run, seconds, period_us, emulator_pid, folder)
+            with emulator(CHANNEL, "--scenario", "idle", *devices, folder=folder) as played:
+                block = run_block(run, seconds, period_us, played.pid, folder)
             blocks[run.name].append(block)
             print(
                 f"round {number + 1}/{rounds}  {run.name:16} {block.cycles} cycles, {block.overruns} overruns, "
@@ -343,10 +358,19 @@ def measure(
     return blocks
 
 
-def percentiles_us(blocks: Sequence[Block], name: str) -> list[float]:
-    """Return p50, p99, p99.9 and the maximum of a time over all blocks, µs."""
-    values = np.concatenate([block.times_ns[name] for block in blocks])
-    return [float(value) * 1e-3 for value in np.percentile(values, SHARES)]
+def time_percentiles_us(times_ns: NDArray[np.int64]) -> list[float]:
+    """Return p50, p99, p99.9 and the maximum, µs; empty without a value."""
+    return [float(value) * 1e-3 for value in np.percentile(times_ns, SHARES)] if len(times_ns) else []
+
+
+def head(title: str) -> str:
+    """Lay out the line above rows of percentiles."""
+    return f"{title:50} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}"
+
+
+def row(name: str, values: Sequence[float]) -> str:
+    """Lay out one row of percentiles."""
+    return f"{name:50} " + " ".join(f"{value:8.1f}" for value in values)
 
 
 def ratios(above: Sequence[Block], below: Sequence[Block], value: Callable[[Block], float]) -> list[float]:
@@ -380,7 +404,10 @@ def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
                 for other in each[0].cpu_us
                 if other != name
             },
-            "times_us": {time_name: percentiles_us(each, time_name) for time_name in TIMES},
+            "times_us": {
+                time_name: time_percentiles_us(np.concatenate([block.times_ns[time_name] for block in each]))
+                for time_name in TIMES
+            },
             "notes": [block.notes for block in each],
         }
     pairs = [(HOST, YARDSTICK), (STRAIGHTFORWARD, HOST)]
@@ -405,24 +432,22 @@ def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
 
 def as_text(described: dict[str, Any]) -> str:
     """Lay the figures out as a table."""
-    lines = [f"{'µs':50} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}"]
+    lines = [head("µs")]
     names = [name for name in (YARDSTICK, HOST, STRAIGHTFORWARD) if name in described]
     for time_name in TIMES:
         for name in names:
-            values = " ".join(f"{value:8.1f}" for value in described[name]["times_us"][time_name])
             title = TITLES[time_name] if name == names[0] else ""
-            lines.append(f"{title:34} {name:>15} {values}")
+            lines.append(row(f"{title:34} {name:>15}", described[name]["times_us"][time_name]))
     lines.append("")
-    lines.append(
-        f"{'':20} {'CPU µs/cycle':>13} {'quiet':>8} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}  scheduler"
-    )
+    titles = f"{'CPU µs/cycle':>13} {'quiet':>8} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}"
+    lines.append(f"{'':20} {titles}  scheduler")
     for name in names:
-        row = described[name]
-        lines.append(
-            f"{name:20} {row['cpu_us']:13.1f} {row['cpu_quiet_us']:8.1f} {row['overruns']:9d} {row['overruns_per_100000']:9.1f} "
-            f"{row['cycles']:9d} {row['frames_lost']:5d}  {row['scheduler']}"
+        each = described[name]
+        skipped = (
+            f"{each['overruns']:9d} {each['overruns_per_100000']:9.1f} {each['cycles']:9d} {each['frames_lost']:5d}"
         )
-        lines += [f"{f'  its {other}':20} {value:13.1f}" for other, value in row["cpu_of_others_us"].items()]
+        lines.append(f"{name:20} {each['cpu_us']:13.1f} {each['cpu_quiet_us']:8.1f} {skipped}  {each['scheduler']}")
+        lines += [f"{f'  its {other}':20} {value:13.1f}" for other, value in each["cpu_of_others_us"].items()]
     lines.append("")
     for pair, each in described["ratios"].items():
         for what, (middle, low, high) in each.items():
@@ -430,19 +455,16 @@ def as_text(described: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def prepare(channel: str, folder: Path, program: Path | None, period_us: int = 1000) -> list[Run]:
-    """Say how all three are run at one period; without the yardstick where there is no compiler."""
-    runs = [] if program is None else [yardstick_run(program, channel, folder, period_us)]
-    return [*runs, host_run(channel, folder, patient_config(folder)), straightforward_run(channel, folder)]
+def compare(rounds: int, seconds: float) -> dict[str, Any]:
+    """Run all three beside each other at 1 kHz and return the figures. Raises TimingError.
 
-
-def compare(channel: str, rounds: int, seconds: float) -> dict[str, Any]:
-    """Run all three beside each other on an interface at 1 kHz and return the figures. Raises TimingError."""
+    Where there is no C compiler one line says so, and it is the other two.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         program, reason = yardstick.build(folder)
         if reason:
             print(reason, file=sys.stderr)
-        with emulator(channel, "--scenario", "idle", folder=folder) as devices:
-            blocks = measure(prepare(channel, folder, program), rounds, seconds, 1000, devices.pid, folder)
-        return summarise(blocks)
+        runs = [] if program is None else [yardstick_run(program, CHANNEL, folder, 1000)]
+        runs += [host_run(CHANNEL, folder, patient_config(folder)), straightforward_run(CHANNEL, folder)]
+        return summarise(measure(runs, rounds, seconds, 1000, folder))

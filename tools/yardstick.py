@@ -20,16 +20,16 @@ RESET_COMMUNICATION, START, PRE_OPERATIONAL = 0x82, 0x01, 0x80
 OPERATIONAL = 5
 
 
-def build(folder: Path) -> tuple[Path | None, str]:
-    """Compile the yardstick into a folder; without a C compiler return None and one line that says so.
+def build(folder: Path, source: Path = SOURCE) -> tuple[Path | None, str]:
+    """Compile a program into a folder; without a C compiler return None and one line that says so.
 
     Raises CalledProcessError when it doesn't compile.
     """
     compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
-        return None, "no C compiler (cc, gcc, clang), so no yardstick; on Debian: apt-get install gcc libc6-dev"
-    program = folder / "yardstick"
-    subprocess.run([compiler, *FLAGS, "-o", program, SOURCE], check=True)
+        return None, f"no C compiler (cc, gcc, clang), so no {source.stem}; on Debian: apt-get install gcc libc6-dev"
+    program = folder / source.stem
+    subprocess.run([compiler, *FLAGS, "-o", program, source], check=True)
     return program, ""
 
 

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scheme.smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 
 from adacd_hil.config import Settings
@@ -29,6 +30,7 @@ def run_compiled(settings: Settings, q: np.ndarray, dq: np.ndarray, tau_J: np.nd
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_the_numpy_step_learns_and_watches_as_the_compiled_one() -> None:
     settings = settings_with()
     q, dq, ddq = smooth_motion(np.arange(LEARNED + WATCHED) * 1e-3)

@@ -1,0 +1,106 @@
+"""tools/timing_campaign.py: the inputs it writes can be used, and what it makes of frames and memory is right."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import timing_campaign
+import timing_disk
+import timing_hour
+import witness
+import yardstick
+
+from adacd_hil.cli.run import check_budget_of
+from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.wire.codec import load_codec
+from firmware_sim.scenario import load_scenario
+
+MS = 1_000_000
+
+
+def seen(*rows: tuple[int, int, int]) -> witness.Seen:
+    frames = np.zeros(len(rows), witness.RECORD)
+    for place, (wall_ns, can_id, data) in enumerate(rows):
+        frames[place] = (wall_ns, can_id, 8, data)
+    return witness.Seen(frames)
+
+
+def test_an_hour_holds_more_than_a_thousand_contacts_that_can_be_played(tmp_path: Path) -> None:
+    path = tmp_path / "contacts.toml"
+    count = timing_hour.write_contacts(path, 3600.0)
+    scenario = load_scenario(str(path))
+    assert len(scenario.contacts) == count
+    assert count > 1000
+    gaps = np.diff([contact.at_s for contact in scenario.contacts])
+    assert gaps.min() == pytest.approx(3.0)
+    assert {contact.link for contact in scenario.contacts} == {1, 2}
+    assert scenario.contacts[-1].at_s < 3600.0
+
+
+def test_a_contract_that_is_not_judged_is_the_same_on_the_wire(tmp_path: Path) -> None:
+    fast = load_settings()
+    fast = dataclasses.replace(fast, bus=dataclasses.replace(fast.bus, period_us=500))
+    with pytest.raises(ConfigError, match="contract arm"):
+        check_budget_of(load_codec(), fast)
+    unjudged = load_codec(timing_campaign.contract_without_budget(tmp_path))
+    check_budget_of(unjudged, fast)
+    assert unjudged.layout_digest == load_codec().layout_digest
+
+
+def test_settings_that_a_measured_run_has_of_its_own_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ending:
+        timing_campaign.parse_arguments(["hour", "--settings", "[log]\n[bus]\nperiod_us = 2000"])
+    assert ending.value.code == 2
+    assert "[bus]" in capsys.readouterr().err
+    assert timing_campaign.parse_arguments(["hour", "--settings", "[tare]"]).settings == "[tare]"
+
+
+def test_the_bus_says_how_the_cycle_went() -> None:
+    offset_ns = 7 * MS + 123
+    low, high = 0, 2**18  # a quarter of a turn
+    frames = seen(
+        (offset_ns + 1 * MS + 10_000, 0x080, 1),
+        (offset_ns + 1 * MS + 300_000, 0x181, low),
+        (offset_ns + 1 * MS + 500_000, 0x202, 0),
+        (offset_ns + 2 * MS + 20_000, 0x080, 2),
+        (offset_ns + 2 * MS + 300_000, 0x181, 2**32 - high),
+        (offset_ns + 2 * MS + 820_000, 0x202, 0),
+        (offset_ns + 9 * MS, 0x080, 3),
+    )
+    span = timing_disk.describe_span(frames, offset_ns, offset_ns + 4 * MS, 1000, offset_ns)
+    assert (span["cycles"], span["overruns"]) == (2, 2)
+    assert span["lateness_us"][0] == pytest.approx(15.0)
+    assert span["command_us"][-1] == pytest.approx(800.0)
+    assert span["command_us"][0] == pytest.approx(645.0)
+    assert span["moved_deg"] == pytest.approx(90.0)
+
+
+def test_a_command_belongs_to_the_sync_before_it() -> None:
+    begin_ns, end_ns = np.array([10, 20, 30]), np.array([5, 12, 29, 30])
+    assert witness.times_after(begin_ns, end_ns).tolist() == [2, 9, 0]
+
+
+def test_a_cut_record_of_the_witness_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "witness.bin"
+    whole = seen((1, 0x080, 5), (2, 0x201, 6)).frames.tobytes()
+    path.write_bytes(whole + whole[:10])
+    read = witness.read_witness(path)
+    assert read.wall_ns.tolist() == [1, 2]
+    assert read.of(0x201).data.tolist() == [6]
+
+
+def test_memory_is_judged_after_the_first_minute() -> None:
+    memory = [[0.0, 90.0, 10.0, 50.0], [60.0, 100.0, 20.0, 50.0], [70.0, 103.0, 19.0, 50.0], [80.0, 102.0, 21.0, 50.0]]
+    assert timing_hour.memory_spans(memory)["host"] == [100.0, 103.0, 2.0]
+    assert timing_hour.memory_spans(memory)["logger"] == [19.0, 21.0, 1.0]
+
+
+def test_the_witness_compiles_without_a_warning(tmp_path: Path) -> None:
+    program, reason = yardstick.build(tmp_path, witness.SOURCE)
+    if program is None:
+        pytest.skip(reason)
+    assert program.is_file()
