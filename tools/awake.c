@@ -2,9 +2,8 @@
 //
 // Where the kernel counts CPU time by sampling at its timer's ticks, as user-mode Linux does, the CPU clock of a process
 // that runs for parts of a millisecond says nothing. A process of the highest priority is on the processor whenever it
-// is not waiting; so what it takes is the time that passes less the time spent in these calls. AWAKE_FILE names a file
-// of four numbers that grow: ticks of the counter at the start, its ns at the start, ticks waited, calls. The first
-// process that makes the file is the one that is looked at; its children are not.
+// is not waiting; so what it takes is the time that passes less the time spent in these calls. AWAKE_FILE names the file
+// of the numbers below. The first process that makes the file is the one that is looked at; its children are not.
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <fcntl.h>

@@ -4,9 +4,11 @@ A *block* is one of them for some seconds against the emulator. Blocks alternate
 besides hits all alike. Each process writes down its own times; its CPU time is read from outside, from its CPU clock,
 at the ends of windows of a fifth of a second, start-up and end left out. A window's CPU time is divided by the cycles
 that began in it. What is compared is the median of the windows, and their tenth percentile: a machine that takes the
-processor away counts that time as used, and few windows of a busy one are free of it.
+processor away counts that time as used, and few windows of a busy one are free of it. Where the kernel samples CPU
+time at its ticks, it says little: there `awake` counts, the time that passed less the time spent waiting.
 """
 
+import functools
 import itertools
 import json
 import os
@@ -23,6 +25,8 @@ from typing import Any
 
 import numpy as np
 import yardstick
+from awake import Awake
+from awake import build as build_awake
 from numpy.typing import NDArray
 
 from adacd_hil.log.reader import RunLog, read_log
@@ -32,6 +36,7 @@ ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 CHANNEL = "vcan0"
+AWAKE = "awake"
 HOST, YARDSTICK, STRAIGHTFORWARD = "host", "yardstick", "straightforward"
 SETTLE_S = 1.0
 WINDOW_S = 0.2
@@ -76,7 +81,7 @@ class Window:
     """CPU time in ns that each process had used at some time `t_ns` of the monotonic clock."""
 
     t_ns: int
-    cpu_ns: dict[str, int]
+    cpu_ns: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -176,10 +181,18 @@ def wait_for(word: str, process: "subprocess.Popen[Any]", complaints: Path) -> N
         time.sleep(0.05)
 
 
-def take_window(pids: dict[str, int]) -> Window:
-    """Read the CPU clocks of some processes; one that has gone is left out."""
-    used = {}
+@functools.cache
+def awake_of(folder: Path) -> Awake | None:
+    """Build what looks at a process's waiting, once for each folder; None without a C compiler."""
+    return build_awake(folder)
+
+
+def take_window(pids: dict[str, int], awake: Awake | None = None) -> Window:
+    """Read the CPU clocks of some processes, and how long one has been awake; one that has gone is left out."""
+    used: dict[str, float] = {}
     t_ns = time.monotonic_ns()
+    if awake is not None:
+        used[AWAKE] = t_ns - awake.waited_ns()
     for name, pid in pids.items():
         try:
             used[name] = cpu_clock_ns(pid)
@@ -205,11 +218,12 @@ class Running:
 
 
 @contextmanager
-def running(run: Run, folder: Path) -> Iterator[Running]:
-    """Run one of the three while the block lasts. Raises TimingError when it doesn't begin its cycles."""
+def running(run: Run, folder: Path, awake: Awake | None = None) -> Iterator[Running]:
+    """Run one of the three while the block lasts, looked at by `awake`. Raises TimingError when it doesn't begin."""
     complaints = folder / f"{run.name}.stderr"
+    environment = ENVIRONMENT | (awake.environment() if awake is not None else {})
     with complaints.open("w") as stderr:
-        process = subprocess.Popen(run.command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=ENVIRONMENT)
+        process = subprocess.Popen(run.command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment)
     try:
         wait_for("running", process, complaints)
         yield Running(process, complaints, run.has_logger)
@@ -221,16 +235,17 @@ def running(run: Run, folder: Path) -> Iterator[Running]:
 
 def run_block(run: Run, seconds: float, period_us: int, emulator_pid: int, folder: Path) -> Block:
     """Run one block and read what it says. Raises TimingError."""
-    with running(run, folder) as begun:
+    awake = awake_of(folder)
+    with running(run, folder, awake) as begun:
         time.sleep(SETTLE_S)
         pids = {run.name: begun.process.pid, "emulator": emulator_pid}
         if begun.logger_pid is not None:
             pids["logger"] = begun.logger_pid
-        windows = [take_window(pids)]
+        windows = [take_window(pids, awake)]
         begin_s = time.monotonic()
         while time.monotonic() - begin_s < seconds and begun.process.poll() is None:
             time.sleep(WINDOW_S)
-            windows.append(take_window(pids))
+            windows.append(take_window(pids, awake))
         status = begun.end()
         if status not in ENDED_WELL:
             raise TimingError(f"{run.name} ended with status {status}: {begun.complaints.read_text().strip()[-400:]}")
@@ -244,7 +259,7 @@ def run_block(run: Run, seconds: float, period_us: int, emulator_pid: int, folde
         period_us=period_us,
         due_ns=due_ns,
         times_ns={name: values[measured] for name, values in times_ns.items()},
-        cpu_us={name: cpu_per_cycle(windows, due_ns, name) for name in pids},
+        cpu_us={name: cpu_per_cycle(windows, due_ns, name) for name in (*pids, AWAKE)},
         overruns=count_overruns(due_ns, period_us),
         frames_lost=rest.pop("frames_lost", 0),
         scheduler=rest.pop("scheduler", ""),
@@ -399,10 +414,12 @@ def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
             "frames_lost": sum(block.frames_lost for block in each),
             "cpu_us": float(np.median([block.cpu_per_cycle_us(name) for block in each])),
             "cpu_quiet_us": float(np.median([block.cpu_per_cycle_us(name, QUIET_PERCENT) for block in each])),
+            "awake_us": float(np.median([block.cpu_per_cycle_us(AWAKE) for block in each])),
+            "awake_quiet_us": float(np.median([block.cpu_per_cycle_us(AWAKE, QUIET_PERCENT) for block in each])),
             "cpu_of_others_us": {
                 other: float(np.median([block.cpu_per_cycle_us(other) for block in each]))
                 for other in each[0].cpu_us
-                if other != name
+                if other not in (name, AWAKE)
             },
             "times_us": {
                 time_name: time_percentiles_us(np.concatenate([block.times_ns[time_name] for block in each]))
@@ -416,6 +433,10 @@ def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
             "cpu": ratios(blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(block.name)),
             "cpu_quiet": ratios(
                 blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(block.name, QUIET_PERCENT)
+            ),
+            "awake": ratios(blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(AWAKE)),
+            "awake_quiet": ratios(
+                blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(AWAKE, QUIET_PERCENT)
             ),
             "command_p50": ratios(
                 blocks[above], blocks[below], lambda block: float(np.median(block.times_ns["command"]))
@@ -439,15 +460,16 @@ def as_text(described: dict[str, Any]) -> str:
             title = TITLES[time_name] if name == names[0] else ""
             lines.append(row(f"{title:34} {name:>15}", described[name]["times_us"][time_name]))
     lines.append("")
-    titles = f"{'CPU µs/cycle':>13} {'quiet':>8} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}"
+    titles = f"{'awake µs/cycle':>14} {'quiet':>7} {'CPU clock':>9} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}"
     lines.append(f"{'':20} {titles}  scheduler")
     for name in names:
         each = described[name]
         skipped = (
             f"{each['overruns']:9d} {each['overruns_per_100000']:9.1f} {each['cycles']:9d} {each['frames_lost']:5d}"
         )
-        lines.append(f"{name:20} {each['cpu_us']:13.1f} {each['cpu_quiet_us']:8.1f} {skipped}  {each['scheduler']}")
-        lines += [f"{f'  its {other}':20} {value:13.1f}" for other, value in each["cpu_of_others_us"].items()]
+        used = f"{each['awake_us']:14.1f} {each['awake_quiet_us']:7.1f} {each['cpu_us']:9.1f}"
+        lines.append(f"{name:20} {used} {skipped}  {each['scheduler']}")
+        lines += [f"{f'  its {other}':20} {'':22} {value:9.1f}" for other, value in each["cpu_of_others_us"].items()]
     lines.append("")
     for pair, each in described["ratios"].items():
         for what, (middle, low, high) in each.items():
