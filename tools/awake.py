@@ -1,15 +1,12 @@
 """How long a process is awake, from outside: builds the library to be preloaded and reads what it counts."""
 
-import os
 import struct
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from yardstick import find_compiler
+import yardstick
 
 SOURCE = Path(__file__).resolve().parent / "awake.c"
-FLAGS = ("-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
 _NUMBERS = struct.Struct("=6Q")
 """Ticks and ns at the start; ticks waited; waits; ticks and ns at some wait, every 1024 of them."""
 
@@ -40,9 +37,5 @@ class Awake:
 
 def build(folder: Path) -> Awake | None:
     """Compile the library into a folder; None without a C compiler. Raises CalledProcessError."""
-    compiler = find_compiler()
-    if compiler is None or os.name != "posix":
-        return None
-    library = folder / "awake.so"
-    subprocess.run([compiler, *FLAGS, "-o", library, SOURCE, "-ldl"], check=True)
-    return Awake(library, folder / "awake")
+    library, _ = yardstick.build(folder, SOURCE, "-shared", "-fPIC")
+    return None if library is None else Awake(library, folder / "awake.numbers")

@@ -389,8 +389,8 @@ def row(name: str, values: Sequence[float]) -> str:
 
 
 def ratios(above: Sequence[Block], below: Sequence[Block], value: Callable[[Block], float]) -> list[float]:
-    """Divide round by round: the median of the rounds, the lowest, the highest."""
-    each = [value(a) / value(b) for a, b in zip(above, below, strict=True)]
+    """Divide round by round: the median of the rounds, the lowest, the highest; NaN where nothing was counted."""
+    each = [value(a) / value(b) if value(b) else float("nan") for a, b in zip(above, below, strict=True)]
     return [float(np.median(each)), min(each), max(each)]
 
 
@@ -460,8 +460,8 @@ def as_text(described: dict[str, Any]) -> str:
             title = TITLES[time_name] if name == names[0] else ""
             lines.append(row(f"{title:34} {name:>15}", described[name]["times_us"][time_name]))
     lines.append("")
-    titles = f"{'awake µs/cycle':>14} {'quiet':>7} {'CPU clock':>9} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}"
-    lines.append(f"{'':20} {titles}  scheduler")
+    titles = f"{'awake µs/cycle':>14} {'quiet':>7} {'CPU clock':>9} {'overruns':>9} {'/100,000':>9} {'cycles':>9}"
+    lines.append(f"{'':20} {titles} {'lost':>5}  scheduler")
     for name in names:
         each = described[name]
         skipped = (
