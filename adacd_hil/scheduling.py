@@ -9,7 +9,7 @@ import errno
 import gc
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -218,14 +218,12 @@ def _lock_memory(libc: ctypes.CDLL) -> str:
 def _keep_awake() -> tuple[bool, list[Refusal]]:
     """Forbid idle states that take time to leave, for as long as this process lives: the file must stay open."""
     try:
-        descriptor = os.open(_DMA_LATENCY, os.O_WRONLY)
+        os.write(os.open(_DMA_LATENCY, os.O_WRONLY), bytes(4))  # the longest latency to bear, int32 in µs
     except FileNotFoundError:
         return False, []  # nothing to forbid here
     except OSError as error:
         remedy = f'allow it with the udev rule `KERNEL=="{_DMA_LATENCY.name}", GROUP="realtime", MODE="0660"`'
         return False, [Refusal(f"shallow idle states: {_DMA_LATENCY}: {error.strerror}", remedy)]
-    with suppress(OSError):
-        os.write(descriptor, bytes(4))
     return True, []
 
 
