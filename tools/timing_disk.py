@@ -22,7 +22,6 @@ from side_by_side import (
     emulator,
     head,
     host_run,
-    log_parts,
     patient_config,
     row,
     running,
@@ -152,7 +151,7 @@ def run_disk_case(case: str, chosen: argparse.Namespace, folder: Path) -> dict[s
         status = begun.end()
         if slow is not None:
             slow.close()
-        log = folder / "copy.mcap" if slow is not None else log_parts(out)[-1]
+        log = folder / "copy.mcap" if slow is not None else out / LOG_NAME
         problem = log_problem(log)
     seen = read_witness(seen_path)
     offset_ns = time.time_ns() - time.monotonic_ns()

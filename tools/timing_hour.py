@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from side_by_side import (
     CHANNEL,
     emulator,
     head,
     host_run,
-    log_parts,
     patient_config,
     read_cycles,
     row,
@@ -25,7 +26,7 @@ from side_by_side import (
 )
 from witness import Seen, read_witness, witness
 
-from adacd_hil.log.errors import LogError
+from adacd_hil.control.session import LOG_NAME
 from adacd_hil.log.reader import read_log
 
 FIRST_COMMAND_ID = 0x201
@@ -37,6 +38,7 @@ FIRST_CONTACT_S = 10.0
 CONTACTS = ((1, 0.25, 90.0, 20.0), (1, 0.25, -90.0, 20.0), (2, 0.20, 90.0, 15.0), (2, 0.20, -90.0, 15.0))
 """Link, point in m, direction in degrees, force in N: those of the paper's experiment."""
 CONTACT_S = 0.25
+LOG_PARTS = "run*.mcap"
 REACTION = "MONITOR -> REACT"
 
 
@@ -70,7 +72,7 @@ def run_hour(chosen: argparse.Namespace) -> dict[str, Any]:
     total_s = chosen.minutes * 60.0
     contacts = write_contacts(folder / "contacts.toml", total_s + 3600.0)
     config = patient_config(folder, period_us=chosen.period_us, more=chosen.settings)
-    for old in log_parts(folder / "host"):
+    for old in (folder / "host").glob(LOG_PARTS):
         old.unlink()
     memory: list[list[float]] = []
     with ExitStack() as stack:
@@ -91,47 +93,49 @@ def run_hour(chosen: argparse.Namespace) -> dict[str, Any]:
     return {"status": status, "said": described, "contacts_planned": contacts, "memory_MB": memory, "witness": counts}
 
 
-def reaction_times(log_folder: Path, seen: Seen) -> dict[str, Any]:
-    """Read every part of a log: is it whole, how went the cycles, and how long did each reaction take.
+def read_parts(folder: Path) -> list[dict[str, Any]]:
+    """Open every part of a log by itself, with a reader that isn't ours: its messages, or what is wrong with it."""
+    parts: list[dict[str, Any]] = []
+    for path in sorted(folder.glob(LOG_PARTS), key=lambda path: path.stat().st_mtime_ns):
+        described: dict[str, Any] = {"name": path.name, "bytes": path.stat().st_size, "messages": 0, "problem": ""}
+        try:
+            with path.open("rb") as file:
+                summary = make_reader(file).get_summary()
+            if summary is None or summary.statistics is None:
+                described["problem"] = "no summary"
+            else:
+                described["messages"] = summary.statistics.message_count
+        except (McapError, OSError) as error:
+            described["problem"] = f"{type(error).__name__}: {error}"
+        parts.append(described)
+    return parts
+
+
+def reaction_times(path: Path, seen: Seen) -> dict[str, Any]:
+    """Read a log: is it whole, how went the cycles, and how long did each reaction take.
 
     compute: feedback read to commands handed over, by the host's clock, in the cycles that decide to react. wire:
-    feedback read to the kernel's stamp of the first command after it.
+    feedback read to the kernel's stamp of the first command after it. Raises LogError, TimingError.
     """
-    parts, times, compute_ns, wire_ns = [], [], [], []
-    overruns = lost = 0
-    for path in log_parts(log_folder):
-        try:
-            log = read_log(path, ("/cycle", "/events"))
-        except LogError as error:
-            parts.append({"name": path.name, "problem": str(error), "cycles": 0, "dropped": ""})
+    log = read_log(path, ("/cycle", "/events"))
+    _, times_ns, rest = read_cycles(log)
+    t_ns = log.cycle.t_ns
+    compute_ns, wire_ns = [], []
+    for event in log.events:
+        place = int(np.searchsorted(t_ns, event.t_ns))
+        if event.event.message != REACTION or place == len(t_ns) or t_ns[place] != event.t_ns:
             continue
-        dropped = log.summary.get("dropped", "")
-        parts.append({"name": path.name, "problem": log.problem, "cycles": len(log.cycle), "dropped": dropped})
-        if not len(log.cycle):
-            continue
-        _, times_ns, rest = read_cycles([log])
-        overruns, lost = int(log.cycle["overruns"][-1]), rest["frames_lost"]
-        times.append({name: values.astype(np.int32) for name, values in times_ns.items()})
-        t_ns = log.cycle.t_ns
-        for event in log.events:
-            if event.event.message != REACTION:
-                continue
-            place = int(np.searchsorted(t_ns, event.t_ns))
-            if place == len(t_ns) or t_ns[place] != event.t_ns:
-                continue
-            compute_ns.append(int(times_ns["compute"][place]))
-            begin_ns = event.t_ns + log.epoch_ns
-            sent = int(np.searchsorted(seen.wall_ns, begin_ns))
-            if sent < len(seen.wall_ns):
-                wire_ns.append(int(seen.wall_ns[sent]) - begin_ns - int(times_ns["feedback"][place]))
+        compute_ns.append(int(times_ns["compute"][place]))
+        begin_ns = event.t_ns + log.epoch_ns
+        sent = int(np.searchsorted(seen.wall_ns, begin_ns))
+        if sent < len(seen.wall_ns):
+            wire_ns.append(int(seen.wall_ns[sent]) - begin_ns - int(times_ns["feedback"][place]))
     return {
-        "parts": parts,
-        "overruns": overruns,
-        "frames_lost": lost,
-        "times_us": {
-            name: time_percentiles_us(np.concatenate([part[name] for part in times]))
-            for name in (times[0] if times else ())
-        },
+        "log_problem": log.problem,
+        "cycles": len(t_ns),
+        "overruns": int(log.cycle["overruns"][-1]),
+        "frames_lost": rest["frames_lost"],
+        "times_us": {name: time_percentiles_us(values) for name, values in times_ns.items()},
         "contacts_detected": len(compute_ns),
         "reaction_us": {
             "compute": time_percentiles_us(np.array(compute_ns, np.int64)),
@@ -155,17 +159,17 @@ def memory_spans(memory: Sequence[Sequence[float]]) -> dict[str, list[float]]:
 def finish_hour(chosen: argparse.Namespace, result: dict[str, Any]) -> dict[str, Any]:
     """Read the log and the witness of an hour."""
     seen = read_witness(chosen.out / "witness.bin")
-    return result | reaction_times(chosen.out / "host", seen) | {"memory_span_MB": memory_spans(result["memory_MB"])}
+    spans = {"memory_span_MB": memory_spans(result["memory_MB"]), "parts": read_parts(chosen.out / "host")}
+    return result | reaction_times(chosen.out / "host" / LOG_NAME, seen) | spans
 
 
 def show_hour(result: dict[str, Any]) -> str:
     """Lay out what `run_hour` and the log say."""
     said = result["said"]
     bad = [part for part in result["parts"] if part["problem"]]
-    cycles = sum(part["cycles"] for part in result["parts"])
     lines = [
-        f"exit status {result['status']}, {cycles} cycles in {len(result['parts'])} parts of the log, "
-        f"{len(bad)} of them not whole",
+        f"exit status {result['status']}, {result['cycles']} cycles in {len(result['parts'])} parts of the log, "
+        f"{len(bad)} of them not readable, the log {result['log_problem'] or 'whole'}",
         f"dropped {said.get('dropped')}, frames lost {result['frames_lost']}, overruns {result['overruns']}, "
         f"faults {said.get('recoveries')}, log error {said.get('log_error')!r}",
         f"{result['contacts_detected']} contacts detected, {result['reactions_witnessed']} seen on the bus; "

@@ -17,7 +17,7 @@ from adacd_hil.config import load_settings
 
 def block(name: str, cpu_us: list[float], overruns: int = 0, compute_ns: int = 50_000) -> Block:
     due_ns = np.arange(100, dtype=np.int64) * 1_000_000
-    times_ns = {key: np.full(100, compute_ns, np.int64) for key in side_by_side.TIMES}
+    times_ns = {key: np.full(100, compute_ns, np.int64) for key in side_by_side.TITLES}
     return Block(name, 1000, due_ns, times_ns, {name: np.array(cpu_us)}, overruns, 0)
 
 

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import side_by_side
 import timing_campaign
 import timing_disk
 import timing_hour
@@ -51,12 +53,30 @@ def test_a_contract_that_is_not_judged_is_the_same_on_the_wire(tmp_path: Path) -
     assert unjudged.layout_digest == load_codec().layout_digest
 
 
-def test_settings_that_a_measured_run_has_of_its_own_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_are_laid_over_those_of_a_measured_run(tmp_path: Path) -> None:
+    chosen = timing_campaign.parse_arguments(["hour", "--settings", "[bus]\nheartbeat_ms = 200"])
+    settings = load_settings(str(side_by_side.patient_config(tmp_path, more=chosen.settings)), "P")
+    assert settings.bus.heartbeat_ms == 200
+    assert settings.bus.max_age_cycles == 100
+
+
+def test_the_period_is_no_setting_of_a_measured_run(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ending:
-        timing_campaign.parse_arguments(["hour", "--settings", "[log]\n[bus]\nperiod_us = 2000"])
+        timing_campaign.parse_arguments(["hour", "--settings", "[bus]\nperiod_us = 2000"])
     assert ending.value.code == 2
-    assert "[bus]" in capsys.readouterr().err
-    assert timing_campaign.parse_arguments(["hour", "--settings", "[tare]"]).settings == "[tare]"
+    assert "period_us" in capsys.readouterr().err
+
+
+def test_a_part_that_no_reader_can_open_is_named(tmp_path: Path) -> None:
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_message(writer.register_channel("/topic", "json", 0), 0, b"{}", 0)
+        writer.finish()
+    (tmp_path / "run_001.mcap").write_bytes((tmp_path / "run.mcap").read_bytes()[:-20])
+    whole, cut = timing_hour.read_parts(tmp_path)
+    assert (whole["messages"], whole["problem"]) == (1, "")
+    assert cut["problem"]
 
 
 def test_the_bus_says_how_the_cycle_went() -> None:
