@@ -148,7 +148,7 @@ class Recorder:
     @property
     def waiting_bytes(self) -> int:
         """Bytes that wait for the writer; 0 in lockstep, where they say nothing of the run. Costs no system call."""
-        return 0 if self._is_blocking or self._summary else self._ring.waiting
+        return 0 if self._is_blocking else self._ring.waiting
 
     def cycle(
         self, t_ns: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]] = ()
