@@ -23,7 +23,7 @@ from adacd_hil.log.channels import MessageLike
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.parts import find_parts
-from adacd_hil.log.ring import Ring
+from adacd_hil.log.ring import Ring, room_of
 from adacd_hil.log.setup import Setup, tell_messages
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.wire.bus import Frame
@@ -148,7 +148,7 @@ class Recorder:
     @property
     def waiting_bytes(self) -> int:
         """Bytes that wait for the writer; 0 in lockstep, where they say nothing of the run. Costs no system call."""
-        return 0 if self._is_blocking or self._summary else self._ring.waiting
+        return 0 if self._is_blocking else self._ring.waiting
 
     def cycle(
         self, t_ns: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]] = ()
@@ -177,11 +177,14 @@ class Recorder:
 
     def _put_patiently(self, data: bytes) -> bool:
         """Add a packet once the writer has made room; False when it is dead, or the packet larger than the ring."""
-        try:
-            self._socket.send(words.ROOM)
-            return bool(self._socket.recv(words.MOST_BYTES)) and self._ring.put(data)
-        except OSError:
-            return False
+        is_put = False
+        with contextlib.suppress(OSError):  # nobody there
+            while not is_put and room_of(len(data)) <= self._ring.capacity:
+                self._socket.send(words.ROOM)
+                if self._socket.recv(words.MOST_BYTES) == words.NOTHING:
+                    break
+                is_put = self._ring.put(data)
+        return is_put
 
     def close(self) -> LogSummary:
         """End the log and say how it went; never raises, twice is once."""

@@ -112,9 +112,11 @@ class Ring(_SharedRing):
         return self._counts[_WRITTEN]
 
     def close(self) -> None:
-        """Release the memory."""
+        """Release the memory; from then on there is no room."""
         super().close()
         os.close(self.descriptor)
+        self._counts = memoryview(bytearray(_COUNTS_BYTES)).cast("Q")
+        self.capacity = self._room_until = 0
 
 
 class RingReader(_SharedRing):

@@ -3,7 +3,7 @@
 WAKE = b"wake"
 """Take what waits in the ring."""
 ROOM = b"room"
-"""Take it and answer the same: there is room again."""
+"""Take some of it and answer the same: there is more room."""
 END = b"end"
 """Take it and end the log."""
 NOTHING = b""

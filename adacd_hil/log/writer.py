@@ -73,10 +73,11 @@ class WriterProcess:
         """Write until the end, then answer with the last word."""
         while True:
             word = self._hear()
-            self._take()
             if word == words.ROOM:
-                _send(self._connection, words.ROOM)
-            elif word in (words.END, words.NOTHING):
+                self._take_some()
+                _send(self._connection, words.ROOM)  # before the rest, so that both sides work at once
+            self._take()
+            if word in (words.END, words.NOTHING):
                 break
         self._write()
         self._end(self._finish("closed" if word == words.END else "control process died"))
@@ -103,15 +104,18 @@ class WriterProcess:
     def _take(self) -> None:
         """Take all that waits in the ring; in real time, flush by the clock."""
         while True:
-            if data := self._ring.take(BATCH_BYTES):
-                self._gathered.append(data)
-                self._gathered_bytes += len(data)
-                if self._gathered_bytes >= BATCH_BYTES:
-                    self._write()
+            self._take_some()
+            if self._gathered_bytes >= BATCH_BYTES:
+                self._write()
             if not self._setup.is_blocking:
                 self._look_at_clock()
             if not self._ring.waiting:
                 return
+
+    def _take_some(self) -> None:
+        if data := self._ring.take(BATCH_BYTES):
+            self._gathered.append(data)
+            self._gathered_bytes += len(data)
 
     def _look_at_clock(self) -> None:
         """Flush if it is time, and see to a disk that has failed."""

@@ -23,7 +23,7 @@ from adacd_hil.log.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
 pytestmark = pytest.mark.slow
 
 MOST_WAITING = 300_000
-STEP_NS = 4 * FLUSH_PERIOD_NS
+STEP_NS = 8 * FLUSH_PERIOD_NS
 
 
 class HastyClock:
@@ -40,7 +40,7 @@ class HastyClock:
 class Writer:
     """The writer in a thread of this process, fed through its ring as by a control process in real time."""
 
-    def __init__(self, path, descriptor, may_rotate=True):
+    def __init__(self, path, descriptor, may_rotate=True, part_bytes=0):
         self.ring = Ring(4 * 2**20)
         self.dropped = 0
         self.clock = HastyClock()
@@ -54,7 +54,7 @@ class Writer:
             messages=(),
             parameter_count=7,
             epoch_ns=0,
-            part_bytes=0,
+            part_bytes=part_bytes,
             part_ns=0,
             may_rotate=may_rotate,
             attachments={},
@@ -121,8 +121,8 @@ def test_a_slow_disk_costs_packets_and_bounded_memory(tmp_path):
             written.extend(data)
 
     writer = Writer(tmp_path / "run.mcap", right, may_rotate=False)
-    for start in range(0, 1900, 100):
-        writer.feed(run.cycles[start : start + 100])
+    for start in range(0, 1900, 190):
+        writer.feed(run.cycles[start : start + 190])
         writer.wait_until_taken()
         assert writer.sink.waiting < MOST_WAITING + 300_000
     assert writer.sink.is_behind
@@ -208,6 +208,23 @@ def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path,
     assert [file.name for file in tmp_path.iterdir()] == ["run.mcap"]
     assert len(read_log(path).scheme) == 200 * has_chunk
     assert word["error"].startswith("No space left on device")
+
+
+def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):
+    run = make_run(30)
+    path = tmp_path / "run.mcap"
+    writer = Writer(path, create(path), part_bytes=1)
+    for start in (0, 10, 20):
+        writer.dropped = (start > 0) * 5
+        writer.ring.count_dropped(writer.dropped)
+        writer.feed(run.cycles[start : start + 10])
+        writer.wait_until_taken()
+    word = writer.end()
+    log = read_log(path)
+    assert log.parts == int(word["parts"]) >= 3
+    assert log.problem == ""
+    assert missing_in(log) == [5]
+    assert log.summary["dropped"] == "5"
 
 
 def test_the_setup_arrives_as_it_was_sent(tmp_path):

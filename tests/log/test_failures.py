@@ -127,6 +127,7 @@ def test_a_writer_that_is_behind_costs_packets_not_time(tmp_path):
     while recorder.dropped < 50:
         feed(recorder, run.cycles)
         sent += packets
+    assert 4 * 2**20 - 1000 < recorder.waiting_bytes <= 4 * 2**20
     os.kill(recorder.pid, signal.SIGCONT)
     wait_until_taken(recorder)
     dropped = recorder.dropped
@@ -134,6 +135,7 @@ def test_a_writer_that_is_behind_costs_packets_not_time(tmp_path):
     sent += packets
     summary = recorder.close()
     assert summary.dropped == dropped
+    assert summary.queue_peak_bytes > 4 * 2**20 - 1000
     assert not summary.is_complete
     log = read_log(tmp_path / "run.mcap")
     assert log.problem == ""
@@ -169,6 +171,17 @@ def test_in_lockstep_a_writer_that_is_behind_is_waited_for(tmp_path):
     sender.join()
     assert recorder.close().is_complete
     assert [t_ns for t_ns, _ in read_log(tmp_path / "run.mcap").events] == sent
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blocking", [True, False])
+def test_what_is_logged_after_the_end_is_dropped_and_raises_nothing(blocking, tmp_path):
+    run = make_run(3)
+    recorder = start(tmp_path / "run.mcap", run, blocking=blocking)
+    assert recorder.close().is_complete
+    feed(recorder, run.cycles)
+    assert recorder.dropped == 3
+    assert recorder.waiting_bytes == 0
 
 
 @pytest.mark.slow
