@@ -400,7 +400,7 @@ def row(name: str, values: Sequence[float]) -> str:
 
 
 def ratios(above: Sequence[Block], below: Sequence[Block], value: Callable[[Block], float]) -> list[float]:
-    """Divide round by round: the median of the rounds, the lowest, the highest; NaN where there is nothing to divide."""
+    """Divide round by round: the median of the rounds, the lowest, the highest; NaN where nothing was counted."""
     each = np.array([value(a) / value(b) if value(b) > 0.0 else np.nan for a, b in zip(above, below, strict=True)])
     return [float(np.median(each)), float(each.min()), float(each.max())]
 
