@@ -75,10 +75,6 @@ script = [{ at_s = 10.0, request = "finish" }]
 [bus]  # a machine that stalls is to be measured, not to fault the arm
 command_patience_cycles = 250
 max_age_cycles = 100
-
-[realtime]
-misses = 1000000
-sample_period = "nominal"
 """
 
 
