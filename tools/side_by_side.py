@@ -1,10 +1,9 @@
 """The cycle of the host beside the C yardstick's and the straightforward loop's: in turn, on one bus, in one run.
 
 A *block* is one of them for some seconds against the emulator. Blocks alternate, so that what the machine does
-besides hits all alike. Each process writes down its own times; its CPU time is read from outside, from its CPU clock,
-at the ends of windows of a fifth of a second, start-up and end left out. A window's CPU time is divided by the cycles
-that began in it. What is compared is the median of the windows, and their tenth percentile: a machine that takes the
-processor away counts that time as used, and few windows of a busy one are free of it.
+besides hits all alike. Each process writes down its own times. How long it works per cycle is seen from outside: a
+preloaded library (waits.c) notes when it waits. CPU clocks are read besides, in windows of a fifth of a second, where
+the kernel's account is fine enough.
 """
 
 import dataclasses
@@ -26,6 +25,7 @@ import numpy as np
 import yardstick
 from numpy.typing import NDArray
 
+import adacd_hil
 from adacd_hil.config import Settings
 from adacd_hil.control.session import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
@@ -33,7 +33,9 @@ from adacd_hil.wire.codec import contract_folder, load_codec
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(adacd_hil.__file__).resolve().parents[1])}
+WAITS = Path(__file__).resolve().parent / "waits.c"
+FINE_STEP_NS = 1_000_000
 CHANNEL = "vcan0"
 HOST, YARDSTICK, STRAIGHTFORWARD = "host", "yardstick", "straightforward"
 SETTLE_S = 1.0
@@ -94,7 +96,8 @@ class Window:
 class Block:
     """One process for some seconds. Arrays (n,) of the cycles of the measured part, int64 ns.
 
-    cpu_us: µs per cycle by process, a value per window. overruns: periods skipped within the measured part.
+    cpu_us: µs per cycle by process, a value per window. work_us: µs of each cycle in which the process didn't wait;
+    empty where that was not noted. overruns: periods skipped within the measured part.
     """
 
     name: str
@@ -104,6 +107,7 @@ class Block:
     cpu_us: dict[str, NDArray[np.float64]]
     overruns: int
     frames_lost: int
+    work_us: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     scheduler: str = ""
     notes: dict[str, Any] = field(default_factory=dict)
 
@@ -116,6 +120,10 @@ class Block:
         """Return a percentile of the CPU time per cycle of a process, µs; NaN when it was not seen."""
         values = self.cpu_us.get(process, np.empty(0))
         return float(np.percentile(values, percent)) if values.size else float("nan")
+
+    def work_per_cycle_us(self, percent: float = 50.0) -> float:
+        """Return a percentile of the time per cycle in which the process didn't wait, µs; NaN when not noted."""
+        return float(np.percentile(self.work_us, percent)) if self.work_us.size else float("nan")
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,31 @@ def cpu_per_cycle(windows: Sequence[Window], due_ns: NDArray[np.int64], process:
         if count > 0 and process in before.cpu_ns and process in after.cpu_ns:
             values.append((after.cpu_ns[process] - before.cpu_ns[process]) * 1e-3 / count)
     return np.array(values, np.float64)
+
+
+def work_per_cycle(path: Path, begin_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Add up, for all cycles but the last, the time in which a process didn't wait, µs; empty without a file.
+
+    begin_ns (n,): when each cycle began. Each stretch of work contains one reading of the clock that is the noting's
+    own; it is taken off.
+    """
+    if not path.exists() or len(begin_ns) < 2:
+        return np.empty(0)
+    noted = np.fromfile(path, np.int64)
+    waits = noted[1:].reshape(-1, 2)
+    stretch_ns = np.stack((waits[:-1, 1], waits[1:, 0]), axis=1)
+    done_ns = np.cumsum(np.maximum(stretch_ns[:, 1] - stretch_ns[:, 0] - noted[0], 0))
+    before_ns = np.concatenate(([0], done_ns[:-1]))
+    worked_ns = np.interp(begin_ns, stretch_ns.ravel(), np.stack((before_ns, done_ns), axis=1).ravel())
+    return np.diff(worked_ns) * 1e-3
+
+
+def is_cpu_clock_fine() -> bool:
+    """Tell whether this kernel's account of CPU time moves in steps that tell cycles apart."""
+    begin_ns = now_ns = time.process_time_ns()
+    while now_ns == begin_ns:
+        now_ns = time.process_time_ns()
+    return now_ns - begin_ns < FINE_STEP_NS
 
 
 def cpu_clock_ns(pid: int) -> int:
@@ -221,12 +254,24 @@ class Running:
         return self.process.returncode
 
 
+def waits_path(run: Run, folder: Path) -> Path:
+    """Name the file of a process's waits."""
+    return folder / f"{run.name}.waits"
+
+
 @contextmanager
-def running(run: Run, folder: Path) -> Iterator[Running]:
-    """Run one of the three while the block lasts. Raises TimingError when it doesn't begin its cycles."""
+def running(run: Run, folder: Path, preload: Path | None = None) -> Iterator[Running]:
+    """Run one of the three while the block lasts; with `preload`, its waits are noted.
+
+    Raises TimingError when it doesn't begin its cycles.
+    """
     complaints = folder / f"{run.name}.stderr"
+    environment = dict(ENVIRONMENT)
+    if preload is not None:
+        waits_path(run, folder).unlink(missing_ok=True)
+        environment |= {"LD_PRELOAD": str(preload), "WAITS": str(waits_path(run, folder))}
     with complaints.open("w") as stderr:
-        process = subprocess.Popen(run.command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=ENVIRONMENT)
+        process = subprocess.Popen(run.command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment)
     try:
         wait_for("running", process, complaints)
         yield Running(process, complaints, run.has_logger)
@@ -236,9 +281,11 @@ def running(run: Run, folder: Path) -> Iterator[Running]:
             process.wait()
 
 
-def run_block(run: Run, seconds: float, period_us: int, emulator_pid: int, folder: Path) -> Block:
+def run_block(
+    run: Run, seconds: float, period_us: int, emulator_pid: int, folder: Path, preload: Path | None = None
+) -> Block:
     """Run one block and read what it says. Raises TimingError."""
-    with running(run, folder) as begun:
+    with running(run, folder, preload) as begun:
         time.sleep(SETTLE_S)
         pids = {run.name: begun.process.pid, "emulator": emulator_pid}
         if begun.logger_pid is not None:
@@ -261,7 +308,8 @@ def run_block(run: Run, seconds: float, period_us: int, emulator_pid: int, folde
         period_us=period_us,
         due_ns=due_ns,
         times_ns={name: values[measured] for name, values in times_ns.items()},
-        cpu_us={name: cpu_per_cycle(windows, due_ns, name) for name in pids},
+        cpu_us={name: cpu_per_cycle(windows, due_ns, name) for name in pids if is_cpu_clock_fine()},
+        work_us=work_per_cycle(waits_path(run, folder), due_ns + times_ns["lateness"][measured]),
         overruns=count_overruns(due_ns, period_us),
         frames_lost=rest.pop("frames_lost", 0),
         scheduler=rest.pop("scheduler", ""),
@@ -355,14 +403,15 @@ def measure(
     `devices`: options of the emulator. Raises TimingError.
     """
     blocks: dict[str, list[Block]] = {run.name: [] for run in runs}
+    preload, _ = yardstick.build(folder, WAITS, "-shared", "-fPIC", "-ldl")
     for number in range(rounds):
         for run in runs:
             with emulator(CHANNEL, "--scenario", "idle", *devices, folder=folder) as played:
-                block = run_block(run, seconds, period_us, played.pid, folder)
+                block = run_block(run, seconds, period_us, played.pid, folder, preload)
             blocks[run.name].append(block)
             print(
                 f"round {number + 1}/{rounds}  {run.name:16} {block.cycles} cycles, {block.overruns} overruns, "
-                f"{block.cpu_per_cycle_us(run.name):.0f} µs CPU per cycle",
+                f"{block.work_per_cycle_us():.0f} µs of work per cycle",
                 file=sys.stderr,
                 flush=True,
             )
@@ -385,7 +434,7 @@ def row(name: str, values: Sequence[float]) -> str:
 
 
 def ratios(above: Sequence[Block], below: Sequence[Block], value: Callable[[Block], float]) -> list[float]:
-    """Divide round by round: the median of the rounds, the lowest, the highest; NaN where there is nothing to divide."""
+    """Divide round by round: the median of the rounds, the lowest, the highest; NaN where there's nothing to divide."""
     each = np.array([value(a) / value(b) if value(b) > 0.0 else np.nan for a, b in zip(above, below, strict=True)])
     return [float(np.median(each)), float(each.min()), float(each.max())]
 
@@ -409,7 +458,8 @@ def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
             "overruns_per_100000": per_100_000(each),
             "frames_lost": sum(block.frames_lost for block in each),
             "cpu_us": float(np.median([block.cpu_per_cycle_us(name) for block in each])),
-            "cpu_quiet_us": float(np.median([block.cpu_per_cycle_us(name, QUIET_PERCENT) for block in each])),
+            "work_us": float(np.median([block.work_per_cycle_us() for block in each])),
+            "work_quiet_us": float(np.median([block.work_per_cycle_us(QUIET_PERCENT) for block in each])),
             "cpu_of_others_us": {
                 other: float(np.median([block.cpu_per_cycle_us(other) for block in each]))
                 for other in each[0].cpu_us
@@ -425,9 +475,8 @@ def summarise(blocks: dict[str, list[Block]]) -> dict[str, Any]:
     described["ratios"] = {
         f"{above}/{below}": {
             "cpu": ratios(blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(block.name)),
-            "cpu_quiet": ratios(
-                blocks[above], blocks[below], lambda block: block.cpu_per_cycle_us(block.name, QUIET_PERCENT)
-            ),
+            "work": ratios(blocks[above], blocks[below], Block.work_per_cycle_us),
+            "work_quiet": ratios(blocks[above], blocks[below], lambda block: block.work_per_cycle_us(QUIET_PERCENT)),
             "command_p50": ratios(
                 blocks[above], blocks[below], lambda block: float(np.median(block.times_ns["command"]))
             ),
@@ -450,18 +499,25 @@ def as_text(described: dict[str, Any]) -> str:
             if time_name in described[name]["times_us"]:
                 lines.append(row(f"{title:38} {name:>15}", described[name]["times_us"][time_name]))
     lines.append("")
-    titles = f"{'CPU µs/cycle':>13} {'quiet':>8} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}"
+    titles = (
+        f"{'work µs/cycle':>13} {'quiet':>8} {'CPU µs':>8} {'overruns':>9} {'/100,000':>9} {'cycles':>9} {'lost':>5}"
+    )
     lines.append(f"{'':20} {titles}  scheduler")
     for name in names:
         each = described[name]
         skipped = (
             f"{each['overruns']:9d} {each['overruns_per_100000']:9.1f} {each['cycles']:9d} {each['frames_lost']:5d}"
         )
-        lines.append(f"{name:20} {each['cpu_us']:13.1f} {each['cpu_quiet_us']:8.1f} {skipped}  {each['scheduler']}")
-        lines += [f"{f'  its {other}':20} {value:13.1f}" for other, value in each["cpu_of_others_us"].items()]
+        work = f"{each['work_us']:13.1f} {each['work_quiet_us']:8.1f} {each['cpu_us']:8.1f}"
+        lines.append(f"{name:20} {work} {skipped}  {each['scheduler']}")
+        lines += [
+            f"{f'  its {other}':20} {'':13} {'':8} {value:8.1f}" for other, value in each["cpu_of_others_us"].items()
+        ]
     lines.append("")
     for pair, each in described["ratios"].items():
         for what, (middle, low, high) in each.items():
+            if np.isnan(middle):
+                continue
             lines.append(f"{pair + ', ' + what:44} {middle:8.2f} ({low:.2f} to {high:.2f} by round)")
     return "\n".join(lines)
 

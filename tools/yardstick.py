@@ -20,7 +20,7 @@ RESET_COMMUNICATION, START, PRE_OPERATIONAL = 0x82, 0x01, 0x80
 OPERATIONAL = 5
 
 
-def build(folder: Path, source: Path = SOURCE) -> tuple[Path | None, str]:
+def build(folder: Path, source: Path = SOURCE, *options: str) -> tuple[Path | None, str]:
     """Compile a program into a folder; without a C compiler return None and one line that says so.
 
     Raises CalledProcessError when it doesn't compile.
@@ -29,7 +29,7 @@ def build(folder: Path, source: Path = SOURCE) -> tuple[Path | None, str]:
     if compiler is None:
         return None, f"no C compiler (cc, gcc, clang), so no {source.stem}; on Debian: apt-get install gcc libc6-dev"
     program = folder / source.stem
-    subprocess.run([compiler, *FLAGS, "-o", program, source], check=True)
+    subprocess.run([compiler, *FLAGS, *options, "-o", program, source], check=True)
     return program, ""
 
 

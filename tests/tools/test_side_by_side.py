@@ -1,6 +1,7 @@
 """tools/side_by_side.py: CPU time by window, overruns by the grid, ratios by round."""
 
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import side_by_side
+import yardstick
 from side_by_side import Block, Window
 
 from adacd_hil.config import load_settings
@@ -18,7 +20,7 @@ from adacd_hil.config import load_settings
 def block(name: str, cpu_us: list[float], overruns: int = 0, compute_ns: int = 50_000) -> Block:
     due_ns = np.arange(100, dtype=np.int64) * 1_000_000
     times_ns = {key: np.full(100, compute_ns, np.int64) for key in side_by_side.TITLES}
-    return Block(name, 1000, due_ns, times_ns, {name: np.array(cpu_us)}, overruns, 0)
+    return Block(name, 1000, due_ns, times_ns, {name: np.array(cpu_us)}, overruns, 0, np.array(cpu_us))
 
 
 def test_overruns_are_the_periods_missing_from_the_grid() -> None:
@@ -45,9 +47,9 @@ def test_ratios_compare_within_a_round() -> None:
     yardsticks = [block("yardstick", [50.0]), block("yardstick", [100.0])]
     hosts = [block("host", [100.0, 120.0, 900.0]), block("host", [300.0])]
     described = side_by_side.summarise({"yardstick": yardsticks, "host": hosts})
-    np.testing.assert_allclose(described["ratios"]["host/yardstick"]["cpu"], [2.7, 2.4, 3.0])
+    np.testing.assert_allclose(described["ratios"]["host/yardstick"]["work"], [2.7, 2.4, 3.0])
     assert described["host"]["cpu_us"] == pytest.approx(210.0)
-    assert "host/yardstick, cpu" in side_by_side.as_text(described)
+    assert "host/yardstick, work" in side_by_side.as_text(described)
 
 
 def test_overruns_are_counted_against_all_periods() -> None:
@@ -60,3 +62,24 @@ def test_the_configuration_of_a_measured_run_can_be_used(tmp_path: Path) -> None
     settings = load_settings(str(side_by_side.patient_config(tmp_path, "fd_500us", 500)), "P")
     assert settings.devices.contract == "arm_fd_500us"
     assert (settings.bus.period_us, settings.bus.max_age_cycles, settings.operator.script) == (500, 100, ())
+
+
+def test_work_is_what_lies_between_two_waits(tmp_path: Path) -> None:
+    path = tmp_path / "waits"
+    waits = [(0, 1_000_100), (1_010_000, 1_030_000), (1_050_000, 2_000_000), (2_100_000, 3_000_000)]
+    np.array([5_000, *np.ravel(waits)], np.int64).tofile(path)
+    due_ns = np.array([1_000_000, 2_000_000, 3_000_000], np.int64)
+    np.testing.assert_allclose(side_by_side.work_per_cycle(path, due_ns), [4.9 + 15.0, 95.0])
+
+
+def test_waits_of_a_process_are_noted(tmp_path: Path) -> None:
+    library, reason = yardstick.build(tmp_path, side_by_side.WAITS, "-shared", "-fPIC", "-ldl")
+    if library is None:
+        pytest.skip(reason)
+    path = tmp_path / "waits.noted"
+    program = "import select, time; time.sleep(1e-4); select.select([], [], [], 1e-4)"
+    environment = {**os.environ, "LD_PRELOAD": str(library), "WAITS": str(path)}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
+    waits = np.fromfile(path, np.int64)[1:].reshape(-1, 2)
+    assert len(waits) == 2
+    assert (waits[:, 1] - waits[:, 0] >= 100_000).all()
