@@ -154,15 +154,16 @@ def cpu_per_cycle(windows: Sequence[Window], due_ns: NDArray[np.int64], process:
 def work_per_cycle(path: Path, begin_ns: NDArray[np.int64]) -> NDArray[np.float64]:
     """Add up, for all cycles but the last, the time in which a process didn't wait, µs; empty without a file.
 
-    begin_ns (n,): when each cycle began. Each stretch of work contains one reading of the clock that is the noting's
-    own; it is taken off.
+    begin_ns (n,): when each cycle began. What is noted is in ticks of the processor's counter, but for the first two
+    rows, which say what they are in ns.
     """
     if not path.exists() or len(begin_ns) < 2:
         return np.empty(0)
-    noted = np.fromfile(path, np.int64)
-    waits = noted[1:].reshape(-1, 2)
-    stretch_ns = np.stack((waits[:-1, 1], waits[1:, 0]), axis=1)
-    done_ns = np.cumsum(np.maximum(stretch_ns[:, 1] - stretch_ns[:, 0] - noted[0], 0))
+    noted = np.fromfile(path, np.int64).reshape(-1, 2)
+    (start, start_ns), (end, end_ns) = noted[:2].tolist()
+    waits_ns = (noted[2:] - start) * ((end_ns - start_ns) / (end - start)) + start_ns
+    stretch_ns = np.stack((waits_ns[:-1, 1], waits_ns[1:, 0]), axis=1)
+    done_ns = np.cumsum(np.maximum(stretch_ns[:, 1] - stretch_ns[:, 0], 0.0))
     before_ns = np.concatenate(([0], done_ns[:-1]))
     worked_ns = np.interp(begin_ns, stretch_ns.ravel(), np.stack((before_ns, done_ns), axis=1).ravel())
     return np.diff(worked_ns) * 1e-3

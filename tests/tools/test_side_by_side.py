@@ -67,9 +67,11 @@ def test_the_configuration_of_a_measured_run_can_be_used(tmp_path: Path) -> None
 def test_work_is_what_lies_between_two_waits(tmp_path: Path) -> None:
     path = tmp_path / "waits"
     waits = [(0, 1_000_100), (1_010_000, 1_030_000), (1_050_000, 2_000_000), (2_100_000, 3_000_000)]
-    np.array([5_000, *np.ravel(waits)], np.int64).tofile(path)
+    clocks = [(7, 500), (7 + 8_000_000, 500 + 4_000_000)]  # two ticks are 1 ns
+    ticks = [(7 + 2 * (before - 500), 7 + 2 * (after - 500)) for before, after in waits]
+    np.array([*clocks, *ticks], np.int64).tofile(path)
     due_ns = np.array([1_000_000, 2_000_000, 3_000_000], np.int64)
-    np.testing.assert_allclose(side_by_side.work_per_cycle(path, due_ns), [4.9 + 15.0, 95.0])
+    np.testing.assert_allclose(side_by_side.work_per_cycle(path, due_ns), [9.9 + 20.0, 100.0])
 
 
 def test_waits_of_a_process_are_noted(tmp_path: Path) -> None:
@@ -80,6 +82,8 @@ def test_waits_of_a_process_are_noted(tmp_path: Path) -> None:
     program = "import select, time; time.sleep(1e-4); select.select([], [], [], 1e-4)"
     environment = {**os.environ, "LD_PRELOAD": str(library), "WAITS": str(path)}
     subprocess.run([sys.executable, "-c", program], env=environment, check=True)
-    waits = np.fromfile(path, np.int64)[1:].reshape(-1, 2)
+    noted = np.fromfile(path, np.int64).reshape(-1, 2)
+    ticks_per_ns = (noted[1, 0] - noted[0, 0]) / (noted[1, 1] - noted[0, 1])
+    waits = noted[2:]
     assert len(waits) == 2
-    assert (waits[:, 1] - waits[:, 0] >= 100_000).all()
+    assert (waits[:, 1] - waits[:, 0] >= 100_000 * ticks_per_ns).all()
