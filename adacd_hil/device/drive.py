@@ -139,15 +139,19 @@ _TARGET_REACHED = 1 << 10  # of the statusword; in QUICK_STOP_ACTIVE with such a
 _STANDSTILL_RAD_S = 0.02
 """Speed of the joint that counts as standing still, for drives that leave bit 10 alone."""
 
-_STATUS_SIGNALS = (
-    "statusword",
-    "mode_display",
-    "torque_actual",
-    "error_code",
-    "error_register",
-    "torque_demand",
-    "acted_commands",
-)
+class _StatusPlaces(NamedTuple):
+    """Where the signals of a status are among a message's values; -1: not in it."""
+
+    statusword: int = -1
+    mode_display: int = -1
+    torque_actual: int = -1
+    error_code: int = -1
+    error_register: int = -1
+    torque_demand: int = -1
+    acted_commands: int = -1
+
+
+_NO_STATUS = _StatusPlaces()
 
 
 def option_codes(settings: Settings, profile: ProfileSettings) -> tuple[int | None, int | None]:
@@ -205,15 +209,16 @@ class Drive:
         self._position_at = find_signal(self.feedback_message, "position")
         self._velocity_at = find_signal(self.feedback_message, "velocity")
         self._feedback_status = _status_places(self.feedback_message)
-        self._status_places = [] if self.status_message is None else _status_places(self.status_message)
+        self._status_places = _NO_STATUS if self.status_message is None else _status_places(self.status_message)
         self._status_receiver = None if self.status_message is None else self.status_message.receiver()
         self.is_protected = self.feedback_message.header_bytes > 0
         """Whether the feedback carries an end-to-end header; else it is checked by plausibility."""
         self._command, self._controlword_at, self._torque_at = _command_template(
             self.command_message, max_torque_permille
         )
-        carried = {name for name, _ in (*self._feedback_status, *self._status_places)}
-        if "statusword" not in carried:
+        self.has_status_frame = self._feedback_status == _NO_STATUS
+        """Whether the status comes in a frame of its own."""
+        if max(self._feedback_status.statusword, self._status_places.statusword) < 0:
             raise CodecError(f"{name}: no message carries signal statusword")
         self._received_position_rad: float | None = None
         self._received_cycle = 0
@@ -228,17 +233,13 @@ class Drive:
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         # Where no frame shows the mode, the master has compared 0x6061 before the start.
-        self.mode = 0 if "mode_display" in carried else MODE_CYCLIC_SYNCHRONOUS_TORQUE
+        is_mode_shown = max(self._feedback_status.mode_display, self._status_places.mode_display) >= 0
+        self.mode = 0 if is_mode_shown else MODE_CYCLIC_SYNCHRONOUS_TORQUE
         self.torque_actual_permille = 0
         self.torque_demand_permille = 0
         self.error_code = 0
         self.error_register = 0
         self.acted_commands = 0
-
-    @property
-    def has_status_frame(self) -> bool:
-        """Whether the status comes in a frame of its own."""
-        return not self._feedback_status
 
     def accept_feedback(self, data: bytes, cycle: int) -> bool:
         """Take one feedback frame of `cycle`; False when a check fails and it changes nothing."""
@@ -258,7 +259,7 @@ class Drive:
         self.position_rad = position
         self.velocity_rad_s = values[self._velocity_at]
         self.sample_cycle = cycle
-        if self._feedback_status:
+        if not self.has_status_frame:
             self._take_status(values, self._feedback_status, cycle)
         return True
 
@@ -285,17 +286,23 @@ class Drive:
             self._take_status(message.decode_values(data), self._status_places, cycle)
         return is_valid
 
-    def _take_status(self, values: tuple[float, ...], places: list[tuple[str, int]], cycle: int) -> None:
-        found = {name: int(values[at]) for name, at in places}
+    def _take_status(self, values: tuple[float, ...], at: _StatusPlaces, cycle: int) -> None:
         self.status_cycle = cycle
-        self.statusword = found.get("statusword", self.statusword)
-        self.state = decode_statusword(self.statusword)
-        self.mode = found.get("mode_display", self.mode)
-        self.torque_actual_permille = found.get("torque_actual", self.torque_actual_permille)
-        self.torque_demand_permille = found.get("torque_demand", self.torque_demand_permille)
-        self.error_code = found.get("error_code", self.error_code)
-        self.error_register = found.get("error_register", self.error_register)
-        self.acted_commands = found.get("acted_commands", self.acted_commands)
+        if at.statusword >= 0:
+            self.statusword = int(values[at.statusword])
+            self.state = decode_statusword(self.statusword)
+        if at.mode_display >= 0:
+            self.mode = int(values[at.mode_display])
+        if at.torque_actual >= 0:
+            self.torque_actual_permille = int(values[at.torque_actual])
+        if at.torque_demand >= 0:
+            self.torque_demand_permille = int(values[at.torque_demand])
+        if at.error_code >= 0:
+            self.error_code = int(values[at.error_code])
+        if at.error_register >= 0:
+            self.error_register = int(values[at.error_register])
+        if at.acted_commands >= 0:
+            self.acted_commands = int(values[at.acted_commands])
 
     @property
     def is_enabled(self) -> bool:
@@ -354,9 +361,9 @@ def find_signal(message: MessageCodec, name: str) -> int:
     raise CodecError(f"{message.name} has no signal {name}")
 
 
-def _status_places(message: MessageCodec) -> list[tuple[str, int]]:
+def _status_places(message: MessageCodec) -> _StatusPlaces:
     places = {signal.name: place for place, signal in enumerate(message.values)}
-    return [(name, places[name]) for name in _STATUS_SIGNALS if name in places]
+    return _StatusPlaces(**{name: places[name] for name in _StatusPlaces._fields if name in places})
 
 
 def _command_template(message: MessageCodec, max_torque_permille: int) -> tuple[list[int], int, int]:
