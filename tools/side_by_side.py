@@ -6,7 +6,6 @@ preloaded library (waits.c) notes when it waits. CPU clocks are read besides, in
 the kernel's account is fine enough.
 """
 
-import dataclasses
 import itertools
 import json
 import os
@@ -26,7 +25,6 @@ import yardstick
 from numpy.typing import NDArray
 
 import adacd_hil
-from adacd_hil.config import Settings
 from adacd_hil.control.session import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.wire.codec import contract_folder, load_codec
@@ -70,14 +68,12 @@ script = []
 acknowledge_after_s = 0.4
 acknowledge_faults = 1000
 acknowledge_fault_after_s = 0.1
-"""
-"""Configuration of a measured run."""
-UNHURRIED = """
+
 [realtime]
 misses = 1000000
-sample_period = "nominal"
+sample_period = "nominal"  # the emulated arm moves one period per SYNC
 """
-"""The same where the host counts skipped periods. Nominal: the emulated arm moves one period per SYNC."""
+"""Configuration of a measured run."""
 
 
 class TimingError(Exception):
@@ -390,8 +386,7 @@ def read_cycles(log: RunLog) -> tuple[NDArray[np.int64], dict[str, NDArray[np.in
 def patient_config(folder: Path, base: str = "paper", period_us: int = 1000, more: str = "") -> Path:
     """Write the configuration of a measured run; `more` is TOML that outweighs it."""
     patient, path = folder / "patient.toml", folder / "measured.toml"
-    has_deadlines = any(section.name == "realtime" for section in dataclasses.fields(Settings))
-    patient.write_text(PATIENT.format(base=base, period_us=period_us) + (UNHURRIED if has_deadlines else ""))
+    patient.write_text(PATIENT.format(base=base, period_us=period_us))
     path.write_text(f'extends = "{patient.resolve()}"\n{more}\n')
     return path
 

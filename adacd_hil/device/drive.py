@@ -139,6 +139,7 @@ _TARGET_REACHED = 1 << 10  # of the statusword; in QUICK_STOP_ACTIVE with such a
 _STANDSTILL_RAD_S = 0.02
 """Speed of the joint that counts as standing still, for drives that leave bit 10 alone."""
 
+
 class _StatusPlaces(NamedTuple):
     """Where the signals of a status are among a message's values; -1: not in it."""
 
