@@ -80,7 +80,7 @@ class CycleColumns:
             return None
         values_ns = self[quantity.column]
         if quantity.column == "feedback_ns":
-            values_ns = values_ns[values_ns >= 0]  # a cycle of a test whose feedback was not complete has -1
+            values_ns = values_ns[self["frames_missing"] == 0]  # else it is when the host gave up
         return np.asarray(values_ns / 1000.0, dtype=np.float64)
 
     def steps(self, name: str) -> Cycles:

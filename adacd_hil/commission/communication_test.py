@@ -109,22 +109,7 @@ class CommunicationTest:
         self._complete += state.is_complete
         self._ages.append(ages)
         self._recent.append(cycle)
-        record = CycleRecord(
-            cycle=state.cycle,
-            lateness_ns=cycle.lateness_ns,
-            feedback_ns=cycle.feedback_ns,
-            command_ns=cycle.command_ns,
-            compute_ns=cycle.compute_ns,
-            slack_ns=cycle.slack_ns,
-            data_age=max(ages),
-            overruns=self._overruns,
-            frames_missing=sum(age != 0 for age in ages),
-            commands_late=cycle.late_commands,
-            frames_lost=cycle.frames_lost,
-            receive_queue_bytes=cycle.receive_queue_bytes,
-            transmit_queue_bytes=cycle.transmit_queue_bytes,
-            log_queue_bytes=log_queue_bytes,
-        )
+        record = cycle.record._replace(overruns=self._overruns, log_queue_bytes=log_queue_bytes)
         self._t_ns.append(state.t_ns)
         self._records.append(record)
         return record

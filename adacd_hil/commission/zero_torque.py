@@ -7,12 +7,13 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
+from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
 from adacd_hil.control.realtime import Recurrence, make_pacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
-from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason
+from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.tap import Tap
 
@@ -21,23 +22,11 @@ DISABLE_CYCLES = 20
 
 
 class ZeroTorqueCycle(NamedTuple):
-    """How one cycle went; times in ns. feedback_ns: SYNC to the last cyclic frame, -1 when not all came.
-
-    compute_ns: last cyclic frame to last command handed to the bus. slack_ns: from there to the next grid point. The
-    rest as in records.CycleRecord.
-    """
+    """One cycle: what the arm reported, how it went, and its frames, True for sent."""
 
     state: ArmState
-    lateness_ns: int
-    feedback_ns: int
-    command_ns: int
+    record: CycleRecord
     frames: list[tuple[bool, Frame]]
-    late_commands: int
-    compute_ns: int
-    slack_ns: int
-    frames_lost: int
-    receive_queue_bytes: int
-    transmit_queue_bytes: int
 
 
 class ZeroTorqueLoop:
@@ -48,12 +37,12 @@ class ZeroTorqueLoop:
     ) -> None:
         self.pacer = make_pacer(settings, clock, bus, arm.sync_id)
         self._period_ns = settings.bus.period_ns
-        self._is_following = settings.bus.follows
         self._clock = clock
         self._bus, self._arm, self._master = bus, arm, master
         self._is_enabling = is_enabling
         self._is_interrupted = False
         self._exchange = Exchange(settings, bus, arm, master, clock)
+        self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
         self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
         self._max_age_cycles = settings.bus.max_age_cycles
         self._gate = Gate(settings.arm, settings.bus.period_s)
@@ -98,29 +87,13 @@ class ZeroTorqueLoop:
             self._cycle(False, quick_stop)
 
     def _cycle(self, is_enabling: bool, quick_stop: bool) -> ZeroTorqueCycle:
-        bus, arm, clock = self._bus, self._arm, self._clock
+        bus = self._bus
         tick = self.pacer.next()
         state = self._exchange.read(tick)
-        sync_ns = self._exchange.sync_ns
-        feedback_ns = self._exchange.feedback_ns - sync_ns if arm.is_complete else -1
         self._gate.limit(self._tau_d, is_enabling and state.is_enabled, self._tau_c)
         bus.held_ns = self.pacer.spend(self._exchange.feedback_ns)
-        arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
-        handed_ns = clock.now_ns()
-        # Where SYNC is followed, it is the grid point itself, however late this host woke up for it.
-        late_ns = 0 if self._is_following else tick.lateness_ns
+        self._arm.write(ArmCommand(self._tau_c, is_enabling, quick_stop))
+        record = self._evidence.record(tick, state, self.pacer.overruns, log_queue_bytes=0)
         if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()
-        return ZeroTorqueCycle(
-            state=state,
-            lateness_ns=tick.lateness_ns,
-            feedback_ns=feedback_ns,
-            command_ns=handed_ns - sync_ns,
-            frames=bus.take(),
-            late_commands=self._exchange.late_commands.count,
-            compute_ns=handed_ns - self._exchange.feedback_ns,
-            slack_ns=tick.t_ns - late_ns + self._period_ns - handed_ns,
-            frames_lost=bus.frames_lost,
-            receive_queue_bytes=self._exchange.queues.received,
-            transmit_queue_bytes=self._exchange.queues.sent,
-        )
+        return ZeroTorqueCycle(state, record, bus.take())

@@ -131,7 +131,7 @@ class Cycle:
             self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
             command, flags = self._limit(arm, output, self._bus.held_ns)
             self._arm.write(command)
-            record = self._evidence.record(tick, arm, self._pacer.overruns, recorder)
+            record = self._evidence.record(tick, arm, self._pacer.overruns, recorder.waiting_bytes)
             if self._heartbeats.is_due(tick.cycle):
                 self._master.send_heartbeat()
             self._log(recorder, record, arm, request, output, command, flags)
@@ -201,7 +201,7 @@ class Cycle:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
         exchange = self._exchange
-        for source in (self._master, exchange.troubles, exchange.late_commands):
+        for source in (self._master, exchange.troubles, exchange.late_commands, self._evidence):
             for event in source.take_events():
                 recorder.event(t_ns, event)
         if output.state is not self._state:

@@ -5,9 +5,10 @@ from adacd_hil.config import Settings
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.realtime import Tick
 from adacd_hil.device.arm import Arm
-from adacd_hil.log.recorder import Recorder
-from adacd_hil.records import ArmState, CycleRecord
+from adacd_hil.records import ArmState, CycleRecord, Event
 from adacd_hil.wire.tap import Tap
+
+_REPEAT_NS = 1_000_000_000
 
 
 class Evidence:
@@ -18,14 +19,20 @@ class Evidence:
         self._clock = clock
         self._period_ns = settings.bus.period_ns
         self._is_following = settings.bus.follows
+        self._said_lost = bus.frames_lost
+        self._silent_until_ns = 0
+        self._events: list[Event] = []
 
-    def record(self, tick: Tick, arm: ArmState, overruns: int, recorder: Recorder) -> CycleRecord:
+    def record(self, tick: Tick, arm: ArmState, overruns: int, log_queue_bytes: int) -> CycleRecord:
         """Sum up the cycle that began with `tick`, whose commands have just been handed to the bus.
 
-        `overruns`: periods skipped since the run began.
+        `overruns`: periods skipped since the run began. `log_queue_bytes`: what waits for the log's writer.
         """
         exchange = self._exchange
         command_ns = self._clock.now_ns()
+        frames_lost = self._bus.frames_lost
+        if frames_lost != self._said_lost and command_ns >= self._silent_until_ns:
+            self._tell(frames_lost, command_ns)
         # Where SYNC is followed, it is the grid point itself, however late this host woke up for it.
         late_ns = 0 if self._is_following else tick.lateness_ns
         return CycleRecord(
@@ -39,8 +46,19 @@ class Evidence:
             overruns=overruns,
             frames_missing=self._arm.missing_frames,
             commands_late=exchange.late_commands.count,
-            frames_lost=self._bus.frames_lost,
+            frames_lost=frames_lost,
             receive_queue_bytes=exchange.queues.received,
             transmit_queue_bytes=exchange.queues.sent,
-            log_queue_bytes=recorder.waiting_bytes,
+            log_queue_bytes=log_queue_bytes,
         )
+
+    def _tell(self, frames_lost: int, t_ns: int) -> None:
+        count, self._said_lost = frames_lost - self._said_lost, frames_lost
+        self._silent_until_ns = t_ns + _REPEAT_NS
+        what = "1 received frame" if count == 1 else f"{count} received frames"
+        self._events.append(Event("warning", "bus", f"{what} dropped by the kernel: this host reads too late"))
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call: frames that were lost, at most once a second."""
+        events, self._events = self._events, []
+        return events

@@ -24,7 +24,8 @@ from adacd_hil.records import CycleRecord
 def columns(**values: list[int]) -> CycleColumns:
     count = len(next(iter(values.values())))
     made = {name: np.array(column, dtype=np.int64) for name, column in values.items()}
-    return CycleColumns(np.arange(count) * 1_000_000, {"cycle": np.arange(count), **made})
+    usual = {"cycle": np.arange(count), "frames_missing": np.zeros(count, np.int64)}
+    return CycleColumns(np.arange(count) * 1_000_000, usual | made)
 
 
 def evidence_of(**values: list[int]):
@@ -51,7 +52,7 @@ def test_of_slack_the_low_percentiles_are_given():
 
 
 def test_a_cycle_without_complete_feedback_has_no_time_of_it():
-    found = evidence_of(feedback_ns=[5000, -1, 7000]).times["sync_to_feedback"]
+    found = evidence_of(feedback_ns=[5000, 700_000, 7000], frames_missing=[0, 1, 0]).times["sync_to_feedback"]
     assert (found.percentiles["max"], int(found.histogram.counts.sum()), found.histogram.below) == (7.0, 2, 0)
 
 

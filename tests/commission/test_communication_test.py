@@ -91,7 +91,7 @@ def test_a_device_that_never_answers_is_not_sufficient() -> None:
     report, _ = run(rig)
     assert (report.verdict, report.share) == (Verdict.NOT_SUFFICIENT, 0.0)
     assert (report.devices["Drive2"].never, sum(report.devices["Drive2"].ages)) == (200, 0)
-    assert set(report.columns["feedback_ns"].tolist()) == {-1}
+    assert set(report.columns["frames_missing"].tolist()) == {1}
 
 
 def test_skipped_periods_count_as_without_data() -> None:

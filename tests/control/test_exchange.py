@@ -1,10 +1,13 @@
-"""One exchange with the arm: what belongs to which cycle, and when the last of it came."""
+"""One exchange with the arm: what belongs to which cycle, when the last of it came, and what its record says."""
 
+import pytest
 from bench_bus import CODEC, PERIOD_NS, BenchBus
 
+from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.realtime import Tick
 from adacd_hil.records import ArmState
+from adacd_hil.wire.bus import EmbeddedBus
 
 
 class Rig:
@@ -17,11 +20,14 @@ class Rig:
         self.exchange = Exchange(bench.settings, bench.tap, bench.arm, bench.master, bench.clock)
         self._cycle = -1
 
-    def read(self) -> ArmState:
+    def begin(self) -> Tick:
         clock = self.bench.clock
         clock.sleep_until_ns((clock.now_ns() // PERIOD_NS + 1) * PERIOD_NS)
         self._cycle += 1
-        return self.exchange.read(Tick(self._cycle, clock.now_ns(), 1, 0))
+        return Tick(self._cycle, clock.now_ns(), 1, 0)
+
+    def read(self) -> ArmState:
+        return self.exchange.read(self.begin())
 
 
 def test_a_duplicate_that_comes_between_two_cycles_stands_for_no_frame_of_the_next() -> None:
@@ -65,3 +71,26 @@ def test_the_feedback_is_in_when_its_last_frame_came_not_when_it_was_read() -> N
     rig.bench.bus.receive = read_late  # type: ignore[method-assign]
     rig.read()
     assert rig.exchange.feedback_ns == rig.exchange.sync_ns == clock.now_ns() - 30_000
+
+
+def test_frames_that_the_kernel_dropped_are_counted_and_said_at_most_once_a_second(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig()
+    bench = rig.bench
+    lost = [0]
+    monkeypatch.setattr(EmbeddedBus, "frames_lost", property(lambda _: lost[-1]))
+    evidence = Evidence(bench.settings, bench.tap, bench.arm, rig.exchange, bench.clock)
+    counted, said = [], []
+    for count in (0, 1, 4, 4):
+        lost.append(count)
+        tick = rig.begin()
+        counted.append(evidence.record(tick, rig.exchange.read(tick), 0, 0).frames_lost)
+        said += evidence.take_events()
+    assert counted == [0, 1, 4, 4]
+    assert [event.message for event in said] == ["1 received frame dropped by the kernel: this host reads too late"]
+    bench.clock.sleep_until_ns(bench.clock.now_ns() + 1_000_000_000)
+    tick = rig.begin()
+    evidence.record(tick, rig.exchange.read(tick), 0, 0)
+    (event,) = evidence.take_events()
+    assert event.message.startswith("3 received frames")
