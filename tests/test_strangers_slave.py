@@ -21,7 +21,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, ArmState, FaultReason
-from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import contract_folder
 
 PERIOD_NS = 1_000_000
@@ -73,7 +73,7 @@ class Later:
         self.action()
 
 
-class Wire:
+class Wire(Bus):
     """The host's bus, and to canopen's networks a python-can bus, in one process."""
 
     channel = "in-process"
