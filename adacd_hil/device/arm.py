@@ -78,6 +78,8 @@ class Arm:
         self._received = 0
         self._seen = 0
         self._was_enabled = False
+        self.has_all_frames = False
+        """Whether all cyclic frames of this cycle are in, passed their checks or not."""
 
     def _build_handlers(self) -> dict[int, tuple[_Take, int]]:
         handlers: dict[int, tuple[_Take, int]] = {}
@@ -100,13 +102,14 @@ class Arm:
 
         SYNC is sent here, unless another host sends it; pipelined commands leave behind it.
         """
-        if self._cycle >= 0 and self._seen != _COMPLETE:
+        if self._cycle >= 0 and not self.has_all_frames:
             self._miss()
         self._cycle = cycle
         self._t_ns = t_ns
         self._periods = periods
         self._received = 0
         self._seen = 0
+        self.has_all_frames = False
         frames: tuple[tuple[int, bytes], ...] = (
             () if self._is_following else ((self.sync_id, bytes((1 + cycle % SYNC_OVERFLOW,))),)
         )
@@ -136,14 +139,10 @@ class Arm:
             take(frame.data, self._cycle - 1)
             return True
         self._seen |= bit
+        self.has_all_frames = self._seen == _COMPLETE
         if take(frame.data, self._cycle):
             self._received |= bit
         return True
-
-    @property
-    def has_all_frames(self) -> bool:
-        """Whether all cyclic frames of this cycle are in, passed their checks or not."""
-        return self._seen == _COMPLETE
 
     @property
     def is_complete(self) -> bool:

@@ -236,6 +236,8 @@ class Drive:
         # Where no frame shows the mode, the master has compared 0x6061 before the start.
         is_mode_shown = max(self._feedback_status.mode_display, self._status_places.mode_display) >= 0
         self.mode = 0 if is_mode_shown else MODE_CYCLIC_SYNCHRONOUS_TORQUE
+        self.is_enabled = False
+        """Whether the drive produces the commanded torque."""
         self.torque_actual_permille = 0
         self.torque_demand_permille = 0
         self.error_code = 0
@@ -294,6 +296,7 @@ class Drive:
             self.state = decode_statusword(self.statusword)
         if at.mode_display >= 0:
             self.mode = int(values[at.mode_display])
+        self.is_enabled = self.state is Cia402State.OPERATION_ENABLED and self.mode == MODE_CYCLIC_SYNCHRONOUS_TORQUE
         if at.torque_actual >= 0:
             self.torque_actual_permille = int(values[at.torque_actual])
         if at.torque_demand >= 0:
@@ -304,11 +307,6 @@ class Drive:
             self.error_register = int(values[at.error_register])
         if at.acted_commands >= 0:
             self.acted_commands = int(values[at.acted_commands])
-
-    @property
-    def is_enabled(self) -> bool:
-        """Whether the drive produces the commanded torque."""
-        return self.state is Cia402State.OPERATION_ENABLED and self.mode == MODE_CYCLIC_SYNCHRONOUS_TORQUE
 
     def command(self, torque_permille: int, enable: bool, quick_stop: bool) -> bytes:
         """Encode one command frame; torque is zero unless the drive is wanted and enabled."""
