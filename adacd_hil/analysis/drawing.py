@@ -6,12 +6,14 @@ the page's own CSS variables and which carries no style, script, date or referen
 
 import io
 import re
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -147,7 +149,7 @@ def plot(axes: Axes, x: Vector, y: Vector, bins: int = _ENVELOPE_BINS, **look: A
     axes.plot(x[rows], y[rows], **look)
 
 
-def note(axes: Axes, text: str) -> None:
+def note(axes: Axes, text: str, colour: str = COLOURS["muted"]) -> None:
     """Write above the right end of a panel."""
     axes.annotate(
         text,
@@ -158,7 +160,19 @@ def note(axes: Axes, text: str) -> None:
         ha="right",
         va="bottom",
         fontsize=7.8,
-        color=COLOURS["muted"],
+        color=colour,
+    )
+
+
+def legend_above(figure: Figure, handles: Sequence[Artist], labels: Sequence[str], height: float) -> None:
+    """Put the legend above the right end of a figure of `height` inches."""
+    figure.legend(
+        handles,
+        labels,
+        loc="upper right",
+        bbox_to_anchor=(0.985, 1.0 - 0.06 / height),
+        ncols=len(labels),
+        columnspacing=1.8,
     )
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.drawing import COLOURS, PANEL_BINS, PAPER, Drawing, label_below, note, plot, style
+from adacd_hil.analysis.drawing import COLOURS, PANEL_BINS, PAPER, Drawing, label_below, legend_above, note, plot, style
 from adacd_hil.analysis.metrics import Contact, Metrics, Run, Section, filtered
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
 
@@ -308,14 +308,7 @@ def close_ups(run: Run, metrics: Metrics) -> Drawing:
         axes.set_axis_off()
     label_below(figure, "time since onset, ms" if run.truth else "time since detection, ms")
     handles, labels = grid.flat[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="upper right",
-        bbox_to_anchor=(0.985, 1.0 - 0.06 / height),
-        ncols=len(labels),
-        columnspacing=1.6,
-    )
+    legend_above(figure, handles, labels, height)
     more = f" The first {CLOSE_UPS} of {len(metrics.contacts)}." if len(metrics.contacts) > CLOSE_UPS else ""
     ideal = "; dotted, the true torque through the same filter" if run.truth is not None else ""
     caption = f"Estimated external torque of both joints, Nm, around each contact{ideal}.{more}"
@@ -387,14 +380,4 @@ def _describe(axes: Axes, contact: Contact) -> None:
         text, colour = f"detected at {contact.detected_s:.2f} s", COLOURS["muted"]
     else:
         text, colour = ("missed" if contact.is_armed else "not armed"), COLOURS["alarm"]
-    axes.annotate(
-        text,
-        (1.0, 1.0),
-        xycoords="axes fraction",
-        xytext=(0, 5),
-        textcoords="offset points",
-        ha="right",
-        va="bottom",
-        fontsize=7.8,
-        color=colour,
-    )
+    note(axes, text, colour)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from adacd_hil.analysis.drawing import COLOURS, Drawing, label_below, note, style
+from adacd_hil.analysis.drawing import COLOURS, Drawing, label_below, legend_above, note, style
 from adacd_hil.analysis.histogram import BINS_PER_DECADE
 from adacd_hil.analysis.timing import (
     COMPUTE,
@@ -164,14 +164,7 @@ def time_line(columns: CycleColumns, evidence: TimingEvidence, zero_ns: int, zer
     if overruns_s.size:
         handles.append(Line2D([], [], color=COLOURS["alarm"], marker="v", markersize=4.5, linestyle="none"))
         labels.append("overrun")
-    figure.legend(
-        handles,
-        labels,
-        loc="upper right",
-        bbox_to_anchor=(0.985, 1.0 - 0.06 / height),
-        ncols=len(labels),
-        columnspacing=1.8,
-    )
+    legend_above(figure, handles, labels, height)
     caption = "The smallest and the largest value of each stretch of time, so that none is lost."
     if evidence.is_modelled:
         caption += " Lockstep: times of the model of bus and host; it has no grid to be late on and no queues."
