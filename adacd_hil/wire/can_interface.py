@@ -13,8 +13,6 @@ from pathlib import Path
 
 from adacd_hil.wire.bus import BusError, InterfaceDownError, can_interfaces, is_hardware
 
-CAN_MTU = 16
-"""Size of a classic frame in SocketCAN, bytes."""
 CANFD_MTU = 72
 """Size of an FD frame in SocketCAN, bytes."""
 

@@ -32,9 +32,9 @@ _RECEIVED = struct.Struct(f"=IB3x64s {_HEAD}qq {_HEAD}I")
 """A frame, its stamp's control message, and that of the drops, which comes once there has been one."""
 _SLOT_BYTES = CANFD_MTU + 64
 _STEP_NS = 20_000_000
-"""From a longer silence, or a step of the wall clock, on the clocks are compared anew."""
+"""After a longer silence, or a larger step of the wall clock, the clocks are compared anew."""
 _TRUST_NS = 1_000_000_000
-"""How long a comparison of the clocks holds: the wall clock is slewed by 0.5 ms in a second at the most."""
+"""How long a comparison of the clocks holds at most. Slewing moves both alike; only a step sets them apart."""
 
 
 class _Vector(ctypes.Structure):
