@@ -99,5 +99,8 @@ def test_the_same_seed_twice_gives_the_same_decisions_bit_for_bit(played: dict[s
 
 
 def test_another_seed_gives_other_numbers(played: dict[str, Played], tmp_path: Path) -> None:
-    other = demo(tmp_path, "--seed", "8")
-    assert topic_bytes(other.log, "/scheme") != topic_bytes(played["P"].log, "/scheme")
+    (tmp_path / "short.toml").write_text('[operator]\nscript = [{ at_s = 0.5, request = "finish" }]\n')
+    other = demo(tmp_path, "--seed", "8", "--config", str(tmp_path / "short.toml"))
+    ours, theirs = (read_log(one.log).scheme["tau_J"][:600] for one in (played["P"], other))
+    assert len(ours) == len(theirs) == 600
+    assert not np.array_equal(ours, theirs)
