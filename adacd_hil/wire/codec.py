@@ -160,6 +160,13 @@ class MessageCodec:
         if self._body is None:
             return self.decode(data)[len(self.signals) - len(self.values) :]
         raw = self._body.unpack_from(data, self._body_offset)
+        # A comprehension costs more than what it computes for the one or two values of a classic frame.
+        if len(raw) == 1:
+            ((scale, offset),) = self._scales
+            return (raw[0] * scale + offset,)
+        if len(raw) == 2:
+            (scale1, offset1), (scale2, offset2) = self._scales
+            return raw[0] * scale1 + offset1, raw[1] * scale2 + offset2
         return tuple([r * scale + offset for r, (scale, offset) in zip(raw, self._scales, strict=True)])
 
     def encode_raw(self, *raw: int) -> bytearray:

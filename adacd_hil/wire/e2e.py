@@ -59,6 +59,9 @@ class Protection(Enum):
         return {Protection.NONE: 0, Protection.PROFILE_2: 2, Protection.PROFILE_5: 4}[self]
 
 
+_LAST_VALID = 1  # OK_SOME_LOST: a plain number, since looking it up costs more than the comparison
+
+
 class E2eStatus(IntEnum):
     """What the receiver's check says of one cycle of one message. The numbers are logged."""
 
@@ -73,7 +76,7 @@ class E2eStatus(IntEnum):
     @property
     def is_valid(self) -> bool:
         """Whether the frame's values may be used."""
-        return self <= E2eStatus.OK_SOME_LOST
+        return self <= _LAST_VALID
 
 
 @dataclass(frozen=True)
