@@ -36,7 +36,7 @@ from side_by_side import (
     yardstick_run,
 )
 from timing_disk import DISK_CASES, run_disk, show_disk
-from timing_hour import finish_hour, run_hour, show_hour
+from timing_hour import CONTACT_S, finish_hour, run_hour, show_hour
 
 from adacd_hil.wire.codec import contract_folder
 
@@ -114,7 +114,9 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         command = commands.add_parser(name)
         command.add_argument("--minutes", type=float, default=minutes, help="of each side; default %(default)s")
     period = "SYNC period in µs; default %(default)s"
-    commands.choices["hour"].add_argument("--period-us", type=int, default=1000, help=period)
+    hour = commands.choices["hour"]
+    hour.add_argument("--period-us", type=int, default=1000, help=period)
+    hour.add_argument("--every", type=float, default=3.0, help="seconds from contact to contact; default %(default)s")
     disk = commands.add_parser("disk")
     disk.add_argument("--seconds", type=float, default=20.0, help="before and during each case; default %(default)s")
     disk.add_argument("--case", action="append", choices=DISK_CASES, help="only this one; may be repeated")
@@ -127,6 +129,8 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         command.add_argument("--inside", action="store_true", help=f"on an interface {CHANNEL} that is up")
         command.add_argument("--mem", default="2G", help="of the guest, where there is one; default %(default)s")
     chosen = parser.parse_args(argv)
+    if chosen.command == "hour" and not chosen.every > CONTACT_S:
+        parser.error(f"--every = {chosen.every:g} s must be above the {CONTACT_S:g} s that a contact takes")
     if chosen.out is None:
         chosen.out = Path("runs") / f"timing-{chosen.command}"
     if re.search(r"^\s*period_us\b", chosen.settings, re.MULTILINE):

@@ -33,7 +33,6 @@ FIRST_COMMAND_ID = 0x201
 MEMORY_EVERY_S = 10.0
 MEMORY_SETTLED_S = 60.0
 MEGABYTE = 1e6
-CONTACT_EVERY_S = 3.0
 FIRST_CONTACT_S = 10.0
 CONTACTS = ((1, 0.25, 90.0, 20.0), (1, 0.25, -90.0, 20.0), (2, 0.20, 90.0, 15.0), (2, 0.20, -90.0, 15.0))
 """Link, point in m, direction in degrees, force in N: those of the paper's experiment."""
@@ -42,14 +41,14 @@ LOG_PARTS = "run*.mcap"
 REACTION = "MONITOR -> REACT"
 
 
-def write_contacts(path: Path, lasts_s: float) -> int:
-    """Write a scenario with a contact every three seconds, after one adaptation; return how many."""
-    lines = ['about = "A contact every three seconds."', 'group = "timing"', f"lasts_s = {lasts_s:.1f}"]
+def write_contacts(path: Path, lasts_s: float, every_s: float) -> int:
+    """Write a scenario with a contact every so many seconds, after one adaptation; return how many."""
+    lines = [f'about = "A contact every {every_s:g} s."', 'group = "timing"', f"lasts_s = {lasts_s:.1f}"]
     lines += ["start_deg = [-30.0, -60.0]", "contacts = ["]
-    count = max(0, int((lasts_s - FIRST_CONTACT_S) / CONTACT_EVERY_S))
+    count = max(0, int((lasts_s - FIRST_CONTACT_S) / every_s))
     for number in range(count):
         link, point_m, angle_deg, force_N = CONTACTS[number % len(CONTACTS)]
-        at_s = FIRST_CONTACT_S + CONTACT_EVERY_S * number
+        at_s = FIRST_CONTACT_S + every_s * number
         lines.append(
             f"  {{ at_s = {at_s:.1f}, link = {link}, point_m = {point_m}, angle_deg = {angle_deg}, "
             f"force_N = {force_N}, duration_s = {CONTACT_S} }},"
@@ -70,7 +69,7 @@ def run_hour(chosen: argparse.Namespace) -> dict[str, Any]:
     """Let the host run with contacts; sample the memory of all processes. The log is read afterwards."""
     folder = chosen.out
     total_s = chosen.minutes * 60.0
-    contacts = write_contacts(folder / "contacts.toml", total_s + 3600.0)
+    contacts = write_contacts(folder / "contacts.toml", total_s + 3600.0, chosen.every)
     config = patient_config(folder, period_us=chosen.period_us, more=chosen.settings)
     for old in (folder / "host").glob(LOG_PARTS):
         old.unlink()

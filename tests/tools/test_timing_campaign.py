@@ -33,7 +33,7 @@ def seen(*rows: tuple[int, int, int]) -> witness.Seen:
 
 def test_an_hour_holds_more_than_a_thousand_contacts_that_can_be_played(tmp_path: Path) -> None:
     path = tmp_path / "contacts.toml"
-    count = timing_hour.write_contacts(path, 3600.0)
+    count = timing_hour.write_contacts(path, 3600.0, 3.0)
     scenario = load_scenario(str(path))
     assert len(scenario.contacts) == count
     assert count > 1000
