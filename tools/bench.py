@@ -114,7 +114,7 @@ def time_calls(name: str, call: Callable[[], object]) -> None:
         start_ns = clock()
         call()
         times_ns[index] = clock() - start_ns
-    overhead_ns = min(clock() - clock() for _ in range(1000)) * -1
+    overhead_ns = min(-(clock() - clock()) for _ in range(1000))
     show(name, np.maximum(times_ns - overhead_ns, 0.0) * 1e-3)
 
 
