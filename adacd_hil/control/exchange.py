@@ -64,17 +64,19 @@ class Exchange:
         for early in tick.ahead:
             self._accept(early)
         try:
-            self.feedback_ns = self._await_feedback()
+            self.feedback_ns = self._await_feedback(tick.ahead[-1].t_ns if tick.ahead else tick.t_ns)
         except SilenceError as silence:
             names = ", ".join(arm.missing_names())
             raise SilenceError(f"no answer from {names} to SYNC of cycle {tick.cycle}: {silence}") from None
         return arm.state()
 
-    def _await_feedback(self) -> int:
-        """Take frames until all of this cycle are in or the time for them is over; return when that was."""
+    def _await_feedback(self, last_ns: int) -> int:
+        """Take frames until all of this cycle are in or the time for them is over; return when that was.
+
+        `last_ns`: when the last frame came that is in already.
+        """
         bus, arm, sync_ns = self._bus, self._arm, self.sync_ns
         patience_s = self._patience_s
-        last_ns = sync_ns
         for _ in range(_MOST_FRAMES):
             if arm.has_all_frames:
                 return last_ns

@@ -136,7 +136,7 @@ class Arm:
             return False
         take, bit = handler
         if is_late:
-            take(frame.data, self._cycle - 1)
+            take(frame.data, self._cycle - self._periods)
             return True
         self._seen |= bit
         self.has_all_frames = self._seen == _COMPLETE

@@ -88,11 +88,11 @@ class SocketCanBus(Bus):
             opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, int(self._is_fd))
             opened.setblocking(False)
             opened.bind((self.channel,))
+            self._receiver = FrameReceiver(opened, self._clock)
         except OSError as error:
             opened.close()
             raise BusMissingError(f"CAN interface {self.channel}: {error.strerror}") from None
         self._socket = opened
-        self._receiver = FrameReceiver(opened, self._clock)
         self._sender = FrameSender(opened)
         self._received: deque[Frame] = deque()
         self._is_down = False

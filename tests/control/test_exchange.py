@@ -7,7 +7,7 @@ from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.realtime import Tick
 from adacd_hil.records import ArmState
-from adacd_hil.wire.bus import EmbeddedBus
+from adacd_hil.wire.bus import EmbeddedBus, Frame
 
 
 class Rig:
@@ -28,6 +28,13 @@ class Rig:
 
     def read(self) -> ArmState:
         return self.exchange.read(self.begin())
+
+
+def drain(bus: EmbeddedBus) -> list[Frame]:
+    frames = []
+    while (frame := bus.receive(0.0)) is not None:
+        frames.append(frame)
+    return frames
 
 
 def test_a_duplicate_that_comes_between_two_cycles_stands_for_no_frame_of_the_next() -> None:
@@ -71,6 +78,18 @@ def test_the_feedback_is_in_when_its_last_frame_came_not_when_it_was_read() -> N
     rig.bench.bus.receive = read_late  # type: ignore[method-assign]
     rig.read()
     assert rig.exchange.feedback_ns == rig.exchange.sync_ns == clock.now_ns() - 30_000
+
+
+def test_feedback_that_was_read_with_a_followed_sync_came_when_its_last_frame_did() -> None:
+    rig = Rig()
+    bus = rig.bench.bus
+    rig.read()
+    tick = rig.begin()
+    rig.bench.arm.synchronise(tick.cycle, tick.t_ns, 1)  # for another cycle's answers, as they wait beside its SYNC
+    ahead = tuple(frame._replace(t_ns=tick.t_ns + 1000 * place) for place, frame in enumerate(drain(bus), 1))
+    rig.bench.tamper = lambda can_id, data: None
+    rig.exchange.read(tick._replace(cycle=tick.cycle + 1, ahead=ahead))
+    assert rig.exchange.feedback_ns == ahead[-1].t_ns == tick.t_ns + 4000
 
 
 def test_frames_that_the_kernel_dropped_are_counted_and_said_at_most_once_a_second(

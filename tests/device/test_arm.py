@@ -265,6 +265,15 @@ def test_a_late_frame_is_of_the_cycle_before_and_leaves_the_present_one_open() -
     assert not devices.arm.has_all_frames
 
 
+def test_after_skipped_periods_a_late_frame_is_as_old_as_the_cycle_before_them() -> None:
+    devices = Devices()
+    devices.arm.synchronise(0, 0, 1)
+    devices.arm.synchronise(75, 0, 75)
+    feedback = CODEC.message("Drive1Feedback")
+    devices.arm.accept(Frame(feedback.can_id, bytes(feedback.encode(0.1, 0.01)), 0), is_late=True)
+    assert devices.arm.state().age_q[0] == 75
+
+
 COMMANDED = ArmCommand(np.array((1.2, -0.6)), enable=True, quick_stop=False)
 TORQUES = (100, -100)
 """Per mille of the rated 12 and 6 Nm."""
