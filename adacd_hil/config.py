@@ -391,6 +391,12 @@ class ReactionSettings:
     position_margin_deg: float = setting(
         3.0, unit="deg", low=0.0, high=90.0, meaning="how far the withdrawal stays from the position limits"
     )
+    clear_s: float = setting(
+        0.5, unit="s", low=0.0, high=60.0, meaning="how long nothing pushes until the arm goes on after a contact"
+    )
+    patience_s: float = setting(
+        10.0, unit="s", low=0.1, high=3600.0, meaning="a contact that lasts longer waits to be acknowledged"
+    )
 
 
 @dataclass(frozen=True)

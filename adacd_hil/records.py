@@ -130,13 +130,14 @@ class SchemeState(IntEnum):
 
     INIT = 0  # the first complete cycle; or FAULT when it doesn't come
     COMMISSION = 1  # enough complete cycles at rest; or FAULT when they don't come
-    ENABLE = 2  # both drives report Operation enabled; or FAULT on timeout
-    ADAPT = 3  # eq. (15) with excitation proven; or FAULT on timeout
-    MONITOR = 4  # a collision, or the announcement of a payload change
-    REACT = 5  # the arm has come to rest
+    ENABLE = 2  # both drives report Operation enabled; a contact; or FAULT on timeout
+    ADAPT = 3  # eq. (15) with excitation proven, or all that a test of the fit needs; a contact; or FAULT on timeout
+    MONITOR = 4  # a contact, or the announcement of a payload change
+    REACT = 5  # after a collision: at rest; after a contact: it has cleared
     STOPPED = 6  # the user acknowledges
-    PAYLOAD = 7  # the user says that the payload has been changed
+    PAYLOAD = 7  # the user says that the payload has been changed; a contact
     FAULT = 8  # latched; the user acknowledges, and everything begins again with INIT
+    CERTIFY = 9  # theta frozen, tested on motion not used for the fit; out: certified; refuted; a contact
 
 
 class Request(IntEnum):
@@ -147,6 +148,17 @@ class Request(IntEnum):
     PAYLOAD = 2  # park the arm, the payload is about to change
     PAYLOAD_CHANGED = 3  # the payload has changed; adapt again
     FINISH = 4  # end the run: come to rest, then disable the drives
+
+
+class Reaction(IntEnum):
+    """What the arm does about a contact."""
+
+    NONE = 0  # goes on as if nothing had happened
+    STOP = 1  # brakes to rest and holds its place
+    WITHDRAW = 2  # moves away along the external torque, then rests
+    FLOAT = 3  # gives way: zero torque, friction and gravity compensated, damped
+    ADMITTANCE = 4  # moves as a virtual mass with a damper would under the external torque
+    SLOW_DOWN = 5  # goes on along its path at a part of the speed
 
 
 class FaultReason(IntEnum):
@@ -224,6 +236,7 @@ class SchemeOutput(NamedTuple):
     tau_ext_hat: Vector
     contact: ContactReport | None  # set in the cycle in which a report begins or becomes final
     block: Vector
+    reaction: Reaction = Reaction.NONE  # to the contact of REACT and STOPPED
 
 
 class CycleRecord(NamedTuple):

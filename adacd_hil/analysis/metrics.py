@@ -266,6 +266,7 @@ def evaluate(run: Run) -> Metrics:
 
 _KINDS: Final = {
     SchemeState.ADAPT: "adaptation",
+    SchemeState.CERTIFY: "adaptation",
     SchemeState.MONITOR: "detection",
     SchemeState.REACT: "detection",
     SchemeState.STOPPED: "detection",

@@ -36,6 +36,7 @@ from adacd_hil.records import (
     SchemeState,
 )
 from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.scheme.supervisor import POWERED
 from adacd_hil.wire.tap import Tap
 
 FAULT_LINGER_S = 0.5
@@ -45,10 +46,7 @@ DISABLE_CYCLES = 20
 FRAME_CHECKS_S = 1.0
 """How often the log gets what the checks of frames have counted."""
 
-_POWERED = frozenset(
-    (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
-)
-_ENABLING = _POWERED | {SchemeState.ENABLE}
+_ENABLING = POWERED | {SchemeState.ENABLE}
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ class Cycle:
 
     def _finish(self) -> Request:
         self._is_finishing = True
-        if self._state in _POWERED:
+        if self._state in POWERED:
             self._reference.park()
         return Request.FINISH
 
@@ -173,7 +171,7 @@ class Cycle:
         A cycle that took so long, as when the process was stopped, that its torque belongs to the past has none.
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
-        is_open = output.state in _POWERED and arm.is_enabled and not is_stale
+        is_open = output.state in POWERED and arm.is_enabled and not is_stale
         flags = self._gate.limit(self._tau_d, is_open, self._tau_c)
         quick_stop = output.state is SchemeState.FAULT or (bool(flags) and GateFlag.NOT_A_NUMBER in flags)
         return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
@@ -218,7 +216,15 @@ class Cycle:
             return Event("info", "supervisor", text)
         excess = self._arm.describe_excess() if output.fault is FaultReason.LIMIT else []
         late = [self._deadline.describe()] if output.fault is FaultReason.DEADLINE else []
-        causes = [*late, *excess, *self._arm.describe_faults(), *self._lost, *self._master.describe_emergencies()]
+        missing = self._pipeline.describe_missing() if output.fault is FaultReason.ADAPT_TIMEOUT else []
+        causes = [
+            *late,
+            *missing,
+            *excess,
+            *self._arm.describe_faults(),
+            *self._lost,
+            *self._master.describe_emergencies(),
+        ]
         details = "; ".join([output.fault.name, *causes])
         return Event("error", "supervisor", f"{text}: {details}")
 
@@ -236,7 +242,7 @@ class Cycle:
             return output.cycle - self._faulted_cycle >= FAULT_LINGER_S / self._period_s
         if self._interrupts > 1:
             return True
-        return self._is_finishing and (self._state not in _POWERED or self._reference.is_parked(output.cycle))
+        return self._is_finishing and (self._state not in POWERED or self._reference.is_parked(output.cycle))
 
     def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
         """Send zero torque and disabled drives for a while, without the scheme."""

@@ -21,7 +21,7 @@ PARK_SETTLE_S = 0.3
 AT_CORNER_RAD = 1e-3
 """Nearer than this the trajectory starts at once: a fifth of a degree, ten encoder steps of the noise."""
 
-_FOLLOWING = (SchemeState.ADAPT, SchemeState.MONITOR)
+_FOLLOWING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
 
 Segment = Callable[[float], None]
 
@@ -86,7 +86,7 @@ class Reference:
     def _enter(self, output: SchemeOutput, cycle: int) -> None:
         """Choose the motion of a state that begins in this cycle."""
         state = output.state
-        is_moving_on = state is SchemeState.MONITOR and output.previous_state is SchemeState.ADAPT
+        is_moving_on = state in _FOLLOWING and output.previous_state in _FOLLOWING
         self._follows_at_cycle = self._follows_at_cycle if is_moving_on else None
         if self._is_parking or is_moving_on:
             return

@@ -16,7 +16,6 @@ counts: T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is
 `contact.undo_filter`: of the mean of five derivatives only the ends count, and the five periods between them.
 """
 
-from enum import IntFlag
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Layout, Vector, scheme_layout
 from adacd_hil.scheme import contact, detector, estimator, filters, regressor, termination
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 
 Structured = np.ndarray[Any, np.dtype[np.void]]
 
@@ -34,31 +34,16 @@ ARMED = 2
 REPORTING = 4
 
 
-class Observation(IntFlag):
-    """What one cycle's numbers say, as far as the supervisor needs it."""
-
-    NONE = 0
-    NOT_A_NUMBER = 1  # a measurement is not finite
-    OVER_LIMIT = 2  # |q| or |dq| beyond the arm's limits
-    AT_REST = 4  # every |dq| below the rest velocity
-    UNLOADED = 8  # every |tau_J| below the rest torque
-    ADAPTED = 16  # eq. (15) holds with the evidence for it
-    CONTACT = 32  # a joint is over its threshold
-
-
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
 _AT_REST = int(Observation.AT_REST)
 _UNLOADED = int(Observation.UNLOADED)
 _ADAPTED = int(Observation.ADAPTED)
-_CONTACT = int(Observation.CONTACT)
+_COLLISION = int(Observation.CONTACT | Observation.COLLISION)
 
 # Shares of the nominal period: the shortest and the longest interval of two samples that follow each other.
 _SHORTEST_SHARE = 0.5
 _LONGEST_SHARE = 1.5
-
-CONTACT_SHIFT = 8
-"""The joints over their threshold are the bits of `Observation` from here on."""
 
 
 def block_dtype(layout: Layout) -> np.dtype[np.void]:
@@ -273,7 +258,7 @@ def _learn(c: Any, m: Any, out: Any, period_s: float) -> int:
 
 @compiled
 def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
-    """Compare with the thresholds; return CONTACT and the joints that are over, if any."""
+    """Compare with the thresholds; return the joints that are over, and that any of it is a collision."""
     F_c = out["theta_hat"][regressor.F_C1 : regressor.F_C2 + 1]
     detector.fill_threshold(c["threshold_Nm"], m["standstill"], F_c, out["threshold"])
     if is_fresh:
@@ -287,7 +272,7 @@ def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
             m["peak"],
         )
     joints = detector.joints_over(out["tau_ext_hat"], out["threshold"])
-    return _CONTACT | joints << CONTACT_SHIFT if joints else 0
+    return _COLLISION | joints << CONTACT_SHIFT if joints else 0
 
 
 @compiled

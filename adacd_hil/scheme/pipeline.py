@@ -14,6 +14,7 @@ from adacd_hil.config import Settings
 from adacd_hil.records import ArmState, ContactReport, Request, SchemeOutput, SchemeState, scheme_layout
 from adacd_hil.scheme import kernel
 from adacd_hil.scheme.contact import Isolation
+from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.regressor import has_positive_definite_mass, inverse_dynamics
 from adacd_hil.scheme.supervisor import Supervisor
 
@@ -57,6 +58,10 @@ class Pipeline:
         kernel.step(self._constants, memory, block, 1, 1, kernel.LEARN)
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
 
+    def describe_missing(self) -> list[str]:
+        """Say what an adaptation that takes too long is waiting for. The paper's condition is one: eq. (15)."""
+        return []
+
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
         supervisor, isolation = self._supervisor, self._isolation
@@ -70,7 +75,7 @@ class Pipeline:
             self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), mode
         )
         state = supervisor.step(arm, request, observation, isolation.is_open)
-        joints = observation >> kernel.CONTACT_SHIFT
+        joints = observation >> CONTACT_SHIFT
         block = self._values.copy()
         if state is not previous:
             self._enter(state, previous, arm.cycle, joints)

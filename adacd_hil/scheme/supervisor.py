@@ -1,19 +1,23 @@
 """The scheme's state machine: one table, and the conditions that raise its events.
 
-INIT -> COMMISSION -> ENABLE -> ADAPT -> MONITOR -> REACT -> STOPPED -> MONITOR; MONITOR or STOPPED -> PAYLOAD -> ADAPT;
-any -> FAULT, which is latched. A pair that is not in the table leaves the state as it is. One event per cycle: the
-first that applies in the order of `SchemeEvent`, so a fault outranks everything.
+INIT -> COMMISSION -> ENABLE -> ADAPT (-> CERTIFY) -> MONITOR; a contact in any of ENABLE, ADAPT, CERTIFY, MONITOR and
+PAYLOAD -> REACT, and from there back; MONITOR or STOPPED -> PAYLOAD -> ADAPT; any -> FAULT, which is latched. A pair
+that is not in the table leaves the state as it is. One event per cycle: the first that applies in the order of
+`SchemeEvent`, so a fault outranks everything.
+
+A collision is latched: REACT -> STOPPED until the user acknowledges. So are a host that was late, a contact that has
+grown into a collision, and one that has lasted too long. Any other contact clears itself: REACT -> where it came from.
 
 A request is kept until it can be served, but only in the states of `_KEPT_IN`; elsewhere it is dropped, so that an
 acknowledgement given too early can't release the next stop.
 """
 
-from enum import IntEnum
+from enum import Enum, IntEnum
 from types import MappingProxyType
 
 from adacd_hil.config import Settings
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
-from adacd_hil.scheme.kernel import Observation
+from adacd_hil.scheme.observation import Observation
 
 REST_HOLD_S = 0.05
 """How long |dq| stays below the rest velocity until the arm counts as at rest. At the reversal of a withdrawal with
@@ -25,19 +29,30 @@ class SchemeEvent(IntEnum):
 
     NONE = 0
     FAULT = 1  # a check of the running arm failed, or a phase took too long
-    COMPLETE = 2  # a cycle with all its data
-    COMMISSIONED = 3  # enough complete cycles at rest in a row
-    ENABLED = 4  # both drives report Operation enabled
-    ADAPTED = 5  # eq. (15) with the evidence for it
-    COLLISION = 6  # eq. (14) on any joint
-    LATE = 7  # the host has missed so many deadlines that the arm is to be held
-    AT_REST = 8  # the arm has come to rest and the collision's report is final
-    ACKNOWLEDGED = 9  # the user has acknowledged, no joint is over its threshold and the host is on time
-    PAYLOAD_ANNOUNCED = 10  # the user wants to change the payload
-    PAYLOAD_CHANGED = 11  # the user has changed the payload and the arm is at rest
+    COLLISION = 2  # a joint is over its upper threshold
+    CONTACT = 3  # a joint is over its lower threshold
+    LATE = 4  # the host has missed so many deadlines that the arm is to be held
+    COMPLETE = 5  # a cycle with all its data
+    COMMISSIONED = 6  # enough complete cycles at rest in a row
+    ENABLED = 7  # both drives report Operation enabled
+    ADAPTED = 8  # eq. (15) with the evidence for it
+    FITTED = 9  # the estimate is ready to be tested
+    CERTIFIED = 10  # the frozen model has passed its test
+    REFUTED = 11  # the frozen model has failed its test
+    AT_REST = 12  # the arm has come to rest, the report is final, and all of it is to be acknowledged
+    CLEARED = 13  # nothing has pushed for a while, the report is final, and nothing is to be acknowledged
+    ACKNOWLEDGED = 14  # the user has acknowledged, no joint is over its threshold and the host is on time
+    PAYLOAD_ANNOUNCED = 15  # the user wants to change the payload
+    PAYLOAD_CHANGED = 16  # the user has changed the payload and the arm is at rest
 
 
-TRANSITIONS = MappingProxyType(
+class Back(Enum):
+    """A place in the table that depends on the past."""
+
+    TO_ORIGIN = "the state from which REACT was entered"
+
+
+TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]] = MappingProxyType(
     {
         # Gathers nothing yet. Out: the first complete cycle; too late is a fault.
         SchemeState.INIT: {
@@ -49,37 +64,54 @@ TRANSITIONS = MappingProxyType(
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COMMISSIONED: SchemeState.ENABLE,
         },
-        # Drives are asked to enable. Out: both have; too late is a fault.
+        # Drives are asked to enable. Out: both have; too late is a fault; a contact once they have.
         SchemeState.ENABLE: {
             SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.ENABLED: SchemeState.ADAPT,
         },
-        # Moves and learns, detection off. Out: eq. (15) with evidence; too late is a fault.
+        # Moves and learns. Out: eq. (15) with evidence; a fit to be tested; a contact; too late is a fault.
         SchemeState.ADAPT: {
             SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.ADAPTED: SchemeState.MONITOR,
+            SchemeEvent.FITTED: SchemeState.CERTIFY,
         },
-        # Moves, detection armed. Out: a collision; a host that is late; the announcement of a payload change.
+        # Moves on, the model frozen and tested. Out: the test's result; a contact; too late is a fault.
+        SchemeState.CERTIFY: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
+            SchemeEvent.CERTIFIED: SchemeState.MONITOR,
+            SchemeEvent.REFUTED: SchemeState.ADAPT,
+        },
+        # Moves, detection armed. Out: a contact; a host that is late; the announcement of a payload change.
         SchemeState.MONITOR: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.LATE: SchemeState.REACT,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
         },
-        # Withdraws, or brakes when nothing pushes. Out: at rest, and the link is final.
+        # Reacts. Out, once the report is final: at rest, if it is to be acknowledged; else cleared.
         SchemeState.REACT: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.AT_REST: SchemeState.STOPPED,
+            SchemeEvent.CLEARED: Back.TO_ORIGIN,
         },
         # Holds its place. Out: acknowledged while nothing pushes; the announcement of a payload change.
         SchemeState.STOPPED: {
             SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.ACKNOWLEDGED: SchemeState.MONITOR,
+            SchemeEvent.ACKNOWLEDGED: Back.TO_ORIGIN,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
         },
-        # Parks, detection off. Out: the payload has been changed and the arm is at rest.
+        # Parks. Out: the payload has been changed and the arm is at rest; a contact.
         SchemeState.PAYLOAD: {
             SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
         },
         # Latched. Out: a new run.
@@ -88,9 +120,13 @@ TRANSITIONS = MappingProxyType(
 )
 
 
-def next_state(state: SchemeState, event: SchemeEvent) -> SchemeState:
-    """Look up the table; a pair that is not in it leaves the state as it is."""
-    return TRANSITIONS[state].get(event, state)
+def next_state(state: SchemeState, event: SchemeEvent, origin: SchemeState) -> SchemeState:
+    """Look up the table; a pair that is not in it leaves the state as it is.
+
+    origin: the state from which REACT was entered last.
+    """
+    following = TRANSITIONS[state].get(event, state)
+    return origin if following is Back.TO_ORIGIN else following
 
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
@@ -98,24 +134,49 @@ _OVER_LIMIT = int(Observation.OVER_LIMIT)
 _AT_REST = int(Observation.AT_REST)
 _REST_UNLOADED = int(Observation.AT_REST | Observation.UNLOADED)
 _ADAPTED = int(Observation.ADAPTED)
+_FITTED = int(Observation.FITTED)
+_CERTIFIED = int(Observation.CERTIFIED)
+_REFUTED = int(Observation.REFUTED)
 _CONTACT = int(Observation.CONTACT)
+_COLLISION = int(Observation.COLLISION)
+_ANY_CONTACT = _CONTACT | _COLLISION
 
-_POWERED = frozenset(
-    (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
+POWERED = frozenset(
+    (
+        SchemeState.ADAPT,
+        SchemeState.CERTIFY,
+        SchemeState.MONITOR,
+        SchemeState.REACT,
+        SchemeState.STOPPED,
+        SchemeState.PAYLOAD,
+    )
 )
-_CHECKED = _POWERED | {SchemeState.ENABLE}
+"""Where the drives are enabled and may have torque."""
+_CHECKED = POWERED | {SchemeState.ENABLE}
+_LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
 _HELD_FROM = frozenset((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
 """Where a host that is late holds the arm, or does so already; elsewhere there is no way to, and it is a fault."""
 
 _KEPT_IN = MappingProxyType(
     {
         Request.ACKNOWLEDGE: frozenset((SchemeState.STOPPED,)),
-        Request.PAYLOAD: frozenset((SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED)),
+        Request.PAYLOAD: POWERED - {SchemeState.PAYLOAD},
         Request.PAYLOAD_CHANGED: frozenset((SchemeState.PAYLOAD,)),
         Request.FINISH: frozenset[SchemeState](),
     }
 )
 """Where a request waits to be served. FINISH is the control layer's."""
+
+
+def _verdict(state: SchemeState, observation: int) -> SchemeEvent:
+    """Return what the numbers say of a model that is learnt or tested, or none."""
+    if state is SchemeState.ADAPT:
+        if observation & _ADAPTED:
+            return SchemeEvent.ADAPTED
+        return SchemeEvent.FITTED if observation & _FITTED else SchemeEvent.NONE
+    if observation & _REFUTED:
+        return SchemeEvent.REFUTED
+    return SchemeEvent.CERTIFIED if observation & _CERTIFIED else SchemeEvent.NONE
 
 
 class Supervisor:
@@ -126,19 +187,27 @@ class Supervisor:
         self._max_age_cycles = settings.bus.max_age_cycles
         self._commission_cycles = settings.safety.commission_cycles
         self._rest_cycles = round(REST_HOLD_S / period_s)
+        self._clear_cycles = round(settings.reaction.clear_s / period_s)
+        self._patience_cycles = round(settings.reaction.patience_s / period_s)
         phase_cycles = round(settings.safety.phase_timeout_s / period_s)
+        adapt_cycles = round(settings.termination.timeout_s / period_s)
         self._limits = {
             SchemeState.INIT: (phase_cycles, FaultReason.COMMISSION_TIMEOUT),
             SchemeState.COMMISSION: (phase_cycles, FaultReason.COMMISSION_TIMEOUT),
             SchemeState.ENABLE: (phase_cycles, FaultReason.ENABLE_TIMEOUT),
-            SchemeState.ADAPT: (round(settings.termination.timeout_s / period_s), FaultReason.ADAPT_TIMEOUT),
+            SchemeState.ADAPT: (adapt_cycles, FaultReason.ADAPT_TIMEOUT),
+            SchemeState.CERTIFY: (adapt_cycles, FaultReason.ADAPT_TIMEOUT),
         }
         self._state = SchemeState.INIT
+        self._origin = SchemeState.MONITOR
+        self._is_latched = False
         self._fault = FaultReason.NONE
-        self._pending = Request.NONE
-        self._state_cycles = 0
+        self._pending: set[Request] = set()
+        self._phase_cycles = 0
+        self._learning_cycles = 0
         self._commissioned_cycles = 0
         self._still_cycles = 0
+        self._cleared_cycles = 0
 
     @property
     def state(self) -> SchemeState:
@@ -146,43 +215,77 @@ class Supervisor:
         return self._state
 
     @property
+    def origin(self) -> SchemeState:
+        """Where REACT was entered from last: where the arm goes on after REACT or STOPPED."""
+        return self._origin
+
+    @property
+    def is_latched(self) -> bool:
+        """Whether what REACT and STOPPED are about is to be acknowledged."""
+        return self._is_latched
+
+    @property
     def fault(self) -> FaultReason:
         """Why it stands in FAULT; NONE elsewhere."""
         return self._fault
 
-    def step(self, arm: ArmState, request: Request, observation: int, is_reporting: bool) -> SchemeState:
+    def step(
+        self, arm: ArmState, request: Request, observation: int, is_reporting: bool, goes_on: bool = False
+    ) -> SchemeState:
         """Take in one cycle and return the new state.
 
-        observation: bits of `Observation`. is_reporting: a collision's report is not final yet.
+        observation: bits of `Observation`. is_reporting: a contact's report is not final yet. goes_on: the reaction in
+        force lets the arm move on, so that a contact clears without rest.
         """
-        self._state_cycles += arm.periods
+        self._phase_cycles += arm.periods
+        self._learning_cycles += arm.periods if self._state in _LEARNING else 0
         self._still_cycles = self._still_cycles + 1 if observation & _AT_REST else 0
+        self._cleared_cycles = 0 if observation & _ANY_CONTACT else self._cleared_cycles + 1
         if request is not Request.NONE:
             self._take(request)
-        event = self._event(arm, observation, is_reporting)
+        if self._state is SchemeState.REACT and not self._is_latched:
+            self._is_latched = self._has_grown(arm, observation)
+        event = self._event(arm, observation, is_reporting, goes_on)
         if event is not SchemeEvent.NONE:
-            self._enter(next_state(self._state, event))
+            self._enter(next_state(self._state, event, self._origin), event)
         return self._state
+
+    def _has_grown(self, arm: ArmState, observation: int) -> bool:
+        """Tell whether a contact that would clear itself has become one to be acknowledged."""
+        return bool(observation & _COLLISION) or arm.is_late or self._phase_cycles >= self._patience_cycles
 
     def _take(self, request: Request) -> None:
         """Keep a request if this state serves it sooner or later."""
-        if self._state in _KEPT_IN[request]:
-            self._pending = request
+        if self._keeps(request, self._state):
+            self._pending.add(request)
 
-    def _enter(self, state: SchemeState) -> None:
-        """Go to a state, and drop the request that it has served or that means nothing there."""
+    def _keeps(self, request: Request, state: SchemeState) -> bool:
+        """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
+        is_interrupted = state in (SchemeState.REACT, SchemeState.STOPPED)
+        if request is Request.PAYLOAD_CHANGED and is_interrupted and self._origin is SchemeState.PAYLOAD:
+            return True
+        return state in _KEPT_IN[request]
+
+    def _enter(self, state: SchemeState, event: SchemeEvent) -> None:
+        """Go to a state, and drop the requests that it has served or that mean nothing there."""
         if state is self._state:
             return
+        if state is SchemeState.REACT:
+            self._origin = self._state
+            self._is_latched = event is not SchemeEvent.CONTACT
+        elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
+            self._learning_cycles = 0
         self._state = state
-        self._state_cycles = 0
+        self._phase_cycles = 0
         self._commissioned_cycles = 0
-        if self._pending is not Request.NONE and state not in _KEPT_IN[self._pending]:
-            self._pending = Request.NONE
+        self._pending = {request for request in self._pending if self._keeps(request, state)}
 
-    def _event(self, arm: ArmState, observation: int, is_reporting: bool) -> SchemeEvent:
+    def _event(self, arm: ArmState, observation: int, is_reporting: bool, goes_on: bool) -> SchemeEvent:
         """Return the first event of this cycle that means something in this state."""
         fault = self._check(arm, observation) if self._state in _CHECKED else FaultReason.NONE
-        event = self._progress(arm, observation, is_reporting)
+        event = self._touch(arm, observation)
+        if event is SchemeEvent.NONE:
+            event = self._progress(arm, observation, is_reporting, goes_on)
         if fault is FaultReason.NONE and event is SchemeEvent.NONE:
             fault = self._overdue()
         if fault is FaultReason.NONE:
@@ -190,25 +293,30 @@ class Supervisor:
         self._fault = fault
         return SchemeEvent.FAULT
 
-    def _progress(self, arm: ArmState, observation: int, is_reporting: bool) -> SchemeEvent:
+    def _touch(self, arm: ArmState, observation: int) -> SchemeEvent:
+        """Return COLLISION or CONTACT where this state reacts to it, or none; an arm without torque can't react."""
+        if not observation & _ANY_CONTACT or not arm.is_enabled:
+            return SchemeEvent.NONE
+        event = SchemeEvent.COLLISION if observation & _COLLISION else SchemeEvent.CONTACT
+        return event if event in TRANSITIONS[self._state] else SchemeEvent.NONE
+
+    def _progress(self, arm: ArmState, observation: int, is_reporting: bool, goes_on: bool) -> SchemeEvent:
         """Return the event with which this state is left as it should be, or none."""
         event = SchemeEvent.NONE
         is_still = self._still_cycles >= self._rest_cycles
         match self._state:
-            case SchemeState.MONITOR if observation & _CONTACT:
-                event = SchemeEvent.COLLISION
             case SchemeState.MONITOR if arm.is_late:
                 event = SchemeEvent.LATE
-            case SchemeState.MONITOR | SchemeState.STOPPED if self._pending is Request.PAYLOAD:
+            case SchemeState.MONITOR | SchemeState.STOPPED if Request.PAYLOAD in self._pending:
                 event = SchemeEvent.PAYLOAD_ANNOUNCED
-            case SchemeState.STOPPED if self._pending is Request.ACKNOWLEDGE:
-                if not (observation & _CONTACT or arm.is_late):
+            case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
+                if not (observation & _ANY_CONTACT or arm.is_late):
                     event = SchemeEvent.ACKNOWLEDGED
-            case SchemeState.ADAPT if observation & _ADAPTED:
-                event = SchemeEvent.ADAPTED
-            case SchemeState.REACT if is_still and not is_reporting:
-                event = SchemeEvent.AT_REST
-            case SchemeState.PAYLOAD if is_still and self._pending is Request.PAYLOAD_CHANGED:
+            case SchemeState.ADAPT | SchemeState.CERTIFY:
+                event = _verdict(self._state, observation)
+            case SchemeState.REACT if not is_reporting:
+                event = self._settled(is_still, goes_on)
+            case SchemeState.PAYLOAD if is_still and Request.PAYLOAD_CHANGED in self._pending:
                 event = SchemeEvent.PAYLOAD_CHANGED
             case SchemeState.ENABLE if arm.is_enabled:
                 event = SchemeEvent.ENABLED
@@ -217,6 +325,13 @@ class Supervisor:
             case SchemeState.INIT if arm.is_complete:
                 event = SchemeEvent.COMPLETE
         return event
+
+    def _settled(self, is_still: bool, goes_on: bool) -> SchemeEvent:
+        """Return how REACT ends in this cycle, or none."""
+        if self._is_latched:
+            return SchemeEvent.AT_REST if is_still else SchemeEvent.NONE
+        has_cleared = self._cleared_cycles >= self._clear_cycles and (is_still or goes_on)
+        return SchemeEvent.CLEARED if has_cleared else SchemeEvent.NONE
 
     def _is_commissioned(self, arm: ArmState, observation: int) -> bool:
         """Count this cycle if all is well in it, and tell whether enough have been counted in a row."""
@@ -229,9 +344,10 @@ class Supervisor:
         return self._commissioned_cycles >= self._commission_cycles
 
     def _overdue(self) -> FaultReason:
-        """Return the timeout of a phase that has taken too long, or NONE."""
+        """Return the timeout of a phase that has taken too long, or NONE. A learning arm's clock stops in REACT."""
         limit = self._limits.get(self._state)
-        if limit is None or self._state_cycles < limit[0]:
+        cycles = self._learning_cycles if self._state in _LEARNING else self._phase_cycles
+        if limit is None or cycles < limit[0]:
             return FaultReason.NONE
         return limit[1]
 
@@ -245,6 +361,6 @@ class Supervisor:
             return FaultReason.DATA_AGE
         if observation & _OVER_LIMIT:
             return FaultReason.LIMIT
-        if self._state in _POWERED and not arm.is_enabled:
+        if self._state in POWERED and not arm.is_enabled:
             return FaultReason.DRIVE
         return FaultReason.DEADLINE if arm.is_late and self._state not in _HELD_FROM else FaultReason.NONE

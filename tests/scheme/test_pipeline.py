@@ -14,6 +14,7 @@ from smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 from adacd_hil.config import load_settings
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, scheme_layout
 from adacd_hil.scheme import kernel
+from adacd_hil.scheme.observation import Observation
 from adacd_hil.scheme.pipeline import Pipeline
 from adacd_hil.scheme.regressor import has_positive_definite_mass
 
@@ -368,14 +369,14 @@ def test_an_adaptation_begins_without_the_evidence_of_the_last():
     for k in range(len(q)):
         block[0]["q"][:], block[0]["dq"][:], block[0]["tau_J"][:] = q[k], dq[k], tau_J[k]
         moving = kernel.step(constants, memory, block, 1, 1, kernel.LEARN)
-    assert moving & kernel.Observation.ADAPTED
+    assert moving & Observation.ADAPTED
     assert block[0]["excitation"] > 1e-5
     kernel.begin_adaptation(constants, memory, block)
     block[0]["dq"][:] = 0.0
     kernel.step(constants, memory, block, 1, 1, kernel.LEARN)
     assert block[0]["quiet_s"] == settings.bus.period_s
     standing = [kernel.step(constants, memory, block, 1, 1, kernel.LEARN) for _ in range(200)]
-    assert not any(observation & kernel.Observation.ADAPTED for observation in standing)
+    assert not any(observation & Observation.ADAPTED for observation in standing)
     assert block[0]["excitation"] < 1e-12
 
 
@@ -392,7 +393,7 @@ def test_an_adaptation_needs_travel_and_speed_of_its_own(missing, sign):
         for k in range(200):
             block[0]["q"][:], block[0]["dq"][:] = this_time["q"][k % 2], this_time["dq"][k % 2]
             observation = kernel.step(constants, memory, block, 1, 1, kernel.LEARN)
-        seen.append(bool(observation & kernel.Observation.ADAPTED))
+        seen.append(bool(observation & Observation.ADAPTED))
     assert seen == [True, False]
 
 

@@ -7,24 +7,28 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
-from adacd_hil.scheme.kernel import Observation
-from adacd_hil.scheme.supervisor import REST_HOLD_S, SchemeEvent, Supervisor, next_state
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor import REST_HOLD_S, TRANSITIONS, SchemeEvent, Supervisor, next_state
 
-# What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens.
+# What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens, "back"
+# the state from which REACT was entered.
 EVENTS = (
-    "FAULT COMPLETE COMMISSIONED ENABLED ADAPTED COLLISION LATE AT_REST ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED"
+    "FAULT COLLISION CONTACT LATE COMPLETE COMMISSIONED ENABLED ADAPTED FITTED CERTIFIED REFUTED "
+    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED"
 )
 EXPECTED = """
-INIT        FAULT  COMMISSION  .       .      .        .      .      .        .        .        .
-COMMISSION  FAULT  .           ENABLE  .      .        .      .      .        .        .        .
-ENABLE      FAULT  .           .       ADAPT  .        .      .      .        .        .        .
-ADAPT       FAULT  .           .       .      MONITOR  .      .      .        .        .        .
-MONITOR     FAULT  .           .       .      .        REACT  REACT  .        .        PAYLOAD  .
-REACT       FAULT  .           .       .      .        .      .      STOPPED  .        .        .
-STOPPED     FAULT  .           .       .      .        .      .      .        MONITOR  PAYLOAD  .
-PAYLOAD     FAULT  .           .       .      .        .      .      .        .        .        ADAPT
-FAULT       .      .           .       .      .        .      .      .        .        .        .
-"""
+INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .
+COMMISSION  FAULT  .      .      .      .           ENABLE  .      .        .        .        .      .        .     .     .        .
+ENABLE      FAULT  REACT  REACT  .      .           .       ADAPT  .        .        .        .      .        .     .     .        .
+ADAPT       FAULT  REACT  REACT  .      .           .       .      MONITOR  CERTIFY  .        .      .        .     .     .        .
+CERTIFY     FAULT  REACT  REACT  .      .           .       .      .        .        MONITOR  ADAPT  .        .     .     .        .
+MONITOR     FAULT  REACT  REACT  REACT  .           .       .      .        .        .        .      .        .     .     PAYLOAD  .
+REACT       FAULT  .      .      .      .           .       .      .        .        .        .      STOPPED  back  .     .        .
+STOPPED     FAULT  .      .      .      .           .       .      .        .        .        .      .        .     back  PAYLOAD  .
+PAYLOAD     FAULT  REACT  REACT  .      .           .       .      .        .        .        .      .        .     .     .        ADAPT
+FAULT       .      .      .      .      .           .       .      .        .        .        .      .        .     .     .        .
+"""  # noqa: E501
+ORIGINS = ("ENABLE", "ADAPT", "CERTIFY", "MONITOR", "PAYLOAD")
 
 
 def expectations():
@@ -37,12 +41,19 @@ def expectations():
 
 @pytest.mark.parametrize(("state", "event", "expected"), list(expectations()))
 def test_every_event_in_every_state_leads_where_the_hand_written_table_says(state, event, expected):
-    assert next_state(SchemeState[state], SchemeEvent[event]) is SchemeState[expected]
+    for origin in ORIGINS:
+        following = next_state(SchemeState[state], SchemeEvent[event], SchemeState[origin])
+        assert following is SchemeState[origin if expected == "back" else expected]
+
+
+def test_react_is_entered_from_these_states_only():
+    entered_from = {state.name for state, row in TRANSITIONS.items() if SchemeState.REACT in row.values()}
+    assert entered_from == set(ORIGINS)
 
 
 @pytest.mark.parametrize("state", SchemeState)
 def test_no_event_leaves_every_state_as_it_is(state):
-    assert next_state(state, SchemeEvent.NONE) is state
+    assert next_state(state, SchemeEvent.NONE, SchemeState.MONITOR) is state
 
 
 def test_the_hand_written_table_covers_all_states_and_events():
@@ -60,10 +71,15 @@ def test_events_are_numbered_in_order_of_precedence():
 SETTINGS = settings_with(
     safety={"commission_cycles": 20, "phase_timeout_s": 0.1},
     termination={"timeout_s": 1.0},
+    reaction={"clear_s": 0.2, "patience_s": 3.0},
     bus={"max_age_cycles": 3},
 )
 REST_CYCLES = round(REST_HOLD_S / SETTINGS.bus.period_s)
+CLEAR_CYCLES = 200
+PATIENCE_CYCLES = 3000
 RESTING = Observation.AT_REST | Observation.UNLOADED
+CONTACT = Observation.CONTACT
+COLLISION = Observation.CONTACT | Observation.COLLISION
 
 GOOD = ArmState(
     cycle=0,
@@ -91,9 +107,11 @@ class Run:
     def state(self):
         return self.supervisor.state
 
-    def step(self, arm=GOOD, request=Request.NONE, observation=Observation.NONE, is_reporting=False, cycles=1):
+    def step(
+        self, arm=GOOD, request=Request.NONE, observation=Observation.NONE, is_reporting=False, goes_on=False, cycles=1
+    ):
         for _ in range(cycles):
-            self.supervisor.step(arm, request, int(observation), is_reporting)
+            self.supervisor.step(arm, request, int(observation), is_reporting, goes_on)
         return self.state
 
     def to(self, state):
@@ -101,12 +119,15 @@ class Run:
         if state is SchemeState.FAULT:
             self.to(SchemeState.MONITOR).step(GOOD._replace(fault=FaultReason.SENSOR))
             return self
+        if state is SchemeState.CERTIFY:
+            assert self.to(SchemeState.ADAPT).step(observation=Observation.FITTED) is state
+            return self
         next_step = {
             SchemeState.INIT: lambda: self.step(DISABLED),
             SchemeState.COMMISSION: lambda: self.step(DISABLED, observation=RESTING, cycles=20),
             SchemeState.ENABLE: self.step,
             SchemeState.ADAPT: lambda: self.step(observation=Observation.ADAPTED),
-            SchemeState.MONITOR: lambda: self.step(observation=Observation.CONTACT),
+            SchemeState.MONITOR: lambda: self.step(observation=COLLISION),
             SchemeState.REACT: lambda: self.step(observation=Observation.AT_REST, cycles=REST_CYCLES),
             SchemeState.STOPPED: lambda: self.step(request=Request.PAYLOAD),
         }
@@ -121,7 +142,14 @@ def run_in(state):
     return Run().to(state)
 
 
-POWERED = (SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED, SchemeState.PAYLOAD)
+POWERED = (
+    SchemeState.ADAPT,
+    SchemeState.CERTIFY,
+    SchemeState.MONITOR,
+    SchemeState.REACT,
+    SchemeState.STOPPED,
+    SchemeState.PAYLOAD,
+)
 CHECKED = (SchemeState.ENABLE, *POWERED)
 BAD = [
     (GOOD._replace(is_enabled=False), Observation.NONE, FaultReason.DRIVE),
@@ -161,7 +189,7 @@ def test_data_as_old_as_allowed_is_no_fault(state):
 @pytest.mark.parametrize("state", POWERED)
 def test_a_fault_outranks_everything_else_in_its_cycle(state):
     run = run_in(state)
-    everything = Observation.CONTACT | Observation.ADAPTED | Observation.AT_REST | Observation.OVER_LIMIT
+    everything = COLLISION | Observation.ADAPTED | Observation.AT_REST | Observation.OVER_LIMIT
     assert run.step(observation=everything, request=Request.ACKNOWLEDGE) is SchemeState.FAULT
 
 
@@ -222,11 +250,12 @@ def test_one_bad_cycle_begins_commissioning_anew(arm, observation):
         (SchemeState.COMMISSION, 100, FaultReason.COMMISSION_TIMEOUT),
         (SchemeState.ENABLE, 100, FaultReason.ENABLE_TIMEOUT),
         (SchemeState.ADAPT, 1000, FaultReason.ADAPT_TIMEOUT),
+        (SchemeState.CERTIFY, 1000 - 1, FaultReason.ADAPT_TIMEOUT),
     ],
 )
 def test_a_phase_that_takes_too_long_faults(state, cycles, reason):
     run = run_in(state)
-    arm = GOOD if state is SchemeState.ADAPT else DISABLED
+    arm = DISABLED if reason in (FaultReason.COMMISSION_TIMEOUT, FaultReason.ENABLE_TIMEOUT) else GOOD
     assert run.step(arm, cycles=cycles - 1) is state
     assert run.step(arm) is SchemeState.FAULT
     assert run.supervisor.fault is reason
@@ -268,14 +297,143 @@ def test_each_step_returns_the_state_that_it_leads_to():
     assert supervisor.step(DISABLED, Request.NONE, int(Observation.NONE), False) is SchemeState.COMMISSION
 
 
-@pytest.mark.parametrize("state", [SchemeState.ADAPT, SchemeState.PAYLOAD])
-def test_a_touch_while_disarmed_is_no_collision(state):
-    assert run_in(state).step(observation=Observation.CONTACT) is state
+TOUCHABLE = [SchemeState[name] for name in ORIGINS]
+
+
+@pytest.mark.parametrize("state", TOUCHABLE)
+@pytest.mark.parametrize(("observation", "is_latched"), [(CONTACT, False), (COLLISION, True)])
+def test_a_touch_is_reacted_to_wherever_it_is_found(state, observation, is_latched):
+    run = run_in(state)
+    assert run.step(observation=observation) is SchemeState.REACT
+    assert run.supervisor.origin is state
+    assert run.supervisor.is_latched is is_latched
+
+
+def test_an_arm_whose_drives_are_still_off_does_not_react_to_a_touch():
+    run = run_in(SchemeState.ENABLE)
+    assert run.step(DISABLED, observation=COLLISION) is SchemeState.ENABLE
+
+
+@pytest.mark.parametrize("state", [SchemeState.ADAPT, SchemeState.CERTIFY])
+def test_a_touch_outranks_whatever_the_estimate_says_in_the_same_cycle(state):
+    verdicts = Observation.ADAPTED | Observation.FITTED | Observation.CERTIFIED | Observation.REFUTED
+    assert run_in(state).step(observation=CONTACT | verdicts) is SchemeState.REACT
+
+
+@pytest.mark.parametrize("state", TOUCHABLE)
+def test_a_contact_that_has_cleared_lets_the_arm_go_on_where_it_was(state):
+    run = run_in(state)
+    run.step(observation=CONTACT | Observation.AT_REST, cycles=500)
+    assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES - 1) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST) is state
+
+
+@pytest.mark.parametrize("state", TOUCHABLE)
+def test_an_acknowledged_collision_lets_the_arm_go_on_where_it_was(state):
+    run = run_in(state)
+    run.step(observation=COLLISION)
+    assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES) is SchemeState.STOPPED
+    assert run.step(cycles=1000) is SchemeState.STOPPED
+    assert run.step(request=Request.ACKNOWLEDGE) is state
+
+
+def test_a_contact_that_comes_back_clears_anew():
+    run = run_in(SchemeState.MONITOR)
+    run.step(observation=CONTACT)
+    run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES - 1)
+    run.step(observation=CONTACT | Observation.AT_REST)
+    assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES - 1) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST) is SchemeState.MONITOR
+
+
+def test_a_contact_does_not_clear_before_the_arm_rests_and_its_report_is_final():
+    run = run_in(SchemeState.MONITOR)
+    run.step(observation=CONTACT)
+    assert run.step(cycles=1000) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST, is_reporting=True, cycles=500) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST) is SchemeState.MONITOR
+
+
+def test_a_contact_of_an_arm_that_goes_on_clears_without_rest():
+    run = run_in(SchemeState.MONITOR)
+    run.step(observation=CONTACT)
+    assert run.step(goes_on=True, cycles=CLEAR_CYCLES - 1) is SchemeState.REACT
+    assert run.step(goes_on=True) is SchemeState.MONITOR
+
+
+@pytest.mark.parametrize(
+    ("arm", "observation", "cycles"),
+    [(GOOD, COLLISION, 1), (LATE, CONTACT, 1), (GOOD, CONTACT, PATIENCE_CYCLES)],
+)
+def test_a_contact_that_grows_or_lasts_is_to_be_acknowledged(arm, observation, cycles):
+    run = run_in(SchemeState.ADAPT)
+    run.step(observation=CONTACT)
+    run.step(arm, observation=observation, cycles=cycles)
+    assert run.supervisor.is_latched
+    assert run.step(observation=Observation.AT_REST, cycles=1000) is SchemeState.STOPPED
+
+
+def test_a_contact_after_a_collision_is_not_latched_by_it():
+    run = run_in(SchemeState.STOPPED)
+    run.step(request=Request.ACKNOWLEDGE)
+    run.step(observation=CONTACT)
+    assert run.step(observation=Observation.AT_REST, cycles=1000) is SchemeState.MONITOR
+
+
+def test_a_fit_is_tested_and_a_refuted_one_is_learnt_on():
+    run = run_in(SchemeState.CERTIFY)
+    assert run.step(observation=Observation.ADAPTED | Observation.FITTED) is SchemeState.CERTIFY
+    assert run.step(observation=Observation.REFUTED | Observation.CERTIFIED) is SchemeState.ADAPT
+    run.step(observation=Observation.FITTED)
+    assert run.step(observation=Observation.CERTIFIED) is SchemeState.MONITOR
+
+
+def test_a_test_and_what_was_learnt_before_it_share_one_time_limit():
+    run = run_in(SchemeState.ADAPT)
+    run.step(cycles=500)
+    run.step(observation=Observation.FITTED)
+    run.step(cycles=300)
+    run.step(observation=Observation.REFUTED)
+    assert run.step(cycles=197) is SchemeState.ADAPT
+    assert run.step() is SchemeState.FAULT
+
+
+def test_a_contact_stops_the_clock_of_the_adaptation_and_does_not_set_it_back():
+    run = run_in(SchemeState.ADAPT)
+    run.step(cycles=600)
+    run.step(observation=CONTACT)
+    run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES)
+    assert run.step(cycles=398) is SchemeState.ADAPT
+    assert run.step() is SchemeState.FAULT
+
+
+def test_an_adaptation_after_a_payload_has_its_own_time():
+    run = run_in(SchemeState.ADAPT)
+    run.step(cycles=900)
+    run.step(observation=Observation.ADAPTED)
+    run.step(request=Request.PAYLOAD)
+    run.step(observation=Observation.AT_REST, cycles=REST_CYCLES)
+    assert run.step(observation=Observation.AT_REST, request=Request.PAYLOAD_CHANGED) is SchemeState.ADAPT
+    assert run.step(cycles=999) is SchemeState.ADAPT
+
+
+@pytest.mark.parametrize("observation", [CONTACT, COLLISION])
+def test_hands_that_change_the_payload_do_not_make_the_arm_forget_that_it_was_changed(observation):
+    run = run_in(SchemeState.PAYLOAD)
+    run.step(observation=observation)
+    run.step(request=Request.PAYLOAD_CHANGED)
+    run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES)
+    run.step(observation=Observation.AT_REST, request=Request.ACKNOWLEDGE)
+    assert run.step(observation=Observation.AT_REST, cycles=2) is SchemeState.ADAPT
+
+
+def test_the_joints_of_an_observation_are_beyond_its_flags():
+    assert max(Observation) < 1 << CONTACT_SHIFT
 
 
 def test_a_collision_outranks_the_announcement_of_a_payload():
     run = run_in(SchemeState.MONITOR)
-    assert run.step(request=Request.PAYLOAD, observation=Observation.CONTACT) is SchemeState.REACT
+    assert run.step(request=Request.PAYLOAD, observation=COLLISION) is SchemeState.REACT
 
 
 def test_the_arm_counts_as_stopped_after_fifty_milliseconds_at_rest():
@@ -289,7 +447,7 @@ def test_rest_counts_from_the_first_cycle_on():
     run.step(DISABLED, observation=RESTING, cycles=21)
     run.step(observation=Observation.AT_REST)
     run.step(observation=Observation.AT_REST | Observation.ADAPTED)
-    assert run.step(observation=Observation.AT_REST | Observation.CONTACT) is SchemeState.REACT
+    assert run.step(observation=Observation.AT_REST | COLLISION) is SchemeState.REACT
     assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES - 25) is SchemeState.REACT
     assert run.step(observation=Observation.AT_REST) is SchemeState.STOPPED
 
@@ -319,6 +477,7 @@ def test_the_arm_is_not_stopped_before_the_report_is_final():
         (SchemeState.COMMISSION, SchemeState.COMMISSION),
         (SchemeState.ENABLE, SchemeState.FAULT),
         (SchemeState.ADAPT, SchemeState.FAULT),
+        (SchemeState.CERTIFY, SchemeState.FAULT),
         (SchemeState.MONITOR, SchemeState.REACT),
         (SchemeState.REACT, SchemeState.REACT),
         (SchemeState.STOPPED, SchemeState.STOPPED),
@@ -357,8 +516,8 @@ def test_an_acknowledged_stop_goes_on():
 
 def test_an_acknowledgement_waits_until_nothing_pushes():
     run = run_in(SchemeState.STOPPED)
-    assert run.step(request=Request.ACKNOWLEDGE, observation=Observation.CONTACT) is SchemeState.STOPPED
-    assert run.step(observation=Observation.CONTACT, cycles=300) is SchemeState.STOPPED
+    assert run.step(request=Request.ACKNOWLEDGE, observation=CONTACT) is SchemeState.STOPPED
+    assert run.step(observation=CONTACT, cycles=300) is SchemeState.STOPPED
     assert run.step() is SchemeState.MONITOR
 
 
@@ -380,6 +539,15 @@ def test_an_acknowledgement_is_good_for_one_stop():
 @pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.STOPPED])
 def test_a_payload_is_announced_to_an_arm_that_monitors_or_is_stopped(state):
     assert run_in(state).step(request=Request.PAYLOAD) is SchemeState.PAYLOAD
+
+
+def test_a_payload_announced_during_the_test_of_the_fit_waits_for_its_end():
+    run = run_in(SchemeState.CERTIFY)
+    run.step(request=Request.PAYLOAD)
+    run.step(observation=Observation.REFUTED)
+    run.step(observation=Observation.FITTED)
+    assert run.step(observation=Observation.CERTIFIED) is SchemeState.MONITOR
+    assert run.step() is SchemeState.PAYLOAD
 
 
 def test_a_payload_announced_during_adaptation_waits_for_its_end():
