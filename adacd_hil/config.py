@@ -377,6 +377,95 @@ class DetectorSettings:
     )
 
 
+FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width")
+"""Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.friction`."""
+
+_KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
+
+
+@dataclass(frozen=True)
+class CertifiedSettings:
+    """The scheme that goes beyond the paper: what is believed, when it is enough, and what stands out from it.
+
+    Seven numbers are by kind of parameter: inertia, viscous friction, Coulomb friction, gravity, torque offset, lag,
+    further friction.
+    """
+
+    cutoffs_rad_s: tuple[float, ...] = setting(
+        (10.0, 50.0, 200.0), unit="rad/s", low=1.0, high=1000.0, meaning="filters of the bank, from slow to fast"
+    )
+    sigmas: tuple[float, ...] = setting(
+        (5.0, 5.5, 6.0), low=1.0, high=50.0, meaning="threshold of each filter in standard deviations"
+    )
+    friction_terms: tuple[str, ...] = setting((), choices=FRICTION_TERMS, meaning="friction beyond viscous and Coulomb")
+    coulomb_width_rad_s: float = setting(
+        0.005, unit="rad/s", low=0.0, high=1.0, meaning="Coulomb friction is F_c tanh(dq / width); 0: F_c sgn(dq)"
+    )
+    stribeck_rad_s: float = setting(
+        0.05, unit="rad/s", low=1e-3, high=10.0, meaning="speed over which static friction falls off"
+    )
+    prior_std: tuple[float, ...] = setting(
+        (1.0, 0.5, 0.5, 10.0, 0.3, 0.003, 0.2), low=0.0, high=1e6, meaning=f"what an arm may be: {_KINDS}"
+    )
+    enough_std: tuple[float, ...] = setting(
+        (0.02, 0.04, 0.04, 0.2, 0.04, 0.004, 0.2), low=0.0, high=1e6, meaning=f"how well it must be known: {_KINDS}"
+    )
+    drift_std: tuple[float, ...] = setting(
+        (0.0, 0.003, 0.003, 0.0, 0.001, 0.0, 0.003),
+        low=0.0,
+        high=1e3,
+        meaning=f"how far it may wander in a second of motion: {_KINDS}",
+    )
+    model_error: tuple[float, ...] = setting(
+        (0.01, 0.02, 0.02, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
+    )
+    payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="what a payload at the tip may weigh")
+    payload_inertia_std: float = setting(
+        0.02, unit="kg m²", low=0.0, high=100.0, meaning="what it may add to each inertia beside a point mass"
+    )
+    residual_Nm: float = setting(0.02, unit="Nm", low=1e-4, high=10.0, meaning="residual of one filtered sample")
+    learn_every: int = setting(4, low=1, high=100, meaning="samples between two that are learnt")
+    hold_back_s: float = setting(
+        0.06, unit="s", low=0.0, high=1.0, meaning="how long a sample waits until it is learnt; a contact discards it"
+    )
+    recover_s: float = setting(0.5, unit="s", low=0.0, high=60.0, meaning="after a contact, nothing is learnt so long")
+    fit_s: tuple[float, float] = setting(
+        (1.4, 0.45), unit="s", low=0.05, high=600.0, meaning="shortest fit: of the arm, of a payload"
+    )
+    test_s: tuple[float, float] = setting(
+        (0.85, 0.4), unit="s", low=0.05, high=600.0, meaning="test of the frozen model: of the arm, with a payload"
+    )
+    beta_Nm: float = setting(
+        0.06, unit="Nm", low=1e-3, high=100.0, meaning="test: largest |tau_ext_hat| of the slowest filter"
+    )
+    excitation_Nm2s: float = setting(
+        5e-5, unit="Nm² s", low=0.0, high=1e6, meaning="smallest eigenvalue of the scaled information matrix"
+    )
+    condition: float = setting(1e5, low=1.0, high=1e12, meaning="largest condition number of the same matrix")
+    refine_s: float = setting(4.0, unit="s", low=0.1, high=3600.0, meaning="test of a refined model before it is used")
+    torque_noise_Nm: float = setting(0.02, unit="Nm", low=0.0, high=10.0, meaning="torque sensor, rms of one sample")
+    velocity_noise_rad_s: float = setting(6e-4, unit="rad/s", low=0.0, high=1.0, meaning="velocity, rms of one sample")
+    reversal_rad_s: float = setting(
+        0.02, unit="rad/s", low=0.0, high=10.0, meaning="speed below which friction is less certain"
+    )
+    reversal_share: float = setting(1.0, low=0.0, high=10.0, meaning="part of F_c that is uncertain at rest")
+    collision_Nm: tuple[float, float] = setting(
+        (2.0, 1.0), unit="Nm", low=0.01, high=1000.0, meaning="a contact above it is a collision, per joint"
+    )
+
+    def __post_init__(self) -> None:
+        if len(self.sigmas) != len(self.cutoffs_rad_s):
+            raise ConfigError(
+                f"`certified.sigmas` has {len(self.sigmas)} values for {len(self.cutoffs_rad_s)} cut-offs"
+            )
+        if list(self.cutoffs_rad_s) != sorted(self.cutoffs_rad_s):
+            raise ConfigError(f"`certified.cutoffs_rad_s` = {self.cutoffs_rad_s} must go from slow to fast")
+        for name in ("prior_std", "enough_std", "drift_std", "model_error"):
+            count = len(getattr(self, name))
+            if count != 7:
+                raise ConfigError(f"`certified.{name}` has {count} values, 7 expected: {_KINDS}")
+
+
 @dataclass(frozen=True)
 class ReactionSettings:
     """Withdrawal along +tau_ext."""
@@ -594,6 +683,7 @@ class Settings:
     """Everything a run depends on, resolved. Attached to every log."""
 
     name: str = setting("", meaning="name of the configuration")
+    scheme: str = setting("paper", choices=("paper", "certified"), meaning="the paper's scheme, or the one beyond it")
     arm: ArmSettings = setting(ArmSettings, meaning="the arm")
     bus: BusSettings = setting(BusSettings, meaning="timing on the bus")
     devices: DevicesSettings = setting(DevicesSettings, meaning="drives and sensors")
@@ -601,6 +691,7 @@ class Settings:
     estimator: EstimatorSettings = setting(EstimatorSettings, meaning="adaptation law")
     termination: TerminationSettings = setting(TerminationSettings, meaning="end of adaptation")
     detector: DetectorSettings = setting(DetectorSettings, meaning="collision detection")
+    certified: CertifiedSettings = setting(CertifiedSettings, meaning="the scheme beyond the paper")
     reaction: ReactionSettings = setting(ReactionSettings, meaning="withdrawal")
     trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")

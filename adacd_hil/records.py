@@ -91,6 +91,30 @@ def scheme_layout(parameter_count: int) -> Layout:
     )
 
 
+def certified_layout(parameter_count: int, further_count: int, filter_count: int) -> Layout:
+    """Lay out the block of the certified scheme: the scheme's, then what only it has.
+
+    parameter_count: dynamic parameters. further_count: offsets, lags and friction terms. filter_count: of the bank.
+    The scheme's tau_f, tau_ext_hat and threshold are those of the slowest filter; the bank is filter by filter.
+    """
+    bank = JOINTS * filter_count
+    return Layout(
+        (
+            *scheme_layout(parameter_count).fields,
+            Field("tau_ext_bank", bank, "Nm", "estimated external torque of each filter"),
+            Field("threshold_bank", bank, "Nm", "its threshold in force, inf while detection is off"),
+            Field("theta_further", further_count, "see PARAMETER_UNITS", "estimated offsets, lags and friction terms"),
+            Field("theta_std", parameter_count + further_count, "see PARAMETER_UNITS", "how well theta is known"),
+            Field("condition", 1, "", "condition number of the scaled information matrix of this adaptation"),
+            Field("promotions", 1, "", "refined models that have taken over since the certificate"),
+            Field("paper_is_armed", 1, "", "whether the paper's scheme, run beside, has ended its adaptation"),
+            Field("paper_tau_ext_hat", JOINTS, "Nm", "its estimated external torque"),
+            Field("paper_threshold", JOINTS, "Nm", "its threshold in force, inf while it adapts"),
+            Field("paper_theta_hat", parameter_count, "see PARAMETER_UNITS", "its estimated parameters"),
+        )
+    )
+
+
 CONTROL_LAYOUT = Layout(
     (
         Field("q_d", JOINTS, "rad", "desired joint position"),
