@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES, Vector
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
 
 
@@ -394,18 +394,27 @@ class CertifiedSettings:
     cutoffs_rad_s: tuple[float, ...] = setting(
         (10.0, 50.0, 200.0), unit="rad/s", low=1.0, high=1000.0, meaning="filters of the bank, from slow to fast"
     )
-    sigmas: tuple[float, ...] = setting(
-        (5.0, 5.5, 6.0), low=1.0, high=50.0, meaning="threshold of each filter in standard deviations"
+    smoothing_rad_s: float = setting(
+        200.0, unit="rad/s", low=10.0, high=3000.0, meaning="second low-pass behind each filter, against velocity noise"
     )
+    noise_sigmas: float = setting(6.5, low=1.0, high=50.0, meaning="threshold in deviations of the torque's noise")
+    model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold in deviations of the model")
     friction_terms: tuple[str, ...] = setting((), choices=FRICTION_TERMS, meaning="friction beyond viscous and Coulomb")
+    still_rad_s: float = setting(
+        0.002,
+        unit="rad/s",
+        low=0.0,
+        high=1.0,
+        meaning="|dq| below which a joint may stand still; above the noise of dq",
+    )
     coulomb_width_rad_s: float = setting(
-        0.005, unit="rad/s", low=0.0, high=1.0, meaning="Coulomb friction is F_c tanh(dq / width); 0: F_c sgn(dq)"
+        0.0, unit="rad/s", low=0.0, high=1.0, meaning="Coulomb friction is F_c tanh(dq / width); 0: F_c sgn(dq)"
     )
     stribeck_rad_s: float = setting(
         0.05, unit="rad/s", low=1e-3, high=10.0, meaning="speed over which static friction falls off"
     )
     prior_std: tuple[float, ...] = setting(
-        (1.0, 0.5, 0.5, 10.0, 0.3, 0.003, 0.2), low=0.0, high=1e6, meaning=f"what an arm may be: {_KINDS}"
+        (1.0, 0.5, 0.5, 10.0, 0.3, 0.001, 0.2), low=0.0, high=1e6, meaning=f"what an arm may be: {_KINDS}"
     )
     enough_std: tuple[float, ...] = setting(
         (0.02, 0.04, 0.04, 0.2, 0.04, 0.004, 0.2), low=0.0, high=1e6, meaning=f"how well it must be known: {_KINDS}"
@@ -444,20 +453,20 @@ class CertifiedSettings:
     condition: float = setting(1e5, low=1.0, high=1e12, meaning="largest condition number of the same matrix")
     refine_s: float = setting(4.0, unit="s", low=0.1, high=3600.0, meaning="test of a refined model before it is used")
     torque_noise_Nm: float = setting(0.02, unit="Nm", low=0.0, high=10.0, meaning="torque sensor, rms of one sample")
-    velocity_noise_rad_s: float = setting(6e-4, unit="rad/s", low=0.0, high=1.0, meaning="velocity, rms of one sample")
-    reversal_rad_s: float = setting(
-        0.02, unit="rad/s", low=0.0, high=10.0, meaning="speed below which friction is less certain"
+    velocity_noise_rad_s: float = setting(
+        3.3e-3, unit="rad/s", low=0.0, high=1.0, meaning="velocity, largest error of one sample"
     )
-    reversal_share: float = setting(1.0, low=0.0, high=10.0, meaning="part of F_c that is uncertain at rest")
+    lag_s: float = setting(
+        0.00125, unit="s", low=0.0, high=0.1, meaning="expected age of the velocity when the torque is new; identified"
+    )
+    standstill_share: float = setting(1.0, low=0.0, high=10.0, meaning="part of F_c that is uncertain at rest")
     collision_Nm: tuple[float, float] = setting(
         (2.0, 1.0), unit="Nm", low=0.01, high=1000.0, meaning="a contact above it is a collision, per joint"
     )
 
     def __post_init__(self) -> None:
-        if len(self.sigmas) != len(self.cutoffs_rad_s):
-            raise ConfigError(
-                f"`certified.sigmas` has {len(self.sigmas)} values for {len(self.cutoffs_rad_s)} cut-offs"
-            )
+        if len(self.cutoffs_rad_s) < 2:
+            raise ConfigError(f"`certified.cutoffs_rad_s` has {len(self.cutoffs_rad_s)} values, at least 2 expected")
         if list(self.cutoffs_rad_s) != sorted(self.cutoffs_rad_s):
             raise ConfigError(f"`certified.cutoffs_rad_s` = {self.cutoffs_rad_s} must go from slow to fast")
         for name in ("prior_std", "enough_std", "drift_std", "model_error"):
@@ -497,6 +506,38 @@ class TrajectorySettings:
         (1.125, 4.5), unit="s", low=0.1, high=60.0, meaning="as printed (1.125, 4.5); synchronous (2.25, 2.25)"
     )
     approach_deg_s: float = setting(90.0, unit="deg/s", low=1.0, high=360.0, meaning="peak speed to the start corner")
+
+
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """The motion of the certified scheme's adaptation: periodic, from the trajectory's start corner at rest.
+
+    In amplitudes of the trajectory, q_d = -1 + sum_n cosine_n (cos(n w t) - 1) + sine_n sin(n w t), w = 2 pi / period.
+    """
+
+    period_s: float = setting(0.0, unit="s", low=0.0, high=600.0, meaning="of the motion; 0: adapt on the trajectory")
+    cosine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
+        ((), ()), low=-2.0, high=2.0, meaning="per joint and harmonic"
+    )
+    sine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
+        ((), ()), low=-2.0, high=2.0, meaning="per joint and harmonic"
+    )
+
+    def __post_init__(self) -> None:
+        for joint in range(JOINTS):
+            cosine, sine = self.cosine[joint], self.sine[joint]
+            if len(cosine) != len(sine):
+                raise ConfigError(
+                    f"joint {joint + 1} has {len(cosine)} values in `excitation.cosine`, "
+                    f"{len(sine)} in `excitation.sine`"
+                )
+            velocity = sum((n + 1) * value for n, value in enumerate(sine))
+            acceleration = sum((n + 1) ** 2 * value for n, value in enumerate(cosine))
+            if abs(velocity) > 1e-3 or abs(acceleration) > 1e-3:
+                raise ConfigError(
+                    f"excitation of joint {joint + 1} does not begin at rest: the sum of n sine_n = {velocity:.3g}, "
+                    f"of n² cosine_n = {acceleration:.3g}, each within 0.001"
+                )
 
 
 @dataclass(frozen=True)
@@ -694,6 +735,7 @@ class Settings:
     certified: CertifiedSettings = setting(CertifiedSettings, meaning="the scheme beyond the paper")
     reaction: ReactionSettings = setting(ReactionSettings, meaning="withdrawal")
     trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
+    excitation: ExcitationSettings = setting(ExcitationSettings, meaning="the motion of the certified adaptation")
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
     operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
     lockstep: LockstepSettings = setting(LockstepSettings, meaning="modelled time of the host")
@@ -701,6 +743,29 @@ class Settings:
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
     log: LogSettings = setting(LogSettings, meaning="the log")
+
+    @property
+    def further_names(self) -> tuple[str, ...]:
+        """Names of what the certified scheme estimates beside the dynamic parameters, in order; none of the paper's."""
+        if self.scheme == "paper":
+            return ()
+        kinds = ("offset", "lag", *self.certified.friction_terms)
+        return tuple(f"{kind}{joint + 1}" for kind in kinds for joint in range(JOINTS))
+
+    @property
+    def further_count(self) -> int:
+        """Number of `further_names`."""
+        return len(self.further_names)
+
+    @property
+    def filter_count(self) -> int:
+        """Filters in the certified scheme's bank; 0 of the paper's."""
+        return len(self.certified.cutoffs_rad_s) if self.scheme == "certified" else 0
+
+    @property
+    def channel_count(self) -> int:
+        """Residuals per joint that have a threshold: each filter's smoothed, and all but the slowest one's bare."""
+        return max(2 * self.filter_count - 1, 0)
 
     @property
     def cad_theta(self) -> Vector:

@@ -35,6 +35,10 @@ PARAMETER_UNITS = {
     "F_c2": "Nm",
     "a4": "Nm",
     "a5": "Nm",
+    "offset1": "Nm",
+    "offset2": "Nm",
+    "lag1": "s",
+    "lag2": "s",
 }
 
 
@@ -91,17 +95,18 @@ def scheme_layout(parameter_count: int) -> Layout:
     )
 
 
-def certified_layout(parameter_count: int, further_count: int, filter_count: int) -> Layout:
+def certified_layout(parameter_count: int, further_count: int, channel_count: int) -> Layout:
     """Lay out the block of the certified scheme: the scheme's, then what only it has.
 
-    parameter_count: dynamic parameters. further_count: offsets, lags and friction terms. filter_count: of the bank.
-    The scheme's tau_f, tau_ext_hat and threshold are those of the slowest filter; the bank is filter by filter.
+    parameter_count: dynamic parameters. further_count: offsets, lags and friction terms. channel_count: of the bank.
+    The scheme's tau_f, tau_ext_hat and threshold are those of the slowest filter. The bank is channel by channel: each
+    filter smoothed, then all but the slowest bare.
     """
-    bank = JOINTS * filter_count
+    bank = JOINTS * channel_count
     return Layout(
         (
             *scheme_layout(parameter_count).fields,
-            Field("tau_ext_bank", bank, "Nm", "estimated external torque of each filter"),
+            Field("tau_ext_bank", bank, "Nm", "estimated external torque of each channel"),
             Field("threshold_bank", bank, "Nm", "its threshold in force, inf while detection is off"),
             Field("theta_further", further_count, "see PARAMETER_UNITS", "estimated offsets, lags and friction terms"),
             Field("theta_std", parameter_count + further_count, "see PARAMETER_UNITS", "how well theta is known"),

@@ -81,3 +81,19 @@ def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Ve
             for j in range(W_f.shape[2]):
                 total += W_f[c, i, j] * theta[j]
             tau_ext_hat[c, i] = total
+
+
+@compiled
+def smooth(smoothing: float, r: Vector, y: Vector) -> None:
+    """Take the channels y (2 C - 1, n) over one period: r (C, n) through a second low-pass, then all but r[0] as is.
+
+    The drive's velocity noise rises with frequency up to the bandwidth of its tracking loop. A first-order filter
+    passes it on through the momentum undiminished; a second pole takes it away, for a few milliseconds of a small
+    step's detection. What is large enough is found in the bare residual first.
+    """
+    count = r.shape[0]
+    for c in range(count):
+        for i in range(r.shape[1]):
+            y[c, i] = r[c, i] + smoothing * (y[c, i] - r[c, i])
+            if c > 0:
+                y[count + c - 1, i] = r[c, i]

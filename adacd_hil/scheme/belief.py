@@ -26,9 +26,9 @@ from adacd_hil.scheme import estimator
 
 
 @compiled
-def begin(prior_std: Vector, theta: Vector, P: Vector) -> None:
-    """Set theta (p,) and P (p, p) to the prior: zero, and the given standard deviations."""
-    theta[:] = 0.0
+def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
+    """Set theta (p,) and P (p, p) to the prior and its standard deviations (p,)."""
+    theta[:] = prior
     P[:] = 0.0
     for j in range(theta.shape[0]):
         P[j, j] = prior_std[j] ** 2

@@ -69,14 +69,11 @@ _WIDE = 1
 """Filter of the bank whose output, with the filter undone, is the external torque of contact reports."""
 _FIT = 0
 """Filter of the bank that is learnt from: the slow one, whose noise is least."""
-_VELOCITY_SHAPE_RAD_S = 1257.0
-"""Bandwidth of the drive's velocity: of its noise, a filter of cut-off a passes on a M (1 + a / this)^-1."""
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
     """Name all parameters of the certified scheme, in order: dynamic ones, offsets, lags, further friction."""
-    further = ("offset", "lag", *settings.certified.friction_terms)
-    return settings.estimator.parameter_names + tuple(f"{name}{i + 1}" for name in further for i in range(JOINTS))
+    return settings.estimator.parameter_names + settings.further_names
 
 
 def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
@@ -86,6 +83,11 @@ def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
     exact = {"a1": inertia, "a2": inertia, "a3": inertia, "a4": gravity, "a5": gravity}
     found = [exact.get(name, next((v for p, v in prefixes if name.startswith(p)), further)) for name in names]
     return np.array(found)
+
+
+def prior_of(settings: Settings) -> Vector:
+    """Return what is expected of an arm of which nothing is known (p,): nothing, but the velocity's usual lag."""
+    return _by_kind((0.0, 0.0, 0.0, 0.0, 0.0, settings.certified.lag_s, 0.0), parameter_names(settings))
 
 
 def constants_of(settings: Settings) -> Structured:
@@ -112,6 +114,7 @@ def constants_of(settings: Settings) -> Structured:
         "stribeck_rad_s": certified.stribeck_rad_s,
         "terms": [FRICTION_TERMS.index(term) for term in certified.friction_terms],
         "theta_cad": theta_cad,
+        "prior": prior_of(settings),
         "prior_std": _by_kind(certified.prior_std, names),
         "enough_std": _by_kind(certified.enough_std, names),
         "drift_std": _by_kind(certified.drift_std, names),
@@ -131,12 +134,12 @@ def constants_of(settings: Settings) -> Structured:
         "scale": _by_kind((inertia, viscous, coulomb, gravity, coulomb, 0.005, coulomb), names),
         "travel_rad": np.radians(settings.termination.travel_deg),
         "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
-        "sigmas": certified.sigmas,
-        "torque_variance": certified.torque_noise_Nm**2 * 0.5 * cutoff * period_s,
+        "smoothing": np.exp(-certified.smoothing_rad_s * period_s),
+        **sensitivity.noise_constants(certified, period_s),
+        "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
-        "velocity_variance": (certified.velocity_noise_rad_s * cutoff / (1.0 + cutoff / _VELOCITY_SHAPE_RAD_S)) ** 2,
-        "reversal_rad_s": certified.reversal_rad_s,
-        "reversal_share": certified.reversal_share,
+        "still_rad_s": certified.still_rad_s,
+        "standstill_share": certified.standstill_share,
         "collision_Nm": certified.collision_Nm,
         "position_limit_rad": settings.arm.position_limit_rad,
         "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
@@ -152,7 +155,8 @@ def constants_of(settings: Settings) -> Structured:
 def new_memory(settings: Settings) -> Structured:
     """Return the memory before the first sample: a gap, and a belief that is the prior."""
     certified = settings.certified
-    filter_count, count = len(certified.cutoffs_rad_s), len(parameter_names(settings))
+    filter_count, channel_count = settings.filter_count, settings.channel_count
+    count = len(parameter_names(settings))
     learn_s = settings.bus.period_s * certified.learn_every
     waiting = max(round(certified.hold_back_s / learn_s), 1)
     joint, parameter = (JOINTS,), (count,)
@@ -204,9 +208,12 @@ def new_memory(settings: Settings) -> Structured:
         "frozen_square": (),
         "candidate_worst": (),
         # detection
-        "y": (filter_count, JOINTS),
-        "h": (filter_count, JOINTS),
-        "near": (filter_count, JOINTS),
+        "r": (filter_count, JOINTS),
+        "y": (channel_count, JOINTS),
+        "h": (channel_count, JOINTS),
+        "still": (filter_count, JOINTS),
+        "still_smooth": (filter_count, JOINTS),
+        "doubt": (filter_count, JOINTS),
         "rest_samples": (),
         "rest_tau": joint,
         "rest_square": joint,
@@ -221,8 +228,9 @@ def new_memory(settings: Settings) -> Structured:
     memory["roughness"] = 1.0
     state = memory[0]
     prior_std = _by_kind(certified.prior_std, parameter_names(settings))
-    belief.begin(prior_std, state["belief"], state["P_belief"])
-    belief.begin(prior_std, state["theta"], state["P"])
+    prior = prior_of(settings)
+    belief.begin(prior, prior_std, state["belief"], state["P_belief"])
+    belief.begin(prior, prior_std, state["theta"], state["P"])
     return memory
 
 
@@ -230,7 +238,7 @@ def new_block(settings: Settings) -> Structured:
     """Return a block before the first sample: zeros, and thresholds that nothing exceeds."""
     base = len(settings.estimator.parameter_names)
     further = len(parameter_names(settings)) - base
-    layout = certified_layout(base, further, len(settings.certified.cutoffs_rad_s))
+    layout = certified_layout(base, further, settings.channel_count)
     block = np.zeros(1, block_dtype(layout))
     for name in ("threshold", "threshold_bank", "paper_threshold"):
         block[name] = np.inf
@@ -254,7 +262,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
         m["P_belief"][:] = m["P"]
         belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_inertia_std"], m["P_belief"])
     else:
-        belief.begin(k["prior_std"], m["belief"], m["P_belief"])
+        belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)
     belief.discard(m)
     m["samples"] = 0.0
@@ -310,7 +318,7 @@ def step(
         if mode & MEASURE:
             _measure_noise(k, m, out["tau_J"])
         period_s = _filter(k, m, out, periods)
-        if not (np.all(np.isfinite(m["y"])) and np.all(np.isfinite(m["theta"]))):
+        if not (np.all(np.isfinite(m["r"])) and np.all(np.isfinite(m["theta"]))):
             observation |= _NOT_A_NUMBER
     else:
         m["has_gap"] = 1.0
@@ -385,15 +393,16 @@ def _filter(k: Any, m: Any, out: Any, periods: int) -> float:
             m["tau_old"], m["input_old"], m["S"], m["tau_f"], m["W_f"],
         )  # fmt: skip
     bank.fill_lag(cutoff, tau_J, m["tau_f"], base + q.shape[0], m["W_f"])
-    bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["y"])
-    sensitivity.follow_reversal(dq, k["reversal_rad_s"], k["decay"], m["near"])
+    bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
+    bank.smooth(k["smoothing"], m["r"], m["y"])
+    sensitivity.follow_standstill(dq, k["still_rad_s"], k["decay"], k["smoothing"], m["still"], m["still_smooth"])
     out["tau_f"][:] = m["tau_f"][_FIT]
     detector.predict(m["W_f"][_FIT], k["theta_cad"], out["tau_f_cad"])
     for i in range(q.shape[0]):
-        out["tau_ext_hat"][i] = m["y"][_FIT, i]
-        out["tau_f_hat"][i] = m["y"][_FIT, i] + out["tau_f"][i]
+        out["tau_ext_hat"][i] = m["r"][_FIT, i]
+        out["tau_f_hat"][i] = m["r"][_FIT, i] + out["tau_f"][i]
         out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
-    contact.undo_filter(m["y"][_WIDE], k["decay"][_WIDE], m["history"], out["tau_ext_wide_hat"])
+    contact.undo_filter(m["r"][_WIDE], k["decay"][_WIDE], m["history"], out["tau_ext_wide_hat"])
     return period_s
 
 
@@ -404,9 +413,10 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
     regressor.fill_momentum(q, dq, m["Y_p"][:, :base])
     regressor.fill_remainder(q, dq, m["Y_h"][:, :base])
     for i in range(count):
-        m["Y_h"][i, first_coulomb + i] = friction.smooth_sign(dq[i], k["width_rad_s"])
+        m["Y_h"][i, first_coulomb + i] = friction.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
         m["Y_h"][i, base + i] = 1.0
-    friction.fill_terms(dq, tau_J, k["terms"], k["width_rad_s"], k["stribeck_rad_s"], base + 2 * count, m["Y_h"])
+    speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
+    friction.fill_terms(dq, tau_J, k["terms"], speeds, base + 2 * count, m["Y_h"])
     regressor.fill_mass_matrix(q, m["theta"], m["M"])
 
 
@@ -424,8 +434,9 @@ def _watch(k: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
     if not joints:
         return 0
     observation = _CONTACT | joints << CONTACT_SHIFT
+    bare = m["r"].shape[0] + _WIDE - 1
     for i in range(m["y"].shape[1]):
-        if not (abs(m["y"][_WIDE, i]) <= max(k["collision_Nm"][i], m["h"][_WIDE, i])):
+        if not (abs(m["r"][_WIDE, i]) <= max(k["collision_Nm"][i], m["h"][bare, i])):
             observation |= _COLLISION
     return observation
 
@@ -455,7 +466,7 @@ def _test(k: Any, m: Any) -> int:
     """Take this sample into the test of the frozen model; return what that has come to."""
     m["tested"] += 1.0
     for i in range(m["y"].shape[1]):
-        if not (abs(m["y"][_FIT, i]) <= k["beta_Nm"]):
+        if not (abs(m["r"][_FIT, i]) <= k["beta_Nm"]):
             return _REFUTED
     return _CERTIFIED if m["tested"] >= k["test_cycles"][int(m["is_payload"])] else 0
 
@@ -524,7 +535,7 @@ def step_record(
     """Play an arm that doesn't react over n samples: ADAPT, CERTIFY, MONITOR; at a payload's sample all again.
 
     q, dq, tau_J (n, 2) at the nominal period; payload_at: sample, -1 for none. Fills state (n,) by `SchemeState`,
-    observation (n,), y and h (n, C, 2), and the model in use theta (n, p).
+    observation (n,), y and h (n, channels, 2), and the model in use theta (n, p).
     """
     now = ADAPT
     begin_adaptation(constants, memory, False)

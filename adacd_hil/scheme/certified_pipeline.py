@@ -45,8 +45,7 @@ class CertifiedPipeline:
     def __init__(self, settings: Settings) -> None:
         base = len(settings.estimator.parameter_names)
         self._names = certified_kernel.parameter_names(settings)
-        filters = len(settings.certified.cutoffs_rad_s)
-        places = certified_layout(base, len(self._names) - base, filters).slices
+        places = certified_layout(base, len(self._names) - base, settings.channel_count).slices
         self._constants = certified_kernel.constants_of(settings)
         self._memory = certified_kernel.new_memory(settings)
         self._block = certified_kernel.new_block(settings)
@@ -170,7 +169,7 @@ class _Beside:
     def __init__(self, settings: Settings, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> None:
         base = len(settings.estimator.parameter_names)
         further = len(certified_kernel.parameter_names(settings)) - base
-        places = certified_layout(base, further, len(settings.certified.cutoffs_rad_s)).slices
+        places = certified_layout(base, further, settings.channel_count).slices
         names = ("paper_is_armed", "paper_tau_ext_hat", "paper_threshold", "paper_theta_hat")
         self._is_armed, self._tau_ext_hat, self._threshold, self._theta_hat = (values[places[name]] for name in names)
         self._constants = kernel.constants_of(settings)

@@ -5,9 +5,9 @@
     asymmetric   |sgn(dq)|                      half the difference of the two directions' Coulomb friction, Nm
     width        -x / cosh²(x), x = dq / w      a width of tanh that is not w, to first order: F_c log(width / w), Nm
 
-sgn stands for tanh(dq / w), or for the sign itself with w = 0 (then there is no `width`). One parameter per joint and
-term, in the order of the settings. While a joint moves its asymmetry looks like an offset of its torque sensor; only
-rest tells the two apart.
+sgn stands for tanh(dq / w), or with w = 0 for the sign itself, 0 of a joint that may stand still (no `width` then).
+One parameter per joint and term, in the order of the settings. While a joint moves its asymmetry looks like an offset
+of its torque sensor; only rest tells the two apart.
 
 Shapes: dq, tau_J (n,); Y_h (n, p).
 """
@@ -22,20 +22,26 @@ STRIBECK, LOAD, ASYMMETRIC, WIDTH = range(len(FRICTION_TERMS))
 
 
 @compiled
-def smooth_sign(dq: float, width_rad_s: float) -> float:
-    """Return tanh(dq / width), or the sign of dq where the width is 0."""
-    return float(np.tanh(dq / width_rad_s) if width_rad_s > 0.0 else np.sign(dq))
+def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
+    """Return tanh(dq / width); where the width is 0 the sign of dq, and 0 of what may stand still."""
+    if width_rad_s > 0.0:
+        return float(np.tanh(dq / width_rad_s))
+    return float(np.sign(dq)) if abs(dq) >= still_rad_s else 0.0
 
 
 @compiled
 def fill_terms(
-    dq: Vector, tau_J: Vector, terms: Vector, width_rad_s: float, stribeck_rad_s: float, first_column: int, Y_h: Vector
+    dq: Vector, tau_J: Vector, terms: Vector, speeds: tuple[float, float, float], first_column: int, Y_h: Vector
 ) -> None:
-    """Fill the columns of the optional terms, numbers as in `FRICTION_TERMS`, from `first_column` on."""
+    """Fill the columns of the optional terms, numbers as in `FRICTION_TERMS`, from `first_column` on.
+
+    speeds: still, width w and v_s, rad/s.
+    """
     count = dq.shape[0]
+    still_rad_s, width_rad_s, stribeck_rad_s = speeds
     for position in range(terms.shape[0]):
         for i in range(count):
-            sign = smooth_sign(dq[i], width_rad_s)
+            sign = smooth_sign(dq[i], still_rad_s, width_rad_s)
             if terms[position] == STRIBECK:
                 value = sign * np.exp(-((dq[i] / stribeck_rad_s) ** 2))
             elif terms[position] == LOAD:

@@ -34,8 +34,9 @@ def test_candidate(k: Any, m: Any) -> bool:
                 residual += m["W_f"][c, i, j] * m["candidate"][j]
             if c == 0:
                 m["candidate_square"] += residual * residual
-                m["frozen_square"] += m["y"][c, i] ** 2
-            m["candidate_worst"] = max(m["candidate_worst"], abs(residual) / m["h"][c, i])
+                m["frozen_square"] += m["r"][c, i] ** 2
+            bare = max(m["r"].shape[0] + c - 1, 0) if c > 0 else 0
+            m["candidate_worst"] = max(m["candidate_worst"], abs(residual) / m["h"][bare, i])
     if m["candidate_cycles"] < k["refine_cycles"]:
         return False
     is_better = m["candidate_square"] < m["frozen_square"] and m["candidate_worst"] < 1.0
