@@ -399,7 +399,9 @@ class CertifiedSettings:
     )
     noise_sigmas: float = setting(6.5, low=1.0, high=50.0, meaning="threshold in deviations of the torque's noise")
     model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold in deviations of the model")
-    friction_terms: tuple[str, ...] = setting((), choices=FRICTION_TERMS, meaning="friction beyond viscous and Coulomb")
+    friction_terms: tuple[str, ...] = setting(
+        ("stribeck",), choices=FRICTION_TERMS, meaning="friction beyond viscous and Coulomb"
+    )
     still_rad_s: float = setting(
         0.002,
         unit="rad/s",

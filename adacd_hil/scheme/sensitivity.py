@@ -9,7 +9,8 @@
   (1 + a / 650) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
 - g² = w (P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
   parameter explains however long one learns. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
-- s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c.
+- s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
+  where it is in the model, and as much more as these are uncertain.
 
 Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C, n); y, h (2 C - 1, n); W_f (C, n, p);
 M (n, n). Units: Nm.
@@ -22,6 +23,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import CertifiedSettings
 from adacd_hil.records import Vector
+from adacd_hil.scheme import friction
 
 _SMOOTHED_SHARE = 0.31 / 200.0
 _SMOOTHED_FALL_RAD_S = 650.0
@@ -57,7 +59,7 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
         momentum = 0.0
         for j in range(m["M"].shape[1]):
             momentum += m["M"][i, j] ** 2
-        hold = k["standstill_share"] * max(m["theta"][int(k["first_coulomb"]) + i], 0.0)
+        hold = k["standstill_share"] * _static_friction(k, m, i)
         for c in range(filters):
             g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i]))
             m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
@@ -65,6 +67,18 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
             if c > 0:
                 bare = filters + c - 1
                 h[bare, i] = _threshold(k, m, bare, i, momentum, g, hold * m["still"][c, i])
+
+
+@compiled
+def _static_friction(k: Any, m: Any, joint: int) -> float:
+    """Return the most that friction is believed to hold of a joint that stands still, Nm."""
+    coulomb = int(k["first_coulomb"]) + joint
+    total = max(m["theta"][coulomb], 0.0) + np.sqrt(max(m["P"][coulomb, coulomb], 0.0))
+    for position in range(k["terms"].shape[0]):
+        if k["terms"][position] == friction.STRIBECK:
+            term = int(k["first_term"]) + position * m["r"].shape[1] + joint
+            total += max(m["theta"][term], 0.0) + np.sqrt(max(m["P"][term, term], 0.0))
+    return float(total)
 
 
 @compiled
