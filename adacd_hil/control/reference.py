@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from adacd_hil.config import Settings
+from adacd_hil.control.excitation import Excitation
 from adacd_hil.control.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
 from adacd_hil.records import JOINTS, ArmState, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.reaction import Withdrawal
@@ -22,6 +23,7 @@ AT_CORNER_RAD = 1e-3
 """Nearer than this the trajectory starts at once: a fifth of a degree, ten encoder steps of the noise."""
 
 _FOLLOWING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
+_LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 
 Segment = Callable[[float], None]
 
@@ -37,6 +39,7 @@ class Reference:
         self._approach_rad_s = float(np.radians(settings.trajectory.approach_deg_s))
         self._corner = -self._amplitude
         self._q_d, self._dq_d, self._ddq_d = q_d, dq_d, ddq_d
+        self._excitation = Excitation(settings)
         self._segment: Segment | None = None
         self._start_cycle = 0
         self._follows_at_cycle: int | None = None
@@ -47,6 +50,8 @@ class Reference:
         """Plan and run every kind of motion once, so that nothing happens for the first time in the cycle."""
         zeros = np.zeros(2)
         self._follow(0.0)
+        if self._excitation.is_on:
+            self._excite(0.0)
         for plan in (
             lambda: self._approach(0),
             lambda: self._withdraw(Withdrawal(self._settings, zeros, zeros, np.ones(2)), 0),
@@ -79,14 +84,16 @@ class Reference:
             self._ddq_d[:] = 0.0
             return
         if self._follows_at_cycle is not None and cycle >= self._follows_at_cycle and not self._is_parking:
-            self._start(self._follow, self._follows_at_cycle)
+            excites = self._excitation.is_on and output.state in _LEARNING
+            self._start(self._excite if excites else self._follow, self._follows_at_cycle)
             self._follows_at_cycle = None
         self._segment((cycle - self._start_cycle) * self._period_s)
 
     def _enter(self, output: SchemeOutput, cycle: int) -> None:
         """Choose the motion of a state that begins in this cycle."""
         state = output.state
-        is_moving_on = state in _FOLLOWING and output.previous_state in _FOLLOWING
+        ends_excitation = self._excitation.is_on and state is SchemeState.MONITOR
+        is_moving_on = state in _FOLLOWING and output.previous_state in _FOLLOWING and not ends_excitation
         self._follows_at_cycle = self._follows_at_cycle if is_moving_on else None
         if self._is_parking or is_moving_on:
             return
@@ -107,6 +114,9 @@ class Reference:
 
     def _follow(self, elapsed_s: float) -> None:
         corner_to_corner(elapsed_s, self._amplitude, self._half_period_s, self._q_d, self._dq_d, self._ddq_d)
+
+    def _excite(self, elapsed_s: float) -> None:
+        self._excitation.evaluate(elapsed_s, self._q_d, self._dq_d, self._ddq_d)
 
     def _withdraw(self, withdrawal: Withdrawal, cycle: int) -> None:
         def segment(elapsed_s: float) -> None:
