@@ -178,6 +178,8 @@ def new_memory(settings: Settings) -> Structured:
         "P": square,
         "M": (JOINTS, JOINTS),
         "promotions": (),
+        "certified": parameter,
+        "P_certified": square,
         # belief
         "belief": parameter,
         "P_belief": square,
@@ -248,7 +250,9 @@ def new_block(settings: Settings) -> Structured:
 
 @compiled
 def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool) -> None:
-    """Begin to learn: from the prior, or with a payload on top of the certified arm. The arm is at rest.
+    """Begin to learn: from the prior, or with a payload on top of the arm as it was certified.
+
+    What was learnt before is forgotten, so a contact on the way, whenever it is noticed, leaves no trace.
 
     Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
@@ -259,8 +263,8 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     m["history"][:] = 0.0
     m["is_payload"] = 1.0 if is_payload else 0.0
     if is_payload:
-        m["belief"][:] = m["theta"]
-        m["P_belief"][:] = m["P"]
+        m["belief"][:] = m["certified"]
+        m["P_belief"][:] = m["P_certified"]
         belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_inertia_std"], m["P_belief"])
     else:
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
@@ -291,8 +295,11 @@ def begin_test(constants: Structured, memory: Structured) -> None:
 @compiled
 def begin_refinement(memory: Structured) -> None:
     """Begin to refine the model that has just been certified."""
-    memory[0]["promotions"] = 0.0
-    refinement.restart(memory[0])
+    m = memory[0]
+    m["promotions"] = 0.0
+    m["certified"][:] = m["theta"]
+    m["P_certified"][:] = m["P"]
+    refinement.restart(m)
 
 
 @compiled
@@ -535,32 +542,41 @@ def step_record(
 ) -> None:
     """Play an arm that doesn't react over n samples: ADAPT, CERTIFY, MONITOR; at a payload's sample all again.
 
+    After a contact before the certificate it waits as after one while monitoring, then begins anew.
+
     q, dq, tau_J (n, 2) at the nominal period; payload_at: sample, -1 for none. Fills state (n,) by `SchemeState`,
     observation (n,), y and h (n, channels, 2), and the model in use theta (n, p).
     """
-    now = ADAPT
-    begin_adaptation(constants, memory, False)
+    now, begins_in = ADAPT, -1
+    is_payload = False
+    begin_adaptation(constants, memory, is_payload)
     for k in range(q.shape[0]):
         if k == payload_at:
-            begin_adaptation(constants, memory, now == MONITOR)
+            is_payload, begins_in = now == MONITOR, 0
+        if begins_in == 0:
+            begin_adaptation(constants, memory, is_payload)
             now = ADAPT
+        begins_in -= 1
         block[0]["q"][:] = q[k]
         block[0]["dq"][:] = dq[k]
         block[0]["tau_J"][:] = tau_J[k]
         block[0]["period_s"][0] = 0.0
-        mode = LEARN if now == ADAPT else (TEST if now == CERTIFY else REFINE)
+        mode = 0
+        if begins_in < 0:
+            mode = LEARN if now == ADAPT else (TEST if now == CERTIFY else REFINE)
         found = step(constants, memory, block, 1, 1, WATCH | mode)
         state[k] = now
         observation[k] = found
         y[k] = memory[0]["y"]
         h[k] = memory[0]["h"]
         theta[k] = memory[0]["theta"]
-        if found & _FITTED:
+        if found & _CONTACT and now != MONITOR and begins_in < 0:
+            begins_in = int(constants[0]["recover_cycles"])
+        elif found & _FITTED:
             begin_test(constants, memory)
             now = CERTIFY
-        elif found & _REFUTED and not found & _CONTACT:
-            begin_adaptation(constants, memory, memory[0]["is_payload"] != 0.0)
-            now = ADAPT
+        elif found & _REFUTED:
+            is_payload, begins_in = False, 0
         elif found & _CERTIFIED:
             begin_refinement(memory)
             now = MONITOR

@@ -36,6 +36,7 @@ _MODES = {
     SchemeState.STOPPED: _WATCH,
     SchemeState.PAYLOAD: _WATCH,
 }
+_LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 _ADAPTED = int(Observation.ADAPTED)
 
 
@@ -67,6 +68,8 @@ class CertifiedPipeline:
         self._isolation = Isolation(window_cycles, settings.certified.cutoffs_rad_s[0])
         self._theta_ff = np.zeros(base)
         self._has_certificate = False
+        self._is_payload = False
+        self._has_forgotten = False
         self._refined = 0.0
 
     def compile(self) -> None:
@@ -103,6 +106,7 @@ class CertifiedPipeline:
             self._feed_forward()
         block = self._values.copy()
         contact = self._report(arm.cycle, joints) if isolation.is_open else None
+        self._forget_if_disturbed(state)
         return SchemeOutput(
             cycle=arm.cycle,
             state=state,
@@ -142,15 +146,24 @@ class CertifiedPipeline:
             self._isolation.cancel()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
-        """Begin to learn anew, but go on after a contact with what was learnt before it."""
-        if previous in (SchemeState.REACT, SchemeState.STOPPED):
-            return
-        is_payload = self._has_certificate and previous is SchemeState.PAYLOAD
-        if previous is SchemeState.CERTIFY:
-            is_payload = bool(self._memory[0]["is_payload"])
-        if previous is not SchemeState.CERTIFY:
+        """Begin to learn anew: a payload on top of the certified arm, until that has failed; else everything."""
+        if previous in (SchemeState.ENABLE, SchemeState.PAYLOAD):
+            self._is_payload = self._has_certificate
             self._paper.begin_adaptation()
-        certified_kernel.begin_adaptation(self._constants, self._memory, is_payload)
+        elif previous is SchemeState.CERTIFY:
+            self._is_payload = False
+        certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+
+    def _forget_if_disturbed(self, state: SchemeState) -> None:
+        """Once a contact that interrupted an adaptation is reported, forget what this adaptation has learnt.
+
+        It may have learnt the contact's beginning, or this may be no contact but an earlier one that was learnt. Then
+        only a model that claims to know nothing lets the arm go on.
+        """
+        is_disturbed = state in (SchemeState.REACT, SchemeState.STOPPED) and self._supervisor.origin in _LEARNING
+        if is_disturbed and not self._isolation.is_open and not self._has_forgotten:
+            certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+        self._has_forgotten = is_disturbed and not self._isolation.is_open
 
     def _feed_forward(self) -> None:
         """Take the model in use for the feedforward from now on."""

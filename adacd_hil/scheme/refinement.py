@@ -44,6 +44,8 @@ def test_candidate(k: Any, m: Any) -> bool:
     if is_promoted:
         m["theta"][:] = m["candidate"]
         m["P"][:] = m["P_candidate"]
+        m["certified"][:] = m["theta"]
+        m["P_certified"][:] = m["P"]
         m["promotions"] += 1.0
     restart(m)
     return bool(is_promoted)
