@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from lab_arm import LabArm, profile_arm, random_arm
-from lab_motion import PERIOD_S, Motion, join, multisine, paper_motion, random_motion, random_moves
+from lab_motion import PERIOD_S, Motion, cut, join, multisine, paper_motion, random_motion, random_moves, still
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
@@ -32,8 +32,8 @@ from firmware_sim.scenario import PayloadSettings, Scenario
 from firmware_sim.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
 
 __all__ = [
-    "ContactSettings", "LabArm", "Motion", "Push", "Recording", "join", "multisine", "paper_motion", "profile_arm",
-    "random_arm", "random_motion", "random_moves", "record",
+    "PERIOD_S", "ContactSettings", "LabArm", "Motion", "Push", "Recording", "cut", "join", "multisine", "paper_motion",
+    "profile_arm", "random_arm", "random_motion", "random_moves", "record", "still",
 ]  # fmt: skip
 
 TICKS = ticks(PERIOD_S)

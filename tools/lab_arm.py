@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from lab_motion import PERIOD_S
 from numpy.typing import NDArray
 
 from adacd_hil.config import load_settings
@@ -18,6 +19,8 @@ FRICTIONS = ("plain", "stribeck", "drift", "load", "asymmetric")
 STATIC_SHARE = 2.0
 """Static over Coulomb friction of variant "stribeck"; it falls off at 0.05 rad/s."""
 DRIFT_SHARE = 0.2
+DRIFT_S = 120.0
+"""Friction goes up and down by DRIFT_SHARE in this time, in variant "drift"."""
 ASYMMETRY = 0.15
 """Coulomb friction is larger by this share at positive velocity, and smaller at negative, in variant "asymmetric"."""
 LOAD_SHARE = (0.02, 0.02)
@@ -68,8 +71,8 @@ class LabArm:
         if self.friction != "drift":
             return np.ones((count, 2))
         turns = np.random.default_rng([seed, 3]).uniform(0.0, 1.0, 2)
-        way = np.arange(count)[:, None] / max(count, 1)
-        return 1.0 + DRIFT_SHARE * np.sin(2.0 * np.pi * (way + turns))
+        turns = turns + np.arange(count)[:, None] * (PERIOD_S / DRIFT_S)
+        return 1.0 + DRIFT_SHARE * np.sin(2.0 * np.pi * turns)
 
 
 def profile_arm(profile: str, payload_kg: float = 0.0, friction: str = "plain", **changes: object) -> LabArm:

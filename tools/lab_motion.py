@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.config import TrajectorySettings
-from adacd_hil.control.quintic import PEAK_SPEED_FACTOR, corner_to_corner
+from adacd_hil.control.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
+from adacd_hil.control.reference import SHORTEST_APPROACH_S
 
 PERIOD_S = 1e-3
 REACH_RAD = np.radians([60.0, 110.0])
@@ -102,14 +103,42 @@ def random_motion(seed: int, duration_s: float) -> Motion:
     return multisine(seed, duration_s) if seed % 4 == 3 else random_moves(seed, duration_s)
 
 
+def still(at: NDArray[np.float64], duration_s: float) -> Motion:
+    """Stand at a place (2,)."""
+    return _still("", round(duration_s / PERIOD_S), at)
+
+
+def cut(motion: Motion, count: int) -> Motion:
+    """Give the first `count` cycles of a motion."""
+    return Motion(motion.name, motion.q_d[:count], motion.dq_d[:count], motion.ddq_d[:count])
+
+
 def join(motions: Sequence[Motion], speed_deg_s: float = 40.0) -> Motion:
-    """Play motions one after the other, with a synchronous move in between where they don't meet."""
+    """Play motions one after the other, from whatever the one ends with by a quintic to where the next one begins.
+
+    Each but the first begins at rest.
+    """
     parts: list[Motion] = []
     for motion in motions:
-        if parts and np.abs(motion.q_d[0] - parts[-1].q_d[-1]).max() > 1e-3:
-            parts.append(_move(parts[-1].q_d[-1], motion.q_d[0], np.full(2, np.radians(speed_deg_s)), True))
+        if parts:
+            parts.append(_lead(parts[-1], motion.q_d[0], np.radians(speed_deg_s)))
         parts.append(motion)
     return _cut(" + ".join(motion.name for motion in motions), parts, sum(len(part.q_d) for part in parts))
+
+
+def _lead(before: Motion, end: NDArray[np.float64], speed_rad_s: float) -> Motion:
+    """Lead from the last cycle of a motion to rest at `end` (2,)."""
+    q, dq, ddq = before.q_d[-1], before.dq_d[-1], before.ddq_d[-1]
+    is_moving = bool(np.any(dq) or np.any(ddq))
+    duration_s = PEAK_SPEED_FACTOR * float(np.abs(end - q).max()) / speed_rad_s
+    if duration_s < PERIOD_S and not is_moving:
+        return _still("", 0, end)
+    count = round(max(duration_s, SHORTEST_APPROACH_S) / PERIOD_S)
+    coefficients = to_rest(q, dq, ddq, end, count * PERIOD_S)
+    way = _still("", count, end)
+    for k in range(count - 1):
+        evaluate(coefficients, (k + 1) * PERIOD_S, way.q_d[k], way.dq_d[k], way.ddq_d[k])
+    return way
 
 
 def _quintic(
