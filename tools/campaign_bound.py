@@ -29,6 +29,8 @@ LAG_S = 1.6e-3
 """Of the drive's velocity, 2 / (2π 200 Hz)."""
 ORDER = 24
 WINDOW_S = 0.25
+RESPONSE_SAMPLES = 20
+"""After these the step response is what it stays, but for noise."""
 NOISE_S = 60.0
 ONSETS = 12
 REVERSAL_RAD_S = 0.02
@@ -64,6 +66,16 @@ class Bound:
     def delay_s(self, joint: int, step_Nm: float) -> float:
         """Give the median delay of a step, inf when it is not found within WINDOW_S."""
         found = np.flatnonzero(step_Nm * self.step_distances[joint] >= threshold_sigma())
+        return float((found[0] + 0.5) * PERIOD_S) if found.size else float("inf")
+
+    def contact_delay_s(self, tau_ext: NDArray[np.float64]) -> float:
+        """Give the delay of a contact with this torque (n, 2), from its first sample on; inf when it is not found."""
+        response = np.zeros_like(tau_ext)
+        for joint in range(2):
+            impulse = np.diff(self.steps[joint][:RESPONSE_SAMPLES], axis=0, prepend=np.zeros((1, 2)))
+            for i in range(2):
+                response[:, i] += np.convolve(tau_ext[:, joint], impulse[:, i])[: len(tau_ext)]
+        found = np.flatnonzero(self.distance(response) >= threshold_sigma())
         return float((found[0] + 0.5) * PERIOD_S) if found.size else float("inf")
 
     def smallest_Nm(self, joint: int, within_s: float = 0.1) -> float:

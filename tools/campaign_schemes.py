@@ -4,7 +4,7 @@ Only the supervisor's rule for a good run is played: adapt from each cycle of `b
 says so. Nobody reacts, so a detector goes on after an alarm.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -55,13 +55,13 @@ class Scheme(Protocol):
 
 
 class PaperScheme:
-    """The paper's scheme as the configuration `paper` has it."""
+    """The paper's scheme as a configuration has it."""
 
-    name = "paper"
     patience_s = 14.0
 
-    def __init__(self) -> None:
-        self._settings = load_settings("paper", "S")
+    def __init__(self, name: str, settings: Settings) -> None:
+        self.name = name
+        self._settings = settings
 
     def adaptation_motion(self, is_payload: bool) -> Motion:  # noqa: ARG002
         """Give the paper's motion as printed."""
@@ -141,8 +141,6 @@ def true_residual(recording: Recording, cutoff_rad_s: float, lag_s: float = 0.0)
 
 
 def _with_cutoff(settings: Settings, cutoff_rad_s: float) -> Settings:
-    from dataclasses import replace
-
     return replace(settings, filter=replace(settings.filter, a_rad_s=cutoff_rad_s, b_rad_s=cutoff_rad_s))
 
 
@@ -164,8 +162,11 @@ def _run_true(
         tau_ext_hat[k] = out["tau_ext_hat"]
 
 
-def scheme_named(name: str) -> Scheme:
-    """Give a scheme by its configuration's name. Raises ValueError."""
-    if name == "paper":
-        return PaperScheme()
-    raise ValueError(f"no scheme is called {name!r}; known: paper")
+def scheme_named(configuration: str) -> Scheme:
+    """Give the scheme of a configuration: a built-in name or a TOML file. Raises ConfigError."""
+    settings = load_settings(configuration, "S")
+    if getattr(settings, "scheme", "paper") == "certified":
+        from campaign_certified import CertifiedScheme
+
+        return CertifiedScheme(configuration, settings)
+    return PaperScheme(configuration, settings)

@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from campaign_bound import Bound, bound_of
 from campaign_schemes import ARMED, Outcome, Scheme, scheme_named, true_residual
 from lab import (
     PERIOD_S,
@@ -45,6 +46,10 @@ MOVING_RAD_S = 0.02
 MOVING_S = 0.5
 """A joint counts as moving when its desired speed has been above MOVING_RAD_S for MOVING_S, five filter lags."""
 LOCATED_S = 0.01
+ROOT_M = 0.1
+"""Nearer to its joint a link is not touched: what a small force does there, no threshold of any use sees."""
+BLIND_M = 0.1
+"""Below this distance between joint 1 and a force's line, as seen from joint 2, force and lever are not told apart."""
 TOUCH_S = 0.3
 TOUCH_NM = 1.0
 
@@ -221,18 +226,22 @@ def push_steps(case: Case) -> list[Row]:
 
 
 def random_contact(generator: np.random.Generator, at_s: float, lengths_m: tuple[float, float]) -> ContactSettings:
-    """Draw a contact: half-sine of 20 to 100 ms, step or slow push, 5 to 60 N, anywhere on either link but its root."""
+    """Draw a contact: half-sine of 20 to 100 ms, step or slow push, 5 to 60 N, anywhere on either link but its root.
+
+    One in two is without friction, so that its direction is known to be across the link.
+    """
     link = int(generator.integers(1, 3))
     shape = ("half_sine", "step", "push")[int(generator.integers(3))]
     duration_s = {"half_sine": (0.02, 0.1), "step": (0.05, 0.15), "push": (0.3, 0.6)}[shape]
     side = float(generator.choice((-1.0, 1.0)))
+    slant_deg = float(generator.uniform(-45.0, 45.0)) if generator.random() < 0.5 else 0.0
     return ContactSettings(
         at_s=at_s,
         link=link,
-        point_m=float(generator.uniform(0.25, 1.0) * lengths_m[link - 1]),
+        point_m=float(generator.uniform(ROOT_M, lengths_m[link - 1])),
         force_N=float(generator.uniform(5.0, 60.0)),
         duration_s=float(generator.uniform(*duration_s)),
-        angle_deg=side * 90.0 + float(generator.uniform(-45.0, 45.0)),
+        angle_deg=side * 90.0 + slant_deg,
         shape=shape,
     )
 
@@ -253,10 +262,32 @@ def push_links(case: Case) -> list[Row]:
     motion = random_moves(case.seed + 1, CONTACTS_PER_RECORD * spacing_s + 2.0)
     recording = prelude.record(motion, case.seed, contacts=contacts)
     outcome = scheme_of(case.scheme).run(recording, prelude.begins)
-    return [case.labels() | _judge(contact, recording, outcome) for contact in contacts]
+    bound = profile_bound(case.profile, case.is_loaded)
+    return [case.labels() | _judge(contact, recording, outcome, bound) for contact in contacts]
 
 
-def _judge(contact: ContactSettings, recording: Recording, outcome: Outcome) -> Row:
+@cache
+def profile_bound(profile: str, is_loaded: bool) -> Bound:
+    """Give the noise-limited bound of a profile, measured once per process."""
+    return bound_of(profile_arm(profile, PAYLOAD_KG if is_loaded else 0.0))
+
+
+def _lever(contact: ContactSettings, recording: Recording, outcome: Outcome) -> Row:
+    """Compare force and lever arm of a contact on link 2 without friction; nothing near q2 = 90 degrees.
+
+    F = (tau1 - tau2) / (l1 cos q2), lever r = tau2 / F by least squares over the contact.
+    """
+    first, last = int(contact.at_s / PERIOD_S), int((contact.at_s + contact.duration_s) / PERIOD_S) + 3
+    across_m = recording.arm.arm.link_length_m[0] * np.cos(recording.q[first:last, 1])
+    if contact.link != 2 or abs(contact.angle_deg) != 90.0 or np.abs(across_m).min() < BLIND_M:
+        return {}
+    tau = outcome.tau_ext_wide_hat[first:last]
+    force_N = (tau[:, 0] - tau[:, 1]) / across_m
+    lever_m = float(tau[:, 1] @ force_N / (force_N @ force_N))
+    return {"lever_error_m": lever_m - contact.point_m, "force_ratio": float(np.abs(force_N).max() / contact.force_N)}
+
+
+def _judge(contact: ContactSettings, recording: Recording, outcome: Outcome, bound: Bound) -> Row:
     """Compare what was made of a contact with what it was."""
     first = int(np.ceil(contact.at_s / PERIOD_S))
     last = int((contact.at_s + contact.duration_s) / PERIOD_S) + 100
@@ -264,7 +295,7 @@ def _judge(contact: ContactSettings, recording: Recording, outcome: Outcome) -> 
     row: Row = {
         "link": contact.link, "shape": contact.shape, "force_N": contact.force_N, "duration_s": contact.duration_s,
         "peak_Nm": np.abs(truth).max(0).tolist(), "impulse_Nms": np.abs(truth.sum(0) * PERIOD_S).tolist(),
-        "was_over": bool(outcome.over[first - 1]),
+        "was_over": bool(outcome.over[first - 1]), "noise_delay_s": bound.contact_delay_s(truth),
     }  # fmt: skip
     found = np.flatnonzero(outcome.over[first:last])
     if not found.size:
@@ -287,6 +318,7 @@ def _judge(contact: ContactSettings, recording: Recording, outcome: Outcome) -> 
         "is_hidden": hidden,
         "is_direction_right": all(signs),
         "peak_ratio": float(np.abs(wide).max() / np.abs(truth[:, strong]).max()),
+        **_lever(contact, recording, outcome),
     }
 
 

@@ -5,7 +5,8 @@
     python tools/scheme_campaign.py --only steps --schemes paper
 
 No bus: recordings of the emulated arm (`lab`), the schemes' compiled steps on them (`campaign_schemes`). Every run has
-its seed. Tables go to stdout, progress to stderr. Exit status: 0 all figures within their bounds, 1 one is not.
+its seed. Tables go to stdout, progress to stderr. Exit status: 0 the last scheme has all figures within their bounds,
+1 one is not, 2 wrong usage.
 """
 
 import argparse
@@ -22,22 +23,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from campaign_bound import Bound, bound_of
+from campaign_bound import Bound
 from campaign_figures import figure_table, is_all_good, variant_table
 from campaign_trials import (
     CONTACTS_PER_RECORD,
-    PAYLOAD_KG,
     Case,
     Row,
     leave_alone,
+    profile_bound,
     push_links,
     push_steps,
     touch_while_adapting,
 )
-from lab import profile_arm
 from lab_arm import FRICTIONS
 
 PROFILES = ("P", "S", "M")
+CELLS = tuple((profile, is_loaded) for profile in PROFILES for is_loaded in (False, True))
 WATCHED_S = 60.0
 DAY_PART_S = 300.0
 PARTS = ("arms", "variants", "day", "steps", "contacts", "touches")
@@ -45,7 +46,10 @@ PARTS = ("arms", "variants", "day", "steps", "contacts", "touches")
 
 @dataclass(frozen=True)
 class Size:
-    """How much to play. seeds: of each of the first so many `frictions`. steps: records of pushes per profile and payload."""
+    """How much to play.
+
+    seeds: of each of the first so many `frictions`. steps: records of pushes per profile and payload.
+    """
 
     arms: int = 1000
     hours: float = 24.0
@@ -78,20 +82,19 @@ def jobs_of(scheme: str, size: Size) -> Iterator[Job]:
     for seed in range(size.arms):
         case = Case(scheme, "random", seed, seed % 2 == 1)
         yield Job("arms", leave_alone, (case, WATCHED_S, 100_000 + seed))
-    cells = [(profile, is_loaded) for profile in PROFILES for is_loaded in (False, True)]
-    for profile, is_loaded in cells:
+    for profile, is_loaded in CELLS:
         for friction in FRICTIONS[: size.frictions]:
             for seed in range(size.seeds):
                 case = Case(scheme, profile, 10_000 + seed, is_loaded, friction)
                 yield Job("variants", leave_alone, (case, WATCHED_S, 200_000 + seed))
     for index in range(math.ceil(size.hours * 3600.0 / DAY_PART_S)):
-        profile, is_loaded = cells[index % len(cells)]
+        profile, is_loaded = CELLS[index % len(CELLS)]
         yield Job("day", leave_alone, (Case(scheme, profile, 20_000 + index, is_loaded), DAY_PART_S, 300_000 + index))
-    for profile, is_loaded in cells:
+    for profile, is_loaded in CELLS:
         for seed in range(size.steps):
             yield Job("steps", push_steps, (Case(scheme, profile, 30_000 + seed, is_loaded),))
     for index in range(math.ceil(size.contacts / CONTACTS_PER_RECORD)):
-        profile, is_loaded = cells[index % len(cells)]
+        profile, is_loaded = CELLS[index % len(CELLS)]
         yield Job("contacts", push_links, (Case(scheme, profile, 40_000 + index, is_loaded),))
     for index in range(size.touches):
         profile = PROFILES[index % len(PROFILES)]
@@ -118,11 +121,7 @@ def play(jobs: list[Job], processes: int) -> dict[str, list[Row]]:
 
 def bounds() -> dict[tuple[str, bool], Bound]:
     """Measure the noise-limited bound of each profile, without and with payload."""
-    return {
-        (profile, is_loaded): bound_of(profile_arm(profile, PAYLOAD_KG if is_loaded else 0.0))
-        for profile in PROFILES
-        for is_loaded in (False, True)
-    }
+    return {(profile, is_loaded): profile_bound(profile, is_loaded) for profile, is_loaded in CELLS}
 
 
 def as_plain(value: Any) -> Any:
@@ -139,7 +138,7 @@ def as_plain(value: Any) -> Any:
 def main() -> int:
     """Play what was asked for."""
     parser = argparse.ArgumentParser(description="Plays the schemes against many arms, motions and touches.")
-    parser.add_argument("--schemes", default="paper,certified", metavar="NAMES", help="default: paper,certified")
+    parser.add_argument("--schemes", default="paper,certified", metavar="NAMES", help="configurations or TOML files")
     parser.add_argument("--only", default=",".join(PARTS), metavar="PARTS", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--quick", action="store_true", help="a minute's worth")
     for name, value in vars(Size()).items():
