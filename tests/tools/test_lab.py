@@ -12,10 +12,17 @@ from firmware_sim.contact import ContactSettings
 from firmware_sim.scenario import Scenario
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import lab
 from lab import Motion, Push, profile_arm, random_arm, random_moves, record
 
 CYCLES = 150
 PUSHED = slice(80, 120)
+
+
+@pytest.fixture(autouse=True)
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Play with the emulator's compiled functions from Python: the whole loop takes longer to compile than these."""
+    monkeypatch.setattr(lab, "_play", getattr(lab._play, "py_func", lab._play))
 
 
 def short_motion(seed: int = 5):

@@ -9,7 +9,7 @@ import pytest
 from firmware_sim.contact import ContactSettings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-from campaign_bound import Bound, fit, threshold_sigma
+from campaign_bound import Bound, fit, threshold_sigma, whiten
 from campaign_figures import Figure, figure_table, is_all_good, variant_table
 from campaign_schemes import ADAPTING, ARMED, Outcome
 from campaign_trials import _judge, alarms, is_moving, predicted_change
@@ -46,14 +46,16 @@ def test_the_threshold_is_one_false_alarm_a_day():
 
 def test_the_autoregression_of_noise_is_found_without_the_samples_that_don_t_count():
     generator = np.random.default_rng(1)
-    noise = generator.standard_normal((8000, 2))
+    white = generator.standard_normal((8000, 2))
+    noise, matrix = white.copy(), np.array([[0.8, 0.3], [0.0, 0.5]])
     for k in range(1, len(noise)):
-        noise[k] += 0.8 * noise[k - 1]
+        noise[k] += matrix @ noise[k - 1]
+    assert whiten(noise, matrix[np.newaxis]) == pytest.approx(white)
     noise[5000:5100] = 50.0
     is_good = np.ones(len(noise), bool)
     is_good[4999:5101] = False
     coefficients, covariance = fit(noise, is_good)
-    assert coefficients[0] == pytest.approx(0.8 * np.eye(2), abs=0.05)
+    assert coefficients[0] == pytest.approx(matrix, abs=0.05)
     assert covariance == pytest.approx(np.eye(2), abs=0.06)
 
 
@@ -138,3 +140,6 @@ def test_what_was_not_measured_is_not_missed():
     assert figure.is_good(float("nan"))
     assert figure.is_good(1.0)
     assert not figure.is_good(1.1)
+    floor = Figure("", 99.0, lambda rows: 0.0, is_floor=True)
+    assert floor.is_good(99.0)
+    assert not floor.is_good(98.9)
