@@ -161,8 +161,9 @@ def test_friction_columns_are_velocity_and_its_sign():
 
 
 def test_a_point_mass_has_the_kinetic_energy_of_its_speed():
-    """u' I u of a body that turns about z at 1 rad/s: m (x² + y²)."""
+    """u' I u = m |v + omega x r|²."""
     row = np.zeros(10)
-    turn = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    chain.add_form(turn, turn, 1.0, row)
-    assert row @ chain.point_mass(2.0, (0.3, -0.4, 5.0)) == pytest.approx(0.5)
+    omega, v, r = np.array([0.5, -1.0, 2.0]), np.array([3.0, 0.1, -0.2]), np.array([0.3, -0.4, 0.7])
+    u = np.concatenate([omega, v])
+    chain.add_form(u, u, 1.0, row)
+    assert row @ chain.point_mass(2.0, r) == pytest.approx(2.0 * np.sum((v + np.cross(omega, r)) ** 2))

@@ -42,6 +42,12 @@ def test_an_axis_is_made_a_unit_vector_and_limits_are_kept():
     assert (arm.position_low[1], arm.position_high[1]) == (-np.inf, np.inf)
 
 
+def test_a_continuous_joint_has_no_position_limits():
+    spin = joint("spin", "continuous", "b", "c", '<limit lower="-1" upper="1" velocity="3" effort="4"/>')
+    arm = read_urdf(robot(LINKS + TURN + spin))
+    assert (arm.position_low[1], arm.position_high[1], arm.velocity_limit[1]) == (-np.inf, np.inf, 3.0)
+
+
 def test_a_joint_on_what_is_fixed_to_the_base_is_placed_from_the_base():
     arm = seven_joint_arm()
     np.testing.assert_allclose(arm.chain.translation[0], [0.0, 0.0, 0.33])
