@@ -1,5 +1,7 @@
 """A torque-sensed arm of seven joints is identified and watched on its record; Pinocchio moves it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from planar_arm import THETA
@@ -8,6 +10,7 @@ from simulated_arm import Multisine, simulate
 from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.scheme import offline
+from adacd_hil.scheme.chain import mass_matrix
 from adacd_hil.scheme.offline import OfflineSettings, Record
 
 pinocchio = pytest.importorskip("pinocchio")
@@ -120,6 +123,25 @@ def test_pushes_are_found_with_link_and_direction(case):
         pushed = np.abs(tau_ext[begin]) > 0.3
         np.testing.assert_array_equal(np.array(contact.direction)[pushed], np.sign(tau_ext[begin])[pushed])
         assert np.abs(tau_ext[begin, contact.first_joint]) > 0.3
+
+
+def test_noise_of_the_velocity_is_no_contact_and_raises_the_threshold_by_the_mass_that_it_moves(case):
+    """1 mrad/s at 50 rad/s: 50 mNm per kg m² of the joint's row of M."""
+    random = np.random.default_rng(5)
+    noisy = (
+        Record(record.q, record.dq + 1e-3 * random.standard_normal(record.dq.shape), record.tau_J)
+        for record in (case.fitted, case.unseen)
+    )
+    settings = dataclasses.replace(SETTINGS, velocity_noise_rad_s=1e-3)
+    fitted, unseen = noisy
+    estimate = offline.identify(case.columns, fitted, case.before, settings)
+    assert offline.certify(case.columns, unseen, estimate, SETTINGS).margin < 0.2
+    assert offline.certify(case.columns, unseen, estimate, settings).margin > 1.0
+    still = Record(unseen.q[:1], np.zeros((1, 7)), unseen.tau_J[:1])
+    M = mass_matrix(case.arm.chain, unseen.q[0], case.arm.theta_full)
+    threshold = offline.detect(case.columns, still, estimate, settings).threshold[0]
+    expected = 6.0 * np.hypot(FILTERED_NOISE_NM, 0.05 * np.linalg.norm(M, axis=1))
+    np.testing.assert_allclose(threshold, expected, rtol=0.05, atol=0.01)
 
 
 @pytest.mark.parametrize("joint", range(7))
