@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Reaction, Vector
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
 
 
@@ -375,6 +375,13 @@ class DetectorSettings:
     isolation_window_s: float = setting(
         0.05, unit="s", low=0.0, high=1.0, meaning="after detection, until the link is final"
     )
+    collision_Nm: tuple[float, float] = setting(
+        (2.0, 1.0), unit="Nm", low=0.01, high=1000.0, meaning="upper threshold; `paper`: any contact is a collision"
+    )
+
+
+REACTIONS = tuple(reaction.name.lower() for reaction in Reaction)
+"""What can be done about a contact, as a configuration says it."""
 
 
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width")
@@ -462,9 +469,6 @@ class CertifiedSettings:
         0.00125, unit="s", low=0.0, high=0.1, meaning="expected age of the velocity when the torque is new; identified"
     )
     standstill_share: float = setting(1.0, low=0.0, high=10.0, meaning="part of F_c that is uncertain at rest")
-    collision_Nm: tuple[float, float] = setting(
-        (2.0, 1.0), unit="Nm", low=0.01, high=1000.0, meaning="a contact above it is a collision, per joint"
-    )
 
     def __post_init__(self) -> None:
         if len(self.cutoffs_rad_s) < 2:
@@ -479,7 +483,7 @@ class CertifiedSettings:
 
 @dataclass(frozen=True)
 class ReactionSettings:
-    """Withdrawal along +tau_ext."""
+    """What is done about a contact, by its level and link. Link 1's joint is joint 1; pairs of numbers are joints."""
 
     distance_deg: tuple[float, float] = setting((8.0, 8.0), unit="deg", low=0.0, high=90.0, meaning="how far back")
     velocity_limit_deg_s: tuple[float, float] = setting(
@@ -497,6 +501,42 @@ class ReactionSettings:
     patience_s: float = setting(
         10.0, unit="s", low=0.1, high=3600.0, meaning="a contact that lasts longer waits to be acknowledged"
     )
+    contact: tuple[str, str] = setting(
+        ("stop", "stop"), choices=REACTIONS, meaning="to a contact of link 1, of link 2; `paper` knows collisions only"
+    )
+    collision: tuple[str, str] = setting(
+        ("withdraw", "withdraw"), choices=REACTIONS, meaning="to a collision of link 1, of link 2; `paper` withdraws"
+    )
+    start: str = setting(
+        "desired",
+        choices=("desired", "measured"),
+        meaning="stop, withdraw: from where the arm was to be, or also from where a blow has thrown it",
+    )
+    rebound_s: float = setting(
+        0.0, unit="s", low=0.0, high=1.0, meaning="how long a blow may throw the arm faster than its velocity limit"
+    )
+    two_sided: str = setting(
+        "float", choices=("stop", "float"), meaning="to a push from the other side while withdrawing, as in a clamp"
+    )
+    damping_Nm_s: tuple[float, float] = setting(
+        (1.0, 0.4), unit="Nm s/rad", low=0.0, high=100.0, meaning="float: what brakes a push that has ended"
+    )
+    friction_share: float = setting(
+        0.7, low=0.0, high=1.0, meaning="float: part of the identified friction that is compensated"
+    )
+    mass_kg_m2: tuple[float, float] = setting(
+        (0.15, 0.06), unit="kg m²", low=1e-3, high=100.0, meaning="admittance: virtual inertia of each joint"
+    )
+    drag_Nm_s: tuple[float, float] = setting(
+        (3.0, 1.2), unit="Nm s/rad", low=1e-3, high=1000.0, meaning="admittance: virtual damping of each joint"
+    )
+    deadband_Nm: tuple[float, float] = setting(
+        (0.2, 0.1), unit="Nm", low=0.0, high=100.0, meaning="admittance: external torque that moves nothing"
+    )
+    yield_limit_deg_s: tuple[float, float] = setting(
+        (60.0, 90.0), unit="deg/s", low=1.0, high=360.0, meaning="float, admittance: speed that a push may give a joint"
+    )
+    slow_share: float = setting(0.2, low=0.0, high=1.0, meaning="slow_down: part of the speed that is left")
 
 
 @dataclass(frozen=True)
@@ -735,7 +775,7 @@ class Settings:
     termination: TerminationSettings = setting(TerminationSettings, meaning="end of adaptation")
     detector: DetectorSettings = setting(DetectorSettings, meaning="collision detection")
     certified: CertifiedSettings = setting(CertifiedSettings, meaning="the scheme beyond the paper")
-    reaction: ReactionSettings = setting(ReactionSettings, meaning="withdrawal")
+    reaction: ReactionSettings = setting(ReactionSettings, meaning="what is done about a contact")
     trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
     excitation: ExcitationSettings = setting(ExcitationSettings, meaning="the motion of the certified adaptation")
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")

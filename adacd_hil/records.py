@@ -8,6 +8,7 @@ torque, positive when the environment pushes toward +q, Nm; theta_hat dynamic pa
 `PARAMETER_NAMES`. All joint vectors are float64 (2,).
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -236,11 +237,42 @@ class ArmCommand(NamedTuple):
     quick_stop: bool
 
 
+class ContactLevel(IntEnum):
+    """How much pushes."""
+
+    CONTACT = 1  # over the lower threshold: clears itself
+    COLLISION = 2  # over the upper threshold, or lasting: latched until acknowledged
+
+
+class ContactKind(IntEnum):
+    """How it pushes."""
+
+    UNKNOWN = 0  # not classified, or not yet
+    PUSH = 1  # slowly: it lasts, as a hand that guides or a person who leans
+    HIT = 2  # an impact: it was over as fast as it came
+
+
+class Location(IntEnum):
+    """Whether force and lever arm are known, and why not."""
+
+    NOT_SOUGHT = 0
+    KNOWN = 1  # one contact without friction on link 2
+    LINK_1 = 2  # only the moment about joint 1 is known; force_N is the smallest force that has it
+    SINGULAR = 3  # the elbow stands so square that both joints say the same
+    UNCERTAIN = 4  # too weak against the noise
+    BEYOND_TIP = 5  # the lever arm ends past the tip: what the arm carries, or a force at an angle to the link
+    INCONSISTENT = 6  # no single contact on link 2: more than one, as in a clamp, or friction
+
+
 class ContactReport(NamedTuple):
-    """A collision, as first detected and then refined until the isolation window ends.
+    """A contact, as first detected and then refined until the isolation window ends.
 
     link: 1 or 2. direction: sign of the external torque per joint, 0 where below the threshold. tau_ext_peak: largest
-    external torque with the filter undone, Nm. impulse: integral of the external torque so far, Nm s.
+    external torque with the filter undone, Nm. impulse: integral of the external torque so far, Nm s. Each `_sigma` is
+    one standard deviation of the value before it, inf where that is not known. force_N: at right angles to the link,
+    positive on the side of +q; lever_m: its distance from joint 2. blind_rad: a force on link 2 that is nearer than
+    this to the link's own axis reads as one on link 1; pi / 2: any. The fields from `level` on stay as they are where
+    nobody looks.
     """
 
     cycle: int
@@ -249,6 +281,18 @@ class ContactReport(NamedTuple):
     tau_ext_peak: tuple[float, float]
     impulse: tuple[float, float]
     is_final: bool
+    level: ContactLevel = ContactLevel.COLLISION
+    kind: ContactKind = ContactKind.UNKNOWN
+    reaction: Reaction = Reaction.WITHDRAW
+    location: Location = Location.NOT_SOUGHT
+    is_two_sided: bool = False  # something pushes from the other side too, as in a clamp
+    tau_ext_peak_sigma: tuple[float, float] = (math.inf, math.inf)
+    impulse_sigma: tuple[float, float] = (math.inf, math.inf)
+    force_N: float = 0.0
+    force_sigma: float = math.inf
+    lever_m: float = 0.0
+    lever_sigma: float = math.inf
+    blind_rad: float = 0.5 * math.pi
 
 
 class SchemeOutput(NamedTuple):

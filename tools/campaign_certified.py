@@ -3,14 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-from adacd_hil.control.excitation import Excitation
-from adacd_hil.scheme.observation import CONTACT_SHIFT
 from campaign_schemes import ADAPTING, ARMED, TESTING, Outcome
 from lab import PERIOD_S, Motion, Recording, paper_motion
 
 from adacd_hil.config import Settings
+from adacd_hil.control.excitation import Excitation
 from adacd_hil.records import JOINTS, SchemeState
 from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme.observation import CONTACT_SHIFT
 
 WIDE_FILTER = 1
 """Filter of the bank that is undone for the external torque, as in contact reports."""

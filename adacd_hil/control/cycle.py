@@ -16,6 +16,7 @@ from adacd_hil.control.controller import Controller
 from adacd_hil.control.deadline import DeadlineWatch
 from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
+from adacd_hil.control.floating import Floating
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import Pacer, Recurrence, Tick
@@ -90,6 +91,7 @@ class Cycle:
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = CertifiedPipeline(settings) if settings.scheme == "certified" else Pipeline(settings)
         self._controller = Controller(settings)
+        self._floating = Floating(settings)
         self._gate = Gate(settings.arm, self._period_s)
         self._block = np.zeros(CONTROL_LAYOUT.size)
         fields = {name: self._block[place] for name, place in CONTROL_LAYOUT.slices.items()}
@@ -161,9 +163,13 @@ class Cycle:
         return Request.FINISH
 
     def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Turn the desired motion into a desired torque."""
+        """Turn the desired motion, or what gives way to a push, into a desired torque."""
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
+        if self._reference.is_floating:
+            self._floating.torque(arm.q, arm.dq, output.tau_ext_hat, output.theta_ff, self._tau_d)
+            return
+        self._floating.begin()
         self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
 
     def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:

@@ -28,11 +28,15 @@ from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, JOINT_STATE, LOG
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     TRUTH_LAYOUT,
+    ContactKind,
+    ContactLevel,
     ContactReport,
     CycleRecord,
     FaultReason,
     FrameChecks,
     Layout,
+    Location,
+    Reaction,
     Request,
     SchemeOutput,
     SchemeState,
@@ -159,6 +163,18 @@ _CONTACT = (
     Member("is_final", "bool", meaning="the isolation window has ended"),
     Member("tau_ext_peak", "float64", 2, "Nm", "largest external torque, filter undone"),
     Member("impulse", "float64", 2, "Nm s", "integral of the external torque"),
+    Member("level", "uint8", meaning="ContactLevel", constants=_constants("LEVEL", ContactLevel)),
+    Member("kind", "uint8", meaning="ContactKind", constants=_constants("KIND", ContactKind)),
+    Member("reaction", "uint8", meaning="Reaction", constants=_constants("REACTION", Reaction)),
+    Member("location", "uint8", meaning="Location", constants=_constants("LOCATION", Location)),
+    Member("is_two_sided", "bool", meaning="something has pushed from the other side too"),
+    Member("tau_ext_peak_sigma", "float64", 2, "Nm", "standard deviation, inf: not known"),
+    Member("impulse_sigma", "float64", 2, "Nm s", "standard deviation, inf: not known"),
+    Member("force_N", "float64", unit="N", meaning="at right angles to the link"),
+    Member("force_sigma", "float64", unit="N", meaning="standard deviation, inf: not known"),
+    Member("lever_m", "float64", unit="m", meaning="from joint 2"),
+    Member("lever_sigma", "float64", unit="m", meaning="standard deviation, inf: not known"),
+    Member("blind_rad", "float64", unit="rad", meaning="nearer to link 2's axis a force reads as one on link 1"),
 )
 _CONTROL = (
     _CYCLE_NUMBER,
@@ -271,9 +287,9 @@ def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
 
 def pack_contact(report: ContactReport) -> bytes:
     """Pack the body of /contact."""
-    return _CONTACT_BODY.pack(
-        report.cycle, report.link, *report.direction, report.is_final, *report.tau_ext_peak, *report.impulse
-    )
+    values = (value if isinstance(value, tuple) else (value,) for value in report)
+    by_name = dict(zip(report._fields, values, strict=True))
+    return _CONTACT_BODY.pack(*(value for member in _CONTACT for value in by_name[member.name]))
 
 
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:

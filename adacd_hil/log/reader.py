@@ -3,7 +3,7 @@
 Cut and damaged files are read as far as they are intact; `is_complete` and `problem` say so.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +28,16 @@ from adacd_hil.log.ros_types import (
     LOG,
     unpack_log,
 )
-from adacd_hil.records import PARAMETER_NAMES, ContactReport, Event, Vector
+from adacd_hil.records import (
+    PARAMETER_NAMES,
+    ContactKind,
+    ContactLevel,
+    ContactReport,
+    Event,
+    Location,
+    Reaction,
+    Vector,
+)
 
 EPOCH_KEY = "epoch_ns"
 _KNOWN = {
@@ -285,16 +294,23 @@ def _events(topic: Topic | None, epoch_ns: int) -> list[LoggedEvent]:
     return events
 
 
+_CONTACT_TYPES: dict[str, Callable[[Any], Any]] = {
+    **dict.fromkeys(ContactReport._fields, float),
+    **dict.fromkeys(("cycle", "link"), int),
+    **dict.fromkeys(("is_final", "is_two_sided"), bool),
+    **dict.fromkeys(("direction", "tau_ext_peak", "impulse", "tau_ext_peak_sigma", "impulse_sigma"), tuple),
+    "level": ContactLevel,
+    "kind": ContactKind,
+    "reaction": Reaction,
+    "location": Location,
+}
+"""What each field of a report is made of the number or list that the log has."""
+
+
 def _contacts(series: Series) -> list[LoggedContact]:
     contacts = []
+    names = [name for name in ContactReport._fields if name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
-        report = ContactReport(
-            cycle=int(record["cycle"]),
-            link=int(record["link"]),
-            direction=tuple(record["direction"].tolist()),
-            tau_ext_peak=tuple(record["tau_ext_peak"].tolist()),
-            impulse=tuple(record["impulse"].tolist()),
-            is_final=bool(record["is_final"]),
-        )
+        report = ContactReport(**{name: _CONTACT_TYPES[name](record[name].tolist()) for name in names})
         contacts.append(LoggedContact(t_ns, report))
     return contacts

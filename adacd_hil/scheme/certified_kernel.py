@@ -43,7 +43,6 @@ WATCH = 2  # compare the residuals with their thresholds
 LEARN = 4  # correct the belief and use it at once
 TEST = 8  # test the frozen model
 REFINE = 16  # correct the belief, and let its mean take over after a test
-REPORTING = 32  # a contact's report is not final yet
 
 ADAPT = int(SchemeState.ADAPT)
 CERTIFY = int(SchemeState.CERTIFY)
@@ -65,8 +64,9 @@ _LONGEST_SHARE = 1.5
 
 _EIGENVALUE_EVERY = 64
 """Samples between two looks at the eigenvalues: they take 8 µs, the rest of a step about 3 µs."""
-_WIDE = 1
-"""Filter of the bank whose output, with the filter undone, is the external torque of contact reports."""
+WIDE = 1
+"""Filter of the bank whose output, with the filter undone, is the external torque of contact reports: undoing a faster
+one would bring back the noise that it let through."""
 _FIT = 0
 """Filter of the bank that is learnt from: the slow one, whose noise is least."""
 
@@ -141,7 +141,7 @@ def constants_of(settings: Settings) -> Structured:
         "torque_noise_Nm": certified.torque_noise_Nm,
         "still_rad_s": certified.still_rad_s,
         "standstill_share": certified.standstill_share,
-        "collision_Nm": certified.collision_Nm,
+        "collision_Nm": settings.detector.collision_Nm,
         "position_limit_rad": settings.arm.position_limit_rad,
         "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
         "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
@@ -223,8 +223,8 @@ def new_memory(settings: Settings) -> Structured:
         "roughness": joint,
         # contact
         "history": (contact.WIDE_SAMPLES + 1, JOINTS),
-        "integral": joint,
-        "peak": joint,
+        "wide_sigma": joint,
+        "wide_threshold": joint,
     }
     memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
     memory["has_gap"] = 1.0
@@ -314,29 +314,27 @@ def step(
 ) -> int:
     """Take in the block's q, dq, tau_J and fill the rest of it; return bits of `Observation`.
 
-    is_complete: 1 if all values are this cycle's. periods: since the previous step. mode: MEASURE to REPORTING.
+    is_complete: 1 if all values are this cycle's. periods: since the previous step. mode: MEASURE to REFINE.
     """
     k, m, out = constants[0], memory[0], block[0]
     observation = observe(k, out)
-    period_s = k["period_s"]
     if out["period_s"][0] == 0.0:
-        out["period_s"][0] = period_s
+        out["period_s"][0] = k["period_s"]
     is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
     if is_fresh:
         if mode & MEASURE:
             _measure_noise(k, m, out["tau_J"])
-        period_s = _filter(k, m, out, periods)
+        _filter(k, m, out, periods)
         if not (np.all(np.isfinite(m["r"])) and np.all(np.isfinite(m["theta"]))):
             observation |= _NOT_A_NUMBER
     else:
         m["has_gap"] = 1.0
     if mode & WATCH:
-        observation |= _watch(k, m, out, period_s, is_fresh, mode & REPORTING != 0)
+        observation |= _watch(k, m, out, is_fresh)
     else:
         out["threshold"][:] = np.inf
         out["threshold_bank"][:] = np.inf
-        m["integral"][:] = 0.0
-        m["peak"][:] = 0.0
+        m["wide_threshold"][:] = np.inf
     if is_fresh and mode & (LEARN | TEST | REFINE):
         observation |= _improve(k, m, out, observation & _CONTACT != 0, mode)
     _fill_model(k, m, out)
@@ -373,11 +371,8 @@ def _measure_noise(k: Any, m: Any, tau_J: Vector) -> None:
 
 
 @compiled
-def _filter(k: Any, m: Any, out: Any, periods: int) -> float:
-    """Take the bank to this sample and estimate the external torque that each filter sees.
-
-    Return the time that the sample stands for: the measured interval, or after a gap the nominal one.
-    """
+def _filter(k: Any, m: Any, out: Any, periods: int) -> None:
+    """Take the bank to this sample and estimate the external torque that each filter sees."""
     base = int(k["base"])
     q, dq, tau_J, cutoff = out["q"], out["dq"], out["tau_J"], k["cutoff"]
     _fill_regressor(k, m, q, dq, tau_J)
@@ -385,7 +380,6 @@ def _filter(k: Any, m: Any, out: Any, periods: int) -> float:
     period_s: float = out["period_s"][0]
     is_near = _SHORTEST_SHARE * nominal_s <= period_s <= _LONGEST_SHARE * nominal_s
     if m["has_gap"] != 0.0 or periods != 1 or not is_near:
-        period_s = nominal_s
         bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
         m["has_gap"] = 0.0
     else:
@@ -410,8 +404,7 @@ def _filter(k: Any, m: Any, out: Any, periods: int) -> float:
         out["tau_ext_hat"][i] = m["r"][_FIT, i]
         out["tau_f_hat"][i] = m["r"][_FIT, i] + out["tau_f"][i]
         out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
-    contact.undo_filter(m["r"][_WIDE], k["decay"][_WIDE], m["history"], out["tau_ext_wide_hat"])
-    return period_s
+    contact.undo_filter(m["r"][WIDE], k["decay"][WIDE], m["history"], out["tau_ext_wide_hat"])
 
 
 @compiled
@@ -429,23 +422,20 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
 
 
 @compiled
-def _watch(k: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
+def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
     """Compare with the thresholds; return CONTACT, COLLISION and the joints that are over, if any."""
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m["h"])
         out["threshold"][:] = m["h"][_FIT]
-        contact.follow_contact(
-            out["tau_ext_hat"], out["tau_ext_wide_hat"], out["threshold"], period_s, is_reporting,
-            m["integral"], m["peak"],
-        )  # fmt: skip
+        sensitivity.fill_wide(k, m, WIDE)
     joints = sensitivity.joints_over(m["y"], m["h"])
     if not joints:
         return 0
     observation = _CONTACT | joints << CONTACT_SHIFT
-    bare = m["r"].shape[0] + _WIDE - 1
-    for i in range(m["y"].shape[1]):
-        if not (abs(m["r"][_WIDE, i]) <= max(k["collision_Nm"][i], m["h"][bare, i])):
-            observation |= _COLLISION
+    for c in range(m["r"].shape[0], m["y"].shape[0]):
+        for i in range(m["y"].shape[1]):
+            if not (abs(m["y"][c, i]) <= max(k["collision_Nm"][i], m["h"][c, i])):
+                observation |= _COLLISION
     return observation
 
 

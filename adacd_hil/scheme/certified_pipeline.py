@@ -11,8 +11,6 @@ from adacd_hil.config import Settings
 from adacd_hil.records import (
     PARAMETER_UNITS,
     ArmState,
-    ContactReport,
-    Reaction,
     Request,
     SchemeOutput,
     SchemeState,
@@ -20,10 +18,10 @@ from adacd_hil.records import (
     scheme_layout,
 )
 from adacd_hil.scheme import certificate, certified_kernel, kernel
-from adacd_hil.scheme.contact import Isolation
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.regressor import inverse_dynamics
 from adacd_hil.scheme.supervisor import Supervisor
+from adacd_hil.scheme.touch import Touch
 
 _WATCH = certified_kernel.WATCH
 _MODES = {
@@ -59,13 +57,13 @@ class CertifiedPipeline:
         self._is_measuring = settings.realtime.sample_period == "measured"
         self._t_ns: int | None = None
         self._theta_hat = places["theta_hat"]
-        self._tau_ext_hat = places["tau_ext_hat"]
-        self._integral = self._memory[0]["integral"]
-        self._peak = self._memory[0]["peak"]
+        self._tau_ext_hat = self._memory[0]["y"][certified_kernel.WIDE]  # what a reaction goes by: fast, and smooth
+        self._tau_ext_wide_hat = self._values[places["tau_ext_wide_hat"]]
+        self._sigma = self._memory[0]["wide_sigma"]
+        self._threshold = self._memory[0]["wide_threshold"]
         self._paper = _Beside(settings, self._values)
         self._supervisor = Supervisor(settings)
-        window_cycles = round(settings.detector.isolation_window_s / settings.bus.period_s)
-        self._isolation = Isolation(window_cycles, settings.certified.cutoffs_rad_s[0])
+        self._touch = Touch(settings)
         self._theta_ff = np.zeros(base)
         self._has_certificate = False
         self._is_payload = False
@@ -80,6 +78,7 @@ class CertifiedPipeline:
         certified_kernel.begin_test(self._constants, memory)
         certified_kernel.begin_refinement(memory)
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
+        self._touch.compile()
         self._paper.compile()
 
     def describe_missing(self) -> list[str]:
@@ -88,38 +87,48 @@ class CertifiedPipeline:
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
-        supervisor, isolation = self._supervisor, self._isolation
+        supervisor, touch = self._supervisor, self._touch
         previous = supervisor.state
         self._q[:] = arm.q
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
         period_s = self._period_s[0] = self._measure(arm.t_ns)
         is_complete, periods = int(arm.is_complete), int(arm.periods)
-        mode = _MODES.get(previous, 0) | (certified_kernel.REPORTING if isolation.is_open else 0)
+        mode = _MODES.get(previous, 0)
         observation = certified_kernel.step(self._constants, self._memory, self._block, is_complete, periods, mode)
         self._paper.step(arm, period_s)
-        state = supervisor.step(arm, request, observation, isolation.is_open)
-        joints = observation >> CONTACT_SHIFT
+        state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
         if state is not previous:
-            self._enter(state, previous, arm.cycle, joints)
+            self._enter(state, previous)
         if self._promotions[0] != self._refined:
             self._feed_forward()
         block = self._values.copy()
-        contact = self._report(arm.cycle, joints) if isolation.is_open else None
+        contact = touch.step(
+            arm.cycle,
+            supervisor,
+            observation,
+            arm.q,
+            arm.dq,
+            self._tau_ext_hat,
+            self._tau_ext_wide_hat,
+            self._sigma,
+            self._threshold,
+            self._has_certificate,
+        )
         self._forget_if_disturbed(state)
         return SchemeOutput(
             cycle=arm.cycle,
             state=state,
             previous_state=previous,
             fault=supervisor.fault,
-            contact_joints=joints,
+            contact_joints=observation >> CONTACT_SHIFT,
             is_model_valid=self._has_certificate,
             theta_hat=block[self._theta_hat],
             theta_ff=self._theta_ff,
-            tau_ext_hat=block[self._tau_ext_hat],
+            tau_ext_hat=self._tau_ext_hat.copy(),
             contact=contact,
             block=block,
-            reaction=Reaction.WITHDRAW,
+            reaction=touch.reaction,
         )
 
     def _measure(self, t_ns: int) -> float:
@@ -130,7 +139,7 @@ class CertifiedPipeline:
         self._t_ns = t_ns
         return period_s
 
-    def _enter(self, state: SchemeState, previous: SchemeState, cycle: int, joints: int) -> None:
+    def _enter(self, state: SchemeState, previous: SchemeState) -> None:
         """Do what a new state begins with, and what the previous one ends with."""
         if state is SchemeState.ADAPT:
             self._begin_adaptation(previous)
@@ -140,10 +149,6 @@ class CertifiedPipeline:
             certified_kernel.begin_refinement(self._memory)
             self._has_certificate = True
             self._feed_forward()
-        elif state is SchemeState.REACT and joints:  # without one, the arm is only held
-            self._isolation.begin(cycle)
-        elif state is SchemeState.FAULT:
-            self._isolation.cancel()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
         """Begin to learn anew: a payload on top of the certified arm, until that has failed; else everything."""
@@ -161,19 +166,15 @@ class CertifiedPipeline:
         only a model that claims to know nothing lets the arm go on.
         """
         is_disturbed = state in (SchemeState.REACT, SchemeState.STOPPED) and self._supervisor.origin in _LEARNING
-        if is_disturbed and not self._isolation.is_open and not self._has_forgotten:
+        is_reported = is_disturbed and not self._touch.is_reporting
+        if is_reported and not self._has_forgotten:
             certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
-        self._has_forgotten = is_disturbed and not self._isolation.is_open
+        self._has_forgotten = is_reported
 
     def _feed_forward(self) -> None:
         """Take the model in use for the feedforward from now on."""
         self._theta_ff = np.array(self._memory[0]["theta"][: self._theta_ff.size])
         self._refined = float(self._promotions[0])
-
-    def _report(self, cycle: int, joints: int) -> ContactReport | None:
-        """Return the report that begins or becomes final in this cycle, if one does."""
-        tau_ext_hat = self._values[self._tau_ext_hat]
-        return self._isolation.report(cycle, joints, tau_ext_hat, self._integral, self._peak)
 
 
 class _Beside:

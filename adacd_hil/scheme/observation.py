@@ -14,7 +14,7 @@ class Observation(IntFlag):
 
     NONE = 0
     NOT_A_NUMBER = 1  # a measurement is not finite
-    OVER_LIMIT = 2  # |q| or |dq| beyond the arm's limits
+    OVER_LIMIT = 2  # beyond the arm's limits: |q|, or |dq| where OVER_SPEED is not told apart
     AT_REST = 4  # every |dq| below the rest velocity
     UNLOADED = 8  # every |tau_J| below the rest torque
     ADAPTED = 16  # eq. (15) holds with the evidence for it
@@ -23,3 +23,4 @@ class Observation(IntFlag):
     CERTIFIED = 128  # the frozen model has passed its test
     REFUTED = 256  # the frozen model has failed its test
     COLLISION = 512  # a joint is over its upper threshold
+    OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment

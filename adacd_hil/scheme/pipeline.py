@@ -11,7 +11,7 @@ adaptation has finished and its mass matrix is positive definite everywhere. It 
 import numpy as np
 
 from adacd_hil.config import Settings
-from adacd_hil.records import ArmState, ContactReport, Request, SchemeOutput, SchemeState, scheme_layout
+from adacd_hil.records import ArmState, ContactReport, Reaction, Request, SchemeOutput, SchemeState, scheme_layout
 from adacd_hil.scheme import kernel
 from adacd_hil.scheme.contact import Isolation
 from adacd_hil.scheme.observation import CONTACT_SHIFT
@@ -48,6 +48,7 @@ class Pipeline:
         self._supervisor = Supervisor(settings)
         window_cycles = round(settings.detector.isolation_window_s / settings.bus.period_s)
         self._isolation = Isolation(window_cycles, settings.filter.a_rad_s)
+        self._reaction = Reaction.NONE
         self._theta_ff = np.zeros(count)
         self._is_model_valid = False
 
@@ -92,6 +93,7 @@ class Pipeline:
             tau_ext_hat=block[self._tau_ext_hat],
             contact=contact,
             block=block,
+            reaction=self._reaction,
         )
 
     def _measure(self, t_ns: int) -> float:
@@ -109,8 +111,10 @@ class Pipeline:
             self._is_model_valid = is_positive_definite(self._theta_ff)
         if state is SchemeState.ADAPT:
             kernel.begin_adaptation(self._constants, self._memory, self._block)
-        elif state is SchemeState.REACT and joints:  # without one, the arm is only held
-            self._isolation.begin(cycle)
+        elif state is SchemeState.REACT:
+            self._reaction = Reaction.WITHDRAW if joints else Reaction.STOP  # without a contact, the arm is only held
+            if joints:
+                self._isolation.begin(cycle)
         elif state is SchemeState.FAULT:
             self._isolation.cancel()
 

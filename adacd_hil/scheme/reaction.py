@@ -71,19 +71,27 @@ def time_optimal(
 class Withdrawal:
     """The way of all joints from one collision to rest. Made when REACT is entered, then sampled per period."""
 
-    def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, tau_ext_hat: Vector) -> None:
-        """Plan from the present desired motion. Without an external torque the arm just stops."""
+    def __init__(
+        self, settings: Settings, q_d: Vector, dq_d: Vector, tau_ext_hat: Vector, start: Vector | None = None
+    ) -> None:
+        """Plan from the present motion. Without an external torque the arm just stops.
+
+        start: where the way began, if not here; what has been covered since is not covered again.
+        """
         distance = np.radians(settings.reaction.distance_deg)
         velocity_limit = np.radians(settings.reaction.velocity_limit_deg_s)
         acceleration_limit = np.radians(settings.reaction.acceleration_limit_deg_s2)
         position_limit = settings.arm.position_limit_rad - np.radians(settings.reaction.position_margin_deg)
         largest = float(np.max(np.abs(tau_ext_hat)))
         share = tau_ext_hat / largest if largest > 0.0 else np.zeros(JOINTS)
+        way = share * distance
+        if start is not None:
+            way = np.copysign(np.maximum(np.abs(way) - np.sign(way) * (q_d - start), 0.0), way)
         self._profiles = tuple(
             _withdraw(
                 float(q_d[i]),
                 float(dq_d[i]),
-                float(share[i] * distance[i]),
+                float(way[i]),
                 float(position_limit[i]),
                 float(velocity_limit[i]),
                 float(acceleration_limit[i]),

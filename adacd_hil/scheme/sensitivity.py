@@ -23,9 +23,11 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import CertifiedSettings
 from adacd_hil.records import Vector
-from adacd_hil.scheme import friction
+from adacd_hil.scheme import contact, friction
 
 _SMOOTHED_SHARE = 0.31 / 200.0
+_VELOCITY_STD_SHARE = 0.12
+"""Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
 _SMOOTHED_FALL_RAD_S = 650.0
 
 
@@ -36,7 +38,11 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
     share = np.concatenate([_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), np.ones(a.size - 1)])
     nu = certified.velocity_noise_rad_s * np.concatenate([a, a[1:]]) * np.minimum(share, 1.0)
     sigma_squared = certified.torque_noise_Nm**2 * 0.5 * period_s * width
-    return {"torque_variance": certified.noise_sigmas**2 * sigma_squared, "velocity_variance": nu**2}
+    return {
+        "torque_variance": certified.noise_sigmas**2 * sigma_squared,
+        "velocity_variance": nu**2,
+        "velocity_std_rad_s": np.array(_VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
+    }
 
 
 @compiled
@@ -85,6 +91,27 @@ def _static_friction(k: Any, m: Any, joint: int) -> float:
 def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float, held: float) -> float:
     noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
     return float(np.sqrt(noise + g * g) + held)
+
+
+@compiled
+def fill_wide(k: Any, m: Any, c: int) -> None:
+    """Fill standard deviation and lower threshold (n,) of the external torque with filter c undone.
+
+    The undone filter is a mean over five samples of what went into it: its noise is white torque noise over five, and
+    of the velocity its change over five samples. A slow push is seen in the slow filters first: the threshold is the
+    least of all channels'.
+    """
+    samples = float(contact.WIDE_SAMPLES)
+    span_s = samples * k["period_s"]
+    for i in range(m["r"].shape[1]):
+        momentum = 0.0
+        for j in range(m["M"].shape[1]):
+            momentum += m["M"][i, j] ** 2
+        noise = k["torque_noise_Nm"] ** 2 * m["roughness"][i] / samples
+        velocity = 2.0 * (k["velocity_std_rad_s"] / span_s) ** 2 * momentum
+        doubt = m["doubt"][c, i] / k["model_sigmas"]
+        m["wide_sigma"][i] = np.sqrt(noise + velocity + doubt * doubt)
+        m["wide_threshold"][i] = np.min(m["h"][:, i])
 
 
 @compiled

@@ -131,6 +131,7 @@ def next_state(state: SchemeState, event: SchemeEvent, origin: SchemeState) -> S
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
+_OVER_SPEED = int(Observation.OVER_SPEED)
 _AT_REST = int(Observation.AT_REST)
 _REST_UNLOADED = int(Observation.AT_REST | Observation.UNLOADED)
 _ADAPTED = int(Observation.ADAPTED)
@@ -189,6 +190,7 @@ class Supervisor:
         self._rest_cycles = round(REST_HOLD_S / period_s)
         self._clear_cycles = round(settings.reaction.clear_s / period_s)
         self._patience_cycles = round(settings.reaction.patience_s / period_s)
+        self._rebound_cycles = round(settings.reaction.rebound_s / period_s)
         phase_cycles = round(settings.safety.phase_timeout_s / period_s)
         adapt_cycles = round(settings.termination.timeout_s / period_s)
         self._limits = {
@@ -359,7 +361,8 @@ class Supervisor:
             return FaultReason.NOT_A_NUMBER
         if max(*arm.age_q, *arm.age_tau_J) > self._max_age_cycles:
             return FaultReason.DATA_AGE
-        if observation & _OVER_LIMIT:
+        is_thrown = self._state is SchemeState.REACT and self._phase_cycles <= self._rebound_cycles
+        if observation & _OVER_LIMIT or (observation & _OVER_SPEED and not is_thrown):
             return FaultReason.LIMIT
         if self._state in POWERED and not arm.is_enabled:
             return FaultReason.DRIVE

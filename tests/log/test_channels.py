@@ -22,9 +22,13 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     TRUTH_LAYOUT,
+    ContactKind,
+    ContactLevel,
     ContactReport,
     CycleRecord,
     FaultReason,
+    Location,
+    Reaction,
     Request,
     SchemeOutput,
     SchemeState,
@@ -156,9 +160,13 @@ def test_truth_is_laid_out_as_its_type_says():
 
 
 def test_contact_is_laid_out_as_its_type_says():
-    message = decode(ChannelId.CONTACT, pack_contact(ContactReport(9, 2, (-1, 1), (1.5, -2.5), (0.25, 0.75), True)))
-    assert (message.cycle, message.link, message.direction, message.is_final) == (9, 2, [-1, 1], True)
-    assert (message.tau_ext_peak, message.impulse) == ([1.5, -2.5], [0.25, 0.75])
+    head = (9, 2, (-1, 1), (1.5, -2.5), (0.25, 0.75), True)
+    rest = (ContactLevel.CONTACT, ContactKind.HIT, Reaction.FLOAT, Location.SINGULAR, True, (0.1, 0.2), (0.3, 0.4))
+    report = ContactReport(*head, *rest, 10.0, 0.5, 0.2, 0.01, 0.05)
+    message = decode(ChannelId.CONTACT, pack_contact(report))
+    for name, value in report._asdict().items():
+        logged = getattr(message, ros_field_name(name))
+        assert logged == (list(value) if isinstance(value, tuple) else value)
 
 
 def test_cycle_is_laid_out_as_its_type_says():

@@ -1,0 +1,119 @@
+"""Where a contact is, and how strong: force and lever arm from the external torques of a 2R arm.
+
+One contact without friction pushes at right angles to its link. On link 2, with the lever arm r from joint 2:
+
+    tau_2 = F r,   tau_1 = F (r + l1 cos q2)    =>    F = (tau_1 - tau_2) / (l1 cos q2),   r = tau_2 / F
+
+At q2 = ±90° both joints say the same and F is not known. Over a contact's samples r is the slope of tau_2 over F by
+least squares, what their noise adds taken out (both contain tau_2). On link 1 only the moment is known: |F| >= |tau_1|
+/ l1. A force along link 2 has no lever arm: one within asin(h_2 / (F l2)) of the link's axis leaves joint 2 below its
+threshold h_2 wherever it is, and reads as one on link 1 that has F l1 |sin q2| = |tau_1|. With friction, or two
+contacts, r may fall off the link.
+
+Shapes: tau_ext_wide_hat (n, 2), Nm, filter undone; q2 (n,), rad; sigma (2,), its standard deviation, Nm.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import Location, Vector
+
+LARGEST_LEVER_SIGMA_M = 0.03
+"""A lever arm that is less certain counts as not known."""
+SQUARE_COSINE = 0.17
+"""|cos q2| within 10° of a right angle: there a percent of error in tau_1 - tau_2 is six of the force."""
+WORTH = 0.5
+"""Samples below this part of the strongest one say little of the place, and more of what the model lacks."""
+
+MODEL_SHARE = 0.015
+"""Standard deviation of a large torque as a part of it: what mean and velocity loop make of a blow."""
+
+_KNOWN = int(Location.KNOWN)
+_SINGULAR = int(Location.SINGULAR)
+_UNCERTAIN = int(Location.UNCERTAIN)
+_BEYOND_TIP = int(Location.BEYOND_TIP)
+_INCONSISTENT = int(Location.INCONSISTENT)
+
+
+class Place(NamedTuple):
+    """Force at right angles to the link and its lever arm, with standard deviations; these are inf where not known."""
+
+    location: Location
+    force_N: float = 0.0
+    force_sigma: float = math.inf
+    lever_m: float = 0.0
+    lever_sigma: float = math.inf
+
+
+def on_link1(tau_1: float, sigma_1: float, length1_m: float) -> Place:
+    """Return the smallest force on link 1 that has the moment `tau_1` about joint 1."""
+    return Place(Location.LINK_1, tau_1 / length1_m, sigma_1 / length1_m)
+
+
+def on_link2(
+    tau_ext_wide_hat: Vector, q2: Vector, sigma: Vector, length_m: tuple[float, float], tip_margin_m: float = 0.03
+) -> Place:
+    """Return force and lever arm of one contact without friction on link 2; the force is that of its peak.
+
+    tip_margin_m: how far past the tip what the arm carries may be touched and still count as the link's end.
+    """
+    location, *values = _fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1], tip_margin_m)
+    return Place(Location(location), *values)
+
+
+def blind_angle(force_N: float, lever_m: float, threshold_2: float) -> float:
+    """Return the half-angle, rad, about link 2's axis within which a force there stays below joint 2's threshold."""
+    moment = abs(force_N * lever_m)
+    return math.asin(threshold_2 / moment) if moment > threshold_2 else 0.5 * math.pi
+
+
+def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float], threshold_2: float) -> float:
+    """Return the half-angle, rad, within which a force at link 2's end would have read as this one on link 1."""
+    across = abs(math.sin(q2))
+    return blind_angle(abs(tau_1) / (length_m[0] * across), length_m[1], threshold_2) if across > 0.0 else 0.0
+
+
+@compiled
+def _fit(
+    tau: Vector, q2: Vector, sigma: Vector, length1_m: float, length2_m: float, tip_margin_m: float
+) -> tuple[int, float, float, float, float]:
+    """Return location, force, its sigma, lever arm and its sigma."""
+    count = tau.shape[0]
+    weight = np.zeros(count)
+    for k in range(count):
+        weight[k] = abs(tau[k, 0]) / sigma[0] + abs(tau[k, 1]) / sigma[1]
+    least = WORTH * np.max(weight)
+    strongest = int(np.argmax(weight))
+    arm = length1_m * np.cos(q2[strongest])
+    if abs(np.cos(q2[strongest])) < SQUARE_COSINE:
+        return _SINGULAR, 0.0, np.inf, 0.0, np.inf
+    squares, products = 0.0, 0.0
+    noise = sigma[0] ** 2 + sigma[1] ** 2
+    for k in range(count):
+        if weight[k] < least:
+            continue
+        arm_k = length1_m * np.cos(q2[k])
+        force = (tau[k, 0] - tau[k, 1]) / arm_k
+        squares += force * force - noise / arm_k**2
+        products += force * tau[k, 1] + sigma[1] ** 2 / arm_k
+    force = (tau[strongest, 0] - tau[strongest, 1]) / arm
+    sigma_1 = np.hypot(sigma[0], MODEL_SHARE * tau[strongest, 0])
+    sigma_2 = np.hypot(sigma[1], MODEL_SHARE * tau[strongest, 1])
+    force_sigma = np.hypot(sigma_1, sigma_2) / abs(arm)
+    if not squares > 0.0:
+        return _UNCERTAIN, force, force_sigma, 0.0, np.inf
+    lever = products / squares
+    # Of tau_2 - r F = tau_2 (1 + r / arm) - tau_1 r / arm. Neighbours share their noise: as good as one sample.
+    share = lever / arm
+    lever_sigma = np.hypot(sigma_2 * (1.0 + share), sigma_1 * share) / abs(force)
+    margin = 3.0 * lever_sigma
+    if lever < -margin or lever > length2_m + tip_margin_m + max(margin, length2_m):
+        return _INCONSISTENT, force, force_sigma, lever, lever_sigma
+    if lever > length2_m + tip_margin_m + margin:
+        return _BEYOND_TIP, force, force_sigma, lever, lever_sigma
+    if lever_sigma > LARGEST_LEVER_SIGMA_M:
+        return _UNCERTAIN, force, force_sigma, lever, lever_sigma
+    return _KNOWN, force, force_sigma, lever, lever_sigma

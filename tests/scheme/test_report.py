@@ -1,0 +1,97 @@
+"""The contact report, made from a hand-written course of torques."""
+
+import math
+
+import numpy as np
+import pytest
+from smooth_motion import settings_with
+
+from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction
+from adacd_hil.scheme.report import ContactHistory, ContactReporter
+
+SETTINGS = settings_with()
+SIGMA, THRESHOLD = np.array([0.03, 0.015]), np.array([0.15, 0.08])
+Q = np.array([0.3, 0.4])
+L1 = SETTINGS.arm.link_length_m[0]
+
+
+def course(force_N=20.0, lever_m=0.2, duration=40, onset=50, length=400):
+    """Return the torques (n, 2) of a half-sine on link 2."""
+    force = np.zeros(length)
+    force[onset : onset + duration] = force_N * np.sin(np.pi * np.arange(duration) / duration)
+    return np.outer(force, [lever_m + L1 * math.cos(Q[1]), lever_m])
+
+
+def play(tau, detected, joints=3, level=ContactLevel.COLLISION):
+    """Return the reports of a contact that is detected in a cycle."""
+    reporter = ContactReporter(SETTINGS)
+    reports = []
+    for cycle, row in enumerate(tau):
+        reporter.observe(Q, row, SIGMA, THRESHOLD)
+        if cycle == detected:
+            reporter.begin(cycle)
+        if reporter.is_open:
+            over = joints if cycle - detected >= 5 else joints & 1
+            reports.append(reporter.report(cycle, over, level, Reaction.STOP, False))
+    return [report for report in reports if report is not None], reporter
+
+
+def test_a_contact_is_reported_at_once_after_ten_and_after_a_hundred_milliseconds():
+    reports, reporter = play(course(), 55)
+    assert [report.is_final for report in reports] == [False, False, True]
+    assert {report.cycle for report in reports} == {55}
+    assert not reporter.is_open
+
+
+def test_a_final_report_says_all_that_can_be_known():
+    final = play(course(), 55)[0][-1]
+    assert (final.link, final.direction, final.kind) == (2, (1, 1), ContactKind.HIT)
+    assert (final.level, final.reaction, final.location) == (ContactLevel.COLLISION, Reaction.STOP, Location.KNOWN)
+    assert final.force_N == pytest.approx(20.0, rel=1e-2)
+    assert final.lever_m == pytest.approx(0.2, rel=1e-3)
+    assert final.tau_ext_peak[1] == pytest.approx(4.0, rel=1e-2)
+    assert final.impulse[1] == pytest.approx(4.0 * 0.04 * 2.0 / math.pi, rel=2e-2)
+    assert final.blind_rad == pytest.approx(math.asin(0.08 / 4.0), rel=1e-2)
+    assert final.tau_ext_peak_sigma == tuple(SIGMA)
+
+
+def test_what_came_before_the_detection_is_part_of_the_contact():
+    late, early = (play(course(duration=200), detected)[0][-1].impulse[1] for detected in (100, 110))
+    assert early > late > 0.0
+
+
+def test_a_force_on_link_1_is_reported_as_a_moment():
+    tau = course()
+    tau[:, 1] = 0.02 * tau[:, 0]
+    final = play(tau, 55, joints=1)[0][-1]
+    assert (final.link, final.location) == (1, Location.LINK_1)
+    assert final.force_N == pytest.approx(np.max(tau[:, 0]) / L1)
+    assert 0.0 < final.blind_rad < 0.5
+
+
+def test_joint_2_decides_the_link_before_it_is_over_its_threshold():
+    tau = course(force_N=8.0, lever_m=0.05, duration=100)
+    first, second, _ = play(tau, 55, joints=1)[0]
+    assert (first.link, second.link) == (1, 2)
+
+
+def test_only_the_last_report_names_the_kind():
+    kinds = [report.kind for report in play(course(), 55)[0]]
+    assert kinds == [ContactKind.UNKNOWN, ContactKind.UNKNOWN, ContactKind.HIT]
+
+
+def test_a_fault_ends_the_report():
+    reporter = ContactReporter(SETTINGS)
+    reporter.observe(Q, np.ones(2), SIGMA, THRESHOLD)
+    reporter.begin(0)
+    reporter.cancel()
+    assert not reporter.is_open
+
+
+def test_the_history_gives_its_last_rows_in_order():
+    history = ContactHistory(5)
+    for number in range(13):
+        history.put(np.array([0.0, number]), np.zeros(2), SIGMA, THRESHOLD)
+        expected = list(range(max(0, number - 3), number + 1))
+        assert history.last(4)[:, 0].tolist() == expected
+    assert history.last(99)[:, 0].tolist() == [8, 9, 10, 11, 12]

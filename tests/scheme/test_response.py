@@ -1,0 +1,129 @@
+"""Which reaction a contact gets, and what changes it."""
+
+import numpy as np
+import pytest
+from smooth_motion import settings_with
+
+from adacd_hil.records import ContactLevel, Reaction
+from adacd_hil.scheme.response import BLIND_S, TURNED_CYCLES, Response
+
+SETTINGS = settings_with(
+    reaction={"contact": ["slow_down", "stop"], "collision": ["admittance", "withdraw"]},
+    detector={"collision_Nm": [2.0, 1.0]},
+)
+PUSH = np.array([6.0, 3.0])
+AWAY, TOWARD = 0.1 * PUSH, -0.1 * PUSH
+BLIND = round(BLIND_S / SETTINGS.bus.period_s)
+
+
+class Contact:
+    """A contact followed cycle by cycle."""
+
+    def __init__(self, level, link, is_model_valid=True, settings=SETTINGS):
+        self.response = Response(settings)
+        self.is_model_valid = is_model_valid
+        self.response.begin(level, link, PUSH, is_model_valid)
+        self.level, self.link = level, link
+
+    def step(self, tau=PUSH, dq=TOWARD, cycles=1, level=None, link=None, is_latched=False):
+        self.level, self.link = level or self.level, link or self.link
+        for _ in range(cycles):
+            self.response.step(self.level, self.link, is_latched, tau, dq, self.is_model_valid)
+        return self.response.reaction
+
+
+@pytest.mark.parametrize(
+    ("level", "link", "reaction"),
+    [
+        (ContactLevel.CONTACT, 1, Reaction.SLOW_DOWN),
+        (ContactLevel.CONTACT, 2, Reaction.STOP),
+        (ContactLevel.COLLISION, 1, Reaction.ADMITTANCE),
+        (ContactLevel.COLLISION, 2, Reaction.WITHDRAW),
+    ],
+)
+def test_each_level_and_link_has_its_reaction(level, link, reaction):
+    assert Contact(level, link).response.reaction is reaction
+
+
+def test_unless_configured_a_contact_stops_the_arm_and_a_collision_is_withdrawn_from():
+    for link in (1, 2):
+        settings = settings_with()
+        assert Contact(ContactLevel.CONTACT, link, settings=settings).response.reaction is Reaction.STOP
+        assert Contact(ContactLevel.COLLISION, link, settings=settings).response.reaction is Reaction.WITHDRAW
+
+
+def test_a_contact_that_grows_gets_the_reaction_of_a_collision_and_keeps_it():
+    contact = Contact(ContactLevel.CONTACT, 2)
+    assert contact.step(level=ContactLevel.COLLISION) is Reaction.WITHDRAW
+    assert contact.step(level=ContactLevel.CONTACT) is Reaction.WITHDRAW
+    assert contact.response.level is ContactLevel.COLLISION
+
+
+def test_a_link_that_turns_out_to_be_another_gets_its_own_reaction():
+    assert Contact(ContactLevel.COLLISION, 1).step(link=2) is Reaction.WITHDRAW
+
+
+def test_an_arm_that_slows_down_goes_on_until_somebody_must_acknowledge():
+    contact = Contact(ContactLevel.CONTACT, 1)
+    assert contact.response.goes_on
+    assert contact.step(is_latched=True) is Reaction.STOP
+    assert not contact.response.goes_on
+
+
+def test_a_withdrawal_from_what_lets_go_goes_on():
+    contact = Contact(ContactLevel.COLLISION, 2)
+    contact.step(cycles=30)
+    assert contact.step(tau=0.0 * PUSH, dq=AWAY, cycles=300) is Reaction.WITHDRAW
+    assert not contact.response.is_two_sided
+
+
+def test_a_withdrawal_that_pushes_something_on_the_other_side_floats():
+    contact = Contact(ContactLevel.COLLISION, 2)
+    contact.step(cycles=BLIND)
+    assert contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES - 1) is Reaction.WITHDRAW
+    assert contact.step(tau=-PUSH, dq=AWAY) is Reaction.FLOAT
+    assert contact.response.is_two_sided
+
+
+def test_what_a_blow_leaves_in_the_estimate_is_no_second_contact():
+    contact = Contact(ContactLevel.COLLISION, 2)
+    contact.step(tau=-PUSH, dq=AWAY, cycles=BLIND)
+    contact.step(tau=-0.2 * PUSH, dq=AWAY, cycles=100)
+    contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES - 1)
+    assert contact.step(tau=0.0 * PUSH, dq=AWAY) is Reaction.WITHDRAW
+
+
+def test_a_withdrawal_that_is_pursued_floats():
+    contact = Contact(ContactLevel.COLLISION, 2)
+    contact.step(cycles=BLIND)
+    contact.step(dq=AWAY)
+    assert contact.step(tau=1.5 * PUSH, dq=AWAY) is Reaction.WITHDRAW
+    assert contact.step(tau=2.0 * PUSH, dq=AWAY) is Reaction.FLOAT
+    assert not contact.response.is_two_sided
+
+
+def test_a_push_that_grows_while_the_arm_still_comes_is_no_pursuit():
+    contact = Contact(ContactLevel.COLLISION, 2)
+    contact.step(cycles=BLIND)
+    assert contact.step(tau=3.0 * PUSH, dq=TOWARD, cycles=50) is Reaction.WITHDRAW
+
+
+def test_a_withdrawal_given_up_is_not_begun_again():
+    contact = Contact(ContactLevel.COLLISION, 2)
+    contact.step(cycles=BLIND)
+    contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES)
+    assert contact.step(link=1, cycles=10) is Reaction.FLOAT
+
+
+def test_without_a_model_an_arm_stops_instead_of_floating():
+    contact = Contact(ContactLevel.COLLISION, 2, is_model_valid=False)
+    contact.step(cycles=BLIND)
+    assert contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES) is Reaction.STOP
+
+
+def test_a_late_host_stops_the_arm_and_the_end_of_it_asks_for_nothing():
+    response = Response(SETTINGS)
+    response.hold()
+    assert response.reaction is Reaction.STOP
+    response.end()
+    assert response.reaction is Reaction.NONE

@@ -1,0 +1,170 @@
+"""An arm and its host without a bus, for many contacts: the emulator's body, a known model, and the reactions.
+
+It begins where an adaptation would have ended: the model is the arm's own, detection is on, the arm follows the
+trajectory. Estimates come from the paper's kernel with a faster filter; contacts and collisions have two thresholds.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adacd_hil.config import Settings, load_settings, merge, parse
+from adacd_hil.control.controller import Controller
+from adacd_hil.control.floating import Floating
+from adacd_hil.control.gate import Gate
+from adacd_hil.control.reference import Reference
+from adacd_hil.records import (
+    TRUTH_LAYOUT,
+    ArmState,
+    ContactReport,
+    FaultReason,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    Vector,
+)
+from adacd_hil.scheme import kernel
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor import Supervisor
+from adacd_hil.scheme.touch import Touch
+from firmware_sim.body import Body, DriveMode
+from firmware_sim.scenario import Scenario
+
+SIGMA_NM = np.array([0.03, 0.015])
+"""Standard deviation of the external torque with the filter undone, profile P."""
+CUT_OFF_rad_s = 50.0
+LAG_SHARE = 0.6
+"""The velocity is 1.6 ms behind the torque, which is delayed as much."""
+_TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
+_TRUTH = TRUTH_LAYOUT.slices
+
+
+def rig_settings(**sections: Any) -> Settings:
+    """Return the settings of profile P for a rig, with some replaced, each section a dict."""
+    paper = load_settings("paper", "P")
+    table = {
+        "arm": {"cad_theta": list(paper.arm.cad_theta)},
+        "filter": {"a_rad_s": CUT_OFF_rad_s, "b_rad_s": CUT_OFF_rad_s},
+        "detector": {"threshold_Nm": [0.15, 0.08], "collision_Nm": [2.0, 1.0]},
+        "safety": {"commission_cycles": 10},
+        "reaction": {"start": "measured", "rebound_s": 0.2},
+        "realtime": {"sample_period": "nominal"},
+    }
+    return parse(Settings, merge(table, sections))
+
+
+class Sample(NamedTuple):
+    """One cycle of a rig."""
+
+    output: SchemeOutput
+    truth: Vector
+    q_d: Vector
+    tau_c: Vector
+
+    def true(self, name: str) -> Vector:
+        """Return a field of the truth."""
+        return self.truth[_TRUTH[name]]
+
+
+class Rig:
+    """One arm that moves on; `step` is a cycle. acknowledge_after_s: what the user takes after a stop, 0: never."""
+
+    def __init__(self, settings: Settings, scenario: Scenario, acknowledge_after_s: float = 0.0) -> None:
+        self.settings = settings
+        self._body = Body(scenario, settings.bus.period_s)
+        self._body.start_scenario()
+        self._theta = np.array(self._theta_of())
+        self._constants = kernel.constants_of(settings)
+        self._memory, self._block = kernel.new_memory(7), kernel.new_block(7)
+        kernel.begin_adaptation(self._constants, self._memory, self._block)
+        self._block[0]["theta_hat"][:] = self._theta
+        self._collision_Nm = np.array(settings.detector.collision_Nm)
+        self._velocity_limit = settings.arm.velocity_limit_rad_s
+        self._touch = Touch(settings)
+        self._q_d, self._dq_d, self._ddq_d = np.zeros(2), np.zeros(2), np.zeros(2)
+        self._tau_d, self._tau_c = np.zeros(2), np.zeros(2)
+        self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)
+        self._controller, self._floating = Controller(settings), Floating(settings)
+        self._controller.feed_forward(self._theta)
+        self._gate = Gate(settings.arm, settings.bus.period_s)
+        self._supervisor = Supervisor(settings)
+        self._cycle = 0
+        self._state = SchemeState.INIT
+        self._stopped_cycles = 0
+        self._acknowledge_cycles = round(acknowledge_after_s / settings.bus.period_s)
+        arm = self._arm(self._body.sample())
+        self._torques = [arm.tau_J] * 3
+        self._q_d[:] = arm.q
+        rest = int(Observation.AT_REST | Observation.UNLOADED)
+        while self._supervisor.state is not SchemeState.MONITOR:
+            is_late = self._supervisor.state is SchemeState.ADAPT
+            self._supervisor.step(arm, Request.NONE, rest | (int(Observation.ADAPTED) if is_late else 0), False)
+
+    def _theta_of(self) -> Vector:
+        truth = np.zeros(TRUTH_LAYOUT.size)
+        self._body.truth(truth)
+        return truth[_TRUTH["theta"]]
+
+    def _arm(self, sample: Any) -> ArmState:
+        return ArmState(
+            self._cycle, self._cycle * 1_000_000, 1, sample.q, sample.dq, sample.tau_J, (0, 0), (0, 0), True, True,
+            FaultReason.NONE,
+        )  # fmt: skip
+
+    def _look(self, arm: ArmState) -> int:
+        """Run the kernel and tell contacts from collisions."""
+        block = self._block[0]
+        self._torques = [arm.tau_J, *self._torques[:2]]
+        delayed = (1.0 - LAG_SHARE) * self._torques[1] + LAG_SHARE * self._torques[2]
+        block["q"][:], block["dq"][:], block["tau_J"][:] = arm.q, arm.dq, delayed
+        observation = kernel.step(self._constants, self._memory, self._block, 1, 1, kernel.ARMED)
+        observation &= ~int(Observation.COLLISION)
+        if np.any(np.abs(block["tau_ext_hat"]) > self._collision_Nm):
+            observation |= int(Observation.COLLISION)
+        is_outside = np.any(np.abs(arm.q) > self.settings.arm.position_limit_rad)
+        if observation & int(Observation.OVER_LIMIT) and not is_outside:
+            observation = observation & ~int(Observation.OVER_LIMIT) | int(Observation.OVER_SPEED)
+        return observation
+
+    def step(self) -> Sample:
+        """Run one cycle: what the arm is told acts one cycle later."""
+        arm = self._arm(self._body.sample())
+        truth = np.zeros(TRUTH_LAYOUT.size)
+        self._body.truth(truth)
+        observation = self._look(arm)
+        previous = self._state
+        self._stopped_cycles = self._stopped_cycles + 1 if previous is SchemeState.STOPPED else 0
+        is_asked = self._acknowledge_cycles and self._stopped_cycles >= self._acknowledge_cycles
+        request = Request.ACKNOWLEDGE if is_asked else Request.NONE
+        state = self._supervisor.step(arm, request, observation, self._touch.is_reporting, self._touch.goes_on)
+        block = self._block[0]
+        tau_ext_hat = block["tau_ext_hat"].copy()
+        contact = self._touch.step(
+            self._cycle, self._supervisor, observation, arm.q, arm.dq, tau_ext_hat,
+            block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"], True,
+        )  # fmt: skip
+        output = SchemeOutput(
+            self._cycle, state, previous, self._supervisor.fault, observation >> CONTACT_SHIFT, True, self._theta,
+            self._theta, tau_ext_hat, contact, self._block.view(np.float64).copy(), self._touch.reaction,
+        )  # fmt: skip
+        self._reference.step(arm, output)
+        if self._reference.is_floating:
+            self._floating.torque(arm.q, arm.dq, tau_ext_hat, self._theta, self._tau_d)
+        else:
+            self._floating.begin()
+            self._controller.torque(arm.q, arm.dq, self._q_d, self._dq_d, self._ddq_d, self._tau_d)
+        self._body.advance(self._tau_c, _TORQUE if state is not SchemeState.FAULT else (DriveMode.BRAKE,) * 2)
+        self._gate.limit(self._tau_d, state is not SchemeState.FAULT, self._tau_c)
+        self._state = state
+        self._cycle += 1
+        return Sample(output, truth, self._q_d.copy(), self._tau_c.copy())
+
+    def run(self, duration_s: float) -> list[Sample]:
+        """Run some time."""
+        return [self.step() for _ in range(round(duration_s / self.settings.bus.period_s))]
+
+
+def reports(samples: list[Sample], is_final: bool = True) -> list[ContactReport]:
+    """List the reports of a record."""
+    found = [sample.output.contact for sample in samples]
+    return [report for report in found if report is not None and report.is_final == is_final]
