@@ -126,12 +126,12 @@ class Reference:
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
             return True
+        is_blow = self._follows_thrown and arm.cycle - self._contact_cycle <= self._thrown_cycles
+        if is_blow and self._is_thrown(arm, output.tau_ext_hat):
+            self._follow_thrown(arm)
         if self._reaction is Reaction.ADMITTANCE:
             self._admittance.step(output.tau_ext_hat, self._q_d, self._dq_d, self._ddq_d)
             return True
-        is_blow = self._follows_thrown and arm.cycle - self._contact_cycle <= self._thrown_cycles
-        if is_blow and self._reaction in (Reaction.STOP, Reaction.WITHDRAW):
-            self._follow_thrown(arm, output.tau_ext_hat)
         return False
 
     def _stay(self, arm: ArmState) -> None:
@@ -202,22 +202,28 @@ class Reference:
     def _brake(self, cycle: int) -> None:
         self._withdraw(Withdrawal(self._settings, self._q_d, self._dq_d, np.zeros(JOINTS)), cycle)
 
-    def _follow_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> None:
-        """Plan anew from the measured motion where a blow that ends has made the arm faster than planned, away from it.
+    def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
+        """Tell whether a blow that ends has made the arm faster than planned, away from what it has hit.
 
-        Else the controller would pull it back to where it was to be: to what it has hit. While it is still pushed the
-        controller resists.
+        While it is still pushed the controller resists.
         """
         along = float(tau_ext_hat @ self._push)
         self._strongest = max(self._strongest, along)
         if along > ENDING * self._strongest:
-            return
+            return False
         largest = float(np.max(np.abs(self._push)))
         ahead = np.sign(self._push) * (arm.dq - self._dq_d) * (np.abs(self._push) >= 0.2 * largest)
-        if float(np.max(ahead)) < THROWN_rad_s:
-            return
-        push = self._push if self._reaction is Reaction.WITHDRAW else np.zeros(JOINTS)
-        self._withdraw(Withdrawal(self._settings, arm.q, arm.dq, push, self._contact_q), arm.cycle)
+        return float(np.max(ahead)) >= THROWN_rad_s
+
+    def _follow_thrown(self, arm: ArmState) -> None:
+        """Go on from the measured motion; else the controller would pull the arm back to what it has hit."""
+        if self._reaction is Reaction.ADMITTANCE:
+            self._q_d[:], self._dq_d[:] = arm.q, arm.dq
+        elif self._reaction is Reaction.WITHDRAW:
+            withdrawal = Withdrawal(self._settings, arm.q, arm.dq, self._push, self._contact_q)
+            self._withdraw(withdrawal, arm.cycle)
+        elif self._reaction is Reaction.STOP:
+            self._withdraw(Withdrawal(self._settings, arm.q, arm.dq, np.zeros(JOINTS)), arm.cycle)
 
     def _start(self, segment: Segment, cycle: int) -> None:
         self._segment = segment
