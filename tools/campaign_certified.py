@@ -43,14 +43,23 @@ class CertifiedScheme:
             self._settings, arm=replace(self._settings.arm, link_length_m=recording.arm.arm.link_length_m)
         )
         n, count = len(recording.q), len(certified_kernel.parameter_names(settings))
-        filters = len(settings.certified.cutoffs_rad_s)
+        memory = certified_kernel.new_memory(settings)
         state, observation, theta = np.zeros(n), np.zeros(n), np.zeros((n, count))
-        y, h = (np.zeros((n, filters, JOINTS)) for _ in range(2))
+        y, h = (np.zeros((n, *memory[0]["y"].shape)) for _ in range(2))
         certified_kernel.step_record(
-            certified_kernel.constants_of(settings), certified_kernel.new_memory(settings),
-            certified_kernel.new_block(settings), recording.q, recording.dq, recording.tau_J,
-            begins[1] if len(begins) > 1 else -1, state, observation, y, h, theta,
-        )  # fmt: skip
+            certified_kernel.constants_of(settings),
+            memory,
+            certified_kernel.new_block(settings),
+            recording.q,
+            recording.dq,
+            recording.tau_J,
+            begins[1] if len(begins) > 1 else -1,
+            state,
+            observation,
+            y,
+            h,
+            theta,
+        )
         phase = np.full(n, ADAPTING)
         for number, its in _PHASES.items():
             phase[state == number] = its

@@ -13,6 +13,8 @@ from adacd_hil.cli.table import format_table
 Rows = dict[str, list[Row]]
 Bounds = dict[tuple[str, bool], Bound]
 WITHIN_S = 0.1
+KNOWN_S = 0.5
+"""A touch that begins earlier in an adaptation meets a model that nothing is known of yet."""
 NAN = float("nan")
 
 
@@ -141,6 +143,7 @@ def touch_figures() -> list[Figure]:
         Figure("force off by, from 10 N, median, share", 0.1, lever(50.0, "force_ratio", 1.0)),
         Figure("force off by, from 10 N, 95 %, share", 0.1, lever(95.0, "force_ratio", 1.0)),
         Figure("touch while adapting flagged within 50 ms, %", 99.0, _flagged_in_time, NAN, two, True),
+        Figure(f"the same, begun after {KNOWN_S:g} s, %", 99.0, _known_flagged_in_time, NAN, two, True),
         Figure("touch flagged after, median, s", 0.05, touched(_median, "flagged_s")),
         Figure("what it changes of the torque, median, Nm", 0.02, touched(_median, "changed_Nm")),
         Figure("what it changes of the torque, worst, Nm", 0.02, touched(_worst, "changed_Nm")),
@@ -253,6 +256,10 @@ def _peak_errors(rows: Rows) -> list[float]:
 
 def _flagged_in_time(rows: Rows) -> float:
     return _share(_touches(rows), lambda row: row["flagged_s"] <= 0.05)
+
+
+def _known_flagged_in_time(rows: Rows) -> float:
+    return _share([row for row in _touches(rows) if row["at_s"] >= KNOWN_S], lambda row: row["flagged_s"] <= 0.05)
 
 
 def _link_right(rows: Rows) -> float:

@@ -108,6 +108,8 @@ def play(jobs: list[Job], processes: int) -> dict[str, list[Row]]:
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         futures = {pool.submit(job.run): index for index, job in enumerate(jobs)}
         for future in as_completed(futures):
+            if future.exception():
+                pool.shutdown(cancel_futures=True)
             results[futures[future]] = future.result()
             done = len(results)
             spent_s = time.monotonic() - begin_s
