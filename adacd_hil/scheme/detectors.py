@@ -238,14 +238,14 @@ def record(
 
     z, held_Nm (N, n); peaks (ceil(N / block_samples), channels, n). One sample per block keeps everything.
     """
-    statistics = np.zeros_like(peaks[0])
+    statistics = np.empty((peaks.shape[1], peaks.shape[2]))
     for k in range(z.shape[0]):
         step(constants, memory, z[k], held_Nm[k], statistics)
         block = k // block_samples
-        if k % block_samples == 0:
-            peaks[block] = statistics
-        else:
-            peaks[block] = np.maximum(peaks[block], statistics)
+        for row in range(peaks.shape[1]):
+            for i in range(peaks.shape[2]):
+                if k % block_samples == 0 or statistics[row, i] > peaks[block, row, i]:
+                    peaks[block, row, i] = statistics[row, i]
 
 
 @compiled
