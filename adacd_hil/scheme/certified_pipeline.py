@@ -108,7 +108,6 @@ class CertifiedPipeline:
             supervisor,
             observation,
             arm.q,
-            arm.dq,
             self._tau_ext_hat,
             self._tau_ext_wide_hat,
             self._sigma,
