@@ -28,8 +28,9 @@ class Outcome:
     """What a scheme made of n samples.
 
     phase (n,): ADAPTING, TESTING, ARMED. over (n,): bits of the joints over their threshold, 0 where detection is off.
-    tau_ext_hat (n, 2): of the slowest filter, Nm; tau_ext_wide_hat (n, 2): with the filter undone; threshold (n, 2) of
-    tau_ext_hat; direction (n, 2): sign of what is most over its threshold. armed: the cycle of each arming, in order of `begins`, -1 for never; theta (m, p): parameters then.
+    tau_ext_hat (n, 2): of the slowest filter, Nm; threshold (n, 2) of it; tau_ext_wide_hat (n, 2): with the filter
+    undone. direction (n, 2): sign of what is most over its threshold. armed: the cycle of each arming, in order of
+    `begins`, -1 for never; theta (m, p): parameters then.
     """
 
     phase: NDArray[np.int64]
