@@ -313,7 +313,8 @@ def _judge(contact: ContactSettings, recording: Recording, outcome: Outcome, bou
     threshold = float(outcome.threshold[alarm, 1])
     hidden = contact.link == 2 and bool(np.abs(recording.tau_ext[first : located.stop, 1]).max() < threshold)
     over = [joint for joint in range(2) if int(outcome.over[alarm]) >> joint & 1]
-    signs = [outcome.direction[alarm, joint] == np.sign(recording.tau_ext[alarm - 1, joint]) for joint in over]
+    pushed = np.sign(recording.tau_ext[first : alarm + 1].sum(0))
+    signs = [outcome.direction[alarm, joint] == pushed[joint] for joint in over]
     strong = int(np.argmax(np.abs(truth).max(0)))
     wide = outcome.tau_ext_wide_hat[first:last, strong]
     return row | {
