@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES, Reaction, Vector
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Reaction, Vector
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
 
 
@@ -384,6 +384,103 @@ REACTIONS = tuple(reaction.name.lower() for reaction in Reaction)
 """What can be done about a contact, as a configuration says it."""
 
 
+FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width")
+"""Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.friction`."""
+
+_KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
+
+
+@dataclass(frozen=True)
+class CertifiedSettings:
+    """The scheme that goes beyond the paper: what is believed, when it is enough, and what stands out from it.
+
+    Seven numbers are by kind of parameter: inertia, viscous friction, Coulomb friction, gravity, torque offset, lag,
+    further friction.
+    """
+
+    cutoffs_rad_s: tuple[float, ...] = setting(
+        (10.0, 50.0, 200.0), unit="rad/s", low=1.0, high=1000.0, meaning="filters of the bank, from slow to fast"
+    )
+    smoothing_rad_s: float = setting(
+        200.0, unit="rad/s", low=10.0, high=3000.0, meaning="second low-pass behind each filter, against velocity noise"
+    )
+    noise_sigmas: float = setting(6.5, low=1.0, high=50.0, meaning="threshold in deviations of the torque's noise")
+    model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold in deviations of the model")
+    friction_terms: tuple[str, ...] = setting(
+        ("stribeck",), choices=FRICTION_TERMS, meaning="friction beyond viscous and Coulomb"
+    )
+    still_rad_s: float = setting(
+        0.002,
+        unit="rad/s",
+        low=0.0,
+        high=1.0,
+        meaning="|dq| below which a joint may stand still; above the noise of dq",
+    )
+    coulomb_width_rad_s: float = setting(
+        0.0, unit="rad/s", low=0.0, high=1.0, meaning="Coulomb friction is F_c tanh(dq / width); 0: F_c sgn(dq)"
+    )
+    stribeck_rad_s: float = setting(
+        0.05, unit="rad/s", low=1e-3, high=10.0, meaning="speed over which static friction falls off"
+    )
+    prior_std: tuple[float, ...] = setting(
+        (1.0, 0.5, 0.5, 10.0, 0.3, 0.001, 0.2), low=0.0, high=1e6, meaning=f"what an arm may be: {_KINDS}"
+    )
+    enough_std: tuple[float, ...] = setting(
+        (0.02, 0.04, 0.04, 0.2, 0.04, 0.004, 0.2), low=0.0, high=1e6, meaning=f"how well it must be known: {_KINDS}"
+    )
+    drift_std: tuple[float, ...] = setting(
+        (0.0, 0.003, 0.003, 0.0, 0.001, 0.0, 0.003),
+        low=0.0,
+        high=1e3,
+        meaning=f"how far it may wander in a second of motion: {_KINDS}",
+    )
+    model_error: tuple[float, ...] = setting(
+        (0.01, 0.02, 0.02, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
+    )
+    payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="what a payload at the tip may weigh")
+    payload_inertia_std: float = setting(
+        0.02, unit="kg m²", low=0.0, high=100.0, meaning="what it may add to each inertia beside a point mass"
+    )
+    residual_Nm: float = setting(0.02, unit="Nm", low=1e-4, high=10.0, meaning="residual of one filtered sample")
+    learn_every: int = setting(4, low=1, high=100, meaning="samples between two that are learnt")
+    hold_back_s: float = setting(
+        0.06, unit="s", low=0.0, high=1.0, meaning="how long a sample waits until it is learnt; a contact discards it"
+    )
+    recover_s: float = setting(0.5, unit="s", low=0.0, high=60.0, meaning="after a contact, nothing is learnt so long")
+    fit_s: tuple[float, float] = setting(
+        (1.4, 0.45), unit="s", low=0.05, high=600.0, meaning="shortest fit: of the arm, of a payload"
+    )
+    test_s: tuple[float, float] = setting(
+        (0.85, 0.4), unit="s", low=0.05, high=600.0, meaning="test of the frozen model: of the arm, with a payload"
+    )
+    beta_Nm: float = setting(
+        0.06, unit="Nm", low=1e-3, high=100.0, meaning="test: largest |tau_ext_hat| of the slowest filter"
+    )
+    excitation_Nm2s: float = setting(
+        5e-5, unit="Nm² s", low=0.0, high=1e6, meaning="smallest eigenvalue of the scaled information matrix"
+    )
+    condition: float = setting(1e5, low=1.0, high=1e12, meaning="largest condition number of the same matrix")
+    refine_s: float = setting(4.0, unit="s", low=0.1, high=3600.0, meaning="test of a refined model before it is used")
+    torque_noise_Nm: float = setting(0.02, unit="Nm", low=0.0, high=10.0, meaning="torque sensor, rms of one sample")
+    velocity_noise_rad_s: float = setting(
+        3.3e-3, unit="rad/s", low=0.0, high=1.0, meaning="velocity, largest error of one sample"
+    )
+    lag_s: float = setting(
+        0.00125, unit="s", low=0.0, high=0.1, meaning="expected age of the velocity when the torque is new; identified"
+    )
+    standstill_share: float = setting(1.0, low=0.0, high=10.0, meaning="part of F_c that is uncertain at rest")
+
+    def __post_init__(self) -> None:
+        if len(self.cutoffs_rad_s) < 2:
+            raise ConfigError(f"`certified.cutoffs_rad_s` has {len(self.cutoffs_rad_s)} values, at least 2 expected")
+        if list(self.cutoffs_rad_s) != sorted(self.cutoffs_rad_s):
+            raise ConfigError(f"`certified.cutoffs_rad_s` = {self.cutoffs_rad_s} must go from slow to fast")
+        for name in ("prior_std", "enough_std", "drift_std", "model_error"):
+            count = len(getattr(self, name))
+            if count != 7:
+                raise ConfigError(f"`certified.{name}` has {count} values, 7 expected: {_KINDS}")
+
+
 @dataclass(frozen=True)
 class ReactionSettings:
     """What is done about a contact, by its level and link. Link 1's joint is joint 1; pairs of numbers are joints."""
@@ -451,6 +548,38 @@ class TrajectorySettings:
         (1.125, 4.5), unit="s", low=0.1, high=60.0, meaning="as printed (1.125, 4.5); synchronous (2.25, 2.25)"
     )
     approach_deg_s: float = setting(90.0, unit="deg/s", low=1.0, high=360.0, meaning="peak speed to the start corner")
+
+
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """The motion of the certified scheme's adaptation: periodic, from the trajectory's start corner at rest.
+
+    In amplitudes of the trajectory, q_d = -1 + sum_n cosine_n (cos(n w t) - 1) + sine_n sin(n w t), w = 2 pi / period.
+    """
+
+    period_s: float = setting(0.0, unit="s", low=0.0, high=600.0, meaning="of the motion; 0: adapt on the trajectory")
+    cosine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
+        ((), ()), low=-2.0, high=2.0, meaning="per joint and harmonic"
+    )
+    sine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
+        ((), ()), low=-2.0, high=2.0, meaning="per joint and harmonic"
+    )
+
+    def __post_init__(self) -> None:
+        for joint in range(JOINTS):
+            cosine, sine = self.cosine[joint], self.sine[joint]
+            if len(cosine) != len(sine):
+                raise ConfigError(
+                    f"joint {joint + 1} has {len(cosine)} values in `excitation.cosine`, "
+                    f"{len(sine)} in `excitation.sine`"
+                )
+            velocity = sum((n + 1) * value for n, value in enumerate(sine))
+            acceleration = sum((n + 1) ** 2 * value for n, value in enumerate(cosine))
+            if abs(velocity) > 1e-3 or abs(acceleration) > 1e-3:
+                raise ConfigError(
+                    f"excitation of joint {joint + 1} does not begin at rest: the sum of n sine_n = {velocity:.3g}, "
+                    f"of n² cosine_n = {acceleration:.3g}, each within 0.001"
+                )
 
 
 @dataclass(frozen=True)
@@ -637,6 +766,7 @@ class Settings:
     """Everything a run depends on, resolved. Attached to every log."""
 
     name: str = setting("", meaning="name of the configuration")
+    scheme: str = setting("paper", choices=("paper", "certified"), meaning="the paper's scheme, or the one beyond it")
     arm: ArmSettings = setting(ArmSettings, meaning="the arm")
     bus: BusSettings = setting(BusSettings, meaning="timing on the bus")
     devices: DevicesSettings = setting(DevicesSettings, meaning="drives and sensors")
@@ -644,8 +774,10 @@ class Settings:
     estimator: EstimatorSettings = setting(EstimatorSettings, meaning="adaptation law")
     termination: TerminationSettings = setting(TerminationSettings, meaning="end of adaptation")
     detector: DetectorSettings = setting(DetectorSettings, meaning="collision detection")
+    certified: CertifiedSettings = setting(CertifiedSettings, meaning="the scheme beyond the paper")
     reaction: ReactionSettings = setting(ReactionSettings, meaning="what is done about a contact")
     trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
+    excitation: ExcitationSettings = setting(ExcitationSettings, meaning="the motion of the certified adaptation")
     controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
     operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
     lockstep: LockstepSettings = setting(LockstepSettings, meaning="modelled time of the host")
@@ -653,6 +785,29 @@ class Settings:
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
     log: LogSettings = setting(LogSettings, meaning="the log")
+
+    @property
+    def further_names(self) -> tuple[str, ...]:
+        """Names of what the certified scheme estimates beside the dynamic parameters, in order; none of the paper's."""
+        if self.scheme == "paper":
+            return ()
+        kinds = ("offset", "lag", *self.certified.friction_terms)
+        return tuple(f"{kind}{joint + 1}" for kind in kinds for joint in range(JOINTS))
+
+    @property
+    def further_count(self) -> int:
+        """Number of `further_names`."""
+        return len(self.further_names)
+
+    @property
+    def filter_count(self) -> int:
+        """Filters in the certified scheme's bank; 0 of the paper's."""
+        return len(self.certified.cutoffs_rad_s) if self.scheme == "certified" else 0
+
+    @property
+    def channel_count(self) -> int:
+        """Residuals per joint that have a threshold: each filter's smoothed, and all but the slowest one's bare."""
+        return max(2 * self.filter_count - 1, 0)
 
     @property
     def cad_theta(self) -> Vector:

@@ -36,6 +36,10 @@ PARAMETER_UNITS = {
     "F_c2": "Nm",
     "a4": "Nm",
     "a5": "Nm",
+    "offset1": "Nm",
+    "offset2": "Nm",
+    "lag1": "s",
+    "lag2": "s",
 }
 
 
@@ -88,6 +92,31 @@ def scheme_layout(parameter_count: int) -> Layout:
             Field("quiet_s", 1, "s", "how long eq. (15) has held"),
             Field("excitation", 1, "Nm² s", "smallest eigenvalue of the scaled information matrix of this adaptation"),
             Field("period_s", 1, "s", "measured time since the sample before"),
+        )
+    )
+
+
+def certified_layout(parameter_count: int, further_count: int, channel_count: int) -> Layout:
+    """Lay out the block of the certified scheme: the scheme's, then what only it has.
+
+    parameter_count: dynamic parameters. further_count: offsets, lags and friction terms. channel_count: of the bank.
+    The scheme's tau_f, tau_ext_hat and threshold are those of the slowest filter. The bank is channel by channel: each
+    filter smoothed, then all but the slowest bare.
+    """
+    bank = JOINTS * channel_count
+    return Layout(
+        (
+            *scheme_layout(parameter_count).fields,
+            Field("tau_ext_bank", bank, "Nm", "estimated external torque of each channel"),
+            Field("threshold_bank", bank, "Nm", "its threshold in force, inf while detection is off"),
+            Field("theta_further", further_count, "see PARAMETER_UNITS", "estimated offsets, lags and friction terms"),
+            Field("theta_std", parameter_count + further_count, "see PARAMETER_UNITS", "how well theta is known"),
+            Field("condition", 1, "", "condition number of the scaled information matrix of this adaptation"),
+            Field("promotions", 1, "", "refined models that have taken over since the certificate"),
+            Field("paper_is_armed", 1, "", "whether the paper's scheme, run beside, has ended its adaptation"),
+            Field("paper_tau_ext_hat", JOINTS, "Nm", "its estimated external torque"),
+            Field("paper_threshold", JOINTS, "Nm", "its threshold in force, inf while it adapts"),
+            Field("paper_theta_hat", parameter_count, "see PARAMETER_UNITS", "its estimated parameters"),
         )
     )
 

@@ -1,4 +1,4 @@
-"""Prints what one step, one cycle, the codec, the plant and the log hand-off cost: percentiles in µs, no verdict.
+"""Prints what one step, one cycle, the codec, the plant and the log hand-off cost: percentiles in µs.
 
     python tools/bench.py                   all; what needs a bus through tools/with-vcan
     python tools/bench.py --side-by-side    only the cycle over vcan, beside the C yardstick's and a straightforward
@@ -24,6 +24,7 @@ from unittest.mock import patch
 
 import cantools
 import numpy as np
+import regressor_bench
 from numpy.typing import NDArray
 from side_by_side import BIN, CHANNEL, ENVIRONMENT, ROOT, TimingError, as_text, compare, emulator
 
@@ -93,6 +94,7 @@ def main() -> int:
     if not chosen.side_by_side:
         print(f"{'µs':44} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}")
         bench_in_process()
+        regressor_bench.main()
         sys.stdout.flush()
     again = [sys.executable, __file__, "--vcan", *sys.argv[1:]]
     return subprocess.run([ROOT / "tools/with-vcan", "--", *again], check=False).returncode

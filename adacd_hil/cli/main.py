@@ -205,6 +205,37 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
     return code
 
 
+@cli.command(epilog=EPILOG)
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--rate-per-h",
+    type=click.FloatRange(1e-6, 1e4),
+    default=0.01,
+    show_default=True,
+    help="Wanted false alarms per hour of a detector.",
+)
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the thresholds here, as TOML.")
+@click.option(
+    "--report",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Compare the detectors; JSON, PNG and SVG go here.",
+)
+@_json
+@_explained
+def thresholds(
+    logs: tuple[Path, ...], rate_per_h: float, out: Path | None, report: Path | None, as_json: bool
+) -> ExitCode:
+    """Find every detector's thresholds for a rate of false alarms, from what nobody touched in these logs.
+
+    Each comes with what limits it, and with the rate that half of the motion predicts for the other half.
+    """
+    from adacd_hil.cli import thresholds as command
+
+    found, comparison = command.find(logs, rate_per_h, out, report)
+    print(command.as_json(found, comparison) if as_json else command.as_text(found, comparison))
+    return ExitCode.OK
+
+
 @cli.command(epilog="Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC.")
 @click.option(
     "--dbc", default="arm", show_default=True, metavar="NAME|FILE", help="The contract: the package's, or a file."

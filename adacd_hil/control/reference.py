@@ -1,9 +1,10 @@
 """Where the arm should be: the desired motion in each state of the scheme.
 
-ADAPT, CERTIFY and MONITOR follow the trajectory, approached from wherever the arm is; REACT does what the reaction
-says; STOPPED keeps to it, or holds; PAYLOAD and the end of a run park the arm in the trajectory's start corner;
-elsewhere the desired motion is the measured place. A run that ends while the arm reacts or is stopped does not move it:
-it ends there, or is parked when the stop has been acknowledged.
+MONITOR follows the trajectory, ADAPT and CERTIFY the excitation where there is one, else the trajectory too, each
+approached from wherever the arm is; REACT does what the reaction says; STOPPED keeps to it, or holds; PAYLOAD and the
+end of a run park the arm in the trajectory's start corner; elsewhere the desired motion is the measured place. A run
+that ends while the arm reacts or is stopped does not move it: it ends there, or is parked when the stop has been
+acknowledged.
 """
 
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import numpy as np
 
 from adacd_hil.config import Settings
 from adacd_hil.control.admittance import Admittance
+from adacd_hil.control.excitation import Excitation
 from adacd_hil.control.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
 from adacd_hil.records import JOINTS, ArmState, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.reaction import Withdrawal
@@ -33,6 +35,7 @@ ENDING = 0.6
 """A blow ends when its torque has fallen to this part of its largest."""
 
 _FOLLOWING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
+_LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 _REACTING = (SchemeState.REACT, SchemeState.STOPPED)
 _ON_PATH = (Reaction.NONE, Reaction.SLOW_DOWN)
 
@@ -56,6 +59,7 @@ class Reference:
         self._q_d, self._dq_d, self._ddq_d = q_d, dq_d, ddq_d
         self._state = SchemeState.INIT
         self._reaction = Reaction.NONE
+        self._excitation = Excitation(settings)
         self._segment: Segment | None = None
         self._start_cycle = 0
         self._follows_at_cycle: int | None = None
@@ -72,6 +76,8 @@ class Reference:
         """Plan and run every kind of motion once, so that nothing happens for the first time in the cycle."""
         zeros = np.zeros(2)
         self._follow(0.0)
+        if self._excitation.is_on:
+            self._excite(0.0)
         for plan in (
             lambda: self._approach(0),
             lambda: self._withdraw(Withdrawal(self._settings, zeros, zeros, np.ones(2)), 0),
@@ -142,7 +148,9 @@ class Reference:
         has_come = self._follows_at_cycle is not None and cycle - self._lag_s / self._period_s >= self._follows_at_cycle
         if has_come and not self._is_parking:
             assert self._follows_at_cycle is not None
-            self._segment, self._start_cycle = self._follow, self._follows_at_cycle
+            is_learning = self._excitation.is_on and self._state in _LEARNING
+            self._segment = self._excite if is_learning else self._follow
+            self._start_cycle = self._follows_at_cycle
             self._follows_at_cycle = None
         assert self._segment is not None
         self._segment((cycle - self._start_cycle) * self._period_s - self._lag_s)
@@ -155,7 +163,8 @@ class Reference:
         state, previous, cycle = output.state, self._state, arm.cycle
         self._state = state
         was_on_path = previous in _FOLLOWING or (previous is SchemeState.REACT and self._reaction in _ON_PATH)
-        is_moving_on = state in _FOLLOWING and was_on_path
+        has_excited = self._excitation.is_on and previous in _LEARNING and state is SchemeState.MONITOR
+        is_moving_on = state in _FOLLOWING and was_on_path and not has_excited
         if state is SchemeState.REACT:
             self._react(output, arm)
             return
@@ -223,6 +232,9 @@ class Reference:
 
     def _follow(self, elapsed_s: float) -> None:
         corner_to_corner(elapsed_s, self._amplitude, self._half_period_s, self._q_d, self._dq_d, self._ddq_d)
+
+    def _excite(self, elapsed_s: float) -> None:
+        self._excitation.evaluate(elapsed_s, self._q_d, self._dq_d, self._ddq_d)
 
     def _withdraw(self, withdrawal: Withdrawal, cycle: int) -> None:
         def segment(elapsed_s: float) -> None:

@@ -210,6 +210,8 @@ class Session:
                 self.out / LOG_NAME,
                 messages=self.codec.messages.values(),
                 parameter_count=len(self.settings.estimator.parameter_names),
+                further_count=self.settings.further_count,
+                channel_count=self.settings.channel_count,
                 attachments=attachments,
                 metadata={**self._metadata(grant), **spin},
                 epoch_ns=0 if is_lockstep else wall_ns() - MonotonicClock().now_ns(),

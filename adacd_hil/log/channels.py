@@ -9,7 +9,7 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /to_can_bus_fd, /from_can_bus_fd | ros2_socketcan_msgs/msg/FdFrame | every longer frame |
 | /decoded/<DBC message> | adacd_hil_msgs/msg/<DBC message> | every frame that the DBC knows |
 | /joint_states | sensor_msgs/msg/JointState | every cycle; measured q, dq, tau_J |
-| /scheme | adacd_hil_msgs/msg/Scheme | every cycle; records.scheme_layout |
+| /scheme | adacd_hil_msgs/msg/Scheme | every cycle; records.scheme_layout or certified_layout |
 | /contact | adacd_hil_msgs/msg/Contact | when a report begins and when it is final |
 | /control | adacd_hil_msgs/msg/Control | every cycle; records.CONTROL_LAYOUT |
 | /cycle | adacd_hil_msgs/msg/Cycle | every cycle; records.CycleRecord |
@@ -41,6 +41,7 @@ from adacd_hil.records import (
     SchemeOutput,
     SchemeState,
     Vector,
+    certified_layout,
     scheme_layout,
 )
 from adacd_hil.wire.e2e import E2eStatus
@@ -218,9 +219,15 @@ SCHEME_BLOCK = _SCHEME_HEAD.size
 """Where the block begins in the body of /scheme, bytes."""
 
 
-def run_channels(parameter_count: int, messages: "tuple[MessageLike, ...]" = ()) -> tuple[Channel, ...]:
-    """List the topics of a run for `parameter_count` dynamic parameters and the DBC's messages."""
-    scheme = (*_SCHEME, *_members(scheme_layout(parameter_count)))
+def run_channels(
+    parameter_count: int, messages: "tuple[MessageLike, ...]" = (), further_count: int = 0, channel_count: int = 0
+) -> tuple[Channel, ...]:
+    """List the topics of a run for `parameter_count` dynamic parameters and the DBC's messages.
+
+    further_count, channel_count: of the certified scheme, see `records.certified_layout`; 0 for the paper's.
+    """
+    layout = certified_layout(parameter_count, further_count, channel_count)
+    scheme = (*_SCHEME, *_members(layout if channel_count else scheme_layout(parameter_count)))
     control = (*_CONTROL, *_members(CONTROL_LAYOUT))
     own = (
         Channel(ChannelId.TO_CAN_BUS, "/to_can_bus", CAN_FRAME),

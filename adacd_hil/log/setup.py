@@ -52,6 +52,8 @@ class Setup:
     is_blocking: bool
     messages: tuple[ToldMessage, ...]
     parameter_count: int
+    further_count: int
+    channel_count: int
     epoch_ns: int
     part_bytes: int
     part_ns: int

@@ -49,7 +49,9 @@ class WriterProcess:
         self, connection: socket.socket, ring: RingReader, sink: Sink, setup: Setup, clock: Clock | None = None
     ) -> None:
         messages = setup.messages
-        self._channels = truth_channels() if setup.is_truth else run_channels(setup.parameter_count, messages)
+        counts = setup.further_count, setup.channel_count
+        channels = run_channels(setup.parameter_count, messages, *counts)
+        self._channels = truth_channels() if setup.is_truth else channels
         self._connection = connection
         self._ring = ring
         self._sink = sink

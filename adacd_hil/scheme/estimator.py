@@ -27,24 +27,32 @@ def update(
     W_f: Vector, tau_f: Vector, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
 ) -> None:
     """Correct theta_hat (p,), and P (p, p) if least squares, by one sample in place; v and K (p,) are scratch."""
-    count = theta_hat.shape[0]
     for i in range(W_f.shape[0]):
-        epsilon = tau_f[i]
-        s = R
+        correct(W_f[i], tau_f[i], R, is_least_squares, theta_hat, P, v, K)
+
+
+@compiled
+def correct(
+    w: Vector, tau: float, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
+) -> None:
+    """Correct theta_hat (p,), and P (p, p) if least squares, by one row w (p,) of variance R; v and K are scratch."""
+    count = theta_hat.shape[0]
+    epsilon = tau
+    s = R
+    for j in range(count):
+        v[j] = 0.0
+        for k in range(count):
+            v[j] += P[j, k] * w[k]
+        s += w[j] * v[j]
+        epsilon -= w[j] * theta_hat[j]
+    for j in range(count):
+        K[j] = v[j] / s
+        theta_hat[j] += K[j] * epsilon
+    if is_least_squares:
         for j in range(count):
-            v[j] = 0.0
-            for k in range(count):
-                v[j] += P[j, k] * W_f[i, k]
-            s += W_f[i, j] * v[j]
-            epsilon -= W_f[i, j] * theta_hat[j]
-        for j in range(count):
-            K[j] = v[j] / s
-            theta_hat[j] += K[j] * epsilon
-        if is_least_squares:
-            for j in range(count):
-                for k in range(j + 1):
-                    P[j, k] += s * K[j] * K[k] - (K[j] * v[k] + v[j] * K[k])
-                    P[k, j] = P[j, k]
+            for k in range(j + 1):
+                P[j, k] += s * K[j] * K[k] - (K[j] * v[k] + v[j] * K[k])
+                P[k, j] = P[j, k]
 
 
 @compiled

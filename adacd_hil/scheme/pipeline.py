@@ -15,7 +15,7 @@ from adacd_hil.records import ArmState, ContactReport, Reaction, Request, Scheme
 from adacd_hil.scheme import kernel
 from adacd_hil.scheme.contact import Isolation
 from adacd_hil.scheme.observation import CONTACT_SHIFT
-from adacd_hil.scheme.regressor import has_positive_definite_mass, inverse_dynamics
+from adacd_hil.scheme.regressor import inverse_dynamics, is_positive_definite
 from adacd_hil.scheme.supervisor import Supervisor
 
 _MODES = {
@@ -108,7 +108,7 @@ class Pipeline:
         """Do what a new state begins with, and what the previous one ends with."""
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
             self._theta_ff = self._values[self._theta_hat].copy()
-            self._is_model_valid = has_positive_definite_mass(self._theta_ff)
+            self._is_model_valid = is_positive_definite(self._theta_ff)
         if state is SchemeState.ADAPT:
             kernel.begin_adaptation(self._constants, self._memory, self._block)
         elif state is SchemeState.REACT:

@@ -86,13 +86,23 @@ def inverse_dynamics(q: Vector, dq: Vector, ddq: Vector, theta: Vector) -> Vecto
     return tau
 
 
+@compiled
+def fill_mass_matrix(q: Vector, theta: Vector, M: Vector) -> None:
+    """Fill M(q) (2, 2), kg m²."""
+    c2 = np.cos(q[1])
+    M[0, 0] = theta[A1] + 2.0 * theta[A2] * c2
+    M[0, 1] = M[1, 0] = theta[A3] + theta[A2] * c2
+    M[1, 1] = theta[A3]
+
+
 def mass_matrix(q: Vector, theta: Vector) -> Vector:
     """Return M(q) (2, 2), kg m²."""
-    c2 = np.cos(q[1])
-    coupling = theta[A3] + theta[A2] * c2
-    return np.array([[theta[A1] + 2.0 * theta[A2] * c2, coupling], [coupling, theta[A3]]])
+    M = np.zeros((JOINTS, JOINTS))
+    fill_mass_matrix(q, theta, M)
+    return M
 
 
-def has_positive_definite_mass(theta: Vector) -> bool:
+@compiled
+def is_positive_definite(theta: Vector) -> bool:
     """Tell whether M(q) is positive definite at every q: a3 > 0 and a3 (a1 - a3) > a2²; NaN is not."""
     return bool(theta[A3] > 0.0 and theta[A3] * (theta[A1] - theta[A3]) > theta[A2] ** 2)

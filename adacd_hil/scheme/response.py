@@ -1,13 +1,10 @@
 """The choice of a reaction: by level and link, and what changes it while the arm reacts.
 
 A contact that grows into a collision, or whose link turns out to be another, has its reaction chosen anew. A withdrawal
-is given up for the `two_sided` reaction
+is given up for the `two_sided` reaction when something pushes from the other side: the external torque along the way of
+the withdrawal has turned against it by more than the upper thresholds, as in a clamp or with a wall behind.
 
-- when something pushes from the other side: the external torque along the way of the withdrawal has turned against it
-  by more than the upper thresholds, as in a clamp or with a wall behind;
-- when what is withdrawn from follows: the torque along the way grows although the arm already moves that way.
-
-Shapes: tau_ext_hat, dq (2,), Nm and rad/s.
+Shapes: tau_ext_hat (2,), Nm.
 """
 
 import numpy as np
@@ -17,8 +14,6 @@ from adacd_hil.records import ContactLevel, Reaction, Vector
 
 TURNED_CYCLES = 5
 """How many samples in a row the torque must be turned: what a blow leaves in the estimate is shorter."""
-GROWTH = 1.3
-"""A push that follows is stronger than when the arm turned by this factor and by the upper thresholds."""
 BLIND_S = 0.02
 """After a withdrawal has begun it is not judged yet: the estimate still rings from the blow."""
 
@@ -42,7 +37,6 @@ class Response:
         self._way = np.zeros(0)
         self._cycles = 0
         self._turned_cycles = 0
-        self._turning: float | None = None
 
     @property
     def reaction(self) -> Reaction:
@@ -86,7 +80,6 @@ class Response:
         link: int,
         is_latched: bool,
         tau_ext_hat: Vector,
-        dq: Vector,
         is_model_valid: bool,
     ) -> None:
         """Take in one cycle of a contact and change the reaction if something calls for it."""
@@ -97,7 +90,7 @@ class Response:
         if is_latched and self.goes_on and self.level is ContactLevel.CONTACT:
             self._begin(Reaction.STOP, tau_ext_hat)
         if self._reaction is Reaction.WITHDRAW and self._way.size:
-            self._judge(tau_ext_hat, dq, is_model_valid)
+            self._judge(tau_ext_hat, is_model_valid)
 
     def _choose(self, tau_ext_hat: Vector, is_model_valid: bool) -> None:
         level, link = self._cause
@@ -114,20 +107,16 @@ class Response:
         size = float(np.linalg.norm(tau_ext_hat)) if tau_ext_hat.size else 0.0
         self._way = tau_ext_hat / size if size > 0.0 else np.zeros(0)
         self._cycles = self._turned_cycles = 0
-        self._turning = None
 
-    def _judge(self, tau_ext_hat: Vector, dq: Vector, is_model_valid: bool) -> None:
-        """Give a withdrawal up if it pushes something on the other side, or is pursued."""
+    def _judge(self, tau_ext_hat: Vector, is_model_valid: bool) -> None:
+        """Give a withdrawal up if it pushes something on the other side."""
         self._cycles += 1
         if self._cycles <= self._blind_cycles:
             return
         along = float(tau_ext_hat @ self._way)
         bound = float(np.abs(self._way) @ self._collision_Nm)
         self._turned_cycles = self._turned_cycles + 1 if along < -bound else 0
-        if self._turning is None and float(dq @ self._way) > 0.0:
-            self._turning = max(along, 0.0)
-        is_pursued = self._turning is not None and along > GROWTH * self._turning + bound
         self._is_two_sided = self._is_two_sided or self._turned_cycles >= TURNED_CYCLES
-        if self._is_two_sided or is_pursued:
+        if self._is_two_sided:
             self._is_given_up = True
             self._begin(self._possible(self._two_sided, is_model_valid), tau_ext_hat)

@@ -69,7 +69,13 @@ def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
 
 @compiled
 def smallest_eigenvalue(information: Vector, scale: Vector, scratch: Vector) -> float:
-    """Return the smallest eigenvalue of D I D, D = diag(scale), from the lower triangle of I (p, p).
+    """Return the smallest eigenvalue of D I D, D = diag(scale), from the lower triangle of I (p, p)."""
+    return eigenvalue_range(information, scale, scratch)[0]
+
+
+@compiled
+def eigenvalue_range(information: Vector, scale: Vector, scratch: Vector) -> tuple[float, float]:
+    """Return the smallest and the largest eigenvalue of D I D, D = diag(scale), from the lower triangle of I (p, p).
 
     By Jacobi's cyclic rotations on `scratch` (p, p): the same bits on every machine, which LAPACK does not promise.
     """
@@ -91,9 +97,11 @@ def smallest_eigenvalue(information: Vector, scale: Vector, scratch: Vector) -> 
             for k in range(j):
                 _rotate(scratch, j, k)
     smallest: float = scratch[0, 0]
+    largest: float = scratch[0, 0]
     for j in range(1, count):
         smallest = min(smallest, scratch[j, j])
-    return max(smallest, 0.0)
+        largest = max(largest, scratch[j, j])
+    return max(smallest, 0.0), max(largest, 0.0)
 
 
 @compiled

@@ -48,7 +48,6 @@ class Touch:
         supervisor: Supervisor,
         observation: int,
         q: Vector,
-        dq: Vector,
         tau_ext_hat: Vector,
         tau_ext_wide_hat: Vector,
         sigma: Vector,
@@ -75,7 +74,7 @@ class Touch:
             self._link = 2 if joints & 2 else 1
             self._response.begin(level, self._link, tau_ext_hat, is_model_valid)
         elif self._link:
-            self._response.step(level, self._link, supervisor.is_latched, tau_ext_hat, dq, is_model_valid)
+            self._response.step(level, self._link, supervisor.is_latched, tau_ext_hat, is_model_valid)
         if not self._reporter.is_open:
             return None
         response = self._response

@@ -16,7 +16,7 @@ from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, schem
 from adacd_hil.scheme import kernel
 from adacd_hil.scheme.observation import Observation
 from adacd_hil.scheme.pipeline import Pipeline
-from adacd_hil.scheme.regressor import has_positive_definite_mass
+from adacd_hil.scheme.regressor import is_positive_definite
 
 NEVER_ALARM = {"detector": {"threshold_Nm": [50.0, 50.0]}}
 
@@ -101,9 +101,9 @@ def test_nothing_is_fed_forward_before_the_first_adaptation_has_ended(adapted):
 
 
 @pytest.mark.slow
-def test_the_model_that_is_fed_forward_has_positive_definite_mass(adapted):
+def test_the_model_that_is_fed_forward_is_positive_definite(adapted):
     assert adapted[-1].is_model_valid
-    assert has_positive_definite_mass(adapted[-1].theta_ff)
+    assert is_positive_definite(adapted[-1].theta_ff)
 
 
 @pytest.mark.slow

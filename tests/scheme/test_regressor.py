@@ -7,8 +7,8 @@ from planar_arm import PAYLOAD_1KG, THETA, acceleration
 from adacd_hil.scheme.regressor import (
     fill_momentum,
     fill_remainder,
-    has_positive_definite_mass,
     inverse_dynamics,
+    is_positive_definite,
     mass_matrix,
     regressor,
 )
@@ -98,8 +98,8 @@ def test_the_paper_coriolis_matrix_is_in_the_regressor(seed):
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
-def test_an_arm_that_exists_has_positive_definite_mass(profile):
-    assert has_positive_definite_mass(THETA[profile])
+def test_an_arm_that_exists_is_positive_definite(profile):
+    assert is_positive_definite(THETA[profile])
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_an_arm_that_exists_has_positive_definite_mass(profile):
     ],
 )
 def test_an_arm_that_cannot_exist_has_no_positive_definite_mass(inertia):
-    assert not has_positive_definite_mass(np.array([*inertia, 0.0, 0.0, 0.0, 0.0]))
+    assert not is_positive_definite(np.array([*inertia, 0.0, 0.0, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -125,4 +125,4 @@ def test_the_mass_test_agrees_with_eigenvalues_over_all_angles(seed):
     theta = np.random.default_rng(seed).uniform(-0.02, 0.2, 7)
     angles = np.linspace(-np.pi, np.pi, 721)
     smallest = min(np.linalg.eigvalsh(mass_matrix(np.array([0.0, angle]), theta))[0] for angle in angles)
-    assert has_positive_definite_mass(theta) == (smallest > 0.0)
+    assert is_positive_definite(theta) == (smallest > 0.0)

@@ -12,7 +12,6 @@ SETTINGS = settings_with(
     detector={"collision_Nm": [2.0, 1.0]},
 )
 PUSH = np.array([6.0, 3.0])
-AWAY, TOWARD = 0.1 * PUSH, -0.1 * PUSH
 BLIND = round(BLIND_S / SETTINGS.bus.period_s)
 
 
@@ -25,10 +24,10 @@ class Contact:
         self.response.begin(level, link, PUSH, is_model_valid)
         self.level, self.link = level, link
 
-    def step(self, tau=PUSH, dq=TOWARD, cycles=1, level=None, link=None, is_latched=False):
+    def step(self, tau=PUSH, cycles=1, level=None, link=None, is_latched=False):
         self.level, self.link = level or self.level, link or self.link
         for _ in range(cycles):
-            self.response.step(self.level, self.link, is_latched, tau, dq, self.is_model_valid)
+            self.response.step(self.level, self.link, is_latched, tau, self.is_model_valid)
         return self.response.reaction
 
 
@@ -73,52 +72,37 @@ def test_an_arm_that_slows_down_goes_on_until_somebody_must_acknowledge():
 def test_a_withdrawal_from_what_lets_go_goes_on():
     contact = Contact(ContactLevel.COLLISION, 2)
     contact.step(cycles=30)
-    assert contact.step(tau=0.0 * PUSH, dq=AWAY, cycles=300) is Reaction.WITHDRAW
+    assert contact.step(tau=0.0 * PUSH, cycles=300) is Reaction.WITHDRAW
     assert not contact.response.is_two_sided
 
 
 def test_a_withdrawal_that_pushes_something_on_the_other_side_floats():
     contact = Contact(ContactLevel.COLLISION, 2)
     contact.step(cycles=BLIND)
-    assert contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES - 1) is Reaction.WITHDRAW
-    assert contact.step(tau=-PUSH, dq=AWAY) is Reaction.FLOAT
+    assert contact.step(tau=-PUSH, cycles=TURNED_CYCLES - 1) is Reaction.WITHDRAW
+    assert contact.step(tau=-PUSH) is Reaction.FLOAT
     assert contact.response.is_two_sided
 
 
 def test_what_a_blow_leaves_in_the_estimate_is_no_second_contact():
     contact = Contact(ContactLevel.COLLISION, 2)
-    contact.step(tau=-PUSH, dq=AWAY, cycles=BLIND)
-    contact.step(tau=-0.2 * PUSH, dq=AWAY, cycles=100)
-    contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES - 1)
-    assert contact.step(tau=0.0 * PUSH, dq=AWAY) is Reaction.WITHDRAW
-
-
-def test_a_withdrawal_that_is_pursued_floats():
-    contact = Contact(ContactLevel.COLLISION, 2)
-    contact.step(cycles=BLIND)
-    contact.step(dq=AWAY)
-    assert contact.step(tau=1.5 * PUSH, dq=AWAY) is Reaction.WITHDRAW
-    assert contact.step(tau=2.0 * PUSH, dq=AWAY) is Reaction.FLOAT
-    assert not contact.response.is_two_sided
-
-
-def test_a_push_that_grows_while_the_arm_still_comes_is_no_pursuit():
-    contact = Contact(ContactLevel.COLLISION, 2)
-    contact.step(cycles=BLIND)
-    assert contact.step(tau=3.0 * PUSH, dq=TOWARD, cycles=50) is Reaction.WITHDRAW
+    contact.step(tau=-PUSH, cycles=BLIND)
+    contact.step(tau=-0.2 * PUSH, cycles=100)
+    contact.step(tau=-PUSH, cycles=TURNED_CYCLES - 1)
+    assert contact.step(tau=0.0 * PUSH) is Reaction.WITHDRAW
 
 
 def test_a_withdrawal_given_up_is_not_begun_again():
     contact = Contact(ContactLevel.COLLISION, 2)
     contact.step(cycles=BLIND)
-    contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES)
+    contact.step(tau=-PUSH, cycles=TURNED_CYCLES)
     assert contact.step(link=1, cycles=10) is Reaction.FLOAT
 
 
 def test_without_a_model_an_arm_stops_instead_of_floating():
     contact = Contact(ContactLevel.COLLISION, 2, is_model_valid=False)
     contact.step(cycles=BLIND)
-    assert contact.step(tau=-PUSH, dq=AWAY, cycles=TURNED_CYCLES) is Reaction.STOP
+    assert contact.step(tau=-PUSH, cycles=TURNED_CYCLES) is Reaction.STOP
 
 
 def test_a_late_host_stops_the_arm_and_the_end_of_it_asks_for_nothing():

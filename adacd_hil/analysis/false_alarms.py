@@ -1,0 +1,430 @@
+"""The false-alarm budget: which threshold gives which rate of false alarms, from motion that nobody touched.
+
+A detector's statistic is kept as its largest value per block of time. Values above a level u that are less than
+`CLUSTER_S` apart are one alarm, of which the largest value counts. What lies above u is described by a generalised
+Pareto tail (peaks over threshold), by probability-weighted moments:
+
+    rate(h) = rate(u) (1 + xi (h - u) / sigma)^(-1 / xi),          exponential at xi = 0
+
+Below u the alarms are counted. Confidence bounds come from resampled clusters and a Poisson number of them; they say
+how well the recorded motion determines the tail, and nothing about motion that was not recorded.
+
+A detector of several channels and joints is calibrated in two steps: each channel and joint for an equal share of the
+wanted rate, then all together by one factor, from the tail of the largest ratio of statistic to threshold. So channels
+that see the same noise share one alarm.
+
+Units: Nm where the statistic is a torque; rates per hour. Sources: Hosking and Wallis, "Parameter and quantile
+estimation for the generalized Pareto distribution", Technometrics 29 (1987); Coles, "An Introduction to Statistical
+Modeling of Extreme Values", 2001, chapters 4 and 5.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.records import Vector
+
+CLUSTER_S: Final = 0.5
+"""Values above a threshold that are nearer than this are one alarm."""
+FITTED_CLUSTERS: Final = (25, 400)
+"""Fewest and most clusters that a tail is fitted to; more lie too deep in the body, fewer say too little."""
+_SHAPES: Final = (-0.5, 0.25)
+"""Bounds of xi. Encoder counts and friction are bounded, so most tails end; a heavier tail than the upper bound has not
+been seen on contact-free motion and would make every extrapolation infinite."""
+_RESAMPLES: Final = 400
+_BISECTIONS: Final = 60
+_S_PER_H: Final = 3600.0
+
+
+class TooLittleMotionError(ValueError):
+    """The recorded motion can't give the asked figure; the message says what is missing."""
+
+
+def clusters(peaks: Vector, level: float, block_s: float) -> Vector:
+    """Give the largest value of each alarm above `level` (m,), of block maxima (B,); NaN blocks don't count."""
+    above = np.flatnonzero(np.nan_to_num(peaks, nan=-np.inf) > level)
+    if above.size == 0:
+        return np.zeros(0)
+    starts = np.flatnonzero(np.r_[True, np.diff(above) * block_s > CLUSTER_S])
+    return np.asarray(np.maximum.reduceat(peaks[above], starts))
+
+
+@dataclass(frozen=True)
+class Tail:
+    """The tail of one statistic."""
+
+    level: float  # u
+    scale: float  # sigma
+    shape: float  # xi
+    rate_per_h: float  # of alarms above u
+    hours: float
+    count: int  # clusters above u
+    largest: float  # value that was seen
+
+    def rate_at(self, threshold: float) -> float:
+        """Give the predicted alarms per hour at a threshold of at least the level."""
+        x = max(threshold - self.level, 0.0) / self.scale
+        if abs(self.shape) < 1e-9:
+            return self.rate_per_h * math.exp(-x)
+        inner = 1.0 + self.shape * x
+        return self.rate_per_h * math.pow(inner, -1.0 / self.shape) if inner > 0.0 else 0.0
+
+    def threshold_at(self, rate_per_h: float) -> float:
+        """Give the threshold of a rate of at most that at the level."""
+        ratio = self.rate_per_h / rate_per_h
+        if ratio <= 1.0:
+            return self.level
+        if abs(self.shape) < 1e-9:
+            return self.level + self.scale * math.log(ratio)
+        return self.level + self.scale / self.shape * (math.pow(ratio, self.shape) - 1.0)
+
+
+def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
+    """Fit scale and shape to excesses (..., m), sorted along the last axis, by probability-weighted moments."""
+    count = excesses.shape[-1]
+    weights = 1.0 - (np.arange(1, count + 1) - 0.35) / count
+    first = excesses.mean(axis=-1)
+    second = (excesses * weights).mean(axis=-1)
+    difference = np.maximum(first - 2.0 * second, 1e-12 * first)
+    shape = np.clip(2.0 - first / difference, *_SHAPES)
+    # with the shape bounded the scale follows from the mean, sigma / (1 - xi)
+    return np.maximum(first * (1.0 - shape), 1e-300), shape
+
+
+def counted_hours(peaks: Vector, block_s: float) -> float:
+    """Give the time that the block maxima (B,) stand for, without the NaN blocks, h."""
+    return float(np.count_nonzero(~np.isnan(peaks))) * block_s / _S_PER_H
+
+
+def threshold_by_count(peaks: Vector, block_s: float, alarms: float) -> float:
+    """Find the lowest threshold with at most that many alarms in the recording."""
+    low, high = float(np.nanmin(peaks)), float(np.nanmax(peaks))
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        if clusters(peaks, middle, block_s).size > alarms:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def fit_tail(peaks: Vector, block_s: float) -> Tail:
+    """Fit the tail of block maxima (B,). Raises TooLittleMotionError with fewer than 25 clusters to fit."""
+    hours = counted_hours(peaks, block_s)
+    least, most = FITTED_CLUSTERS
+    if hours * _S_PER_H < 4.0 * least * CLUSTER_S or float(np.nanmax(peaks)) <= float(np.nanmin(peaks)):
+        raise TooLittleMotionError(
+            f"{hours * _S_PER_H:.0f} s of contact-free motion are too few for a tail, "
+            f"at least {4.0 * least * CLUSTER_S:.0f} s that move are needed"
+        )
+    # one alarm in twenty intervals of CLUSTER_S: with more of them, they touch and are no longer alarms of their own
+    wanted = min(most, max(least, int(0.05 * hours * _S_PER_H / CLUSTER_S)))
+    levels = np.sort(peaks[~np.isnan(peaks)])[::-1]
+    level, found = math.inf, np.zeros(0)
+    for place in np.unique(np.geomspace(least, min(levels.size - 1, 40 * wanted), 16).astype(int)):
+        deeper = clusters(peaks, float(levels[place]), block_s)
+        if found.size < deeper.size <= wanted:
+            level, found = float(levels[place]), deeper
+    if found.size < least // 2:
+        raise TooLittleMotionError(f"only {found.size} peaks stand apart in {hours:.2f} h: the tail can't be told")
+    scale, shape = _moments_fit(np.sort(found - level))
+    return Tail(level, float(scale), float(shape), found.size / hours, hours, found.size, float(found.max()))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A threshold for a wanted rate."""
+
+    threshold: float
+    bound: float  # upper confidence bound of the threshold
+    rate_per_h: float  # wanted
+    rate_bound_per_h: float  # upper confidence bound of the rate at `threshold`
+    is_extrapolated: bool  # the wanted rate is below one alarm in the recorded time
+    tail: Tail
+
+
+def calibrate(peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95, seed: int = 0) -> Calibration:
+    """Find the threshold for a rate, with one-sided confidence bounds, from block maxima (B,).
+
+    Raises TooLittleMotionError.
+    """
+    tail = fit_tail(peaks, block_s)
+    generator = np.random.default_rng(seed)
+    if rate_per_h >= tail.rate_per_h:
+        alarms = rate_per_h * tail.hours
+        threshold = threshold_by_count(peaks, block_s, alarms)
+        deviation = 1.6448536269514722 * math.sqrt(alarms)
+        bound = threshold_by_count(peaks, block_s, max(alarms - deviation, 0.0))
+        return Calibration(threshold, bound, rate_per_h, (alarms + deviation) / tail.hours, False, tail)
+    threshold = tail.threshold_at(rate_per_h)
+    excesses = clusters(peaks, tail.level, block_s) - tail.level
+    drawn = np.sort(generator.choice(excesses, (_RESAMPLES, tail.count)), axis=1)
+    scales, shapes = _moments_fit(drawn)
+    rates = generator.poisson(tail.count, _RESAMPLES) / tail.hours
+    others = [
+        Tail(tail.level, float(scale), float(shape), max(float(rate), 1e-9), tail.hours, tail.count, tail.largest)
+        for scale, shape, rate in zip(scales, shapes, rates, strict=True)
+    ]
+    bound = float(np.quantile([other.threshold_at(rate_per_h) for other in others], confidence))
+    rate_bound = float(np.quantile([other.rate_at(threshold) for other in others], confidence))
+    return Calibration(
+        threshold, max(bound, threshold), rate_per_h, max(rate_bound, rate_per_h), rate_per_h * tail.hours < 1.0, tail
+    )
+
+
+@dataclass(frozen=True)
+class DetectorCalibration:
+    """The thresholds of a detector: per channel and joint, and what all of them together do."""
+
+    thresholds: Vector  # (channels, n)
+    calibration: Calibration  # of the largest ratio of statistic to threshold; `threshold` is 1
+
+    def ratio(self, peaks: Vector) -> Vector:
+        """Give the largest ratio of statistic to threshold per block (B,), of block maxima (B, channels, n)."""
+        return largest_ratio(peaks, self.thresholds)
+
+
+def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:
+    """Divide block maxima (B, channels, n) by thresholds (channels, n) and take the largest of each block (B,)."""
+    return np.asarray((peaks / thresholds).max(axis=(1, 2)))
+
+
+def calibrate_detector(
+    peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95
+) -> DetectorCalibration:
+    """Find the thresholds of a detector, an alarm being an alarm of any channel and joint; peaks (B, channels, n).
+
+    Raises TooLittleMotionError.
+    """
+    share = rate_per_h / (peaks.shape[1] * peaks.shape[2])
+    thresholds = np.array(
+        [
+            [calibrate(peaks[:, row, i], block_s, share, confidence).threshold for i in range(peaks.shape[2])]
+            for row in range(peaks.shape[1])
+        ]
+    )
+    together = calibrate(largest_ratio(peaks, thresholds), block_s, rate_per_h, confidence)
+    thresholds *= together.threshold
+    return DetectorCalibration(thresholds, calibrate(largest_ratio(peaks, thresholds), block_s, rate_per_h, confidence))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A predicted rate and what held-out motion did."""
+
+    predicted_per_h: float
+    counted: int
+    hours: float
+
+    @property
+    def measured_per_h(self) -> float:
+        """Alarms per hour."""
+        return self.counted / self.hours
+
+    @property
+    def factor(self) -> float:
+        """Measured over predicted."""
+        return self.measured_per_h / self.predicted_per_h
+
+
+def compare_with(peaks: Vector, held_out: Vector, block_s: float, rates_per_h: Sequence[float]) -> list[Prediction]:
+    """Find thresholds from one recording and count the alarms of another; block maxima (B,) each."""
+    hours = counted_hours(held_out, block_s)
+    return [
+        Prediction(rate, clusters(held_out, calibrate(peaks, block_s, rate).threshold, block_s).size, hours)
+        for rate in rates_per_h
+    ]
+
+
+@dataclass(frozen=True)
+class Source:
+    """One thing that keeps a threshold up."""
+
+    name: str
+    peak_Nm: float  # what it alone would need
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.peak_Nm:.4f} Nm"
+
+
+def resolution(values: Vector) -> float:
+    """Find the step of a quantised series (n,): the smallest difference of two of its values, 0 if it never changes."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 1e-9 * max(float(np.abs(values).max()), 1e-300)]
+    return float(steps.min()) if steps.size else 0.0
+
+
+def white_noise(values: Vector) -> float:
+    """Estimate the standard deviation of white noise on a smooth series (n,) by its second differences; robust."""
+    second = np.diff(values, 2)
+    return float(np.median(np.abs(second - np.median(second))) / 0.6744897501960817 / math.sqrt(6.0))
+
+
+def impulse_response(poles_rad_s: Sequence[float], period_s: float) -> Vector:
+    """Give the response (L,) of low-passes in a row to one sample of 1, until it has died away."""
+    length = int(12.0 / min(poles_rad_s) / period_s) + 2
+    response = np.zeros(length)
+    response[0] = 1.0
+    for pole in poles_rad_s:
+        decay = math.exp(-pole * period_s)
+        state = 0.0
+        for k in range(length):
+            state = response[k] + decay * (state - response[k])
+            response[k] = state
+    return response
+
+
+def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:
+    """Give what white noise of 1 per sample becomes behind the filter: of the torque, Nm per Nm, and of the momentum.
+
+    The second is in Nm per kg m² rad/s. The stream takes the mean of two torques less lag times their slope.
+    """
+    h = np.r_[impulse_response(poles_rad_s, period_s), 0.0]
+    before = np.r_[0.0, h[:-1]]
+    torque = h * (0.5 - lag_s / period_s) + before * (0.5 + lag_s / period_s)
+    return float(np.linalg.norm(torque)), float(np.linalg.norm(h - before) / period_s)
+
+
+def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
+    """Give how many standard deviations Gaussian noise of that bandwidth exceeds so often, by Rice's formula."""
+    crossings_per_h = 2.0 * bandwidth_rad_s / (2.0 * math.pi) * _S_PER_H
+    return math.sqrt(2.0 * math.log(max(crossings_per_h / rate_per_h, math.e)))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What keeps the threshold of one low-pass channel and joint up, largest first, for a wanted rate."""
+
+    sources: tuple[Source, ...]
+    achievable_Nm: float
+    """All random sources together: what is left if lag and friction were known exactly."""
+
+    @property
+    def limit(self) -> str:
+        """Name the largest source."""
+        return self.sources[0].name
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """What the measurements of one joint are, as far as a threshold depends on it."""
+
+    torque_noise_Nm: float
+    torque_LSB_Nm: float
+    velocity_LSB_rad_s: float
+    mass_row_kg_m2: float  # norm of the joint's row of M(q) where that is largest
+    lag_error_s: float
+    friction_error_Nm: float
+
+
+def find_limits(
+    z: Vector,
+    tau_J: Vector,
+    held_Nm: Vector,
+    sensing: Sensing,
+    poles_rad_s: Sequence[float],
+    period_s: float,
+    lag_s: float,
+    rate_per_h: float,
+) -> Limits:
+    """Split the threshold of a low-pass channel of one joint by its sources, from contact-free motion (N,).
+
+    Random sources are taken at the height that Gaussian noise exceeds at the wanted rate. The velocity's noise beyond
+    its resolution is what the stream has, while the joint moves, that torque noise and resolutions don't explain. An
+    error of the lag counts with the steepest torque, one of the friction as it is; what friction holds at standstill
+    raises the threshold there and is no part of it.
+    """
+    torque, momentum = gains(poles_rad_s, period_s, lag_s)
+    factor = peak_factor(rate_per_h, min(poles_rad_s))
+    held = low_pass(held_Nm, poles_rad_s, period_s)
+    moves = held <= 0.01 * max(float(held_Nm.max()), 1e-300)
+    x = low_pass(z, poles_rad_s, period_s)[moves]
+    slope = low_pass(np.r_[0.0, np.diff(tau_J)] / period_s, poles_rad_s, period_s)
+    random = {
+        "torque noise": torque * sensing.torque_noise_Nm,
+        "torque LSB": torque * sensing.torque_LSB_Nm / math.sqrt(12.0),
+        "velocity LSB": momentum * sensing.mass_row_kg_m2 * sensing.velocity_LSB_rad_s / math.sqrt(12.0),
+    }
+    total = float(np.var(x)) if x.size else 0.0
+    random["velocity noise"] = math.sqrt(max(total - sum(rms_Nm**2 for rms_Nm in random.values()), 0.0))
+    sources = [Source(name, factor * rms_Nm) for name, rms_Nm in random.items()]
+    achievable = math.sqrt(sum(source.peak_Nm**2 for source in sources))
+    sources += [
+        Source("lag", abs(sensing.lag_error_s) * float(np.abs(slope).max())),
+        Source("friction", abs(sensing.friction_error_Nm)),
+    ]
+    return Limits(tuple(sorted(sources, key=lambda source: -source.peak_Nm)), achievable)
+
+
+def low_pass(u: Vector, poles_rad_s: Sequence[float], period_s: float) -> Vector:
+    """Take a series (n,) through low-passes in a row that were at rest before."""
+    from scipy.signal import lfilter  # half a second to load, which the watch below can spare
+
+    for pole in poles_rad_s:
+        decay = math.exp(-pole * period_s)
+        u = np.asarray(lfilter([1.0 - decay], [1.0, -decay], u))
+    return u
+
+
+class MarginWatch:
+    """Watches how far the contact-free peaks stay below the thresholds while a run goes on.
+
+    Fed once per block, of a second say, with the largest ratio of statistic to threshold of each joint. The margin is
+    one over the largest ratio to be expected within the horizon, by a Gumbel law for block maxima whose mean and
+    deviation follow the last blocks; bounded tails stay below it.
+    """
+
+    def __init__(
+        self, joints: int, horizon_blocks: float = 3600.0, memory_blocks: float = 300.0, warn_share: float = 0.75
+    ) -> None:
+        """Begin without a reference. horizon: 3600 blocks of 1 s are an hour. warn_share: of the first margin."""
+        self._forget = 1.0 / memory_blocks
+        self._horizon = math.log(horizon_blocks)
+        self._warn_share = warn_share
+        self._mean = np.zeros(joints)
+        self._square = np.zeros(joints)
+        self._blocks = 0
+        self._settled = round(memory_blocks)
+        self.reference: Vector | None = None
+        """Margin per joint (n,) when the watch had settled; None until then."""
+
+    def add(self, ratio: Vector) -> None:
+        """Take in one contact-free block's largest ratio of each joint (n,); one that isn't finite is left out."""
+        if not np.isfinite(ratio).all():
+            return
+        self._blocks += 1
+        share = max(self._forget, 1.0 / self._blocks)
+        self._mean += share * (ratio - self._mean)
+        self._square += share * (ratio * ratio - self._square)
+        if self._blocks == self._settled:
+            self.reference = self.margin
+
+    def restart(self) -> None:
+        """Forget everything: the model or the thresholds have changed."""
+        self._blocks = 0
+        self.reference = None
+
+    @property
+    def margin(self) -> Vector:
+        """Threshold over expected peak of each joint (n,); infinite before the first block."""
+        if self._blocks == 0:
+            return np.full(self._mean.shape, np.inf)
+        scale = np.sqrt(np.maximum(self._square - self._mean**2, 0.0)) * math.sqrt(6.0) / math.pi
+        # mode of the largest of so many: mean - Euler's constant * scale + ln(horizon) * scale
+        expected = self._mean + (self._horizon - 0.5772156649015329) * scale
+        return np.asarray(1.0 / np.maximum(expected, 1e-9))
+
+    @property
+    def warning(self) -> str:
+        """Say which joint's margin has shrunk: `joint 1: margin 1.4 x, was 2.1 x`; "" while none has."""
+        if self.reference is None:
+            return ""
+        margin = self.margin
+        shrunk: NDArray[np.bool_] = margin < self._warn_share * self.reference
+        return "; ".join(
+            f"joint {i + 1}: margin {margin[i]:.1f} x, was {self.reference[i]:.1f} x" for i in np.flatnonzero(shrunk)
+        )

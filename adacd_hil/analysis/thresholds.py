@@ -1,0 +1,352 @@
+"""Thresholds from logs: the recorded motion that nobody touched, each detector's statistics on it, what they allow.
+
+Of a log counts what lies in MONITOR at least `APART_S` after its beginning, after a gap and after a contact, and at
+least as long before one. A touch that no detector flagged counts as motion, and raises the thresholds.
+
+The velocity's lag is identified from the same motion: what the filtered slope of the torque explains of the stream.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.false_alarms import (
+    Limits,
+    Prediction,
+    Sensing,
+    TooLittleMotionError,
+    calibrate_detector,
+    clusters,
+    counted_hours,
+    find_limits,
+    gains,
+    low_pass,
+    resolution,
+    white_noise,
+)
+from adacd_hil.config import setting
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.scheme import detectors
+from adacd_hil.scheme.regressor import mass_matrix
+
+APART_S: Final = 0.6
+"""Six time constants of the slowest filter."""
+BLOCK_S: Final = 0.1
+TOPICS: Final = ("/scheme",)
+_NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
+_LONGEST_LAG_S: Final = 5e-3
+_MODEL_RAD_S: Final = 20.0
+"""Below this the model's errors stand out of the noise."""
+_CHECKED_ALARMS: Final = 20.0  # of the held-out half: so many are counted well enough to compare with the prediction
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A recording of N samples; `is_free` (N,) where nobody touched the arm and the model was frozen."""
+
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+    theta: Vector  # (N, p)
+    interval_s: Vector  # (N,), 0 after a gap
+    is_free: NDArray[np.bool_]
+    period_s: float
+
+
+def motion_from_log(log: RunLog) -> Motion:
+    """Take the contact-free motion out of a log. Raises LogError when there is none."""
+    scheme = log.scheme
+    if len(scheme) == 0:
+        raise LogError(f"log {log.path} has no /scheme")
+    cycle = scheme["cycle"].astype(np.int64)
+    interval_s = scheme["period_s"].reshape(-1).copy()
+    measured = interval_s[interval_s > 0.0]
+    if measured.size == 0:
+        raise LogError(f"log {log.path} has no measured period")
+    period_s = float(np.median(measured))
+    is_near = (interval_s >= _NEAR[0] * period_s) & (interval_s <= _NEAR[1] * period_s)
+    interval_s[~is_near | (np.diff(cycle, prepend=cycle[0] - 2) != 1)] = 0.0
+    finite = np.isfinite(scheme["q"]).all(axis=1) & np.isfinite(scheme["tau_J"]).all(axis=1)
+    finite &= np.isfinite(scheme["dq"]).all(axis=1) & np.isfinite(scheme["theta_hat"]).all(axis=1)
+    is_free = finite & (scheme["state"] == SchemeState.MONITOR) & (scheme["contact_joints"] == 0) & (interval_s > 0.0)
+    motion = Motion(
+        q=scheme["q"],
+        dq=scheme["dq"],
+        tau_J=scheme["tau_J"],
+        theta=scheme["theta_hat"],
+        interval_s=interval_s,
+        is_free=_away_from(~is_free, round(APART_S / period_s)),
+        period_s=period_s,
+    )
+    if not motion.is_free.any():
+        raise LogError(f"log {log.path} has no motion in MONITOR that is free of contact")
+    return motion
+
+
+def _away_from(is_bad: NDArray[np.bool_], samples: int) -> NDArray[np.bool_]:
+    """Tell which samples have no bad one within so many samples."""
+    counted = np.r_[0, np.cumsum(is_bad)]
+    places = np.arange(is_bad.size)
+    first, last = np.maximum(places - samples, 0), np.minimum(places + samples + 1, is_bad.size)
+    return np.asarray(counted[last] == counted[first])
+
+
+def find_lag(motion: Motion) -> tuple[float, Vector]:
+    """Identify the velocity's lag behind the torque, s: of both joints together, and of each (n,); from 0 to 5 ms.
+
+    Where the torque never changes, the lag is the usual one.
+    """
+    z, _ = detectors.make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
+    moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
+    _, slope_gain = gains((_MODEL_RAD_S,), motion.period_s, 0.0)
+    top, bottom = np.zeros(JOINTS), np.zeros(JOINTS)
+    for i in range(JOINTS):
+        slope = np.diff(motion.tau_J[:, i], prepend=motion.tau_J[0, i]) / motion.period_s
+        explained, by = (
+            low_pass(series * motion.is_free, (_MODEL_RAD_S,), motion.period_s)[moving] for series in (z[:, i], slope)
+        )
+        top[i] = -float(explained @ by)
+        # the noise of the torque has a slope too, of which the stream knows nothing
+        bottom[i] = float(by @ by) - by.size * (slope_gain * white_noise(motion.tau_J[:, i])) ** 2
+    if not (bottom > 0.0).any():
+        return detectors.VELOCITY_LAG_S, np.full(JOINTS, detectors.VELOCITY_LAG_S)
+    known = np.maximum(bottom, 0.0)
+    lag_s = min(max(float(top[known > 0.0].sum() / known.sum()), 0.0), _LONGEST_LAG_S)
+    each = np.where(known > 0.0, top / np.where(known > 0.0, known, 1.0), lag_s)
+    return lag_s, np.clip(each, 0.0, _LONGEST_LAG_S)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """The detectors' statistics on contact-free motion, and the stream that they come from."""
+
+    settings: detectors.DetectorSettings
+    weights: Vector  # (n, N, L), of the likelihood channels
+    peaks: Vector  # (B, channels, n), NaN where not all samples of a block are free
+    z: Vector  # (N, n), 0 where not free
+    held_Nm: Vector
+    is_free: NDArray[np.bool_]
+    motion: Motion
+    lag_s: float
+    lag_of_joint_s: Vector  # (n,)
+
+    @property
+    def hours(self) -> float:
+        """Contact-free time, h."""
+        return counted_hours(self.peaks[:, 0, 0], BLOCK_S)
+
+
+def join_motions(motions: Sequence[Motion]) -> Motion:
+    """Put recordings one after the other; raises LogError unless their periods and parameters fit together."""
+    first = motions[0]
+    for other in motions[1:]:
+        if abs(other.period_s - first.period_s) > 0.02 * first.period_s:
+            raise LogError(f"periods of {1e3 * first.period_s:.3f} and {1e3 * other.period_s:.3f} ms don't go together")
+        if other.theta.shape[1] != first.theta.shape[1]:
+            raise LogError(f"{first.theta.shape[1]} and {other.theta.shape[1]} parameters don't go together")
+    is_free = np.concatenate([motion.is_free for motion in motions])
+    interval_s = np.concatenate([np.r_[0.0, motion.interval_s[1:]] for motion in motions])
+    return Motion(
+        q=np.concatenate([motion.q for motion in motions]),
+        dq=np.concatenate([motion.dq for motion in motions]),
+        tau_J=np.concatenate([motion.tau_J for motion in motions]),
+        theta=np.concatenate([motion.theta for motion in motions]),
+        interval_s=interval_s,
+        is_free=is_free,
+        period_s=first.period_s,
+    )
+
+
+def run_detectors(motion: Motion, settings: detectors.DetectorSettings) -> Statistics:
+    """Run every detector over a recording. Raises TooLittleMotionError."""
+    lag_s, lag_of_joint_s = find_lag(motion)
+    z, held_Nm = detectors.make_stream(
+        motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s, settings.standstill_rad_s
+    )
+    free = motion.is_free
+    z[~free] = 0.0
+    held_Nm[~free] = 0.0
+    try:
+        weights = detectors.likelihood_weights(z[free], settings, lag_s, motion.period_s)
+    except ValueError as error:
+        raise TooLittleMotionError(f"{free.sum()} contact-free samples: {error}") from None
+    constants = detectors.constants_of(settings, weights, motion.period_s)
+    block = round(BLOCK_S / motion.period_s)
+    peaks = np.zeros((-(-len(z) // block), len(settings.channels), JOINTS))
+    detectors.record(constants, detectors.new_memory(constants), z, held_Nm, block, peaks)
+    whole = np.logical_and.reduceat(free, np.arange(0, len(free), block))
+    peaks[~whole] = np.nan
+    return Statistics(settings, weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
+
+
+@dataclass(frozen=True)
+class ChannelRow:
+    """One channel of a detector, a row of the thresholds file."""
+
+    detector: str = setting(meaning="name of the detector")
+    channel: str = setting(meaning="name of the channel")
+    threshold: tuple[float, ...] = setting(low=0.0, meaning="per joint; Nm, but sigmas of likelihood and Nm s of cusum")
+    limit: tuple[str, ...] = setting(meaning="what keeps it up, per joint; empty where it can't be split")
+    achievable_Nm: tuple[float, ...] = setting(
+        unit="Nm", low=0.0, meaning="per joint, with lag and friction known exactly; empty where it can't be split"
+    )
+
+
+@dataclass(frozen=True)
+class DetectorRow:
+    """What all thresholds of a detector do together, a row of the thresholds file."""
+
+    name: str = setting(meaning="name of the detector")
+    rate_bound_per_h: float = setting(unit="1/h", low=0.0, meaning="upper 95 % bound of the rate of false alarms")
+    bound_ratio: float = setting(low=0.0, meaning="factor on the thresholds with which the bound is the wanted rate")
+    predicted_per_h: float | None = setting(
+        None, unit="1/h", low=0.0, meaning="rate predicted from one half of the motion; absent: too short"
+    )
+    measured_per_h: float | None = setting(None, unit="1/h", low=0.0, meaning="rate counted in the other half")
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Thresholds for a wanted rate of false alarms, and how sure they are."""
+
+    rate_per_h: float = setting(unit="1/h", low=1e-6, high=1e4, meaning="wanted false alarms per hour of a detector")
+    hours: float = setting(unit="h", low=0.0, meaning="contact-free motion that they come from")
+    is_extrapolated: bool = setting(meaning="less than one alarm is expected in that motion")
+    lag_s: float = setting(unit="s", low=0.0, high=1.0, meaning="lag of the velocity, identified")
+    logs: tuple[str, ...] = setting(meaning="where the motion is from")
+    missing: tuple[str, ...] = setting(meaning="detectors whose tail this motion can't tell")
+    detectors: tuple[DetectorRow, ...] = setting(meaning="the detectors")
+    channels: tuple[ChannelRow, ...] = setting(meaning="their channels")
+
+
+def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence[str] = ()) -> Thresholds:
+    """Calibrate all detectors. Raises TooLittleMotionError."""
+    rows, channels, missing = [], [], []
+    problem: TooLittleMotionError | None = None
+    limits = channel_limits(statistics, rate_per_h)
+    is_extrapolated = False
+    for name, places in statistics.settings.detectors.items():
+        peaks = statistics.peaks[:, list(places), :]
+        try:
+            found = calibrate_detector(peaks, BLOCK_S, rate_per_h)
+        except TooLittleMotionError as error:
+            problem = error
+            missing.append(name)
+            continue
+        check = check_prediction(peaks)
+        is_extrapolated = is_extrapolated or found.calibration.is_extrapolated
+        rows.append(
+            DetectorRow(
+                name,
+                found.calibration.rate_bound_per_h,
+                found.calibration.bound / found.calibration.threshold,
+                None if check is None else check.predicted_per_h,
+                None if check is None else check.measured_per_h,
+            )
+        )
+        for row, place in enumerate(places):
+            split = limits.get(statistics.settings.channels[place], ())
+            channels.append(
+                ChannelRow(
+                    name,
+                    statistics.settings.channels[place],
+                    tuple(found.thresholds[row].tolist()),
+                    tuple(limit.limit for limit in split),
+                    tuple(limit.achievable_Nm for limit in split),
+                )
+            )
+    if problem is not None and not rows:
+        raise problem
+    return Thresholds(
+        rate_per_h=rate_per_h,
+        hours=statistics.hours,
+        is_extrapolated=is_extrapolated,
+        lag_s=statistics.lag_s,
+        logs=tuple(logs),
+        missing=tuple(missing),
+        detectors=tuple(rows),
+        channels=tuple(channels),
+    )
+
+
+def check_prediction(peaks: Vector) -> Prediction | None:
+    """Calibrate a detector on every other tenth of the motion for a rate that the rest can count; count it there.
+
+    None if half of the motion is too little.
+    """
+    tenth = -(-len(peaks) // 10)
+    is_first = np.arange(len(peaks)) // tenth % 2 == 0
+    seen, held_out = peaks.copy(), peaks.copy()
+    seen[~is_first] = np.nan
+    held_out[is_first] = np.nan
+    hours = counted_hours(held_out[:, 0, 0], BLOCK_S)
+    try:
+        rate = _CHECKED_ALARMS / hours
+        found = calibrate_detector(seen, BLOCK_S, rate)
+    except (TooLittleMotionError, ZeroDivisionError):
+        return None
+    return Prediction(rate, clusters(found.ratio(held_out), 1.0, BLOCK_S).size, hours)
+
+
+def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[Limits, ...]]:
+    """Split the thresholds of the low-pass channels by their sources; per channel a tuple over the joints."""
+    settings, motion, free = statistics.settings, statistics.motion, statistics.is_free
+    places = np.flatnonzero(free)
+    masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
+    largest = np.linalg.norm(masses, axis=2).max(axis=0)
+    sensing = []
+    for i in range(JOINTS):
+        torque_LSB = resolution(motion.tau_J[free, i])
+        moves = statistics.held_Nm[free, i] == 0.0
+        x = low_pass(statistics.z[free, i], (_MODEL_RAD_S,), motion.period_s)[moves]
+        direction = low_pass(np.sign(motion.dq[free, i]), (_MODEL_RAD_S,), motion.period_s)[moves]
+        sensing.append(
+            Sensing(
+                torque_noise_Nm=max(white_noise(motion.tau_J[free, i]) ** 2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
+                torque_LSB_Nm=torque_LSB,
+                velocity_LSB_rad_s=resolution(motion.dq[free, i]),
+                mass_row_kg_m2=float(largest[i]),
+                lag_error_s=float(statistics.lag_of_joint_s[i] - statistics.lag_s),
+                friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
+            )
+        )
+    more = (settings.smoothing_rad_s,)
+    kinds: tuple[tuple[str, tuple[float, ...]], ...] = (("first-order", ()), ("smoothed", more))
+    return {
+        f"{kind} {cutoff:g}": tuple(
+            find_limits(
+                statistics.z[free, i],
+                motion.tau_J[free, i],
+                statistics.held_Nm[free, i],
+                sensing[i],
+                (cutoff, *poles),
+                motion.period_s,
+                statistics.lag_s,
+                rate_per_h,
+            )
+            for i in range(JOINTS)
+        )
+        for kind, poles in kinds
+        for cutoff in settings.cutoff_rad_s
+    }
+
+
+def thresholds_of_logs(paths: Sequence[Path], rate_per_h: float) -> tuple[Thresholds, Statistics]:
+    """Read logs and calibrate all detectors on what nobody touched.
+
+    Raises LogError for a log that can't be used, TooLittleMotionError when all together are too short.
+    """
+    motions = []
+    for path in paths:
+        motion = motion_from_log(read_log(path, TOPICS))
+        if motion.theta.shape[1] < len(PARAMETER_NAMES):
+            raise LogError(f"log {path} has {motion.theta.shape[1]} parameters")
+        motions.append(motion)
+    statistics = run_detectors(join_motions(motions), detectors.DetectorSettings())
+    return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics

@@ -1,0 +1,84 @@
+"""Thresholds from recorded motion: the command's work and its table."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+from adacd_hil.analysis.detector_comparison import Comparison, compare_detectors, write_comparison
+from adacd_hil.analysis.false_alarms import TooLittleMotionError
+from adacd_hil.analysis.thresholds import Thresholds, thresholds_of_logs
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.table import format_table
+from adacd_hil.config import to_toml
+from adacd_hil.control.session import LOG_NAME
+
+
+def find(
+    logs: tuple[Path, ...], rate_per_h: float, out: Path | None, report: Path | None
+) -> tuple[Thresholds, Comparison | None]:
+    """Find the thresholds, write them and the comparison where asked for. Raises LogError, CommandError."""
+    paths = [given / LOG_NAME if given.is_dir() else given for given in logs]
+    try:
+        thresholds, statistics = thresholds_of_logs(paths, rate_per_h)
+        comparison = None if report is None else compare_detectors(statistics, rate_per_h)
+    except TooLittleMotionError as error:
+        raise CommandError(str(error), ExitCode.FAILURE) from None
+    if report is not None and comparison is not None:
+        write_comparison(comparison, report)
+    if out is not None:
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            out.write_text(to_toml(thresholds), encoding="utf-8")
+        except OSError as error:
+            raise CommandError(f"{out} can't be written: {error.strerror}", ExitCode.FAILURE) from None
+    return thresholds, comparison
+
+
+def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
+    """Write both as JSON."""
+    content = dataclasses.asdict(thresholds)
+    if comparison is not None:
+        content["comparison"] = comparison.as_json()
+    return json.dumps(content, indent=2, allow_nan=False)
+
+
+def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
+    """Write both as tables."""
+    lines = [
+        f"{thresholds.rate_per_h:g} false alarms per hour, from {thresholds.hours:.2f} h of contact-free motion"
+        + (", extrapolated" if thresholds.is_extrapolated else "")
+        + f"; the velocity lags by {1e3 * thresholds.lag_s:.2f} ms",
+        "",
+    ]
+    rows = []
+    for row in thresholds.channels:
+        for i, threshold in enumerate(row.threshold):
+            unit = {"likelihood": "sigmas", "cusum": "Nm s"}.get(row.channel.split(" ", maxsplit=1)[0], "Nm")
+            rows.append(
+                (
+                    row.detector,
+                    row.channel,
+                    str(i + 1),
+                    f"{threshold:.4g} {unit}",
+                    f"{row.achievable_Nm[i]:.4f} Nm" if row.achievable_Nm else "",
+                    row.limit[i] if row.limit else "",
+                )
+            )
+    lines += [format_table(("detector", "channel", "joint", "threshold", "achievable", "limited by"), rows, (2, 3, 4))]
+    checks = [
+        (
+            row.name,
+            f"{row.rate_bound_per_h:.2g}",
+            f"x {row.bound_ratio:.2f}",
+            "too short" if row.predicted_per_h is None else f"{row.predicted_per_h:.3g}",
+            "" if row.measured_per_h is None else f"{row.measured_per_h:.3g}",
+        )
+        for row in thresholds.detectors
+    ]
+    head = ("detector", "95 % bound, 1/h", "to be sure", "held out: predicted, 1/h", "measured, 1/h")
+    lines += ["", format_table(head, checks, (1, 2, 3, 4))]
+    if thresholds.missing:
+        lines += ["", f"Too little motion for: {', '.join(thresholds.missing)}"]
+    if comparison is not None:
+        lines += ["", "Median delay of a step, ms, best detector first:", format_table(*comparison.table())]
+    return "\n".join(lines)

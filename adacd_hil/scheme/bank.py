@@ -1,0 +1,99 @@
+"""The bank of filters: the torque filter of eq. (16) with several cut-offs on one stream, each with its own regressor.
+
+A filter that is slow keeps noise and short errors of the model down and finds the smallest torque; one that is fast
+finds a larger one sooner. Each obeys the equations of `adacd_hil.scheme.filters` with b = a, so its DC gain is 1.
+
+Beside the columns of the dynamic parameters a filtered regressor has those of the torque sensors' offsets (input 1)
+and of the lag by which the measured velocity is older than the torque. For a lag d the torque that belongs to the
+measured motion is tau_J(t - d), so tau_J = W theta + d tau_J' to first order, and the filtered derivative needs no
+differentiation: F s tau_J = a (tau_J - tau_f).
+
+Shapes: C filters, n joints, p columns. cutoff, decay, weight_old, weight_new (C,); Y_p, Y_h (n, p); tau_f (C, n);
+S, W_f, input_old (C, n, p). Units: rad/s, Nm.
+"""
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import Vector
+from adacd_hil.scheme import filters
+
+
+@compiled
+def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old: Vector, weight_new: Vector) -> None:
+    """Fill what one period does to each filter (C,)."""
+    for c in range(cutoff_rad_s.shape[0]):
+        decay[c], weight_old[c], weight_new[c] = filters.first_order_hold(cutoff_rad_s[c], cutoff_rad_s[c], period_s)
+
+
+@compiled
+def advance(
+    cutoff_rad_s: Vector,
+    decay: Vector,
+    weight_old: Vector,
+    weight_new: Vector,
+    Y_p: Vector,
+    Y_h: Vector,
+    tau_J: Vector,
+    tau_old: Vector,
+    input_old: Vector,
+    S: Vector,
+    tau_f: Vector,
+    W_f: Vector,
+) -> None:
+    """Take all filters over one period in place; tau_J (n,) becomes tau_old."""
+    for c in range(cutoff_rad_s.shape[0]):
+        filters.advance_torque(decay[c], weight_old[c], weight_new[c], tau_old[c], tau_J, tau_f[c])
+        a = cutoff_rad_s[c]
+        filters.advance_regressor(
+            decay[c], weight_old[c], weight_new[c], a, a, Y_p, Y_h, input_old[c], S[c], W_f[c]
+        )  # fmt: skip
+
+
+@compiled
+def resume(
+    cutoff_rad_s: Vector,
+    Y_p: Vector,
+    Y_h: Vector,
+    tau_J: Vector,
+    tau_old: Vector,
+    input_old: Vector,
+    S: Vector,
+    W_f: Vector,
+) -> None:
+    """Start again from this sample after a gap, with tau_f and W_f as they were; see `filters`."""
+    for c in range(cutoff_rad_s.shape[0]):
+        filters.resume(cutoff_rad_s[c], cutoff_rad_s[c], Y_p, Y_h, tau_J, input_old[c], tau_old[c], S[c], W_f[c])
+
+
+@compiled
+def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: int, W_f: Vector) -> None:
+    """Fill the columns of the lag, one per joint from `first_column` on: the filtered derivative of the torque."""
+    for c in range(cutoff_rad_s.shape[0]):
+        for i in range(tau_J.shape[0]):
+            W_f[c, i, first_column + i] = cutoff_rad_s[c] * (tau_J[i] - tau_f[c, i])
+
+
+@compiled
+def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Vector) -> None:
+    """Fill the external torque (C, n) that each filter sees, Nm: eq. (13) with our sign, for filters with DC gain 1."""
+    for c in range(W_f.shape[0]):
+        for i in range(W_f.shape[1]):
+            total = -tau_f[c, i]
+            for j in range(W_f.shape[2]):
+                total += W_f[c, i, j] * theta[j]
+            tau_ext_hat[c, i] = total
+
+
+@compiled
+def smooth(smoothing: float, r: Vector, y: Vector) -> None:
+    """Take the channels y (2 C - 1, n) over one period: r (C, n) through a second low-pass, then all but r[0] as is.
+
+    The drive's velocity noise rises with frequency up to the bandwidth of its tracking loop. A first-order filter
+    passes it on through the momentum undiminished; a second pole takes it away, for a few milliseconds of a small
+    step's detection. What is large enough is found in the bare residual first.
+    """
+    count = r.shape[0]
+    for c in range(count):
+        for i in range(r.shape[1]):
+            y[c, i] = r[c, i] + smoothing * (y[c, i] - r[c, i])
+            if c > 0:
+                y[count + c - 1, i] = r[c, i]

@@ -1,0 +1,112 @@
+"""What is believed of the parameters: mean theta and covariance P, corrected by samples that have waited.
+
+The prior says in honest units what an arm may be; recursive least squares (`estimator`) corrects it. A filtered sample
+is no independent measurement: the noise of a filter of cut-off a is correlated over about 2 / a. A sample every
+T_learn therefore counts with the variance
+
+    R = sigma² 2 / (a T_learn),    sigma: what a good model leaves in the filtered residual, Nm rms,
+
+so that P means what it says.
+
+**Payload.** One of mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this
+direction g by sigma_m² g g', and a little in each inertia for what is no point mass. All else stays known.
+
+**Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
+
+Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau (h, n).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import Vector
+from adacd_hil.scheme import estimator
+
+
+@compiled
+def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
+    """Set theta (p,) and P (p, p) to the prior and its standard deviations (p,)."""
+    theta[:] = prior
+    P[:] = 0.0
+    for j in range(theta.shape[0]):
+        P[j, j] = prior_std[j] ** 2
+
+
+@compiled
+def add_payload(direction: Vector, payload_std_kg: float, inertia_std: float, P: Vector) -> None:
+    """Widen P (p, p) in place by a payload: mass along `direction` (p,), and a rest in each of its parameters."""
+    for j in range(direction.shape[0]):
+        for k in range(direction.shape[0]):
+            P[j, k] += payload_std_kg**2 * direction[j] * direction[k]
+        if direction[j] != 0.0:
+            P[j, j] += inertia_std**2
+
+
+@compiled
+def wander(drift_std: Vector, elapsed_s: float, P: Vector) -> None:
+    """Widen P (p, p) in place by a random walk of the parameters, `drift_std` (p,) per √s."""
+    for j in range(drift_std.shape[0]):
+        P[j, j] += drift_std[j] ** 2 * elapsed_s
+
+
+@compiled
+def learn(c: Any, m: Any, W_f: Vector, tau_f: Vector) -> bool:
+    """Put this sample into the ring, and correct the belief by the one that has waited long enough, if one has.
+
+    W_f (n, p), tau_f (n,): of the filter that is learnt from. Return whether the belief has changed.
+    """
+    m["since_learnt"] += 1.0
+    if m["since_learnt"] < c["learn_every"]:
+        return False
+    m["since_learnt"] = 0.0
+    place = int(m["ring_next"])
+    has_waited = m["ring_used"] == m["ring_tau"].shape[0]
+    if has_waited:
+        estimator.update(
+            m["ring_W"][place], m["ring_tau"][place], c["R"], True, m["belief"], m["P_belief"], m["v"], m["K"]
+        )
+    else:
+        m["ring_used"] += 1.0
+    m["ring_W"][place] = W_f
+    m["ring_tau"][place] = tau_f
+    m["ring_next"] = (place + 1) % m["ring_tau"].shape[0]
+    return bool(has_waited)
+
+
+@compiled
+def discard(m: Any) -> None:
+    """Throw away the samples that wait."""
+    m["ring_used"] = 0.0
+    m["since_learnt"] = 0.0
+
+
+@compiled
+def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
+    """Move theta (p,) in place so that none of its parameters first .. last - 1 is negative.
+
+    Each that is goes to zero and takes the others along as P says they belong together: the nearest such theta in the
+    metric of P. P stays; it is no less uncertain for that.
+    """
+    for _ in range(last - first):
+        worst = first
+        for j in range(first, last):
+            if theta[j] < theta[worst]:
+                worst = j
+        if theta[worst] >= 0.0 or not P[worst, worst] > 0.0:
+            break
+        share = theta[worst] / P[worst, worst]
+        for j in range(theta.shape[0]):
+            theta[j] -= share * P[j, worst]
+        theta[worst] = 0.0
+    for j in range(first, last):
+        theta[j] = max(theta[j], 0.0)
+
+
+def payload_direction(link_length_m: tuple[float, float], count: int) -> Vector:
+    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,)."""
+    l1, l2 = link_length_m
+    direction = np.zeros(count)
+    direction[:3] = l1**2 + l2**2, l1 * l2, l2**2
+    return direction

@@ -1,0 +1,572 @@
+"""The numbers of one cycle of the certified scheme: bank of filters, belief about the model, evidence, detection.
+
+theta is not only a number here but a belief (`belief`): mean and covariance P in honest units, begun with what any such
+arm may be and corrected by recursive least squares. What a filter's regressor row makes of the belief is the
+uncertainty of its prediction, so every threshold follows from what is known at the time (`sensitivity`). At the start
+of an adaptation P is large and nothing can be told; a fraction of a second later it can.
+
+**A touch is not learnt.** Samples wait in a ring before they correct the belief. When a residual exceeds its threshold
+the ring is thrown away, so nothing of the touch, from its beginning on, is learnt.
+
+**A certificate** is a test of the frozen model on motion that was not used for the fit (`certificate`). While detection
+is armed the belief goes on learning; its mean takes the place of the frozen one after a test (`refinement`).
+
+Three structured arrays of one element carry everything, as in `adacd_hil.scheme.kernel`; the block is
+`records.certified_layout`.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import FRICTION_TERMS, Settings
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, SchemeState, Vector, certified_layout
+from adacd_hil.scheme import (
+    bank,
+    belief,
+    certificate,
+    contact,
+    detector,
+    friction,
+    refinement,
+    regressor,
+    sensitivity,
+    termination,
+)
+from adacd_hil.scheme.kernel import Structured, block_dtype
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+
+# What a cycle does, as bits.
+MEASURE = 1  # the arm is at rest: measure the torque sensors' noise
+WATCH = 2  # compare the residuals with their thresholds
+LEARN = 4  # correct the belief and use it at once
+TEST = 8  # test the frozen model
+REFINE = 16  # correct the belief, and let its mean take over after a test
+
+ADAPT = int(SchemeState.ADAPT)
+CERTIFY = int(SchemeState.CERTIFY)
+MONITOR = int(SchemeState.MONITOR)
+
+_NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
+_OVER_LIMIT = int(Observation.OVER_LIMIT)
+_AT_REST = int(Observation.AT_REST)
+_UNLOADED = int(Observation.UNLOADED)
+_CONTACT = int(Observation.CONTACT)
+_COLLISION = int(Observation.COLLISION)
+_FITTED = int(Observation.FITTED)
+_CERTIFIED = int(Observation.CERTIFIED)
+_REFUTED = int(Observation.REFUTED)
+
+# Shares of the nominal period: the shortest and the longest interval of two samples that follow each other.
+_SHORTEST_SHARE = 0.5
+_LONGEST_SHARE = 1.5
+
+_EIGENVALUE_EVERY = 64
+"""Samples between two looks at the eigenvalues: they take 8 µs, the rest of a step about 3 µs."""
+WIDE = 1
+"""Filter of the bank whose output, with the filter undone, is the external torque of contact reports: undoing a faster
+one would bring back the noise that it let through."""
+_FIT = 0
+"""Filter of the bank that is learnt from: the slow one, whose noise is least."""
+
+
+def parameter_names(settings: Settings) -> tuple[str, ...]:
+    """Name all parameters of the certified scheme, in order: dynamic ones, offsets, lags, further friction."""
+    return settings.estimator.parameter_names + settings.further_names
+
+
+def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
+    """Give each parameter the value of its kind, in the order of `CertifiedSettings`."""
+    inertia, viscous, coulomb, gravity, offset, lag, further = values
+    prefixes = (("F_v", viscous), ("F_c", coulomb), ("offset", offset), ("lag", lag))
+    exact = {"a1": inertia, "a2": inertia, "a3": inertia, "a4": gravity, "a5": gravity}
+    found = [exact.get(name, next((v for p, v in prefixes if name.startswith(p)), further)) for name in names]
+    return np.array(found)
+
+
+def prior_of(settings: Settings) -> Vector:
+    """Return what is expected of an arm of which nothing is known (p,): nothing, but the velocity's usual lag."""
+    return _by_kind((0.0, 0.0, 0.0, 0.0, 0.0, settings.certified.lag_s, 0.0), parameter_names(settings))
+
+
+def constants_of(settings: Settings) -> Structured:
+    """Put the settings into the form that the compiled step reads."""
+    certified, names = settings.certified, parameter_names(settings)
+    period_s = settings.bus.period_s
+    cutoff = np.array(certified.cutoffs_rad_s)
+    decay, weight_old, weight_new = np.zeros_like(cutoff), np.zeros_like(cutoff), np.zeros_like(cutoff)
+    bank.discretise(cutoff, period_s, decay, weight_old, weight_new)
+    base = len(settings.estimator.parameter_names)
+    theta_cad = np.zeros(len(names))
+    theta_cad[: len(settings.arm.cad_theta)] = settings.arm.cad_theta
+    inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
+    correlated = 2.0 / (cutoff[_FIT] * period_s * certified.learn_every)
+    values: dict[str, Any] = {
+        "period_s": period_s,
+        "cutoff": cutoff,
+        "decay": decay,
+        "weight_old": weight_old,
+        "weight_new": weight_new,
+        "base": base,
+        "first_coulomb": PARAMETER_NAMES.index("F_c1"),
+        "first_term": base + 2 * JOINTS,
+        "width_rad_s": certified.coulomb_width_rad_s,
+        "stribeck_rad_s": certified.stribeck_rad_s,
+        "terms": [FRICTION_TERMS.index(term) for term in certified.friction_terms],
+        "theta_cad": theta_cad,
+        "prior": prior_of(settings),
+        "prior_std": _by_kind(certified.prior_std, names),
+        "enough_std": _by_kind(certified.enough_std, names),
+        "drift_std": _by_kind(certified.drift_std, names),
+        "model_error": _by_kind(certified.model_error, names),
+        "payload_direction": belief.payload_direction(settings.arm.link_length_m, len(names)),
+        "payload_std_kg": certified.payload_std_kg,
+        "payload_inertia_std": certified.payload_inertia_std,
+        "R": certified.residual_Nm**2 * max(correlated, 1.0),
+        "learn_every": certified.learn_every,
+        "recover_cycles": round(certified.recover_s / period_s),
+        "fit_cycles": [round(fit_s / period_s) for fit_s in certified.fit_s],
+        "test_cycles": [round(test_s / period_s) for test_s in certified.test_s],
+        "beta_Nm": certified.beta_Nm,
+        "refine_cycles": round(certified.refine_s / period_s),
+        "excitation_Nm2s": certified.excitation_Nm2s,
+        "condition": certified.condition,
+        "scale": _by_kind((inertia, viscous, coulomb, gravity, coulomb, 0.005, coulomb), names)[: base + 2 * JOINTS],
+        "travel_rad": np.radians(settings.termination.travel_deg),
+        "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
+        "smoothing": np.exp(-certified.smoothing_rad_s * period_s),
+        **sensitivity.noise_constants(certified, period_s),
+        "model_sigmas": certified.model_sigmas,
+        "torque_noise_Nm": certified.torque_noise_Nm,
+        "still_rad_s": certified.still_rad_s,
+        "standstill_share": certified.standstill_share,
+        "collision_Nm": settings.detector.collision_Nm,
+        "position_limit_rad": settings.arm.position_limit_rad,
+        "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
+        "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
+        "rest_torque_Nm": settings.safety.rest_torque_Nm,
+    }
+    constants = np.zeros(1, np.dtype([(name, np.float64, np.shape(value)) for name, value in values.items()]))
+    for name, value in values.items():
+        constants[name] = value
+    return constants
+
+
+def new_memory(settings: Settings) -> Structured:
+    """Return the memory before the first sample: a gap, and a belief that is the prior."""
+    certified = settings.certified
+    filter_count, channel_count = settings.filter_count, settings.channel_count
+    count = len(parameter_names(settings))
+    learn_s = settings.bus.period_s * certified.learn_every
+    waiting = max(round(certified.hold_back_s / learn_s), 1)
+    joint, parameter = (JOINTS,), (count,)
+    columns, square = (JOINTS, count), (count, count)
+    shapes: dict[str, tuple[int, ...]] = {
+        "has_gap": (),
+        # bank
+        "Y_p": columns,
+        "Y_h": columns,
+        "input_old": (filter_count, *columns),
+        "S": (filter_count, *columns),
+        "W_f": (filter_count, *columns),
+        "tau_f": (filter_count, JOINTS),
+        "tau_old": (filter_count, JOINTS),
+        "rates": (3, filter_count),
+        # model in use
+        "theta": parameter,
+        "P": square,
+        "M": (JOINTS, JOINTS),
+        "promotions": (),
+        "certified": parameter,
+        "P_certified": square,
+        # belief
+        "belief": parameter,
+        "P_belief": square,
+        "v": parameter,
+        "K": parameter,
+        "ring_W": (waiting, *columns),
+        "ring_tau": (waiting, JOINTS),
+        "ring_used": (),
+        "ring_next": (),
+        "since_learnt": (),
+        "recovering_cycles": (),
+        # evidence
+        "is_payload": (),
+        "samples": (),
+        "tested": (),
+        "q_low": joint,
+        "q_high": joint,
+        "dq_low": joint,
+        "dq_high": joint,
+        "information": square,
+        "scratch": square,
+        "excitation": (),
+        "condition": (),
+        # candidate
+        "candidate": parameter,
+        "P_candidate": square,
+        "candidate_cycles": (),
+        "candidate_square": (),
+        "frozen_square": (),
+        "candidate_worst": (),
+        # detection
+        "r": (filter_count, JOINTS),
+        "y": (channel_count, JOINTS),
+        "h": (channel_count, JOINTS),
+        "still": (filter_count, JOINTS),
+        "still_smooth": (filter_count, JOINTS),
+        "doubt": (filter_count, JOINTS),
+        "rest_samples": (),
+        "rest_tau": joint,
+        "rest_square": joint,
+        "roughness": joint,
+        # contact
+        "history": (contact.WIDE_SAMPLES + 1, JOINTS),
+        "wide_sigma": joint,
+        "wide_threshold": joint,
+    }
+    memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
+    memory["has_gap"] = 1.0
+    memory["roughness"] = 1.0
+    state = memory[0]
+    prior_std = _by_kind(certified.prior_std, parameter_names(settings))
+    prior = prior_of(settings)
+    belief.begin(prior, prior_std, state["belief"], state["P_belief"])
+    belief.begin(prior, prior_std, state["theta"], state["P"])
+    return memory
+
+
+def new_block(settings: Settings) -> Structured:
+    """Return a block before the first sample: zeros, and thresholds that nothing exceeds."""
+    base = len(settings.estimator.parameter_names)
+    further = len(parameter_names(settings)) - base
+    layout = certified_layout(base, further, settings.channel_count)
+    block = np.zeros(1, block_dtype(layout))
+    for name in ("threshold", "threshold_bank", "paper_threshold"):
+        block[name] = np.inf
+    return block
+
+
+@compiled
+def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool) -> None:
+    """Begin to learn: from the prior, or with a payload on top of the arm as it was certified.
+
+    What was learnt before is forgotten, so a contact on the way, whenever it is noticed, leaves no trace.
+
+    Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
+    """
+    k, m = constants[0], memory[0]
+    m["has_gap"] = 1.0
+    m["W_f"][:] = 0.0
+    m["tau_f"][:] = 0.0
+    m["history"][:] = 0.0
+    m["is_payload"] = 1.0 if is_payload else 0.0
+    if is_payload:
+        m["belief"][:] = m["certified"]
+        m["P_belief"][:] = m["P_certified"]
+        belief.add_payload(k["payload_direction"], k["payload_std_kg"], k["payload_inertia_std"], m["P_belief"])
+    else:
+        belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
+    _use_belief(m)
+    belief.discard(m)
+    m["samples"] = 0.0
+    m["recovering_cycles"] = 0.0
+    m["q_low"][:] = np.inf
+    m["q_high"][:] = -np.inf
+    m["dq_low"][:] = np.inf
+    m["dq_high"][:] = -np.inf
+    m["information"][:] = 0.0
+    m["excitation"] = 0.0
+    m["condition"] = np.inf
+
+
+@compiled
+def begin_test(constants: Structured, memory: Structured) -> None:
+    """Freeze the belief, as far as it is physically possible, as the model in use, and begin its test."""
+    k, m = constants[0], memory[0]
+    first_viscous, last_coulomb = int(k["first_coulomb"]) - JOINTS, int(k["first_coulomb"]) + JOINTS
+    belief.keep_non_negative(first_viscous, last_coulomb, m["belief"], m["P_belief"])
+    _use_belief(m)
+    belief.discard(m)
+    m["tested"] = 0.0
+
+
+@compiled
+def begin_refinement(memory: Structured) -> None:
+    """Begin to refine the model that has just been certified."""
+    m = memory[0]
+    m["promotions"] = 0.0
+    m["certified"][:] = m["theta"]
+    m["P_certified"][:] = m["P"]
+    refinement.restart(m)
+
+
+@compiled
+def _use_belief(m: Any) -> None:
+    m["theta"][:] = m["belief"]
+    m["P"][:] = m["P_belief"]
+
+
+@compiled
+def step(
+    constants: Structured, memory: Structured, block: Structured, is_complete: int, periods: int, mode: int
+) -> int:
+    """Take in the block's q, dq, tau_J and fill the rest of it; return bits of `Observation`.
+
+    is_complete: 1 if all values are this cycle's. periods: since the previous step. mode: MEASURE to REFINE.
+    """
+    k, m, out = constants[0], memory[0], block[0]
+    observation = observe(k, out)
+    if out["period_s"][0] == 0.0:
+        out["period_s"][0] = k["period_s"]
+    is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
+    if is_fresh:
+        if mode & MEASURE:
+            _measure_noise(k, m, out["tau_J"])
+        _filter(k, m, out, periods)
+        if not (np.all(np.isfinite(m["r"])) and np.all(np.isfinite(m["theta"]))):
+            observation |= _NOT_A_NUMBER
+    else:
+        m["has_gap"] = 1.0
+    if mode & WATCH:
+        observation |= _watch(k, m, out, is_fresh)
+    else:
+        out["threshold"][:] = np.inf
+        out["threshold_bank"][:] = np.inf
+        m["wide_threshold"][:] = np.inf
+    if is_fresh and mode & (LEARN | TEST | REFINE):
+        observation |= _improve(k, m, out, observation & _CONTACT != 0, mode)
+    _fill_model(k, m, out)
+    return observation
+
+
+@compiled
+def observe(k: Any, out: Any) -> int:
+    """Return what the measurements alone say."""
+    observation = _AT_REST | _UNLOADED
+    for i in range(out["q"].shape[0]):
+        q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
+        if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
+            observation |= _NOT_A_NUMBER
+        if not (abs(q) <= k["position_limit_rad"][i] and abs(dq) <= k["velocity_limit_rad_s"][i]):
+            observation |= _OVER_LIMIT
+        if not (abs(dq) < k["rest_velocity_rad_s"]):
+            observation &= ~_AT_REST
+        if not (abs(tau_J) < k["rest_torque_Nm"]):
+            observation &= ~_UNLOADED
+    return observation
+
+
+@compiled
+def _measure_noise(k: Any, m: Any, tau_J: Vector) -> None:
+    """Take one sample at rest into `roughness` (n,): variance of the torque over that of the settings, at least 1."""
+    m["rest_samples"] += 1.0
+    for i in range(tau_J.shape[0]):
+        if m["rest_samples"] > 1.0:
+            m["rest_square"][i] += 0.5 * (tau_J[i] - m["rest_tau"][i]) ** 2
+            variance = m["rest_square"][i] / (m["rest_samples"] - 1.0)
+            m["roughness"][i] = max(variance / max(k["torque_noise_Nm"] ** 2, 1e-12), 1.0)
+        m["rest_tau"][i] = tau_J[i]
+
+
+@compiled
+def _filter(k: Any, m: Any, out: Any, periods: int) -> None:
+    """Take the bank to this sample and estimate the external torque that each filter sees."""
+    base = int(k["base"])
+    q, dq, tau_J, cutoff = out["q"], out["dq"], out["tau_J"], k["cutoff"]
+    _fill_regressor(k, m, q, dq, tau_J)
+    nominal_s: float = k["period_s"]
+    period_s: float = out["period_s"][0]
+    is_near = _SHORTEST_SHARE * nominal_s <= period_s <= _LONGEST_SHARE * nominal_s
+    if m["has_gap"] != 0.0 or periods != 1 or not is_near:
+        bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
+        m["has_gap"] = 0.0
+    else:
+        decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
+        if period_s == nominal_s:
+            decay[:] = k["decay"]
+            old[:] = k["weight_old"]
+            new[:] = k["weight_new"]
+        else:
+            bank.discretise(cutoff, period_s, decay, old, new)
+        bank.advance(
+            cutoff, decay, old, new, m["Y_p"], m["Y_h"], tau_J,
+            m["tau_old"], m["input_old"], m["S"], m["tau_f"], m["W_f"],
+        )  # fmt: skip
+    bank.fill_lag(cutoff, tau_J, m["tau_f"], base + q.shape[0], m["W_f"])
+    bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
+    bank.smooth(k["smoothing"], m["r"], m["y"])
+    sensitivity.follow_standstill(dq, k["still_rad_s"], k["decay"], k["smoothing"], m["still"], m["still_smooth"])
+    out["tau_f"][:] = m["tau_f"][_FIT]
+    detector.predict(m["W_f"][_FIT], k["theta_cad"], out["tau_f_cad"])
+    for i in range(q.shape[0]):
+        out["tau_ext_hat"][i] = m["r"][_FIT, i]
+        out["tau_f_hat"][i] = m["r"][_FIT, i] + out["tau_f"][i]
+        out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
+    contact.undo_filter(m["r"][WIDE], k["decay"][WIDE], m["history"], out["tau_ext_wide_hat"])
+
+
+@compiled
+def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> None:
+    """Fill Y_p, Y_h (2, p) and M (2, 2) of the 2R arm, offsets and further friction included."""
+    base, first_coulomb, count = int(k["base"]), int(k["first_coulomb"]), q.shape[0]
+    regressor.fill_momentum(q, dq, m["Y_p"][:, :base])
+    regressor.fill_remainder(q, dq, m["Y_h"][:, :base])
+    for i in range(count):
+        m["Y_h"][i, first_coulomb + i] = friction.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
+        m["Y_h"][i, base + i] = 1.0
+    speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
+    friction.fill_terms(dq, tau_J, k["terms"], speeds, base + 2 * count, m["Y_h"])
+    regressor.fill_mass_matrix(q, m["theta"], m["M"])
+
+
+@compiled
+def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
+    """Compare with the thresholds; return CONTACT, COLLISION and the joints that are over, if any."""
+    if is_fresh:
+        sensitivity.fill_thresholds(k, m, m["h"])
+        out["threshold"][:] = m["h"][_FIT]
+        sensitivity.fill_wide(k, m, WIDE)
+    joints = sensitivity.joints_over(m["y"], m["h"])
+    if not joints:
+        return 0
+    observation = _CONTACT | joints << CONTACT_SHIFT
+    for c in range(m["r"].shape[0], m["y"].shape[0]):
+        for i in range(m["y"].shape[1]):
+            if not (abs(m["y"][c, i]) <= max(k["collision_Nm"][i], m["h"][c, i])):
+                observation |= _COLLISION
+    return observation
+
+
+@compiled
+def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
+    """Learn, test or refine by this sample; return what that has come to."""
+    if is_touched:
+        m["recovering_cycles"] = k["recover_cycles"]
+    elif m["recovering_cycles"] > 0.0:
+        m["recovering_cycles"] -= 1.0
+    is_free = m["recovering_cycles"] == 0.0
+    if not is_free:
+        belief.discard(m)
+    if mode & TEST:
+        return _test(k, m)
+    if mode & REFINE:
+        _refine(k, m, is_free)
+        return 0
+    if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT]):
+        _use_belief(m)
+    return _FITTED if is_free and _gather_evidence(k, m, out) else 0
+
+
+@compiled
+def _test(k: Any, m: Any) -> int:
+    """Take this sample into the test of the frozen model; return what that has come to."""
+    m["tested"] += 1.0
+    for i in range(m["y"].shape[1]):
+        if not (abs(m["r"][_FIT, i]) <= k["beta_Nm"]):
+            return _REFUTED
+    return _CERTIFIED if m["tested"] >= k["test_cycles"][int(m["is_payload"])] else 0
+
+
+@compiled
+def _refine(k: Any, m: Any, is_free: bool) -> None:
+    """Learn on beside the model in use, and let what was learnt take over after its test."""
+    if not is_free:
+        refinement.restart(m)
+        return
+    if belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT]):
+        belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])
+    refinement.test_candidate(k, m)
+
+
+@compiled
+def _gather_evidence(k: Any, m: Any, out: Any) -> bool:
+    """Take this sample into the evidence and tell whether it is complete and the model can be an arm's."""
+    termination.widen(out["q"], m["q_low"], m["q_high"])
+    termination.widen(out["dq"], m["dq_low"], m["dq_high"])
+    termination.add_information(m["W_f"][_FIT], k["period_s"], m["information"])
+    if m["samples"] % _EIGENVALUE_EVERY == _EIGENVALUE_EVERY - 1:
+        smallest, largest = termination.eigenvalue_range(m["information"], k["scale"], m["scratch"])
+        m["excitation"] = smallest
+        m["condition"] = largest / smallest if smallest > 0.0 else np.inf
+    m["samples"] += 1.0
+    return bool(certificate.is_complete(k, m) and regressor.is_positive_definite(m["belief"]))
+
+
+@compiled
+def _fill_model(k: Any, m: Any, out: Any) -> None:
+    """Fill what the block says of the model and the bank."""
+    base, joints = int(k["base"]), m["y"].shape[1]
+    for j in range(m["theta"].shape[0]):
+        if j < base:
+            out["theta_hat"][j] = m["theta"][j]
+        else:
+            out["theta_further"][j - base] = m["theta"][j]
+        out["theta_std"][j] = np.sqrt(max(m["P"][j, j], 0.0))
+    for c in range(m["y"].shape[0]):
+        for i in range(joints):
+            out["tau_ext_bank"][c * joints + i] = m["y"][c, i]
+            if out["threshold"][i] != np.inf:
+                out["threshold_bank"][c * joints + i] = m["h"][c, i]
+    out["excitation"][0] = m["excitation"]
+    out["condition"][0] = m["condition"]
+    out["promotions"][0] = m["promotions"]
+    out["quiet_s"][0] = m["tested"] * k["period_s"]
+
+
+@compiled
+def step_record(
+    constants: Structured,
+    memory: Structured,
+    block: Structured,
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    payload_at: int,
+    state: Vector,
+    observation: Vector,
+    y: Vector,
+    h: Vector,
+    theta: Vector,
+) -> None:
+    """Play an arm that doesn't react over n samples: ADAPT, CERTIFY, MONITOR; at a payload's sample all again.
+
+    After a contact before the certificate it waits as after one while monitoring, then begins anew.
+
+    q, dq, tau_J (n, 2) at the nominal period; payload_at: sample, -1 for none. Fills state (n,) by `SchemeState`,
+    observation (n,), y and h (n, channels, 2), and the model in use theta (n, p).
+    """
+    now, begins_in = ADAPT, -1
+    is_payload = False
+    begin_adaptation(constants, memory, is_payload)
+    for k in range(q.shape[0]):
+        if k == payload_at:
+            is_payload, begins_in = now == MONITOR, 0
+        if begins_in == 0:
+            begin_adaptation(constants, memory, is_payload)
+            now = ADAPT
+        begins_in -= 1
+        block[0]["q"][:] = q[k]
+        block[0]["dq"][:] = dq[k]
+        block[0]["tau_J"][:] = tau_J[k]
+        block[0]["period_s"][0] = 0.0
+        mode = 0
+        if begins_in < 0:
+            mode = LEARN if now == ADAPT else (TEST if now == CERTIFY else REFINE)
+        found = step(constants, memory, block, 1, 1, WATCH | mode)
+        state[k] = now
+        observation[k] = found
+        y[k] = memory[0]["y"]
+        h[k] = memory[0]["h"]
+        theta[k] = memory[0]["theta"]
+        if found & _CONTACT and now != MONITOR and begins_in < 0:
+            begins_in = int(constants[0]["recover_cycles"])
+        elif found & _FITTED:
+            begin_test(constants, memory)
+            now = CERTIFY
+        elif found & _REFUTED:
+            is_payload, begins_in = False, 0
+        elif found & _CERTIFIED:
+            begin_refinement(memory)
+            now = MONITOR

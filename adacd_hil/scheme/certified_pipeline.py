@@ -1,0 +1,221 @@
+"""The certified scheme: one ArmState in, one SchemeOutput out, as `adacd_hil.scheme.pipeline`.
+
+A cycle: the state reached so far says what the numbers do (`certified_kernel.step`), the numbers say where the
+supervisor goes, and the new state leaves its traces. The paper's scheme runs beside on the same stream: it adapts when
+this one does, ends by eq. (15), and its would-be alarms are in the block; it decides nothing.
+"""
+
+import numpy as np
+
+from adacd_hil.config import Settings
+from adacd_hil.records import (
+    PARAMETER_UNITS,
+    ArmState,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    certified_layout,
+    scheme_layout,
+)
+from adacd_hil.scheme import certificate, certified_kernel, kernel
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.scheme.supervisor import Supervisor
+from adacd_hil.scheme.touch import Touch
+
+_WATCH = certified_kernel.WATCH
+_MODES = {
+    SchemeState.COMMISSION: certified_kernel.MEASURE,
+    SchemeState.ENABLE: _WATCH,
+    SchemeState.ADAPT: _WATCH | certified_kernel.LEARN,
+    SchemeState.CERTIFY: _WATCH | certified_kernel.TEST,
+    SchemeState.MONITOR: _WATCH | certified_kernel.REFINE,
+    SchemeState.REACT: _WATCH,
+    SchemeState.STOPPED: _WATCH,
+    SchemeState.PAYLOAD: _WATCH,
+}
+_LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
+_ADAPTED = int(Observation.ADAPTED)
+
+
+class CertifiedPipeline:
+    """Adaptation with a certificate, and collision detection, for one run."""
+
+    def __init__(self, settings: Settings) -> None:
+        base = len(settings.estimator.parameter_names)
+        self._names = certified_kernel.parameter_names(settings)
+        places = certified_layout(base, len(self._names) - base, settings.channel_count).slices
+        self._constants = certified_kernel.constants_of(settings)
+        self._memory = certified_kernel.new_memory(settings)
+        self._block = certified_kernel.new_block(settings)
+        self._values = self._block.view(np.float64)
+        self._q = self._values[places["q"]]
+        self._dq = self._values[places["dq"]]
+        self._tau_J = self._values[places["tau_J"]]
+        self._period_s = self._values[places["period_s"]]
+        self._promotions = self._values[places["promotions"]]
+        self._is_measuring = settings.realtime.sample_period == "measured"
+        self._t_ns: int | None = None
+        self._theta_hat = places["theta_hat"]
+        self._tau_ext_hat = self._memory[0]["y"][certified_kernel.WIDE]  # what a reaction goes by: fast, and smooth
+        self._tau_ext_wide_hat = self._values[places["tau_ext_wide_hat"]]
+        self._sigma = self._memory[0]["wide_sigma"]
+        self._threshold = self._memory[0]["wide_threshold"]
+        self._paper = _Beside(settings, self._values)
+        self._supervisor = Supervisor(settings)
+        self._touch = Touch(settings)
+        self._theta_ff = np.zeros(base)
+        self._has_certificate = False
+        self._is_payload = False
+        self._has_forgotten = False
+        self._refined = 0.0
+
+    def compile(self) -> None:
+        """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
+        memory, block = self._memory.copy(), self._block.copy()
+        certified_kernel.begin_adaptation(self._constants, memory, False)
+        certified_kernel.step(self._constants, memory, block, 1, 1, _WATCH | certified_kernel.LEARN)
+        certified_kernel.begin_test(self._constants, memory)
+        certified_kernel.begin_refinement(memory)
+        inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
+        self._touch.compile()
+        self._paper.compile()
+
+    def describe_missing(self) -> list[str]:
+        """Say what an adaptation that takes too long is waiting for, a line each."""
+        return certificate.describe_missing(self._constants[0], self._memory[0], self._names, PARAMETER_UNITS)
+
+    def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
+        """Take in one cycle."""
+        supervisor, touch = self._supervisor, self._touch
+        previous = supervisor.state
+        self._q[:] = arm.q
+        self._dq[:] = arm.dq
+        self._tau_J[:] = arm.tau_J
+        period_s = self._period_s[0] = self._measure(arm.t_ns)
+        is_complete, periods = int(arm.is_complete), int(arm.periods)
+        mode = _MODES.get(previous, 0)
+        observation = certified_kernel.step(self._constants, self._memory, self._block, is_complete, periods, mode)
+        self._paper.step(arm, period_s)
+        state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
+        if state is not previous:
+            self._enter(state, previous)
+        if self._promotions[0] != self._refined:
+            self._feed_forward()
+        block = self._values.copy()
+        contact = touch.step(
+            arm.cycle,
+            supervisor,
+            observation,
+            arm.q,
+            self._tau_ext_hat,
+            self._tau_ext_wide_hat,
+            self._sigma,
+            self._threshold,
+            self._has_certificate,
+        )
+        self._forget_if_disturbed(state)
+        return SchemeOutput(
+            cycle=arm.cycle,
+            state=state,
+            previous_state=previous,
+            fault=supervisor.fault,
+            contact_joints=observation >> CONTACT_SHIFT,
+            is_model_valid=self._has_certificate,
+            theta_hat=block[self._theta_hat],
+            theta_ff=self._theta_ff,
+            tau_ext_hat=self._tau_ext_hat.copy(),
+            contact=contact,
+            block=block,
+            reaction=touch.reaction,
+        )
+
+    def _measure(self, t_ns: int) -> float:
+        """Return the time since the cycle before, s; 0 where that is unknown or not to be used."""
+        if not self._is_measuring:
+            return 0.0
+        period_s = 0.0 if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
+        self._t_ns = t_ns
+        return period_s
+
+    def _enter(self, state: SchemeState, previous: SchemeState) -> None:
+        """Do what a new state begins with, and what the previous one ends with."""
+        if state is SchemeState.ADAPT:
+            self._begin_adaptation(previous)
+        elif state is SchemeState.CERTIFY:
+            certified_kernel.begin_test(self._constants, self._memory)
+        elif state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
+            certified_kernel.begin_refinement(self._memory)
+            self._has_certificate = True
+            self._feed_forward()
+
+    def _begin_adaptation(self, previous: SchemeState) -> None:
+        """Begin to learn anew: a payload on top of the certified arm, until that has failed; else everything."""
+        if previous in (SchemeState.ENABLE, SchemeState.PAYLOAD):
+            self._is_payload = self._has_certificate
+            self._paper.begin_adaptation()
+        elif previous is SchemeState.CERTIFY:
+            self._is_payload = False
+        certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+
+    def _forget_if_disturbed(self, state: SchemeState) -> None:
+        """Once a contact that interrupted an adaptation is reported, forget what this adaptation has learnt.
+
+        It may have learnt the contact's beginning, or this may be no contact but an earlier one that was learnt. Then
+        only a model that claims to know nothing lets the arm go on.
+        """
+        is_disturbed = state in (SchemeState.REACT, SchemeState.STOPPED) and self._supervisor.origin in _LEARNING
+        is_reported = is_disturbed and not self._touch.is_reporting
+        if is_reported and not self._has_forgotten:
+            certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+        self._has_forgotten = is_reported
+
+    def _feed_forward(self) -> None:
+        """Take the model in use for the feedforward from now on."""
+        self._theta_ff = np.array(self._memory[0]["theta"][: self._theta_ff.size])
+        self._refined = float(self._promotions[0])
+
+
+class _Beside:
+    """The paper's scheme on the same stream: adapts until eq. (15) holds, then compares with its thresholds."""
+
+    def __init__(self, settings: Settings, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> None:
+        base = len(settings.estimator.parameter_names)
+        further = len(certified_kernel.parameter_names(settings)) - base
+        places = certified_layout(base, further, settings.channel_count).slices
+        names = ("paper_is_armed", "paper_tau_ext_hat", "paper_threshold", "paper_theta_hat")
+        self._is_armed, self._tau_ext_hat, self._threshold, self._theta_hat = (values[places[name]] for name in names)
+        self._constants = kernel.constants_of(settings)
+        self._memory = kernel.new_memory(base)
+        self._block = kernel.new_block(base)
+        own = self._block.view(np.float64)
+        self._own = {name: own[place] for name, place in scheme_layout(base).slices.items()}
+        self._mode = 0
+
+    def compile(self) -> None:
+        """Run every compiled function once, on copies."""
+        memory, block = self._memory.copy(), self._block.copy()
+        kernel.begin_adaptation(self._constants, memory, block)
+        kernel.step(self._constants, memory, block, 1, 1, kernel.LEARN)
+
+    def begin_adaptation(self) -> None:
+        """Forget the past, as the scheme does whenever it adapts."""
+        kernel.begin_adaptation(self._constants, self._memory, self._block)
+        self._mode = kernel.LEARN
+
+    def step(self, arm: ArmState, period_s: float) -> None:
+        """Take in one cycle, and put what it comes to into the block of the scheme in charge."""
+        own = self._own
+        own["q"][:] = arm.q
+        own["dq"][:] = arm.dq
+        own["tau_J"][:] = arm.tau_J
+        own["period_s"][0] = period_s
+        observation = kernel.step(
+            self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), self._mode
+        )
+        if observation & _ADAPTED:
+            self._mode = kernel.ARMED
+        self._is_armed[0] = float(self._mode == kernel.ARMED)
+        self._tau_ext_hat[:] = own["tau_ext_hat"]
+        self._threshold[:] = own["threshold"]
+        self._theta_hat[:] = own["theta_hat"]

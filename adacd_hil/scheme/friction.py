@@ -1,0 +1,54 @@
+"""Optional friction terms, linear in their parameters: what viscous and Coulomb friction leave out.
+
+    stribeck     sgn(dq) exp(-(dq / v_s)²)      static friction that falls off with speed, Nm
+    load         sgn(dq) |tau_J|                friction in proportion to the transmitted torque, Nm/Nm
+    asymmetric   |sgn(dq)|                      half the difference of the two directions' Coulomb friction, Nm
+    width        -x / cosh²(x), x = dq / w      a width of tanh that is not w, to first order: F_c log(width / w), Nm
+
+sgn stands for tanh(dq / w), or with w = 0 for the sign itself, 0 of a joint that may stand still (no `width` then).
+One parameter per joint and term, in the order of the settings. While a joint moves its asymmetry looks like an offset
+of its torque sensor; only rest tells the two apart.
+
+Shapes: dq, tau_J (n,); Y_h (n, p).
+"""
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import FRICTION_TERMS
+from adacd_hil.records import Vector
+
+STRIBECK, LOAD, ASYMMETRIC, WIDTH = range(len(FRICTION_TERMS))
+
+
+@compiled
+def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
+    """Return tanh(dq / width); where the width is 0 the sign of dq, and 0 of what may stand still."""
+    if width_rad_s > 0.0:
+        return float(np.tanh(dq / width_rad_s))
+    return float(np.sign(dq)) if abs(dq) >= still_rad_s else 0.0
+
+
+@compiled
+def fill_terms(
+    dq: Vector, tau_J: Vector, terms: Vector, speeds: tuple[float, float, float], first_column: int, Y_h: Vector
+) -> None:
+    """Fill the columns of the optional terms, numbers as in `FRICTION_TERMS`, from `first_column` on.
+
+    speeds: still, width w and v_s, rad/s.
+    """
+    count = dq.shape[0]
+    still_rad_s, width_rad_s, stribeck_rad_s = speeds
+    for position in range(terms.shape[0]):
+        for i in range(count):
+            sign = smooth_sign(dq[i], still_rad_s, width_rad_s)
+            if terms[position] == STRIBECK:
+                value = sign * np.exp(-((dq[i] / stribeck_rad_s) ** 2))
+            elif terms[position] == LOAD:
+                value = sign * abs(tau_J[i])
+            elif terms[position] == ASYMMETRIC:
+                value = abs(sign)
+            else:
+                x = dq[i] / width_rad_s if width_rad_s > 0.0 else 0.0
+                value = -x / np.cosh(min(abs(x), 300.0)) ** 2
+            Y_h[i, first_column + position * count + i] = value

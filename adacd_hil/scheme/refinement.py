@@ -1,0 +1,51 @@
+"""Refinement of a certified model while it detects: a candidate, its own test, and its promotion.
+
+The belief goes on learning where nothing touches the arm. Every so often its mean is frozen as a candidate and runs
+beside the model in use on motion that neither was fitted to. It takes over if it explains that motion better and would
+have raised no alarm. So friction that warms up, and a model that was armed early, are followed, but a touch is not:
+a contact ends the test, and what is left below the thresholds can't move a candidate by more than that.
+"""
+
+from typing import Any
+
+from adacd_hil.compiled import compiled
+from adacd_hil.scheme.regressor import is_positive_definite
+
+
+@compiled
+def restart(m: Any) -> None:
+    """Begin the next test with the belief as it is now."""
+    m["candidate_cycles"] = 0.0
+    m["candidate_square"] = 0.0
+    m["frozen_square"] = 0.0
+    m["candidate_worst"] = 0.0
+    m["candidate"][:] = m["belief"]
+    m["P_candidate"][:] = m["P_belief"]
+
+
+@compiled
+def test_candidate(k: Any, m: Any) -> bool:
+    """Take one sample into the test, and tell whether the candidate has just taken over."""
+    m["candidate_cycles"] += 1.0
+    for c in range(m["W_f"].shape[0]):
+        for i in range(m["W_f"].shape[1]):
+            residual = -m["tau_f"][c, i]
+            for j in range(m["candidate"].shape[0]):
+                residual += m["W_f"][c, i, j] * m["candidate"][j]
+            if c == 0:
+                m["candidate_square"] += residual * residual
+                m["frozen_square"] += m["r"][c, i] ** 2
+            bare = max(m["r"].shape[0] + c - 1, 0) if c > 0 else 0
+            m["candidate_worst"] = max(m["candidate_worst"], abs(residual) / m["h"][bare, i])
+    if m["candidate_cycles"] < k["refine_cycles"]:
+        return False
+    is_better = m["candidate_square"] < m["frozen_square"] and m["candidate_worst"] < 1.0
+    is_promoted = is_better and is_positive_definite(m["candidate"])
+    if is_promoted:
+        m["theta"][:] = m["candidate"]
+        m["P"][:] = m["P_candidate"]
+        m["certified"][:] = m["theta"]
+        m["P_certified"][:] = m["P"]
+        m["promotions"] += 1.0
+    restart(m)
+    return bool(is_promoted)

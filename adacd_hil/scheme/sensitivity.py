@@ -1,0 +1,137 @@
+"""The thresholds of the certified scheme: what each channel of the bank may show without a contact.
+
+    h = sqrt((k_tau sigma_tau)² + nu² (M M')_ii + (k_m g)²) + F_c s
+
+- sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
+  that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
+- nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
+  counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.31 (s / 200) /
+  (1 + a / 650) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
+- g² = w (P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
+  parameter explains however long one learns. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
+- s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
+  where it is in the model, and as much more as these are uncertain.
+
+Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C, n); y, h (2 C - 1, n); W_f (C, n, p);
+M (n, n). Units: Nm.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import CertifiedSettings
+from adacd_hil.records import Vector
+from adacd_hil.scheme import contact, friction
+
+_SMOOTHED_SHARE = 0.31 / 200.0
+_VELOCITY_STD_SHARE = 0.12
+"""Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
+_SMOOTHED_FALL_RAD_S = 650.0
+
+
+def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, Vector]:
+    """Return, by channel (2 C - 1,), (k_tau sigma_tau)² in Nm² and nu² in rad²/s⁴."""
+    a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
+    width = np.concatenate([a * s / (a + s), a[1:]])
+    share = np.concatenate([_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), np.ones(a.size - 1)])
+    nu = certified.velocity_noise_rad_s * np.concatenate([a, a[1:]]) * np.minimum(share, 1.0)
+    sigma_squared = certified.torque_noise_Nm**2 * 0.5 * period_s * width
+    return {
+        "torque_variance": certified.noise_sigmas**2 * sigma_squared,
+        "velocity_variance": nu**2,
+        "velocity_std_rad_s": np.array(_VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
+    }
+
+
+@compiled
+def follow_standstill(
+    dq: Vector, still_rad_s: float, decay: Vector, smoothing: float, still: Vector, still_smooth: Vector
+) -> None:
+    """Filter with DC gain 1, into `still` (C, n) from 0 to 1, whether each joint may stand still, and smooth it."""
+    for c in range(still.shape[0]):
+        for i in range(dq.shape[0]):
+            target = 1.0 if abs(dq[i]) < still_rad_s else 0.0
+            still[c, i] = target + decay[c] * (still[c, i] - target)
+            still_smooth[c, i] = still[c, i] + smoothing * (still_smooth[c, i] - still[c, i])
+
+
+@compiled
+def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
+    """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
+    filters = m["r"].shape[0]
+    for i in range(h.shape[1]):
+        momentum = 0.0
+        for j in range(m["M"].shape[1]):
+            momentum += m["M"][i, j] ** 2
+        hold = k["standstill_share"] * _static_friction(k, m, i)
+        for c in range(filters):
+            g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i]))
+            m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
+            h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i], hold * m["still_smooth"][c, i])
+            if c > 0:
+                bare = filters + c - 1
+                h[bare, i] = _threshold(k, m, bare, i, momentum, g, hold * m["still"][c, i])
+
+
+@compiled
+def _static_friction(k: Any, m: Any, joint: int) -> float:
+    """Return the most that friction is believed to hold of a joint that stands still, Nm."""
+    coulomb = int(k["first_coulomb"]) + joint
+    total = max(m["theta"][coulomb], 0.0) + np.sqrt(max(m["P"][coulomb, coulomb], 0.0))
+    for position in range(k["terms"].shape[0]):
+        if k["terms"][position] == friction.STRIBECK:
+            term = int(k["first_term"]) + position * m["r"].shape[1] + joint
+            total += max(m["theta"][term], 0.0) + np.sqrt(max(m["P"][term, term], 0.0))
+    return float(total)
+
+
+@compiled
+def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float, held: float) -> float:
+    noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
+    return float(np.sqrt(noise + g * g) + held)
+
+
+@compiled
+def fill_wide(k: Any, m: Any, c: int) -> None:
+    """Fill standard deviation and lower threshold (n,) of the external torque with filter c undone.
+
+    The undone filter is a mean over five samples of what went into it: its noise is white torque noise over five, and
+    of the velocity its change over five samples. A slow push is seen in the slow filters first: the threshold is the
+    least of all channels'.
+    """
+    samples = float(contact.WIDE_SAMPLES)
+    span_s = samples * k["period_s"]
+    for i in range(m["r"].shape[1]):
+        momentum = 0.0
+        for j in range(m["M"].shape[1]):
+            momentum += m["M"][i, j] ** 2
+        noise = k["torque_noise_Nm"] ** 2 * m["roughness"][i] / samples
+        velocity = 2.0 * (k["velocity_std_rad_s"] / span_s) ** 2 * momentum
+        doubt = m["doubt"][c, i] / k["model_sigmas"]
+        m["wide_sigma"][i] = np.sqrt(noise + velocity + doubt * doubt)
+        m["wide_threshold"][i] = np.min(m["h"][:, i])
+
+
+@compiled
+def _doubt(k: Any, m: Any, w: Vector) -> float:
+    """Return w (P + D) w'."""
+    total = 0.0
+    for j in range(w.shape[0]):
+        row = 0.0
+        for n in range(w.shape[0]):
+            row += m["P"][j, n] * w[n]
+        total += w[j] * row + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
+    return max(total, 0.0)
+
+
+@compiled
+def joints_over(y: Vector, h: Vector) -> int:
+    """Return the joints that are over their threshold in any channel, as bits; what is not a number counts as over."""
+    joints = 0
+    for c in range(y.shape[0]):
+        for i in range(y.shape[1]):
+            if not (abs(y[c, i]) <= h[c, i]):
+                joints |= 1 << i
+    return joints

@@ -1,0 +1,169 @@
+"""The dynamics of a serial arm: against the planar closed form, against itself, and its base parameters."""
+
+import numpy as np
+import pytest
+from serial_arms import PLANAR_LENGTH_M, planar_chain, random_chain, random_state, seven_joint_arm
+
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES
+from adacd_hil.scheme import chain, regressor
+
+SEEDS = range(20)
+G_M_S2 = 9.81
+UPWARD = (0.0, -G_M_S2, 0.0)
+FULL_NAMES = [f"{name}_{link}" for link in (1, 2) for name in chain.LINK_PARAMETERS]
+CLOSED_NAMES = PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES
+
+
+def parts(arm, place, q, dq, columns):
+    """Return Y_p, Y_h (n, columns), friction left out."""
+    Y_p, Y_h = np.zeros((q.size, columns)), np.zeros((q.size, columns))
+    chain.fill(arm, place, q, dq, chain.new_scratch(arm), Y_p, Y_h)
+    return Y_p, Y_h
+
+
+def full_parts(arm, q, dq):
+    return parts(arm, chain.all_columns(arm), q, dq, 10 * q.size)
+
+
+def closed_parts(q, dq, count):
+    Y_p, Y_h = np.zeros((2, count)), np.zeros((2, count))
+    regressor.fill_momentum(q, dq, Y_p)
+    regressor.fill_remainder(q, dq, Y_h)
+    return Y_p, Y_h
+
+
+def unit(**values):
+    """Return theta_full (20,) of the planar arm with some parameters set."""
+    theta_full = np.zeros(20)
+    for name, value in values.items():
+        theta_full[FULL_NAMES.index(name)] = value
+    return theta_full
+
+
+# What each inertial parameter of the closed form is on the chain: its own change of theta_full.
+INERTIA = {
+    "a1": unit(Izz_1=1.0),
+    "a2": unit(mx_2=1.0 / PLANAR_LENGTH_M),
+    "a3": unit(Izz_2=1.0, Izz_1=-1.0),
+}
+GRAVITY = {"a4": unit(mx_1=1.0 / G_M_S2), "a5": unit(mx_2=1.0 / G_M_S2)}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_planar_closed_form_is_a_chain_of_two(seed):
+    """Y_p and Y_h column by column, friction included; a4 and a5 by what gravity alone adds."""
+    q, dq, _ = random_state(seed, 2)
+    Y_p, Y_h = (np.zeros((2, 9)) for _ in range(2))
+    level, upright = full_parts(planar_chain((0.0, 0.0, 0.0)), q, dq), full_parts(planar_chain(UPWARD), q, dq)
+    for name, change in INERTIA.items():
+        Y_p[:, CLOSED_NAMES.index(name)] = level[0] @ change
+        Y_h[:, CLOSED_NAMES.index(name)] = level[1] @ change
+    for name, change in GRAVITY.items():
+        Y_h[:, CLOSED_NAMES.index(name)] = (upright[1] - level[1]) @ change
+    chain.fill_friction(dq, CLOSED_NAMES.index("F_v1"), Y_h)
+    expected = closed_parts(q, dq, 9)
+    np.testing.assert_allclose(Y_p, expected[0], rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(Y_h, expected[1], rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize("gravity", [0.0, G_M_S2])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_planar_arm_that_exists_has_the_same_torque_in_base_parameters(seed, gravity):
+    """Two links of mass, mass centre on the link, inertia: theta_base = B theta_full against eq. (18)."""
+    random = np.random.default_rng(seed)
+    m1, m2, lc1, lc2, I1, I2 = random.uniform(0.1, 2.0, 6)
+    l1 = PLANAR_LENGTH_M
+    theta_full = unit(m_1=m1, mx_1=m1 * lc1, Izz_1=I1 + m1 * lc1**2, m_2=m2, mx_2=m2 * lc2, Izz_2=I2 + m2 * lc2**2)
+    a1, a2, a3 = I1 + m1 * lc1**2 + I2 + m2 * (l1**2 + lc2**2), m2 * l1 * lc2, I2 + m2 * lc2**2
+    theta = np.array([a1, a2, a3, 0.0, 0.0, 0.0, 0.0, (m1 * lc1 + m2 * l1) * gravity, m2 * lc2 * gravity])
+    arm = planar_chain((0.0, -gravity, 0.0))
+    base = chain.find_base(arm)
+    q, dq, _ = random_state(seed, 2)
+    ours = [Y @ base.map @ theta_full for Y in parts(arm, base.place, q, dq, base.columns.size)]
+    expected = [Y @ theta for Y in closed_parts(q, dq, 9)]
+    np.testing.assert_allclose(ours, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_the_planar_arm_has_four_base_parameters_and_six_in_gravity():
+    """Izz_1 + l1² m_2, Izz_2, mx_2, my_2; in gravity also mx_1 + l1 m_2 and my_1."""
+    assert chain.find_base(planar_chain((0.0, 0.0, 0.0))).columns.size == 4
+    assert chain.find_base(planar_chain(UPWARD)).columns.size == 6
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_momentum_and_remainder_make_up_the_torque(seed):
+    """W = d/dt Y_p + Y_h, the derivative by a central difference."""
+    n = 2 + seed % 6
+    arm, _ = random_chain(seed, n)
+    q, dq, ddq = random_state(seed, n)
+    h = 1e-5
+    before, after = (
+        full_parts(arm, q + sign * h * dq + 0.5 * h * h * ddq, dq + sign * h * ddq)[0] for sign in (-1.0, 1.0)
+    )
+    W = (after - before) / (2.0 * h) + full_parts(arm, q, dq)[1]
+    np.testing.assert_allclose(W, chain.regressor(arm, q, dq, ddq), atol=1e-6)
+
+
+def test_the_remainder_is_minus_the_slope_of_the_kinetic_energy():
+    """C' dq is the derivative of 1/2 dq' M dq by q, here by a central difference without gravity."""
+    arm, theta_full = random_chain(3, 5)
+    arm = arm._replace(gravity_m_s2=np.zeros(3))
+    q, dq, _ = random_state(3, 5)
+    h = 1e-5
+
+    def energy(at):
+        return 0.5 * dq @ chain.mass_matrix(arm, at, theta_full) @ dq
+
+    slope = [(energy(q + h * row) - energy(q - h * row)) / (2.0 * h) for row in np.eye(5)]
+    np.testing.assert_allclose(full_parts(arm, q, dq)[1] @ theta_full, -np.array(slope), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_mass_matrix_of_real_bodies_is_positive_definite(seed):
+    arm, theta_full = random_chain(seed, 6)
+    M = chain.mass_matrix(arm, random_state(seed, 6)[0], theta_full)
+    np.testing.assert_allclose(M, M.T, rtol=1e-12, atol=1e-13)
+    assert np.linalg.eigvalsh(M)[0] > 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_base_parameters_tell_the_whole_torque_with_the_fewest_columns(seed):
+    arm = random_chain(seed, 4)[0] if seed else seven_joint_arm().chain
+    n = arm.axis.shape[0]
+    base = chain.find_base(arm)
+    states = [random_state(100 + index, n) for index in range(60)]
+    W = np.concatenate([chain.regressor(arm, *state) for state in states])
+    np.testing.assert_allclose(W[:, base.columns] @ base.map, W, atol=1e-10)
+    assert np.linalg.matrix_rank(W, tol=1e-7) == base.columns.size == len(base.names)
+
+
+def test_the_seven_joint_arm_has_43_base_parameters():
+    """The number known of arms of this build: Gaz et al., Dynamic identification of the Franka Emika Panda, 2019."""
+    assert chain.find_base(seven_joint_arm().chain).columns.size == 43
+
+
+def test_parameters_without_a_column_are_left_out():
+    arm, _ = random_chain(5, 3)
+    base = chain.find_base(arm)
+    q, dq, ddq = random_state(5, 3)
+    W = np.full((3, base.columns.size + 2), 7.0)
+    W[:, :-2] = 0.0
+    chain.fill_regressor(arm, base.place, q, dq, ddq, chain.new_scratch(arm), W)
+    np.testing.assert_array_equal(W[:, :-2], chain.regressor(arm, q, dq, ddq)[:, base.columns])
+    np.testing.assert_array_equal(W[:, -2:], 7.0)
+
+
+def test_friction_columns_are_velocity_and_its_sign():
+    Y_h = np.zeros((3, 8))
+    chain.fill_friction(np.array([0.5, -2.0, 0.0]), 1, Y_h)
+    expected = [[0, 0.5, 0, 0, 1, 0, 0, 0], [0, 0, -2.0, 0, 0, -1, 0, 0], [0.0] * 8]
+    np.testing.assert_array_equal(Y_h, expected)
+
+
+def test_a_point_mass_has_the_kinetic_energy_of_its_speed():
+    """u' I u = m |v + omega x r|²."""
+    row = np.zeros(10)
+    omega, v, r = np.array([0.5, -1.0, 2.0]), np.array([3.0, 0.1, -0.2]), np.array([0.3, -0.4, 0.7])
+    u = np.concatenate([omega, v])
+    chain.add_form(u, u, 1.0, row)
+    assert row @ chain.point_mass(2.0, r) == pytest.approx(2.0 * np.sum((v + np.cross(omega, r)) ** 2))

@@ -1,0 +1,191 @@
+"""Detectors on one stream, against scipy's filters and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from adacd_hil.config import ConfigError
+from adacd_hil.scheme.detectors import (
+    DetectorSettings,
+    autocovariance,
+    constants_of,
+    likelihood_weights,
+    likelihood_windows,
+    make_stream,
+    new_memory,
+    record,
+)
+from adacd_hil.scheme.regressor import inverse_dynamics
+
+T = 1e-3
+SETTINGS = DetectorSettings(onset_samples=(4, 16))
+CHANNELS = SETTINGS.channels
+WEIGHTS = np.random.default_rng(4).standard_normal((2, 2, 24))
+
+
+def statistics(z, held=None, settings=SETTINGS, block=1):
+    constants = constants_of(settings, WEIGHTS, T)
+    peaks = np.zeros((-(-len(z) // block), len(settings.channels), 2))
+    record(constants, new_memory(constants), z, np.zeros(z.shape) if held is None else held, block, peaks)
+    return {name: peaks[:, row] for row, name in enumerate(settings.channels)}
+
+
+def low_pass(z, a):
+    decay = math.exp(-a * T)
+    return scipy.signal.lfilter([1.0 - decay], [1.0, -decay], z, axis=0)
+
+
+def trapezoid(z, gain):
+    # the stream is already the mean over the interval, so of the bilinear numerator only the sum is left
+    b, a = scipy.signal.bilinear([gain], [1.0, gain], 1.0 / T)
+    return scipy.signal.lfilter([b.sum()], a, z, axis=0)
+
+
+NOISE = np.random.default_rng(3).standard_normal((400, 2))
+
+
+@pytest.mark.parametrize(
+    ("channel", "expected"),
+    [
+        ("first-order 10", low_pass(NOISE, 10.0)),
+        ("first-order 200", low_pass(NOISE, 200.0)),
+        ("smoothed 50", low_pass(low_pass(NOISE, 50.0), 200.0)),
+        ("band-pass", low_pass(NOISE, 100.0) - low_pass(NOISE, 10.0)),
+        ("observer 25", trapezoid(NOISE, 25.0)),
+        ("observer 100", trapezoid(NOISE, 100.0)),
+        (
+            "likelihood 16",
+            np.stack([scipy.signal.lfilter(WEIGHTS[i, 1], [1.0], NOISE[:, i]) for i in range(2)], axis=1),
+        ),
+    ],
+)
+def test_a_channel_is_its_linear_filter(channel, expected):
+    np.testing.assert_allclose(statistics(NOISE)[channel], np.abs(expected), rtol=1e-10, atol=1e-12)
+
+
+def test_a_block_keeps_its_largest_statistic():
+    every = statistics(NOISE)["observer 25"]
+    np.testing.assert_array_equal(
+        statistics(NOISE, block=150)["observer 25"], [every[:150].max(0), every[150:300].max(0), every[300:].max(0)]
+    )
+
+
+def test_a_step_crosses_the_threshold_when_the_law_says():
+    step = np.zeros((300, 2))
+    step[100:, 0], step[100:, 1] = 0.3, -1.0
+    filtered = statistics(step)["first-order 10"]
+    late_ms = np.argmax(filtered > 0.15, axis=0) - 99
+    law_ms = [-math.log(1.0 - 0.15 / torque) / 10.0 * 1e3 for torque in (0.3, 1.0)]
+    assert np.all((late_ms >= law_ms) & (late_ms < np.array(law_ms) + 1.0))
+
+
+def test_cusum_adds_up_what_is_above_the_drift_and_forgets_it_at_zero():
+    push = np.zeros((3000, 2))
+    push[:1000] = (0.5, -0.3)
+    summed = statistics(push)["cusum"]
+    # each of the two poles delays by 1 / 200 s
+    np.testing.assert_allclose(summed[999], [0.48 - 0.5 * 0.01, 0.28 - 0.3 * 0.01], rtol=3e-3)
+    assert np.all(np.diff(summed[1100:], axis=0) < 0.0)
+    np.testing.assert_allclose(summed[2000] - summed[2999], 0.02 * 0.999, rtol=1e-6)
+
+
+def test_friction_that_holds_a_joint_still_is_no_torque():
+    held = np.zeros((600, 2))
+    held[100:400, 0] = 0.2
+    friction = 0.2 * np.sign(np.sin(np.arange(600) / 20.0))
+    z = np.zeros((600, 2))
+    z[100:400, 0] = friction[100:400]
+    found = statistics(z, held)
+    for name in CHANNELS:
+        assert found[name].max() <= 1e-12, name
+    assert statistics(z)["first-order 50"].max() > 0.1
+
+
+def test_white_noise_makes_the_average_the_best_window_and_a_sigma_of_one():
+    (weights,) = likelihood_windows(np.r_[0.04, np.zeros(31)], (8,), 0.0, T, floor_Nm=0.0)
+    np.testing.assert_allclose(weights[:8], 1.0 / (0.2 * math.sqrt(8.0)), rtol=1e-12)
+    assert np.all(weights[8:] == 0.0)
+
+
+def test_a_whitened_window_has_a_sigma_of_one_on_coloured_noise():
+    white = np.random.default_rng(5).standard_normal((200_000, 2))
+    coloured = scipy.signal.lfilter([0.02, -0.015], [1.0, -0.5], white, axis=0)
+    weights = likelihood_weights(coloured, DetectorSettings(onset_samples=(4, 16)), 1.5e-3, T)
+    for window in weights.reshape(-1, weights.shape[-1]):
+        through = scipy.signal.lfilter(window, [1.0], coloured[:, 0])
+        assert 0.88 < through.std() <= 1.02
+
+
+def test_the_covariance_of_a_moving_average_is_found():
+    z = scipy.signal.lfilter([1.0, 0.5], [1.0], np.random.default_rng(6).standard_normal(200_000))
+    np.testing.assert_allclose(autocovariance(z, 4), [1.25, 0.5, 0.0, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: autocovariance(np.zeros(90), 10), "90 samples"),
+        (lambda: likelihood_windows(np.zeros(8), (4,), 0.0, T), "variance"),
+        (lambda: likelihood_windows(np.ones(8), (9,), 0.0, T), "8 samples"),
+        (lambda: DetectorSettings(band_rad_s=(50.0, 20.0)), "band_rad_s"),
+        (lambda: DetectorSettings(observer_rad_s=()), "observer_rad_s"),
+    ],
+)
+def test_what_cannot_be_designed_is_refused(call, words):
+    with pytest.raises((ValueError, ConfigError), match=words):
+        call()
+
+
+THETA = np.array([0.3841, 0.06825, 0.04035, 0.12, 0.06, 0.15, 0.08])
+
+
+def moving_arm(lag_s=0.0):
+    """A free motion with its exact torque, the velocity `lag_s` old."""
+    t_s = np.arange(3000) * T
+    w = np.array([1.5, 2.5])
+
+    def at(s):
+        return 0.5 * np.sin(np.outer(s, w)), 0.5 * w * np.cos(np.outer(s, w)), -0.5 * w**2 * np.sin(np.outer(s, w))
+
+    tau = np.array([inverse_dynamics(*row, THETA) for row in zip(*at(t_s), strict=True)])
+    return at(t_s)[0], at(t_s - lag_s)[1], tau
+
+
+def test_the_stream_of_a_free_arm_is_zero_but_for_the_reversals():
+    q, dq, tau = moving_arm()
+    z, held = make_stream(q, dq, tau, THETA, np.full(len(q), T), lag_s=0.0)
+    is_far = (np.minimum(np.abs(dq[1:]), np.abs(dq[:-1])) > 0.01).all(axis=1)
+    assert np.abs(z[1:][is_far]).max() < 2e-5
+    assert held.max() == 0.15
+    assert np.all((held > 0.0) == (np.abs(dq) < 2e-3))
+
+
+def test_an_external_torque_comes_out_positive_when_it_pushes_toward_plus_q():
+    q, dq, tau = moving_arm()
+    z, _ = make_stream(q, dq, tau - np.array([0.4, -0.2]), THETA, np.full(len(q), T), lag_s=0.0)
+    np.testing.assert_allclose(np.median(z, axis=0), [0.4, -0.2], atol=1e-4)
+
+
+def test_a_lag_that_is_known_is_taken_out():
+    q, dq, tau = moving_arm(lag_s=1.5e-3)
+    left = [np.abs(make_stream(q, dq, tau, THETA, np.full(len(q), T), lag_s=lag)[0]) for lag in (0.0, 1.5e-3)]
+    assert np.quantile(left[1], 0.9) < 0.15 * np.quantile(left[0], 0.9)
+
+
+def test_a_gap_and_a_change_of_theta_are_no_torque():
+    q, dq, tau = moving_arm()
+    keep = np.r_[0:1200, 1500:3000]
+    interval_s = np.full(len(keep), T)
+    interval_s[1200] = 0.0
+    unchanged, _ = make_stream(q[keep], dq[keep], tau[keep], THETA, interval_s, lag_s=0.0)
+    theta = np.tile(THETA, (len(keep), 1))
+    theta[600:, 0] *= 1.01
+    z, _ = make_stream(q[keep], dq[keep], tau[keep], theta, interval_s, lag_s=0.0)
+    assert np.all(z[1200] == 0.0)
+    a1_Nm = 0.01 * THETA[0] * np.diff(dq[:, 0])[600:1199] / T
+    np.testing.assert_allclose(z[601:1200, 0] - unchanged[601:1200, 0], a1_Nm, atol=1e-9)
+    np.testing.assert_allclose(
+        z[600, 0] - unchanged[600, 0], 0.01 * THETA[0] * (dq[600, 0] - dq[599, 0]) / T, atol=1e-9
+    )

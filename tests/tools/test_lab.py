@@ -1,0 +1,86 @@
+"""tools/lab.py: it plays the emulator itself, so a record is what the emulator measures, bit for bit."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adacd_hil.control.controller import _torque
+from firmware_sim.body import Body, DriveMode
+from firmware_sim.contact import ContactSettings
+from firmware_sim.scenario import Scenario
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import lab
+from lab import Motion, Push, profile_arm, random_arm, random_moves, record
+
+CYCLES = 150
+PUSHED = slice(80, 120)
+
+
+@pytest.fixture(autouse=True)
+def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Play with the emulator's compiled functions from Python: the whole loop takes longer to compile than these."""
+    monkeypatch.setattr(lab, "_play", getattr(lab._play, "py_func", lab._play))
+
+
+def short_motion(seed: int = 5):
+    return random_moves(seed, CYCLES * 1e-3)
+
+
+def link1_push(torque_Nm: float) -> ContactSettings:
+    return ContactSettings(at_s=0.08, link=1, point_m=0.25, force_N=torque_Nm / 0.25, duration_s=0.04)
+
+
+def test_a_record_is_what_the_emulator_measures_under_the_same_host():
+    arm, motion, contact = profile_arm("M", payload_kg=1.0), short_motion(), link1_push(2.0)
+    recording = record(arm, motion, seed=7, contacts=(contact,))
+    start_deg = np.degrees(motion.q_d[0])
+    body = Body(Scenario(profile="M", seed=7, payload_kg=1.0, start_deg=tuple(start_deg), contacts=(contact,)))
+    body.start_scenario()
+    measured, command, tau_d = [], np.zeros(2), np.zeros(2)
+    rated_Nm = np.array(arm.arm.rated_torque_Nm)
+    for k in range(CYCLES):
+        sample = body.sample()
+        measured.append((sample.q, sample.dq, sample.tau_J))
+        motion_d = motion.q_d[k], motion.dq_d[k], motion.ddq_d[k]
+        _torque(sample.q, sample.dq, *motion_d, np.zeros(7), np.array(arm.Kp), np.array(arm.Kd), tau_d)
+        body.advance(command, (DriveMode.TORQUE, DriveMode.TORQUE))
+        command = np.rint(tau_d / (1e-3 * rated_Nm)) * 1e-3 * rated_Nm
+    q, dq, tau_J = (np.array(values) for values in zip(*measured, strict=True))
+    assert np.abs(dq).max() > 0.05
+    assert recording.q == pytest.approx(q, abs=1e-15)
+    assert np.array_equal(recording.dq, dq)
+    assert recording.tau_J == pytest.approx(tau_J, abs=0.6e-6)  # the wire's LSB is 1 µNm
+
+
+def test_a_push_on_a_joint_is_the_force_that_has_its_torque():
+    arm, motion = profile_arm("S"), short_motion()
+    by_force = record(arm, motion, contacts=(link1_push(2.0),))
+    by_torque = record(arm, motion, pushes=(Push(0.08, 0.04, (2.0, 0.0)),))
+    assert by_torque.tau_ext == pytest.approx(by_force.tau_ext, abs=1e-12)
+    assert by_force.tau_ext[PUSHED, 0] == pytest.approx(2.0)
+    assert by_torque.q == pytest.approx(by_force.q, abs=6.1e-6)
+    assert by_torque.tau_J == pytest.approx(by_force.tau_J, abs=2e-3)
+
+
+def test_the_same_seed_gives_the_same_record():
+    arm = random_arm(3, friction="drift")
+    first, second = record(arm, short_motion(), seed=2), record(arm, short_motion(), seed=2)
+    assert np.array_equal(first.tau_J, second.tau_J)
+    assert not np.array_equal(first.tau_J, record(arm, short_motion(), seed=3).tau_J)
+
+
+def test_asymmetric_friction_takes_more_torque_the_one_way_than_the_other():
+    arm, way = profile_arm("M", friction="asymmetric"), np.ones((600, 2))
+    torques = []
+    for speed in (0.5, -0.5):
+        ramp = Motion("ramp", np.cumsum(speed * 1e-3 * way, 0), speed * way, 0.0 * way)
+        torques.append(record(arm, ramp).tau_J[-200:].mean(0))
+    assert torques[0] + torques[1] == pytest.approx([2.0 * 0.15 * 0.15, 2.0 * 0.15 * 0.08], abs=0.01)
+
+
+def test_an_unknown_friction_is_refused():
+    with pytest.raises(ValueError, match="friction = 'wet' is none of plain"):
+        profile_arm("P", friction="wet")

@@ -1,0 +1,82 @@
+"""The certified scheme behind the campaign's one call; see `campaign_schemes`."""
+
+from dataclasses import replace
+
+import numpy as np
+from campaign_schemes import ADAPTING, ARMED, TESTING, Outcome
+from lab import PERIOD_S, Motion, Recording, paper_motion
+
+from adacd_hil.config import Settings
+from adacd_hil.control.excitation import Excitation
+from adacd_hil.records import JOINTS, SchemeState
+from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme.observation import CONTACT_SHIFT
+
+WIDE_FILTER = 1
+"""Filter of the bank that is undone for the external torque, as in contact reports."""
+WIDE_SAMPLES = 5
+_PHASES = {int(SchemeState.CERTIFY): TESTING, int(SchemeState.MONITOR): ARMED}
+
+
+class CertifiedScheme:
+    """The certified scheme as a configuration has it."""
+
+    patience_s = 12.0
+
+    def __init__(self, name: str, settings: Settings) -> None:
+        self.name = name
+        self._settings = settings
+
+    def adaptation_motion(self, is_payload: bool) -> Motion:  # noqa: ARG002
+        """Give the excitation of the configuration, or where it has none the paper's motion."""
+        excitation = Excitation(self._settings)
+        if not excitation.is_on:
+            return paper_motion(self.patience_s)
+        q_d, dq_d, ddq_d = (np.zeros((round(self.patience_s / PERIOD_S), JOINTS)) for _ in range(3))
+        for k in range(len(q_d)):
+            excitation.evaluate(k * PERIOD_S, q_d[k], dq_d[k], ddq_d[k])
+        return Motion("excitation", q_d, dq_d, ddq_d)
+
+    def run(self, recording: Recording, begins: tuple[int, ...]) -> Outcome:
+        """Play a recording through the compiled step; the second of `begins` is a payload's."""
+        settings = replace(
+            self._settings, arm=replace(self._settings.arm, link_length_m=recording.arm.arm.link_length_m)
+        )
+        n, count = len(recording.q), len(certified_kernel.parameter_names(settings))
+        memory = certified_kernel.new_memory(settings)
+        state, observation, theta = np.zeros(n), np.zeros(n), np.zeros((n, count))
+        y, h = (np.zeros((n, *memory[0]["y"].shape)) for _ in range(2))
+        certified_kernel.step_record(
+            certified_kernel.constants_of(settings),
+            memory,
+            certified_kernel.new_block(settings),
+            recording.q,
+            recording.dq,
+            recording.tau_J,
+            begins[1] if len(begins) > 1 else -1,
+            state,
+            observation,
+            y,
+            h,
+            theta,
+        )
+        phase = np.full(n, ADAPTING)
+        for number, its in _PHASES.items():
+            phase[state == number] = its
+        armed = []
+        for begin, end in zip(begins, (*begins[1:], n), strict=True):
+            cycles = np.flatnonzero(phase[begin:end] == ARMED)
+            armed.append(begin + int(cycles[0]) if cycles.size else -1)
+        over = observation.astype(np.int64) >> CONTACT_SHIFT
+        wide = self._undo(y[:, WIDE_FILTER], settings.certified.cutoffs_rad_s[WIDE_FILTER])
+        return Outcome(phase, over, y[:, 0], wide, h[:, 0], tuple(armed), theta[np.maximum(armed, 0)])
+
+    @staticmethod
+    def _undo(y: np.ndarray, cutoff_rad_s: float) -> np.ndarray:
+        """Undo a filter, as `adacd_hil.scheme.contact.undo_filter` does."""
+        decay = np.exp(-cutoff_rad_s * PERIOD_S)
+        sharp = y.copy()
+        sharp[1:] = (y[1:] - decay * y[:-1]) / (1.0 - decay)
+        total = np.cumsum(np.vstack((np.zeros((WIDE_SAMPLES, JOINTS)), sharp)), axis=0)
+        wide: np.ndarray = (total[WIDE_SAMPLES:] - total[:-WIDE_SAMPLES]) / WIDE_SAMPLES
+        return wide

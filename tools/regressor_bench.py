@@ -1,0 +1,127 @@
+"""Prints what the regressor, its filter and a correction cost per step for 2 and 7 joints, in µs, no verdict.
+
+    python tools/regressor_bench.py
+
+Compiled: a loop in machine code, percentiles over blocks of 100 steps. From Python: single calls. Absolute figures are
+this machine's; compare ratios of one run.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.scheme import chain, estimator, filters, offline, regressor
+from adacd_hil.scheme.urdf import read_urdf
+
+ROOT = Path(__file__).resolve().parent.parent
+BLOCK, BLOCKS = 100, 300
+CUTOFF_RAD_S, PERIOD_S = 10.0, 1e-3
+
+
+@compiled
+def closed_form(q, dq, Y_p, Y_h):
+    """Fill the planar arm's columns for each state."""
+    for k in range(q.shape[0]):
+        regressor.fill_momentum(q[k], dq[k], Y_p)
+        regressor.fill_remainder(q[k], dq[k], Y_h)
+
+
+@compiled
+def by_chain(arm, place, first_friction, q, dq, scratch, Y_p, Y_h):
+    """Fill a chain's columns for each state."""
+    for k in range(q.shape[0]):
+        chain.fill(arm, place, q[k], dq[k], scratch, Y_p, Y_h)
+        chain.fill_friction(dq[k], first_friction, Y_h)
+
+
+@compiled
+def filtered(count, decay, old, new, cutoff, Y_p, Y_h, input_old, S, W_f):
+    """Filter the regressor `count` times."""
+    for _ in range(count):
+        filters.advance_regressor(decay, old, new, cutoff, cutoff, Y_p, Y_h, input_old, S, W_f)
+
+
+@compiled
+def looked_at(count, W_f, P, noise, WP, deviation):
+    """Work out the uncertainty of the residual `count` times."""
+    for _ in range(count):
+        offline.fill_deviation(W_f, P, noise, WP, deviation)
+
+
+@compiled
+def corrected(count, W_f, tau_f, theta_hat, P, v, K):
+    """Correct the estimate `count` times."""
+    for _ in range(count):
+        estimator.update(W_f, tau_f, 1e3, True, theta_hat, P, v, K)
+
+
+def show(name: str, block: Callable[[], object], steps: int) -> None:
+    """Time blocks of so many steps and print a row."""
+    clock = time.perf_counter_ns
+    times_us = np.empty(BLOCKS)
+    block()
+    for index in range(BLOCKS):
+        start_ns = clock()
+        block()
+        times_us[index] = (clock() - start_ns) * 1e-3 / steps
+    p50, p99, p999 = np.percentile(times_us, [50.0, 99.0, 99.9])
+    print(f"{name:44} {p50:8.2f} {p99:8.2f} {p999:8.2f} {times_us.max():8.1f}")
+
+
+def show_rest(named: str, Y_p: np.ndarray, Y_h: np.ndarray) -> None:
+    """Print what follows the regressor: one filter, the uncertainty, one correction."""
+    n, p = Y_p.shape
+    hold = filters.first_order_hold(CUTOFF_RAD_S, CUTOFF_RAD_S, PERIOD_S)
+    input_old, S, W_f, WP = (np.zeros((n, p)) for _ in range(4))
+    P, noise = np.eye(p), np.full(n, 0.02)
+    show(f"{named}: one filter of it", lambda: filtered(BLOCK, *hold, CUTOFF_RAD_S, Y_p, Y_h, input_old, S, W_f), BLOCK)
+    show(f"{named}: w P w'", lambda: looked_at(BLOCK, W_f, P, noise, WP, np.zeros(n)), BLOCK)
+    theta_hat, v, K = (np.zeros(p) for _ in range(3))
+    show(f"{named}: one correction", lambda: corrected(BLOCK, W_f, np.zeros(n), theta_hat, P, v, K), BLOCK)
+
+
+def planar_arm() -> chain.Chain:
+    """Return the emulated arm's geometry."""
+    translation = np.array([[0.0, 0.0, 0.0], [0.35, 0.0, 0.0]])
+    axis = np.array([[0.0, 0.0, 1.0]] * 2)
+    return chain.Chain(np.array([np.eye(3)] * 2), translation, axis, np.zeros(2), np.zeros(3))
+
+
+def main() -> int:
+    """Print the table."""
+    print(f"{'µs per step':44} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}")
+    random = np.random.default_rng(0)
+    q, dq = random.uniform(-1.0, 1.0, (2, BLOCK, 2))
+    Y_p, Y_h = np.zeros((2, 7)), np.zeros((2, 7))
+    show("2 joints, closed form, p = 7: Y_p, Y_h", lambda: closed_form(q, dq, Y_p, Y_h), BLOCK)
+    show("  from Python", lambda: closed_form(q[:1], dq[:1], Y_p, Y_h), 1)
+    show_rest("  p = 7", Y_p, Y_h)
+    seven = read_urdf((ROOT / "tests/scheme/seven_joint_arm.urdf").read_text()).chain
+    for arm in (planar_arm(), seven):
+        bench_chain(arm)
+    return 0
+
+
+def bench_chain(arm: chain.Chain) -> None:
+    """Print the rows of one arm."""
+    base, n = chain.find_base(arm), len(arm.axis)
+    first_friction = base.columns.size
+    p = first_friction + 2 * n
+    q, dq = np.random.default_rng(0).uniform(-1.0, 1.0, (2, BLOCK, n))
+    Y_p, Y_h, scratch = np.zeros((n, p)), np.zeros((n, p)), chain.new_scratch(arm)
+    show(
+        f"{n} joints, chain, p = {p}: Y_p, Y_h",
+        lambda: by_chain(arm, base.place, first_friction, q, dq, scratch, Y_p, Y_h),
+        BLOCK,
+    )
+    one = (arm, base.place, first_friction, q[:1], dq[:1], scratch, Y_p, Y_h)
+    show("  from Python", lambda: by_chain(*one), 1)
+    show_rest(f"  p = {p}", Y_p, Y_h)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
