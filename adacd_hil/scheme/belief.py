@@ -6,14 +6,15 @@ T_learn therefore counts with the variance
 
     R = sigma² 2 / (a T_learn),    sigma: what a good model leaves in the filtered residual, Nm rms,
 
-so that P means what it says.
+so that P means what it says. Friction of a joint that stands still is any torque up to the static one: what of it is in
+the filter counts as further deviation, so an arm at rest teaches next to nothing.
 
 **Payload.** One of mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this
 direction g by sigma_m² g g', and a little in each inertia for what is no point mass. All else stays known.
 
 **Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
 
-Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau (h, n).
+Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R (h, n).
 """
 
 from typing import Any
@@ -52,25 +53,29 @@ def wander(drift_std: Vector, elapsed_s: float, P: Vector) -> None:
 
 
 @compiled
-def learn(c: Any, m: Any, W_f: Vector, tau_f: Vector) -> bool:
+def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector) -> bool:
     """Put this sample into the ring, and correct the belief by the one that has waited long enough, if one has.
 
-    W_f (n, p), tau_f (n,): of the filter that is learnt from. Return whether the belief has changed.
+    W_f (n, p), tau_f (n,): of the filter that is learnt from. held (n,): torque in it that friction may have held at
+    standstill, Nm. Return whether the belief has changed.
     """
     m["since_learnt"] += 1.0
-    if m["since_learnt"] < c["learn_every"]:
+    if m["since_learnt"] < k["learn_every"]:
         return False
     m["since_learnt"] = 0.0
     place = int(m["ring_next"])
     has_waited = m["ring_used"] == m["ring_tau"].shape[0]
     if has_waited:
-        estimator.update(
-            m["ring_W"][place], m["ring_tau"][place], c["R"], True, m["belief"], m["P_belief"], m["v"], m["K"]
-        )
+        for i in range(tau_f.shape[0]):
+            R = m["ring_R"][place, i]
+            w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
+            estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W_f
     m["ring_tau"][place] = tau_f
+    for i in range(tau_f.shape[0]):
+        m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + held[i] ** 2)
     m["ring_next"] = (place + 1) % m["ring_tau"].shape[0]
     return bool(has_waited)
 

@@ -123,7 +123,9 @@ def constants_of(settings: Settings) -> Structured:
         "payload_direction": belief.payload_direction(settings.arm.link_length_m, len(names)),
         "payload_std_kg": certified.payload_std_kg,
         "payload_inertia_std": certified.payload_inertia_std,
-        "R": certified.residual_Nm**2 * max(correlated, 1.0),
+        "correlated": max(correlated, 1.0),
+        "residual_Nm": certified.residual_Nm,
+        "unit_share": period_s / sensitivity.UNIT_S,
         "learn_every": certified.learn_every,
         "recover_cycles": round(certified.recover_s / period_s),
         "fit_cycles": [round(fit_s / period_s) for fit_s in certified.fit_s],
@@ -187,6 +189,7 @@ def new_memory(settings: Settings) -> Structured:
         "K": parameter,
         "ring_W": (waiting, *columns),
         "ring_tau": (waiting, JOINTS),
+        "ring_R": (waiting, JOINTS),
         "ring_used": (),
         "ring_next": (),
         "since_learnt": (),
@@ -221,6 +224,9 @@ def new_memory(settings: Settings) -> Structured:
         "rest_tau": joint,
         "rest_square": joint,
         "roughness": joint,
+        "unit": joint,
+        "hold": joint,
+        "held": joint,
         # contact
         "history": (contact.WIDE_SAMPLES + 1, JOINTS),
         "wide_sigma": joint,
@@ -229,6 +235,7 @@ def new_memory(settings: Settings) -> Structured:
     memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
     memory["has_gap"] = 1.0
     memory["roughness"] = 1.0
+    memory["unit"] = 1.0
     state = memory[0]
     prior_std = _by_kind(certified.prior_std, parameter_names(settings))
     prior = prior_of(settings)
@@ -270,6 +277,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)
     belief.discard(m)
+    m["unit"][:] = 1.0
     m["samples"] = 0.0
     m["recovering_cycles"] = 0.0
     m["q_low"][:] = np.inf
@@ -398,6 +406,7 @@ def _filter(k: Any, m: Any, out: Any, periods: int) -> None:
     bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
     bank.smooth(k["smoothing"], m["r"], m["y"])
     sensitivity.follow_standstill(dq, k["still_rad_s"], k["decay"], k["smoothing"], m["still"], m["still_smooth"])
+    sensitivity.follow_friction(k, m, _FIT)
     out["tau_f"][:] = m["tau_f"][_FIT]
     detector.predict(m["W_f"][_FIT], k["theta_cad"], out["tau_f_cad"])
     for i in range(q.shape[0]):
@@ -454,7 +463,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if mode & REFINE:
         _refine(k, m, is_free)
         return 0
-    if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT]):
+    if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         _use_belief(m)
     return _FITTED if is_free and _gather_evidence(k, m, out) else 0
 
@@ -475,7 +484,8 @@ def _refine(k: Any, m: Any, is_free: bool) -> None:
     if not is_free:
         refinement.restart(m)
         return
-    if belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT]):
+    sensitivity.follow_unit(k, m, _FIT)
+    if belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])
     refinement.test_candidate(k, m)
 

@@ -7,8 +7,9 @@
 - nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
   counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.31 (s / 200) /
   (1 + a / 650) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
-- g² = w (P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
-  parameter explains however long one learns. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
+- g² = w (u P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
+  parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
+  model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
 - s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
   where it is in the model, and as much more as these are uncertain.
 
@@ -24,6 +25,14 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import CertifiedSettings
 from adacd_hil.records import Vector
 from adacd_hil.scheme import contact, friction
+
+UNIT_PEAK = 4.0
+"""Mean square of the residual to that of its hard moments: friction errs where a joint turns round, not all the time."""
+SMALLEST_UNIT = 0.05
+LARGEST_UNIT = 9.0
+"""Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
+UNIT_S = 20.0
+"""Memory of the unit: some swings of a slow motion."""
 
 _SMOOTHED_SHARE = 0.31 / 200.0
 _VELOCITY_STD_SHARE = 0.12
@@ -58,6 +67,22 @@ def follow_standstill(
 
 
 @compiled
+def follow_unit(k: Any, m: Any, fit: int) -> None:
+    """Take one sample without contact into the unit (n,) of the belief's variances."""
+    for i in range(m["unit"].shape[0]):
+        w = m["W_f"][fit, i]
+        believed = k["residual_Nm"] ** 2 + m["held"][i] ** 2
+        for j in range(w.shape[0]):
+            row = 0.0
+            for n in range(w.shape[0]):
+                row += m["P"][j, n] * w[n]
+            believed += w[j] * row
+        ratio = m["r"][fit, i] ** 2 / believed
+        unit = m["unit"][i] + k["unit_share"] * (UNIT_PEAK * ratio - m["unit"][i])
+        m["unit"][i] = min(max(unit, SMALLEST_UNIT), LARGEST_UNIT)
+
+
+@compiled
 def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
     """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
     filters = m["r"].shape[0]
@@ -65,14 +90,22 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
         momentum = 0.0
         for j in range(m["M"].shape[1]):
             momentum += m["M"][i, j] ** 2
-        hold = k["standstill_share"] * _static_friction(k, m, i)
+        hold = m["hold"][i]
         for c in range(filters):
-            g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i]))
+            g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
             m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
             h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i], hold * m["still_smooth"][c, i])
             if c > 0:
                 bare = filters + c - 1
                 h[bare, i] = _threshold(k, m, bare, i, momentum, g, hold * m["still"][c, i])
+
+
+@compiled
+def follow_friction(k: Any, m: Any, fit: int) -> None:
+    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in filter `fit` now, Nm."""
+    for i in range(m["hold"].shape[0]):
+        m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i)
+        m["held"][i] = m["hold"][i] * m["still"][fit, i]
 
 
 @compiled
@@ -115,14 +148,14 @@ def fill_wide(k: Any, m: Any, c: int) -> None:
 
 
 @compiled
-def _doubt(k: Any, m: Any, w: Vector) -> float:
-    """Return w (P + D) w'."""
+def _doubt(k: Any, m: Any, w: Vector, unit: float) -> float:
+    """Return w (u P + D) w'."""
     total = 0.0
     for j in range(w.shape[0]):
         row = 0.0
         for n in range(w.shape[0]):
             row += m["P"][j, n] * w[n]
-        total += w[j] * row + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
+        total += unit * w[j] * row + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
     return max(total, 0.0)
 
 
