@@ -50,6 +50,7 @@ MONITOR = int(SchemeState.MONITOR)
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
+_OVER_SPEED = int(Observation.OVER_SPEED)
 _AT_REST = int(Observation.AT_REST)
 _UNLOADED = int(Observation.UNLOADED)
 _CONTACT = int(Observation.CONTACT)
@@ -357,8 +358,10 @@ def observe(k: Any, out: Any) -> int:
         q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
         if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
             observation |= _NOT_A_NUMBER
-        if not (abs(q) <= k["position_limit_rad"][i] and abs(dq) <= k["velocity_limit_rad_s"][i]):
+        if not (abs(q) <= k["position_limit_rad"][i]):
             observation |= _OVER_LIMIT
+        if not (abs(dq) <= k["velocity_limit_rad_s"][i]):
+            observation |= _OVER_SPEED
         if not (abs(dq) < k["rest_velocity_rad_s"]):
             observation &= ~_AT_REST
         if not (abs(tau_J) < k["rest_torque_Nm"]):
