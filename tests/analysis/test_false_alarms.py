@@ -71,9 +71,10 @@ def test_the_predicted_rate_is_that_of_other_motion():
         assert 0.5 < prediction.factor < 2.0
 
 
+@pytest.mark.slow
 def test_a_rate_that_was_never_seen_is_extrapolated_within_its_bound():
     found = calibrate(noise_peaks(3, 1.0)[:, 0], BLOCK_S, 0.05)
-    truth = calibrate(noise_peaks(4, 30.0)[:, 0], BLOCK_S, 0.5)
+    truth = calibrate(noise_peaks(4, 15.0)[:, 0], BLOCK_S, 0.5)
     assert found.is_extrapolated
     assert not truth.is_extrapolated
     assert truth.threshold < found.bound
