@@ -141,7 +141,7 @@ def test_what_limits_a_threshold_is_named(change, limit):
     t_s = np.arange(20_000) * T
     values = {
         "torque_noise_Nm": 0.02, "torque_LSB_Nm": 1.5e-3, "velocity_LSB_rad_s": 5e-4, "mass_row_kg_m2": 0.4,
-        "lag_error_s": 0.0, "friction_error_Nm": 0.0,
+        "momentum_noise_Nms": 0.0, "lag_error_s": 0.0, "friction_error_Nm": 0.0,
     }  # fmt: skip
     sensing = Sensing(**(values | change))
     z = 0.02 * np.random.default_rng(9).standard_normal(20_000)
@@ -151,12 +151,19 @@ def test_what_limits_a_threshold_is_named(change, limit):
     assert limits.achievable_Nm > 0.0
 
 
-def test_noise_that_nothing_explains_is_the_velocitys():
-    z = 0.5 * np.random.default_rng(9).standard_normal(20_000)
-    sensing = Sensing(0.02, 1.5e-3, 5e-4, 0.4, 0.0, 0.0)
-    limits = find_limits(z, np.zeros(20_000), np.zeros(20_000), sensing, (50.0,), T, 1.2e-3, 0.01)
-    assert limits.limit == "velocity noise"
-    np.testing.assert_allclose(limits.achievable_Nm, peak_factor(0.01, 50.0) * low_pass(z, (50.0,), T).std(), rtol=1e-9)
+def test_fast_noise_is_the_velocitys_and_what_lasts_is_the_models():
+    noise_Nms = 4e-4 * np.random.default_rng(9).standard_normal(20_001)
+    z = np.diff(noise_Nms) / T
+    sensing = Sensing(0.0, 0.0, 0.0, 0.4, 4e-4, 0.0, 0.0)
+
+    def limits(stream):
+        return find_limits(stream, np.zeros(20_000), np.zeros(20_000), sensing, (50.0,), T, 1.2e-3, 0.01)
+
+    fast, slow = limits(z), limits(z + 0.1)
+    assert (fast.limit, slow.limit) == ("velocity noise", "model")
+    expected = peak_factor(0.01, 50.0) * low_pass(z, (50.0,), T).std()
+    np.testing.assert_allclose([fast.achievable_Nm, slow.achievable_Nm], expected, rtol=0.05)
+    np.testing.assert_allclose(slow.sources[0].peak_Nm, peak_factor(0.01, 50.0) * 0.1, rtol=0.02)
 
 
 def test_a_margin_that_shrinks_is_a_warning():
