@@ -11,7 +11,6 @@ from typing import Any
 from adacd_hil.compiled import compiled
 from adacd_hil.scheme.regressor import is_positive_definite
 
-
 MOVING = 0.05
 """Share of standstill in the filter's memory below which friction is what the model says it is."""
 

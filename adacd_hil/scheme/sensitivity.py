@@ -5,11 +5,12 @@
 - sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
   that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
 - nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
-  counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.31 (s / 200) /
-  (1 + a / 650) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
+  counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.335 (s / 200) /
+  (1 + a / 600) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
 - g² = w (u P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
   parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
-  model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
+  model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed,
+  too: a bound, since |F x| <= F |x|.
 - s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
   where it is in the model, and as much more as these are uncertain.
 
@@ -27,17 +28,17 @@ from adacd_hil.records import Vector
 from adacd_hil.scheme import contact, friction
 
 UNIT_PEAK = 4.0
-"""Mean square of the residual to that of its hard moments: friction errs where a joint turns round, not all the time."""
+"""Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
 SMALLEST_UNIT = 0.05
 LARGEST_UNIT = 9.0
 """Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
 UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
 
-_SMOOTHED_SHARE = 0.31 / 200.0
+_SMOOTHED_SHARE = 0.335 / 200.0
 _VELOCITY_STD_SHARE = 0.12
 """Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
-_SMOOTHED_FALL_RAD_S = 650.0
+_SMOOTHED_FALL_RAD_S = 600.0
 
 
 def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, Vector]:
