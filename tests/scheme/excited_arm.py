@@ -1,18 +1,21 @@
-"""The small 2R arm of `planar_arm` on the excitation, recorded and played through the certified scheme's step."""
+"""The small 2R arm of `planar_arm` on the excitation: recorded and played, or in closed loop with the pipeline."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from planar_arm import ENCODER_LSB_RAD, TORQUE_LSB_NM, TORQUE_NOISE_NM, VELOCITY_LSB_RAD_S, advance
+from planar_arm import ENCODER_LSB_RAD, THETA, TORQUE_LSB_NM, TORQUE_NOISE_NM, VELOCITY_LSB_RAD_S, advance
 
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.excitation import Excitation
-from adacd_hil.records import SchemeState
+from adacd_hil.records import ArmState, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
 PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")
+SETTINGS = replace(SETTINGS, safety=replace(SETTINGS.safety, commission_cycles=10))
 NAMES = certified_kernel.parameter_names(SETTINGS)
 
 
@@ -90,3 +93,90 @@ def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS) 
     y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
     certified_kernel.step_record(constants, memory, block, *measured, payload_at, state, observation, y, h, theta)
     return Played(state, observation, y, h, theta, constants, memory, block)
+
+
+LEAD_S = 1.5
+BRAKE_RAD_S2 = 12.0
+MOVING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
+
+
+class ExcitedLoop:
+    """The arm under PD control, and the certified pipeline that watches it; one call of `step` is one period.
+
+    It moves on the excitation wherever the arm moves, brakes where it reacts, and is led back from there.
+    """
+
+    def __init__(self, settings: Settings = SETTINGS, theta: np.ndarray = THETA["P"], seed: int = 1):
+        self.settings = settings
+        self.pipeline = CertifiedPipeline(settings)
+        self.excitation = Excitation(settings)
+        self.theta = theta.copy()
+        self.random = np.random.default_rng(seed)
+        self.desired = np.zeros((3, 2))
+        self.excitation.evaluate(0.0, *self.desired)
+        self.corner = self.desired[0].copy()
+        self.q, self.dq = self.corner.copy(), np.zeros(2)
+        self.tracked_q, self.tracked_dq = self.q.copy(), np.zeros(2)
+        self.tau, self.tau_next, self.tau_ext = np.zeros(2), np.zeros(2), np.zeros(2)
+        self.away = np.zeros(2)
+        self.cycle = self.motion_cycles = 0
+        self.request = Request.NONE
+
+    def measure(self) -> ArmState:
+        tau_J = self.tau + TORQUE_NOISE_NM * self.random.standard_normal(2)
+        return arm_state(
+            self.cycle,
+            np.round(self.q / ENCODER_LSB_RAD) * ENCODER_LSB_RAD,
+            np.round(self.tracked_dq / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S,
+            np.round(tau_J / TORQUE_LSB_NM) * TORQUE_LSB_NM,
+        )
+
+    def move(self, output: SchemeOutput) -> None:
+        """Go on with the desired motion."""
+        if output.state not in MOVING:
+            q_d, dq_d, _ = self.desired
+            dq_d -= np.clip(dq_d, -BRAKE_RAD_S2 * PERIOD_S, BRAKE_RAD_S2 * PERIOD_S)
+            q_d += PERIOD_S * dq_d
+            return
+        if output.previous_state not in MOVING:
+            self.away = self.desired[0] - self.corner
+            self.motion_cycles = 0
+        at_s = self.motion_cycles * PERIOD_S
+        self.excitation.evaluate(at_s, *self.desired)
+        x = min(at_s / LEAD_S, 1.0)
+        self.desired[0] += self.away * (1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+        self.desired[1] -= self.away * 30.0 * x**2 * (1.0 - x) ** 2 / LEAD_S
+        self.motion_cycles += 1
+
+    def step(self) -> SchemeOutput:
+        arm = self.measure()
+        output = self.pipeline.step(arm, self.request)
+        self.request = Request.NONE
+        self.move(output)
+        controller = self.settings.controller
+        self.tau = self.tau_next
+        self.tau_next = controller.Kp * (self.desired[0] - arm.q) + controller.Kd * (self.desired[1] - arm.dq)
+        push = self.tau + self.tau_ext
+        advance(self.q, self.dq, self.tracked_q, self.tracked_dq, push, self.theta, PERIOD_S)
+        self.cycle += 1
+        return output
+
+    def run(self, cycles: int) -> list[SchemeOutput]:
+        return [self.step() for _ in range(cycles)]
+
+    def run_until(self, state: SchemeState, most_cycles: int = 5000) -> list[SchemeOutput]:
+        outputs = []
+        for _ in range(most_cycles):
+            outputs.append(self.step())
+            if outputs[-1].state is state:
+                return outputs
+        raise AssertionError(f"still in {outputs[-1].state.name} after {most_cycles} cycles")
+
+
+def arm_state(cycle, q=(0.0, 0.0), dq=(0.0, 0.0), tau_J=(0.0, 0.0), **changes) -> ArmState:
+    """Return what an enabled, healthy arm reports."""
+    state = ArmState(
+        cycle, cycle * 1_000_000, 1, np.array(q), np.array(dq), np.array(tau_J), (0, 0), (0, 0), is_enabled=True,
+        is_complete=True, fault=FaultReason.NONE,
+    )  # fmt: skip
+    return state._replace(**changes)
