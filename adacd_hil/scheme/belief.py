@@ -25,6 +25,11 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme import estimator
 
+_SWEEPS = 200
+"""Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
+_SETTLED = 1e-9
+"""Nm or Nm s/rad that the last sweep may still have moved one of them by."""
+
 
 @compiled
 def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
@@ -91,20 +96,23 @@ def discard(m: Any) -> None:
 def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
     """Move theta (p,) in place so that none of its parameters first .. last - 1 is negative.
 
-    Each that is goes to zero and takes the others along as P says they belong together: the nearest such theta in the
-    metric of P. P stays; it is no less uncertain for that.
+    To the nearest such theta in the metric of P, theta + P lambda with lambda >= 0: each one that is negative is pushed
+    to zero and takes the others along as P says they belong together; one that was taken further is let go again
+    (Hildreth's method). P stays; it is no less uncertain for that.
     """
-    for _ in range(last - first):
-        worst = first
+    pushed = np.zeros(last - first)
+    for _ in range(_SWEEPS):
+        moved = 0.0
         for j in range(first, last):
-            if theta[j] < theta[worst]:
-                worst = j
-        if theta[worst] >= 0.0 or not P[worst, worst] > 0.0:
+            if not P[j, j] > 0.0:
+                continue
+            push = max(-theta[j] / P[j, j], -pushed[j - first])
+            pushed[j - first] += push
+            for n in range(theta.shape[0]):
+                theta[n] += push * P[n, j]
+            moved = max(moved, abs(push) * P[j, j])
+        if moved < _SETTLED:
             break
-        share = theta[worst] / P[worst, worst]
-        for j in range(theta.shape[0]):
-            theta[j] -= share * P[j, worst]
-        theta[worst] = 0.0
     for j in range(first, last):
         theta[j] = max(theta[j], 0.0)
 
