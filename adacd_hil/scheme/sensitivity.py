@@ -1,6 +1,6 @@
 """The thresholds of the certified scheme: what each channel of the bank may show without a contact.
 
-    h = sqrt((k_tau sigma_tau)² + nu² (M M')_ii + (k_m g)²) + F_c s
+    h = e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)²) + F_c s
 
 - sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
   that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
@@ -11,6 +11,8 @@
   parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
   model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed,
   too: a bound, since |F x| <= F |x|.
+- R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
+- e: 1, or more of a joint that has shown contacts while the arm learnt (`strain`).
 - s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
   where it is in the model, and as much more as these are uncertain.
 
@@ -27,6 +29,19 @@ from adacd_hil.config import CertifiedSettings
 from adacd_hil.records import Vector
 from adacd_hil.scheme import contact, friction
 
+SECOND_DIFFERENCE = 0.3
+"""Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, as below."""
+JUMP = 5.0
+"""Deviations of the noise as which a jump counts at most."""
+ROUGHNESS_S = 0.3
+"""Memory of the velocity's roughness."""
+STRAIN = 2.0
+LARGEST_STRAIN = 8.0
+"""A contact while learning doubles the thresholds, three times at most."""
+STRAIN_S = 10.0
+"""Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
+RELAXED = 0.6
+"""Share of its threshold that the residual must stay below for that."""
 UNIT_PEAK = 4.0
 """Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
 SMALLEST_UNIT = 0.05
@@ -51,6 +66,10 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
     return {
         "torque_variance": certified.noise_sigmas**2 * sigma_squared,
         "velocity_variance": nu**2,
+        "velocity_noise_rad_s": np.array(certified.velocity_noise_rad_s),
+        "roughness_share": np.array(period_s / ROUGHNESS_S),
+        "strain_share": np.array(period_s / STRAIN_S),
+        "unit_share": np.array(period_s / UNIT_S),
         "velocity_std_rad_s": np.array(_VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
     }
 
@@ -65,6 +84,51 @@ def follow_standstill(
             target = 1.0 if abs(dq[i]) < still_rad_s else 0.0
             still[c, i] = target + decay[c] * (still[c, i] - target)
             still_smooth[c, i] = still[c, i] + smoothing * (still_smooth[c, i] - still[c, i])
+
+
+@compiled
+def follow_velocity_noise(k: Any, m: Any, dq: Vector) -> None:
+    """Take one sample without a gap into the roughness (n,) of the velocity: its noise over the settings', squared.
+
+    Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
+    encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most.
+    """
+    floor = (SECOND_DIFFERENCE * k["velocity_noise_rad_s"]) ** 2
+    for i in range(dq.shape[0]):
+        ddq = dq[i] - m["dq_old"][i]
+        if floor > 0.0:
+            square = (ddq - m["ddq_old"][i]) ** 2 / floor
+            square = min(square, JUMP**2 * m["velocity_roughness"][i])
+            rough = m["velocity_roughness"][i] + k["roughness_share"] * (square - m["velocity_roughness"][i])
+            m["velocity_roughness"][i] = max(rough, 1.0)
+        m["ddq_old"][i] = ddq
+        m["dq_old"][i] = dq[i]
+
+
+@compiled
+def strain(m: Any) -> None:
+    """Doubt the thresholds of the joints that are over theirs now: a contact while learning may be the model's failure.
+
+    Once it may be a hand; again and again it is what no parameter explains, such as backlash. Then the arm is armed
+    with higher thresholds rather than never.
+    """
+    for i in range(m["strain"].shape[0]):
+        for c in range(m["y"].shape[0]):
+            if not (abs(m["y"][c, i]) <= m["h"][c, i]):
+                m["strain"][i] = min(STRAIN * m["strain"][i], LARGEST_STRAIN)
+                break
+
+
+@compiled
+def relax(k: Any, m: Any) -> None:
+    """Take one sample without contact into the strain (n,): it goes back while the residual leaves room for it."""
+    for i in range(m["strain"].shape[0]):
+        share = 0.0
+        for c in range(m["y"].shape[0]):
+            share = max(share, abs(m["y"][c, i]) / m["h"][c, i])
+        m["used"][i] = max(share, m["used"][i] * (1.0 - k["strain_share"]))
+        if m["used"][i] < RELAXED:
+            m["strain"][i] = max(m["strain"][i] * (1.0 - k["strain_share"]), 1.0)
 
 
 @compiled
@@ -90,7 +154,7 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
     for i in range(h.shape[1]):
         momentum = 0.0
         for j in range(m["M"].shape[1]):
-            momentum += m["M"][i, j] ** 2
+            momentum += m["velocity_roughness"][j] * m["M"][i, j] ** 2
         hold = m["hold"][i]
         for c in range(filters):
             g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
@@ -124,7 +188,7 @@ def _static_friction(k: Any, m: Any, joint: int) -> float:
 @compiled
 def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float, held: float) -> float:
     noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
-    return float(np.sqrt(noise + g * g) + held)
+    return float(m["strain"][joint] * np.sqrt(noise + g * g) + held)
 
 
 @compiled
@@ -140,7 +204,7 @@ def fill_wide(k: Any, m: Any, c: int) -> None:
     for i in range(m["r"].shape[1]):
         momentum = 0.0
         for j in range(m["M"].shape[1]):
-            momentum += m["M"][i, j] ** 2
+            momentum += m["velocity_roughness"][j] * m["M"][i, j] ** 2
         noise = k["torque_noise_Nm"] ** 2 * m["roughness"][i] / samples
         velocity = 2.0 * (k["velocity_std_rad_s"] / span_s) ** 2 * momentum
         doubt = m["doubt"][c, i] / k["model_sigmas"]
