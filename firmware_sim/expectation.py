@@ -1,7 +1,8 @@
 """What a host makes of a scenario: what its file expects, what a run came to, and where the two differ.
 
 Section `[expect]` of a scenario says what a healthy host of configuration `paper` makes of it, as that host is: where
-it does badly, the expectation says so. Counts are exact unless the key that ends in `_most` gives them room.
+it does badly, the expectation says so. `[expect_certified]` takes its place, as a whole, for a host of configuration
+`certified`; without it both make the same of it. Counts are exact unless the key that ends in `_most` gives them room.
 
 Ends of a run:
 
@@ -25,7 +26,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class ExpectSettings:
-    """What a healthy host of configuration `paper` makes of a scenario."""
+    """What a healthy host makes of a scenario."""
 
     adaptations: int = setting(low=0, high=1000, meaning="adaptations that come to their end")
     contacts: int = setting(low=0, high=100_000, meaning="true contacts that are detected")

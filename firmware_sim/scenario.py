@@ -1,8 +1,8 @@
 """A scenario: which arm, where it starts, who touches it when, when the payload changes, and what goes wrong.
 
 Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
-package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults` and `expect` are for those who
-play a scenario and change nothing on the arm.
+package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults`, `expect` and
+`expect_certified` are for those who play a scenario and change nothing on the arm.
 """
 
 import math
@@ -81,6 +81,9 @@ class Scenario:
 
     mechanics: MechanicsSettings = setting(MechanicsSettings, meaning="the arm beyond rigid links")
     expect: ExpectSettings | None = setting(None, meaning="what a healthy host of configuration `paper` makes of it")
+    expect_certified: ExpectSettings | None = setting(
+        None, meaning="what one of configuration `certified` makes of it, where that is something else"
+    )
 
     def __post_init__(self) -> None:
         if len(self.about.splitlines()) > 1:
@@ -123,6 +126,11 @@ class Scenario:
                     f"`{key}[{index}]`: at at_s = 0 s the arm in its start pose {self.start_deg} deg "
                     f"is {overlap_m:.4g} m inside it"
                 )
+
+    def expected_of(self, scheme: str) -> ExpectSettings | None:
+        """Return what a healthy host of a scheme, `paper` or `certified`, makes of it; None: the file doesn't say."""
+        own = self.expect_certified if scheme == "certified" else None
+        return own or self.expect
 
     @property
     def arm(self) -> Arm:

@@ -29,25 +29,28 @@ def test_a_run_that_deviates_is_told_and_is_the_exit_status(tmp_path: Path) -> N
     good, bad = tmp_path / "good.toml", tmp_path / "bad.toml"
     good.write_text(SHORT.format(adaptations=0))
     bad.write_text(SHORT.format(adaptations=1))
-    done = campaign(str(good), str(bad), "--json", "--keep", str(tmp_path / "logs"))
+    done = campaign(str(good), str(bad), "--config", "paper", "--json", "--keep", str(tmp_path / "logs"))
     assert done.returncode == 1
     rows = {row["name"]: row for row in json.loads(done.stdout)}
     assert (rows["good"]["is_good"], rows["good"]["deviations"]) == (True, [])
     assert (rows["bad"]["is_good"], rows["bad"]["deviations"]) == (False, ["adaptations: none, expected 1"])
     assert rows["bad"]["outcome"]["end"] == "finished"
-    assert (tmp_path / "logs" / "bad" / "run.mcap").is_file()
+    assert (tmp_path / "logs" / "paper" / "bad" / "run.mcap").is_file()
     assert "2/2" in done.stderr
 
 
 @pytest.mark.slow
-def test_a_pattern_chooses_by_name_or_group(tmp_path: Path) -> None:
+def test_a_pattern_chooses_by_name_or_group_and_each_configuration_plays_it(tmp_path: Path) -> None:
     one, two = tmp_path / "one.toml", tmp_path / "two.toml"
     one.write_text(SHORT.format(adaptations=0))
     two.write_text(SHORT.format(adaptations=0).replace('"short"', '"other"'))
-    done = campaign(str(one), str(two), "--only", "sho*")
+    mine = tmp_path / "mine.toml"
+    mine.write_text("extends = 'paper'\n")
+    done = campaign(str(one), str(two), "--only", "sho*", "--config", "paper", "--config", str(mine))
     assert done.returncode == 0
-    assert [line.split()[0] for line in done.stdout.splitlines() if "pass" in line] == ["one"]
-    assert done.stdout.splitlines()[-1] == "1 of 1 as expected"
+    passed = [line.split()[:2] for line in done.stdout.splitlines() if "pass" in line]
+    assert passed == [["one", "paper"], ["one", str(mine)]]
+    assert done.stdout.splitlines()[-1] == "2 of 2 as expected"
 
 
 @pytest.mark.slow
@@ -56,6 +59,7 @@ def test_a_pattern_chooses_by_name_or_group(tmp_path: Path) -> None:
     [
         (("--only", "nothing-fits"), "no scenario fits"),
         (("papr",), "did you mean 'paper'"),
+        (("--config", "certfied"), "did you mean 'certified'"),
         (("-j", "0"), "no process"),
     ],
 )

@@ -2,11 +2,13 @@
 
     python tools/campaign.py                    all that come with the package
     python tools/campaign.py --only 'clamp*'    those whose name or group fits a pattern
-    python tools/campaign.py my.toml -j 2       files, two at a time
+    python tools/campaign.py my.toml -j 2       files, two runs at a time
     python tools/campaign.py --seed 2           with other noise and other chance: expectations have to bear it
+    python tools/campaign.py --config paper     with this host only; can be repeated
 
-Lockstep, configuration `paper`. The table goes to stdout, progress to stderr. Exit status:
-0 all as expected, 1 one deviates or can't be played, 2 wrong usage or a scenario that is not one.
+Lockstep. Without --config each is played with `paper` and with `certified`: what the one does is the measure of what
+the other does, and an expectation that nobody plays does not stay true. The table goes to stdout, progress to stderr.
+Exit status: 0 all as expected, 1 one deviates or can't be played, 2 wrong usage or a scenario that is not one.
 """
 
 import argparse
@@ -22,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil.cli.table import format_table
-from adacd_hil.config import ConfigError
+from adacd_hil.config import ConfigError, load_settings
 from firmware_sim.expectation import deviations
 from firmware_sim.scenario import builtin_scenarios, load_scenario
 
-CONFIG = "paper"
+CONFIGS = ("paper", "certified")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Row:
     """A scenario that has been played. `problem`: empty, or why it could not be."""
 
     name: str
+    config: str
     group: str
     expected: str
     measured: str
@@ -48,26 +51,27 @@ class Row:
         return not self.deviations and not self.problem
 
 
-def play(name_or_file: str, seed: int | None, keep: Path | None) -> Row:
-    """Play one scenario, its logs in a folder below `keep` or nowhere."""
+def play(name_or_file: str, config: str, seed: int | None, keep: Path | None) -> Row:
+    """Play one scenario with one configuration, its logs in a folder of `keep` or nowhere."""
     from adacd_hil.cli.demo import resolve, run_embedded
     from adacd_hil.cli.outcome import outcome_of
 
     scenario = load_scenario(name_or_file)
-    expected = scenario.expect.text if scenario.expect else "–"
+    expect = scenario.expected_of(load_settings(config).scheme)
+    expected = expect.text if expect else "–"
     try:
-        cast = resolve(CONFIG, name_or_file, None, seed)
+        cast = resolve(config, name_or_file, None, seed)
         with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) if keep is None else keep / scenario.name
+            out = Path(folder) if keep is None else keep / Path(config).stem / scenario.name
             summary, truth_path = run_embedded(cast, "lockstep", out)
             outcome = outcome_of(summary, truth_path)
     except Exception as error:
         problem = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return Row(scenario.name, scenario.group, expected, "–", (), None, None, problem)
-    found = deviations(scenario.expect, outcome) if scenario.expect else ()
+        return Row(scenario.name, config, scenario.group, expected, "–", (), None, None, problem)
+    found = deviations(expect, outcome) if expect else ()
     cycles = 0 if summary.result is None else summary.result.cycles
     pace = cycles * cast.settings.bus.period_s / summary.elapsed_s if cycles else None
-    return Row(scenario.name, scenario.group, expected, outcome.text, found, pace, outcome._asdict())
+    return Row(scenario.name, config, scenario.group, expected, outcome.text, found, pace, outcome._asdict())
 
 
 def chosen(scenarios: Sequence[str], pattern: str) -> list[str]:
@@ -83,10 +87,11 @@ def chosen(scenarios: Sequence[str], pattern: str) -> list[str]:
 
 def as_text(rows: Sequence[Row]) -> str:
     """Make the table and, below it, what deviates."""
-    head = ("scenario", "expected", "measured", "", "pace")
+    head = ("scenario", "config", "expected", "measured", "", "pace")
     cells = [
         (
             row.name,
+            row.config,
             row.expected,
             row.measured,
             "pass" if row.is_good else "FAIL",
@@ -94,8 +99,8 @@ def as_text(rows: Sequence[Row]) -> str:
         )
         for row in rows
     ]
-    lines = [format_table(head, cells, right=(4,)), ""]
-    lines += [f"{row.name}: {text}" for row in rows for text in (*row.deviations, row.problem) if text]
+    lines = [format_table(head, cells, right=(5,)), ""]
+    lines += [f"{row.name}, {row.config}: {text}" for row in rows for text in (*row.deviations, row.problem) if text]
     return "\n".join([*lines, f"{sum(row.is_good for row in rows)} of {len(rows)} as expected"])
 
 
@@ -104,28 +109,35 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Plays scenarios and compares them with what they expect.")
     parser.add_argument("scenarios", nargs="*", metavar="NAME|FILE", help="default: all that come with the package")
     parser.add_argument("--only", default="*", metavar="PATTERN", help="shell pattern for name or group")
+    parser.add_argument(
+        "--config", action="append", metavar="NAME|FILE", help=f"the host's, repeatable; default: {', '.join(CONFIGS)}"
+    )
     parser.add_argument("-j", "--jobs", type=int, default=1, metavar="N", help="how many at a time")
     parser.add_argument("--seed", type=int, metavar="N", help="another than the scenarios' own")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the logs, a folder for each scenario")
     parser.add_argument("--json", action="store_true", dest="as_json", help="print JSON in place of the table")
     options = parser.parse_args()
+    configs = options.config or CONFIGS
     try:
         names = chosen(options.scenarios, options.only)
+        for config in configs:
+            load_settings(config)
     except ConfigError as error:
         print(f"campaign: {error}", file=sys.stderr)
         return 2
     if not names or options.jobs < 1:
         print("campaign: no scenario fits, or no process to play it in", file=sys.stderr)
         return 2
-    rows: dict[str, Row] = {}
+    tasks = [(name, config) for config in configs for name in names]
+    rows: dict[tuple[str, str], Row] = {}
     # Spawned: what is compiled and logged here is nobody else's.
-    with ProcessPoolExecutor(min(options.jobs, len(names)), mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(play, name, options.seed, options.keep): name for name in names}
+    with ProcessPoolExecutor(min(options.jobs, len(tasks)), mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(play, *task, options.seed, options.keep): task for task in tasks}
         for future in as_completed(futures):
             row = rows[futures[future]] = future.result()
             state = "as expected" if row.is_good else "; ".join((*row.deviations, row.problem)).strip("; ")
-            print(f"{len(rows)}/{len(names)} {row.name}: {state}", file=sys.stderr, flush=True)
-    played = [rows[name] for name in names]
+            print(f"{len(rows)}/{len(tasks)} {row.name}, {row.config}: {state}", file=sys.stderr, flush=True)
+    played = [rows[task] for task in tasks]
     if options.as_json:
         print(json.dumps([vars(row) | {"is_good": row.is_good} for row in played], indent=2))
     else:

@@ -236,6 +236,34 @@ def thresholds(
     return ExitCode.OK
 
 
+@cli.command(epilog=EPILOG)
+@_config
+@_profile
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0.0, 86_400.0),
+    default=60.0,
+    show_default=True,
+    help="How long to begin new climbs; the one under way is ended.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Where the climbs begin.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write a configuration with it here.")
+@_json
+@_explained
+def excitation(
+    config: str, profile: str | None, seconds: float, seed: int, out: Path | None, as_json: bool
+) -> ExitCode:
+    """Search the motion that shows a model soonest, within the limits of the arm and its trajectory.
+
+    Prints what the configuration's excitation shows and needs, and what the one found does.
+    """
+    from adacd_hil.cli import excitation as command
+
+    outcome = command.search(config, profile, seconds, seed, out)
+    print(command.as_json(outcome) if as_json else command.as_text(outcome))
+    return ExitCode.OK
+
+
 @cli.command(epilog="Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC.")
 @click.option(
     "--dbc", default="arm", show_default=True, metavar="NAME|FILE", help="The contract: the package's, or a file."

@@ -10,6 +10,7 @@ EXPECTED = ExpectSettings(
     adaptations=1, contacts=2, false_alarms=1, false_alarms_most=3, adaptation_s=(5.0, 6.0), delay_ms=30.0, force_N=80.0
 )
 AS_EXPECTED = Outcome("finished", None, None, 1, 5.2, 2, 2, 0, 12.0, 60.0)
+FEW = {"adaptations": 1, "contacts": 1}
 
 
 def test_a_run_as_expected_has_no_deviation():
@@ -82,3 +83,18 @@ def test_what_is_expected_fits_in_a_few_words():
 
 def test_a_run_is_told_in_the_words_of_an_expectation():
     assert AS_EXPECTED.text == "1 adapted, 2 detected, 2 false"
+
+
+def test_a_certified_host_has_its_own_expectation_where_there_is_one():
+    both = parse(Scenario, {"expect": FEW, "expect_certified": FEW | {"contacts": 2}})
+    assert (both.expected_of("paper").contacts, both.expected_of("certified").contacts) == (1, 2)
+
+
+def test_without_an_own_expectation_a_certified_host_is_to_do_what_the_papers_does():
+    one = parse(Scenario, {"expect": FEW})
+    assert one.expected_of("certified") == one.expect
+    assert parse(Scenario, {}).expected_of("certified") is None
+
+
+def test_what_is_expected_of_a_certified_host_is_not_expected_of_the_papers():
+    assert parse(Scenario, {"expect_certified": FEW}).expected_of("paper") is None

@@ -1,0 +1,280 @@
+"""The search for an excitation: the motion that shows every combination of parameters soonest, within the arm's limits.
+
+What a motion shows is judged as the certified scheme judges it: by the information D (∫ W_f' W_f) D of the slow filter
+over the shortest fit, D the errors that must not stay hidden (`termination`), and by that of the inertia alone over the
+shortest fit of a payload. The search makes the smallest eigenvalues large and the condition number small:
+
+    cost = -ln e - ½ ln e_inertia + ¼ ln (largest / e)
+
+The motion is the Fourier series of `config.ExcitationSettings`. That it begins at rest fixes its first harmonic by the
+others. The limits are those of the trajectory's amplitude, of the speed and acceleration of a withdrawal, and where a
+CAD model is given, a share of the torque limit.
+
+L-BFGS climbs from the present motion first, then from random ones. While it climbs, Coulomb friction is a tanh, so that
+the cost has a slope; results are judged with the sign, as the scheme sees it.
+
+Shapes: N samples, K harmonics; q, dq, ddq (N, 2); W (N, 2, p). Units: rad, rad/s, rad/s², Nm.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import ConfigError, ExcitationSettings, Settings
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.certified_kernel import constants_of
+from adacd_hil.scheme.filters import first_order_hold
+from adacd_hil.scheme.regressor import F_C1, F_C2, regressor
+
+PERIOD_S = 2.4
+"""Of an excitation for a configuration that has none: a fit of 1.4 s sees more than half of it."""
+HARMONICS = 6
+"""Of the same: with 2.4 s up to 2.5 Hz; faster ones meet the limit of acceleration before they show anything."""
+TOLERANCE = 1e-3
+"""Part by which a motion may be over a limit: a search from outside ends a little outside."""
+TORQUE_SHARE = 0.5
+"""Part of the torque limit that the motion may need; the rest is for a payload, friction and the controller."""
+ITERATIONS = 150
+"""Of one climb: it has ended by itself before in two of three cases."""
+
+_DIGITS = 5
+_SMOOTH_RAD_S = 0.05
+_PENALTIES = (1e3, 1e5, 1e7)
+_SMALLEST = 1e-15
+
+
+class NoExcitationError(ValueError):
+    """No motion was found that keeps the limits; the message is one line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Figures:
+    """What a motion shows and needs. Pairs are joints; e: smallest eigenvalues, Nm² s."""
+
+    excitation_Nm2s: float
+    condition: float
+    inertia_Nm2s: float
+    travel_deg: tuple[float, float]
+    velocity_deg_s: tuple[float, float]
+    acceleration_deg_s2: tuple[float, float]
+    torque_Nm: tuple[float, float] | None
+    """None: without a CAD model nobody knows."""
+
+    @property
+    def cost(self) -> float:
+        """What the search makes small."""
+        return _cost_of(self.excitation_Nm2s, self.condition, self.inertia_Nm2s)
+
+
+class Limits(NamedTuple):
+    """What a motion has to keep; pairs are joints. travel: largest |q|; torque: infinite without a CAD model."""
+
+    travel_rad: Vector
+    velocity_rad_s: Vector
+    acceleration_rad_s2: Vector
+    torque_Nm: Vector
+
+    def as_json(self) -> dict[str, list[float] | None]:
+        """Give the limits by the names of `Figures`, in their units; None: no limit."""
+        degrees = zip(("travel_deg", "velocity_deg_s", "acceleration_deg_s2"), self[:3], strict=True)
+        torque = self.torque_Nm.tolist() if np.all(np.isfinite(self.torque_Nm)) else None
+        return {name: np.degrees(limit).tolist() for name, limit in degrees} | {"torque_Nm": torque}
+
+
+class _Motion(NamedTuple):
+    q: Vector
+    dq: Vector
+    ddq: Vector
+
+
+@compiled
+def _fill_regressors(q: Vector, dq: Vector, ddq: Vector, W: Vector) -> None:
+    for n in range(W.shape[0]):
+        W[n] = regressor(q[n], dq[n], ddq[n], W.shape[2])
+
+
+class Search:
+    """The search for one configuration's excitation. Raises ConfigError where its trajectory does not move a joint."""
+
+    def __init__(self, settings: Settings) -> None:
+        settings = dataclasses.replace(settings, scheme="certified")
+        certified, arm = settings.certified, settings.arm
+        if min(settings.trajectory.amplitude_deg) <= 0.0:
+            raise ConfigError(
+                f"`trajectory.amplitude_deg` = {settings.trajectory.amplitude_deg} leaves an excitation no room; "
+                "above 0 deg for each joint expected"
+            )
+        self.present = settings.excitation
+        self._period_s = settings.excitation.period_s or PERIOD_S
+        counts = (
+            [len(row) for row in settings.excitation.sine] if settings.excitation.period_s else [HARMONICS] * JOINTS
+        )
+        harmonics = counts[0]
+        if harmonics < 2 or set(counts) != {harmonics}:
+            raise ConfigError(
+                f"`excitation` has {counts} harmonics; the same number for both joints, at least 2, expected"
+            )
+        self._amplitude = np.radians(settings.trajectory.amplitude_deg)
+        self.limits = Limits(
+            self._amplitude,
+            np.minimum(np.radians(settings.reaction.velocity_limit_deg_s), arm.velocity_limit_rad_s),
+            np.radians(settings.reaction.acceleration_limit_deg_s2),
+            np.maximum(TORQUE_SHARE * np.array(arm.torque_limit_Nm), _SMALLEST)
+            if arm.cad_theta
+            else np.full(JOINTS, np.inf),
+        )
+        self._theta = settings.cad_theta if arm.cad_theta else None
+        self._base = len(settings.estimator.parameter_names)
+        scale = constants_of(settings)["scale"][0]
+        # The lag shows in the torque's derivative, so only where a model says what the torque is.
+        self._scale = scale if arm.cad_theta else scale[: self._base + JOINTS]
+        self._step_s = settings.bus.period_s * certified.learn_every
+        elapsed_s = np.arange(0.0, max(self._period_s, *certified.fit_s), self._step_s)
+        self._fit, self._payload_fit = (round(fit_s / self._step_s) for fit_s in certified.fit_s)
+        self._cutoff = certified.cutoffs_rad_s[0]
+        hold = first_order_hold(self._cutoff, self._cutoff, self._step_s)
+        self._taps = ([hold.weight_new, hold.weight_old], [1.0, -hold.decay])
+        self._order = np.arange(1, harmonics + 1)
+        self._rad_s = 2.0 * np.pi / self._period_s * self._order
+        self._cosine, self._sine = (wave(np.outer(elapsed_s, self._rad_s)) for wave in (np.cos, np.sin))
+
+    def figures(self, excitation: ExcitationSettings) -> Figures:
+        """Say what a motion of this period and number of harmonics shows and needs."""
+        motion = self._move(np.array(excitation.cosine), np.array(excitation.sine))
+        W = self._regressors(motion)
+        smallest, largest, inertia = self._shown(W)
+        peaks = [np.abs(part).max(axis=0) for part in motion]
+        travel, velocity, acceleration = (np.degrees(peak) for peak in peaks)
+        return Figures(
+            smallest,
+            largest / max(smallest, _SMALLEST),
+            inertia,
+            _pair(travel),
+            _pair(velocity),
+            _pair(acceleration),
+            None if self._theta is None else _pair(np.abs(W @ self._theta).max(axis=0)),
+        )
+
+    def overshoot(self, excitation: ExcitationSettings) -> float:
+        """Return the part by which a motion is over the limit that it keeps worst; 0 or less: it keeps all."""
+        motion = self._move(np.array(excitation.cosine), np.array(excitation.sine))
+        return max(float(used.max()) for used in self._used(motion, self._regressors(motion))) - 1.0
+
+    def run(
+        self,
+        seed: int,
+        goes_on: Callable[[int], bool],
+        progress: Callable[[str], None] = lambda _: None,
+        iterations: int = ITERATIONS,
+    ) -> ExcitationSettings:
+        """Search and return the best motion found, never a worse one than the present.
+
+        goes_on: asked with the number of climbs so far whether there is to be another; the first is always made. The
+        climbs are those of `seed`, in order, however many. Raises NoExcitationError.
+        """
+        random = np.random.default_rng(seed)
+        shape = (2, JOINTS, len(self._order) - 1)
+        best = self.present if self.present.period_s and self.overshoot(self.present) <= TOLERANCE else None
+        cost = np.inf if best is None else self.figures(best).cost
+        start = np.zeros(shape)
+        if self.present.period_s:
+            start = np.array((self.present.cosine, self.present.sine))[:, :, 1:]
+        climbs = 0
+        while not climbs or goes_on(climbs):
+            if climbs or not self.present.period_s:
+                start = random.normal(scale=0.1, size=shape) / self._order[1:]
+            found = self._climb(start.ravel(), iterations)
+            climbs += 1
+            if self.overshoot(found) > TOLERANCE or self.figures(found).cost >= cost:
+                continue
+            best, figures = found, self.figures(found)
+            cost = figures.cost
+            progress(
+                f"climb {climbs}: smallest eigenvalue {figures.excitation_Nm2s:.3g} Nm² s, "
+                f"condition {figures.condition:.3g}"
+            )
+        if best is None:
+            raise NoExcitationError(f"none of {climbs} motions keeps the limits; search longer or with another seed")
+        return best
+
+    def _climb(self, start: Vector, iterations: int) -> ExcitationSettings:
+        found = start
+        for penalty in _PENALTIES:
+            found = minimize(self._cost, found, (penalty,), "L-BFGS-B", options={"maxiter": iterations}).x
+        cosine, sine = self._complete(np.round(found, _DIGITS))
+        rows = [tuple(tuple(round(float(x), _DIGITS) for x in row) for row in part) for part in (cosine, sine)]
+        return ExcitationSettings(self._period_s, *rows)  # type: ignore[arg-type]  # JOINTS rows each
+
+    def _complete(self, free: Vector) -> tuple[Vector, Vector]:
+        """Return cosine and sine (2, K) of which all but the first harmonic are given, so that it begins at rest."""
+        cosine, sine = free.reshape(2, JOINTS, -1)
+        order = self._order[1:]
+        return (
+            np.column_stack((-cosine @ order**2, cosine)),
+            np.column_stack((-sine @ order, sine)),
+        )
+
+    def _move(self, cosine: Vector, sine: Vector) -> _Motion:
+        """Return the motion (N, 2) over the period: that of `control.excitation`, at all times at once."""
+        cosine, sine = (self._amplitude * part.T for part in (cosine, sine))
+        rate = self._rad_s[:, np.newaxis]
+        return _Motion(
+            -self._amplitude + (self._cosine - 1.0) @ cosine + self._sine @ sine,
+            self._cosine @ (rate * sine) - self._sine @ (rate * cosine),
+            -self._cosine @ (rate**2 * cosine) - self._sine @ (rate**2 * sine),
+        )
+
+    def _regressors(self, motion: _Motion) -> Vector:
+        """Return the regressors of the dynamic parameters (N, 2, base)."""
+        W = np.empty((len(motion.q), JOINTS, self._base))
+        _fill_regressors(*motion, W)
+        return W
+
+    def _used(self, motion: _Motion, W: Vector) -> list[Vector]:
+        """Return which part of each limit is used, (N, 2) each."""
+        parts = [np.abs(value) / limit for value, limit in zip(motion, self.limits[:3], strict=True)]
+        return parts if self._theta is None else [*parts, np.abs(W @ self._theta) / self.limits.torque_Nm]
+
+    def _shown(self, dynamic: Vector) -> tuple[float, float, float]:
+        """Return smallest and largest eigenvalue of the fit's information, and the smallest of the inertia's.
+
+        dynamic (N, 2, base): from `_regressors`.
+        """
+        W = np.zeros((self._fit, JOINTS, len(self._scale)))
+        W[:, :, : self._base] = dynamic[: self._fit]
+        for joint in range(JOINTS):
+            W[:, joint, self._base + joint] = 1.0
+        W_f = lfilter(*self._taps, W, axis=0)
+        if self._theta is not None:
+            tau, tau_f = (value[:, :, : self._base] @ self._theta for value in (W, W_f))
+            for joint in range(JOINTS):
+                W_f[:, joint, self._base + JOINTS + joint] = self._cutoff * (tau - tau_f)[:, joint]
+        fit = self._eigenvalues(W_f, self._scale)
+        inertia = self._eigenvalues(W_f[: self._payload_fit, :, :3], self._scale[:3])
+        return float(fit[0]), float(fit[-1]), float(inertia[0])
+
+    def _eigenvalues(self, W_f: Vector, scale: Vector) -> Vector:
+        rows = (W_f * scale).reshape(-1, len(scale))
+        return np.asarray(np.linalg.eigvalsh(self._step_s * rows.T @ rows), dtype=np.float64)
+
+    def _cost(self, free: Vector, penalty: float) -> float:
+        motion = self._move(*self._complete(free))
+        W = self._regressors(motion)
+        over = sum(float(np.mean(np.maximum(used - 1.0, 0.0) ** 2)) for used in self._used(motion, W))
+        for joint, column in enumerate((F_C1, F_C2)):
+            W[:, joint, column] = np.tanh(motion.dq[:, joint] / _SMOOTH_RAD_S)
+        smallest, largest, inertia = (max(value, _SMALLEST) for value in self._shown(W))
+        return _cost_of(smallest, largest / smallest, inertia) + penalty * over
+
+
+def _cost_of(smallest: float, condition: float, inertia: float) -> float:
+    return float(-np.log(max(smallest, _SMALLEST)) - 0.5 * np.log(max(inertia, _SMALLEST)) + 0.25 * np.log(condition))
+
+
+def _pair(values: Vector) -> tuple[float, float]:
+    return float(values[0]), float(values[1])

@@ -1,0 +1,92 @@
+"""The search for an excitation: the command's work and its table."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from adacd_hil.analysis.excitation import Figures, Limits, NoExcitationError, Search
+from adacd_hil.cli.exit_codes import CommandError
+from adacd_hil.cli.progress import Progress
+from adacd_hil.cli.table import format_table
+from adacd_hil.clock import MonotonicClock
+from adacd_hil.config import ExcitationSettings, builtin_names, load_settings, to_toml
+
+_LABELS = (
+    ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),
+    ("condition", "condition number", "{:.3g}"),
+    ("inertia_Nm2s", "of the inertia after a payload's fit, Nm² s", "{:.3g}"),
+    ("travel_deg", "largest angle, deg", "{:.1f}"),
+    ("velocity_deg_s", "peak speed, deg/s", "{:.1f}"),
+    ("acceleration_deg_s2", "peak acceleration, deg/s²", "{:.0f}"),
+    ("torque_Nm", "peak torque of the CAD model, Nm", "{:.2f}"),
+)
+
+
+class Outcome(NamedTuple):
+    """What a search came to; `present` is None where the configuration has no excitation."""
+
+    config: str
+    present: Figures | None
+    found: Figures
+    limits: Limits
+    excitation: ExcitationSettings
+
+
+def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> Outcome:
+    """Search, and write what was found where asked for. Raises ConfigError, CommandError."""
+    task = Search(load_settings(config, profile))
+    clock, progress = MonotonicClock(), Progress()
+    end_ns = clock.now_ns() + round(1e9 * seconds)
+    try:
+        found = task.run(seed, lambda _: clock.now_ns() < end_ns, progress)
+    except NoExcitationError as error:
+        raise CommandError(str(error)) from None
+    finally:
+        progress.close()
+    present = task.figures(task.present) if task.present.period_s else None
+    outcome = Outcome(config, present, task.figures(found), task.limits, found)
+    if out is not None:
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            out.write_text(as_toml(outcome), encoding="utf-8")
+        except OSError as error:
+            raise CommandError(f"{out} can't be written: {error.strerror}") from None
+    return outcome
+
+
+def as_toml(outcome: Outcome) -> str:
+    """Write the excitation as a configuration that extends the one that it was found for."""
+    base = outcome.config if outcome.config in builtin_names() else str(Path(outcome.config).resolve())
+    return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(outcome.excitation)}"
+
+
+def as_json(outcome: Outcome) -> str:
+    """Write everything as JSON."""
+    named = {
+        "present": None if outcome.present is None else dataclasses.asdict(outcome.present),
+        "found": dataclasses.asdict(outcome.found),
+        "limits": outcome.limits.as_json(),
+        "excitation": dataclasses.asdict(outcome.excitation),
+    }
+    return json.dumps(named, indent=2, allow_nan=False)
+
+
+def as_text(outcome: Outcome) -> str:
+    """Write the figures as a table, joint 1 / joint 2."""
+    limits = outcome.limits.as_json()
+    rows = [
+        (
+            label,
+            *(_cell(getattr(one, name, None), form) for one in (outcome.present, outcome.found)),
+            _cell(limits.get(name), form),
+        )
+        for name, label, form in _LABELS
+    ]
+    return format_table(("", "present", "found", "limit"), rows, (1, 2, 3))
+
+
+def _cell(value: float | tuple[float, float] | list[float] | None, form: str) -> str:
+    if value is None:
+        return "–"
+    return " / ".join(form.format(one) for one in value) if isinstance(value, tuple | list) else form.format(value)
