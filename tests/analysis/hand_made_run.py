@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.metrics import Run, Truth
+from adacd_hil.analysis.run import Run, Truth
 from adacd_hil.analysis.timing import CycleColumns
 from adacd_hil.config import Settings, parse
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState
@@ -40,6 +40,7 @@ def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str
         contact_index=np.full(count, -1.0),
         payload_kg=np.zeros(count),
         theta=np.tile(THETA, (count, 1)),
+        force_N=np.zeros(count),
     )
     run = Run(
         cycle=cycle,
