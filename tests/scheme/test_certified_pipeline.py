@@ -188,6 +188,22 @@ def test_a_model_that_fails_its_test_is_learnt_anew_from_nothing():
     assert not outputs[-1].is_model_valid
 
 
+def test_a_test_that_a_touch_has_broken_off_is_no_certificate_for_an_arm_that_then_stands_still():
+    """The fit is forgotten; at rest no model at all would pass the test."""
+    loop = ExcitedLoop()
+    loop.run_until(SchemeState.CERTIFY)
+    loop.run(300)
+    loop.tau_ext[0] = 1.0
+    loop.run_until(SchemeState.REACT)
+    loop.tau_ext[0] = 0.0
+    outputs = loop.run_until(SchemeState.ADAPT)
+    standing = arm_state(0, loop.q, tau_J=loop.tau)
+    outputs += [loop.pipeline.step(standing._replace(cycle=loop.cycle + k)) for k in range(1000)]
+    assert names(outputs) == ["REACT", "ADAPT"]
+    np.testing.assert_array_equal(outputs[-1].theta_ff, 0.0)
+    assert not outputs[-1].is_model_valid
+
+
 def test_the_pipeline_decides_as_the_compiled_step_does_on_the_same_samples(streamed):
     """The step alone begins with its filters at rest; an arm that stood still for a moment has thresholds for that."""
     _, outputs, _, played = streamed
