@@ -81,6 +81,13 @@ def test_an_arm_learns_is_tested_and_monitors(whole):
     assert (first_in(learnt, SchemeState.MONITOR) - first_in(learnt, SchemeState.ADAPT)) * PERIOD_S <= 2.5
 
 
+def test_each_test_of_a_fit_takes_its_whole_time(whole):
+    learnt, _, fitted = whole
+    for outputs, test_s in zip((learnt, fitted), SETTINGS.certified.test_s, strict=True):
+        tested = [output for output in outputs if output.state is SchemeState.CERTIFY]
+        assert len(tested) == round(test_s / PERIOD_S)
+
+
 def test_nothing_is_fed_forward_before_the_certificate(whole):
     learnt, _, _ = whole
     armed = first_in(learnt, SchemeState.MONITOR)
@@ -194,7 +201,7 @@ def test_a_test_that_a_touch_has_broken_off_is_no_certificate_for_an_arm_that_th
     loop.run_until(SchemeState.CERTIFY)
     loop.run(300)
     loop.tau_ext[0] = 1.0
-    loop.run_until(SchemeState.REACT)
+    assert names(loop.run_until(SchemeState.REACT)) == ["CERTIFY", "REACT"]
     loop.tau_ext[0] = 0.0
     outputs = loop.run_until(SchemeState.ADAPT)
     standing = arm_state(0, loop.q, tau_J=loop.tau)
