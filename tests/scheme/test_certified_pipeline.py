@@ -235,6 +235,20 @@ def test_the_paper_beside_gives_the_bits_of_the_paper_alone(streamed):
     np.testing.assert_array_equal(column(outputs, "paper_threshold")[armed][1:], blocks[armed][1:, alone["threshold"]])
 
 
+def test_both_schemes_count_by_the_stamps(streamed):
+    """SYNCs that are late: each scheme's numbers are those of the measured intervals, bit for bit the same beside."""
+    arms, nominal, _, _ = streamed
+    late_ns = np.random.default_rng(5).integers(0, 200_000, 600)
+    late = [arm._replace(t_ns=arm.t_ns + int(ns)) for arm, ns in zip(arms, late_ns, strict=False)]
+    pipelines = CertifiedPipeline(SETTINGS), Pipeline(replace(SETTINGS, scheme="paper"))
+    outputs, paper = ([pipeline.step(arm) for arm in late] for pipeline in pipelines)
+    alone = np.array([output.block[scheme_layout(7).slices["tau_ext_hat"]] for output in paper])
+    np.testing.assert_array_equal(column(outputs, "paper_tau_ext_hat"), alone)
+    np.testing.assert_array_equal(column(outputs, "period_s")[1:, 0], (1_000_000 + np.diff(late_ns)) * 1e-9)
+    for name in ("tau_ext_hat", "paper_tau_ext_hat"):
+        assert np.max(np.abs(column(outputs, name) - column(nominal[:600], name))) > 1e-5
+
+
 def test_this_scheme_is_armed_while_the_paper_s_still_adapts(streamed):
     _, outputs, paper, _ = streamed
     armed = first_in(outputs, SchemeState.MONITOR)
