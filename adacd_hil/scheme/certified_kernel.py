@@ -489,7 +489,10 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
 
 @compiled
 def _test(k: Any, m: Any, dq: Vector) -> int:
-    """Take this sample into the test of the frozen model; return what that has come to. A joint that rests proves none."""
+    """Take this sample into the test of the frozen model; return what that has come to.
+
+    Where a joint rests nothing is proven.
+    """
     m["tested"] += 1.0
     termination.widen(dq, m["dq_low"], m["dq_high"])
     has_moved = True

@@ -85,7 +85,7 @@ def _peak(tau: Vector, sigma: float) -> float:
     width = max(int(np.sum(np.abs(tau) > 0.5 * largest)) // TOP_PARTS, 1)
     best = 0.0
     for k in range(tau.shape[0] - width + 1):
-        mean = np.mean(tau[k : k + width])
+        mean = float(np.mean(tau[k : k + width]))
         if abs(mean) > abs(best):
             best = mean
     bias = BIAS * sigma * np.sqrt(CORRELATED_SAMPLES / (CORRELATED_SAMPLES - 1.0 + width))
