@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 .PHONY: help demo test check bench clean
 
 help:
-	@echo "make demo   the paper's experiment with an emulated arm; report in runs/demo/report.html"
+	@echo "make demo   the paper's experiment with an emulated arm, certified scheme and paper's side by side; report in runs/demo/report.html"
 	@echo "make test   all checks and tests, SocketCAN included"
 	@echo "make check  format, lint, types, direction of imports"
 	@echo "make bench  codec, step, plant, log hand-off; the cycle over vcan beside a C yardstick and a straightforward loop"

@@ -429,13 +429,13 @@ class CertifiedSettings:
         (0.02, 0.04, 0.04, 0.2, 0.04, 0.004, 0.2), low=0.0, high=1e6, meaning=f"how well it must be known: {_KINDS}"
     )
     drift_std: tuple[float, ...] = setting(
-        (0.0, 0.003, 0.003, 0.0, 0.001, 0.0, 0.003),
+        (0.0, 0.0015, 0.0015, 0.0, 0.0005, 0.0, 0.0015),
         low=0.0,
         high=1e3,
         meaning=f"how far it may wander in a second of motion: {_KINDS}",
     )
     model_error: tuple[float, ...] = setting(
-        (0.01, 0.02, 0.02, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
+        (0.01, 0.01, 0.01, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
     )
     payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="what a payload at the tip may weigh")
     payload_inertia_std: float = setting(

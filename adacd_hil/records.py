@@ -40,6 +40,14 @@ PARAMETER_UNITS = {
     "offset2": "Nm",
     "lag1": "s",
     "lag2": "s",
+    "stribeck1": "Nm",
+    "stribeck2": "Nm",
+    "load1": "Nm/Nm",
+    "load2": "Nm/Nm",
+    "asymmetric1": "Nm",
+    "asymmetric2": "Nm",
+    "width1": "Nm",
+    "width2": "Nm",
 }
 
 

@@ -1,4 +1,5 @@
-"""The paper's experiment in one process: the figures it must reach, and that it can be repeated bit for bit."""
+"""The experiment in one process with the paper's scheme: the figures it must reach, and that it can be repeated bit for
+bit."""
 
 from pathlib import Path
 

@@ -69,7 +69,9 @@ class CertifiedScheme:
             armed.append(begin + int(cycles[0]) if cycles.size else -1)
         over = observation.astype(np.int64) >> CONTACT_SHIFT
         wide = self._undo(y[:, WIDE_FILTER], settings.certified.cutoffs_rad_s[WIDE_FILTER])
-        return Outcome(phase, over, y[:, 0], wide, h[:, 0], tuple(armed), theta[np.maximum(armed, 0)])
+        most = np.argmax(np.abs(y) / h, axis=1)[:, np.newaxis]
+        direction = np.sign(np.take_along_axis(y, most, axis=1)[:, 0])
+        return Outcome(phase, over, y[:, 0], wide, h[:, 0], direction, tuple(armed), theta[np.maximum(armed, 0)])
 
     @staticmethod
     def _undo(y: np.ndarray, cutoff_rad_s: float) -> np.ndarray:

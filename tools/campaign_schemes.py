@@ -28,8 +28,9 @@ class Outcome:
     """What a scheme made of n samples.
 
     phase (n,): ADAPTING, TESTING, ARMED. over (n,): bits of the joints over their threshold, 0 where detection is off.
-    tau_ext_hat (n, 2): of the slowest filter, Nm; tau_ext_wide_hat (n, 2): with the filter undone; threshold (n, 2) of
-    tau_ext_hat. armed: the cycle of each arming, in order of `begins`, -1 for never; theta (m, p): parameters then.
+    tau_ext_hat (n, 2): of the slowest filter, Nm; threshold (n, 2) of it; tau_ext_wide_hat (n, 2): with the filter
+    undone. direction (n, 2): sign of what is most over its threshold. armed: the cycle of each arming, in order of
+    `begins`, -1 for never; theta (m, p): parameters then.
     """
 
     phase: NDArray[np.int64]
@@ -37,6 +38,7 @@ class Outcome:
     tau_ext_hat: NDArray[np.float64]
     tau_ext_wide_hat: NDArray[np.float64]
     threshold: NDArray[np.float64]
+    direction: NDArray[np.float64]
     armed: tuple[int, ...]
     theta: NDArray[np.float64]
 
@@ -77,7 +79,7 @@ class PaperScheme:
             kernel.constants_of(self._settings), kernel.new_memory(p), kernel.new_block(p), recording.q, recording.dq,
             recording.tau_J, np.array(begins), phase, over, tau_ext_hat, wide, threshold, armed, theta,
         )  # fmt: skip
-        return Outcome(phase, over, tau_ext_hat, wide, threshold, tuple(armed.tolist()), theta)
+        return Outcome(phase, over, tau_ext_hat, wide, threshold, np.sign(tau_ext_hat), tuple(armed.tolist()), theta)
 
 
 @compiled

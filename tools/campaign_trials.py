@@ -45,6 +45,8 @@ STEPS_NM = (0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.
 MOVING_RAD_S = 0.02
 MOVING_S = 0.5
 """A joint counts as moving when its desired speed has been above MOVING_RAD_S for MOVING_S, five filter lags."""
+PROBABLY_ARMED = 0.45
+"""Share of a scheme's patience in which most adaptations end: a longer record is made only for those that don't."""
 LOCATED_S = 0.01
 ROOT_M = 0.1
 """Nearer to its joint a link is not touched: what a small force does there, no threshold of any use sees."""
@@ -130,10 +132,15 @@ def arm_up(case: Case) -> Prelude:
 
 def _adapt(scheme: Scheme, prelude: Prelude, seed: int) -> Prelude:
     """Find out when the last adaptation of a prelude ends, and cut its motion there."""
-    recording = record(prelude.arm, prelude.motion, seed, feedforward=prelude.feedforward, payloads=prelude.payloads)
-    outcome = scheme.run(recording, prelude.begins)
-    end = outcome.armed[-1]
-    took_s = (end - prelude.begins[-1]) * PERIOD_S if end >= 0 else float("nan")
+    begin = prelude.begins[-1]
+    for share in (PROBABLY_ARMED, 1.0):
+        motion = cut(prelude.motion, begin + round(share * (len(prelude.motion.q_d) - begin)))
+        recording = record(prelude.arm, motion, seed, feedforward=prelude.feedforward, payloads=prelude.payloads)
+        outcome = scheme.run(recording, prelude.begins)
+        end = outcome.armed[-1]
+        if end >= 0:
+            break
+    took_s = (end - begin) * PERIOD_S if end >= 0 else float("nan")
     prelude = replace(prelude, took_s=(*prelude.took_s, took_s))
     if end < 0:
         return prelude
@@ -306,10 +313,8 @@ def _judge(contact: ContactSettings, recording: Recording, outcome: Outcome, bou
     threshold = float(outcome.threshold[alarm, 1])
     hidden = contact.link == 2 and bool(np.abs(recording.tau_ext[first : located.stop, 1]).max() < threshold)
     over = [joint for joint in range(2) if int(outcome.over[alarm]) >> joint & 1]
-    signs = [
-        np.sign(outcome.tau_ext_wide_hat[alarm, joint]) == np.sign(recording.tau_ext[alarm - 1, joint])
-        for joint in over
-    ]
+    pushed = np.sign(recording.tau_ext[first : alarm + 1].sum(0))
+    signs = [outcome.direction[alarm, joint] == pushed[joint] for joint in over]
     strong = int(np.argmax(np.abs(truth).max(0)))
     wide = outcome.tau_ext_wide_hat[first:last, strong]
     return row | {

@@ -140,7 +140,7 @@ class Rig:
         block = self._block[0]
         tau_ext_hat = block["tau_ext_hat"].copy()
         contact = self._touch.step(
-            self._cycle, self._supervisor, observation, arm.q, arm.dq, tau_ext_hat,
+            self._cycle, self._supervisor, observation, arm.q, tau_ext_hat,
             block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"], True,
         )  # fmt: skip
         output = SchemeOutput(

@@ -181,7 +181,8 @@ def _play(
             is_pushed = is_pushed or (row[0] < tick + TICKS and row[1] > tick)
         is_fine = is_pushed or asymmetry != 0.0
         for index in range(TICKS if is_fine else 1):
-            # The joint's balance knows the sum of motor and external torque only: the one may stand for the other.
+            # The joint's balance knows the sum of motor and external torque only: the one may stand for the other. But
+            # in variant "load" friction then grows with a push as well.
             push1, push2 = _push_torque(pushes, tick + index) if is_pushed else (0.0, 0.0)
             if asymmetry != 0.0:
                 for i in range(JOINTS):

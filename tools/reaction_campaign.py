@@ -190,8 +190,8 @@ def draw(harms: Harms, path: Path) -> None:
                         if limit is not None:
                             panel.plot([number - 0.45, number + 0.45], [limit, limit], color=drawing.COLOURS["ink"])
                 panel.set_xticks(np.arange(len(regions)), regions, rotation=60, ha="right")
-        axes[0][0].legend(ncols=3)
-        figure.tight_layout()
+        figure.legend(*axes[0][0].get_legend_handles_labels(), loc="upper center", ncols=6)
+        figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.96))
         path.write_bytes(drawing.Drawing("reactions", "Reactions", "Peak force and impulse by reaction", figure).png())
 
 

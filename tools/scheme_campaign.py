@@ -1,7 +1,7 @@
 """Plays the schemes against a thousand arms, a day of motion and two thousand touches, and prints what they came to.
 
-    python tools/scheme_campaign.py --quick                 a minute's worth
-    python tools/scheme_campaign.py --json campaign.json    everything; some twenty minutes on two CPUs
+    python tools/scheme_campaign.py --quick                 a few minutes' worth
+    python tools/scheme_campaign.py --json campaign.json    everything; an hour or so on two CPUs
     python tools/scheme_campaign.py --only steps --schemes paper
 
 No bus: recordings of the emulated arm (`lab`), the schemes' compiled steps on them (`campaign_schemes`). Every run has
@@ -142,7 +142,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Plays the schemes against many arms, motions and touches.")
     parser.add_argument("--schemes", default="paper,certified", metavar="NAMES", help="configurations or TOML files")
     parser.add_argument("--only", default=",".join(PARTS), metavar="PARTS", help=f"of {', '.join(PARTS)}")
-    parser.add_argument("--quick", action="store_true", help="a minute's worth")
+    parser.add_argument("--quick", action="store_true", help="a few minutes' worth")
     for name, value in vars(Size()).items():
         parser.add_argument(f"--{name}", type=type(value), metavar="N", help=f"default {value:g}")
     parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")

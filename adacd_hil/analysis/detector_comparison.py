@@ -26,6 +26,7 @@ from adacd_hil.scheme import detectors
 
 STEPS_NM: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 ROC_STEP_NM: Final = 0.1
+ROC_WITHIN_S: Final = 0.03
 HORIZON_S: Final = 0.1
 LOOP_LAG_S: Final = 1.6e-3
 """Of a 200 Hz tracking loop, with which the step reaches the measured velocity."""
@@ -44,7 +45,7 @@ class Row:
     joint: int
     delay_ms: tuple[float, ...]
     found: tuple[float, ...]
-    roc: tuple[float, ...]  # share of steps of ROC_STEP_NM found, per rate of the comparison
+    roc: tuple[float, ...]  # share of steps of ROC_STEP_NM found in ROC_WITHIN_S, per rate of the comparison
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,7 @@ class Comparison:
             "hours": self.hours,
             "steps_Nm": list(STEPS_NM),
             "roc_step_Nm": ROC_STEP_NM,
+            "roc_within_s": ROC_WITHIN_S,
             "roc_rates_per_h": list(self.rates_per_h),
             "ranking": list(self.ranking),
             "missing": list(self.missing),
@@ -137,7 +139,8 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
         [_ratios(statistics, found, chosen, phases_s, torque, before, after) for torque in STEPS_NM]
     )  # (steps, detectors, onsets, after, n), largest ratio so far
     delays_ms = _delays_ms(ratios, phases_s, period_s)
-    largest = _ratios(statistics, found, chosen, phases_s, ROC_STEP_NM, before, after)[:, :, -1]
+    until = round(ROC_WITHIN_S / period_s)
+    largest = _ratios(statistics, found, chosen, phases_s, ROC_STEP_NM, before, after)[:, :, until]
     rows = []
     for place, (name, calibrated) in enumerate(found.items()):
         tail = calibrated.calibration.tail
@@ -232,7 +235,7 @@ def draw_comparison(comparison: Comparison) -> Drawing:
             shares.set_title(f"Joint {i + 1}")
             shares.axvline(comparison.rate_per_h, color=COLOURS["muted"], linewidth=0.8, linestyle=":")
             note(delays, f"at {comparison.rate_per_h:g} false alarms per hour")
-            note(shares, f"steps of {ROC_STEP_NM:g} Nm, within {1e3 * HORIZON_S:.0f} ms")
+            note(shares, f"steps of {ROC_STEP_NM:g} Nm, within {1e3 * ROC_WITHIN_S:.0f} ms")
         figure.legend(
             [lines[name] for name in comparison.ranking],
             comparison.ranking,

@@ -30,6 +30,7 @@ COLOURS: Final = {
     "grid": "#e6eaee",
     "identified": "#0067b1",
     "cad": "#d9780a",
+    "beside": "#a8327e",
     "joint1": "#00856a",
     "joint2": "#8a4fa3",
     "alarm": "#c4342d",

@@ -266,7 +266,7 @@ def white_noise(values: Vector) -> float:
 
 def impulse_response(poles_rad_s: Sequence[float], period_s: float) -> Vector:
     """Give the response (L,) of low-passes in a row to one sample of 1, until it has died away."""
-    length = int(12.0 / min(poles_rad_s) / period_s) + 2
+    length = int(12.0 / min(poles_rad_s, default=math.inf) / period_s) + 2
     response = np.zeros(length)
     response[0] = 1.0
     for pole in poles_rad_s:
@@ -301,7 +301,7 @@ class Limits:
 
     sources: tuple[Source, ...]
     achievable_Nm: float
-    """All random sources together: what is left if lag and friction were known exactly."""
+    """All noise and resolution together: what is left if the model, the lag and the friction were exact."""
 
     @property
     def limit(self) -> str:
@@ -317,6 +317,7 @@ class Sensing:
     torque_LSB_Nm: float
     velocity_LSB_rad_s: float
     mass_row_kg_m2: float  # norm of the joint's row of M(q) where that is largest
+    momentum_noise_Nms: float  # per sample, of the velocity's noise beyond its resolution
     lag_error_s: float
     friction_error_Nm: float
 
@@ -333,10 +334,9 @@ def find_limits(
 ) -> Limits:
     """Split the threshold of a low-pass channel of one joint by its sources, from contact-free motion (N,).
 
-    Random sources are taken at the height that Gaussian noise exceeds at the wanted rate. The velocity's noise beyond
-    its resolution is what the stream has, while the joint moves, that torque noise and resolutions don't explain. An
-    error of the lag counts with the steepest torque, one of the friction as it is; what friction holds at standstill
-    raises the threshold there and is no part of it.
+    Random sources are taken at the height that Gaussian noise exceeds at the wanted rate. What the stream has beyond
+    them while the joint moves is an error of the model. An error of the lag counts with the steepest torque, one of the
+    friction as it is; what friction holds at standstill raises the threshold there and is no part of it.
     """
     torque, momentum = gains(poles_rad_s, period_s, lag_s)
     factor = peak_factor(rate_per_h, min(poles_rad_s))
@@ -349,15 +349,22 @@ def find_limits(
         "torque LSB": torque * sensing.torque_LSB_Nm / math.sqrt(12.0),
         "velocity LSB": momentum * sensing.mass_row_kg_m2 * sensing.velocity_LSB_rad_s / math.sqrt(12.0),
     }
-    total = float(np.var(x)) if x.size else 0.0
-    random["velocity noise"] = math.sqrt(max(total - sum(rms_Nm**2 for rms_Nm in random.values()), 0.0))
+    unexplained = max(mean_square(x) - sum(rms_Nm**2 for rms_Nm in random.values()), 0.0)
+    random["velocity noise"] = min(momentum * sensing.momentum_noise_Nms, math.sqrt(unexplained))
+    model = math.sqrt(max(unexplained - random["velocity noise"] ** 2, 0.0))
     sources = [Source(name, factor * rms_Nm) for name, rms_Nm in random.items()]
     achievable = math.sqrt(sum(source.peak_Nm**2 for source in sources))
     sources += [
+        Source("model", factor * model),
         Source("lag", abs(sensing.lag_error_s) * float(np.abs(slope).max())),
         Source("friction", abs(sensing.friction_error_Nm)),
     ]
     return Limits(tuple(sorted(sources, key=lambda source: -source.peak_Nm)), achievable)
+
+
+def mean_square(x: Vector) -> float:
+    """Give the mean square of a series (n,), 0 of an empty one."""
+    return float(x @ x) / max(x.size, 1)
 
 
 def low_pass(u: Vector, poles_rad_s: Sequence[float], period_s: float) -> Vector:

@@ -5,7 +5,7 @@ vision), green joint 1 and purple joint 2 where the two share an axis, red what 
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,8 +14,11 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.drawing import COLOURS, PANEL_BINS, PAPER, Drawing, label_below, legend_above, note, plot, style
-from adacd_hil.analysis.metrics import Contact, Metrics, Run, Section, filtered
-from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
+from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.sections import Section
+from adacd_hil.analysis.touches import bank_channels, filtered, row_at
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
 
 CLOSE_UPS: Final = 24
 """Contacts shown close up; six rows of four are a page."""
@@ -39,65 +42,91 @@ def draw(run: Run, metrics: Metrics) -> list[Drawing]:
 
 
 def residuals(run: Run, metrics: Metrics) -> Drawing:
-    """Draw figure 5: the residual of both models over the whole run, each joint once in full and once near zero."""
-    figure = Figure(figsize=(10.0, 6.6))
+    """Draw figure 5: the residuals over the whole run, each joint once in full and once, by model, near zero."""
+    has_beside = run.beside is not None
+    lanes: tuple[tuple[str, Vector | None, Vector | None], ...] = (
+        (("certified", run.tau_ext_hat, run.threshold),) if run.certified is not None else (("near zero", None, None),)
+    )
+    if run.beside is not None:
+        lanes += (("paper's", run.beside.tau_ext_hat, run.beside.threshold),)
+    figure = Figure(figsize=(10.0, 8.4 if has_beside else 6.6))
     time_s = run.time_s()
     shown = time_s >= min(0.0, time_s[-1])
-    threshold_Nm = run.settings.detector.threshold_Nm
-    full = _stack(figure, (0.915, 0.475), 0.235)
-    near = _stack(figure, (0.655, 0.215), 0.135)
     end_s = float(time_s[-1])
+    full, near = _panels(figure, len(lanes))
     for joint in range(JOINTS):
-        for axes, is_near in ((full[joint], False), (near[joint], True)):
-            _shade(axes, metrics.sections)
-            h = threshold_Nm[joint]
-            for level in (-h, h):
-                axes.axhline(level, color=COLOURS["ink"], linewidth=0.8, dashes=(4, 2.5), label="threshold")
-            if run.has_cad:
-                plot(
-                    axes,
-                    time_s[shown],
-                    run.tau_ext_hat_cad[shown, joint],
-                    color=COLOURS["cad"],
-                    linewidth=0.7,
-                    label="with the CAD model",
-                )
-            plot(
-                axes,
-                time_s[shown],
-                run.tau_ext_hat[shown, joint],
-                color=COLOURS["identified"],
-                linewidth=0.8,
-                label="with the identified parameters",
-            )
-            axes.set_xlim(0.0, max(end_s, 1e-3))
-            if is_near:
-                axes.set_ylim(-1.8 * h, 1.8 * h)
-                axes.set_yticks([-h, 0.0, h], [f"−{h:g}", "0", f"{h:g}"])
-            else:
-                _pad(axes, run.tau_ext_hat[shown, joint], run.tau_ext_hat_cad[shown, joint], h)
-            axes.yaxis.set_label_coords(-0.052, 0.5)
-            axes.tick_params(labelbottom=is_near and joint == 1)
+        h = run.settings.detector.threshold_Nm[joint]
+        _curves(full[joint], run, metrics, joint, shown)
+        _pad(full[joint], run.tau_ext_hat[shown, joint], run.tau_ext_hat_cad[shown, joint], h)
         full[joint].set_title(f"({'ab'[joint]})  Joint {joint + 1}", pad=17 if joint == 0 else 5)
         full[joint].set_ylabel("Nm")
-        near[joint].set_ylabel("near zero")
         _mark(full[joint], metrics)
+        for axes, (label, residual, threshold) in zip(near[joint], lanes, strict=True):
+            if residual is None or threshold is None:
+                _curves(axes, run, metrics, joint, shown)
+            else:
+                _shade(axes, metrics.sections)
+                colour = COLOURS["beside" if label == "paper's" else "identified"]
+                plot(axes, time_s[shown], residual[shown, joint], color=colour, linewidth=0.8)
+                finite = np.where(np.isfinite(threshold[shown, joint]), threshold[shown, joint], np.nan)
+                for sign in (-1.0, 1.0):
+                    plot(axes, time_s[shown], sign * finite, color=COLOURS["ink"], linewidth=0.7)
+            axes.set_ylim(-1.8 * h, 1.8 * h)
+            axes.set_yticks([-h, 0.0, h], [f"−{h:g}", "0", f"{h:g}"])
+            axes.set_ylabel(label)
+        for axes in (full[joint], *near[joint]):
+            axes.set_xlim(0.0, max(end_s, 1e-3))
+            axes.yaxis.set_label_coords(-0.052, 0.5)
+            axes.tick_params(labelbottom=axes is near[-1][-1])
     _label(full[0], metrics.sections, end_s)
-    near[1].set_xlabel("time since motion start, s")
+    near[1][-1].set_xlabel("time since motion start, s")
     lines = {str(line.get_label()): line for line in reversed(full[0].lines)}
     labels = [label for label in lines if not label.startswith("_")]
     handles = [lines[label] for label in labels]
     figure.legend(
         handles, labels, loc="upper right", bbox_to_anchor=(0.985, 0.99), ncols=len(labels), columnspacing=1.6
     )
-    caption = (
-        "Estimated external torque with the identified parameters and with the CAD model; below each, the range around "
-        "the threshold, where the model's own error shows. Numbers mark contacts"
-    )
+    if run.certified is None:
+        caption = (
+            "Estimated external torque with the identified parameters and with the CAD model; below each, the range "
+            "around the threshold, where the model's own error shows. Numbers mark contacts"
+        )
+    else:
+        caption = (
+            "Estimated external torque of the certified scheme, slowest filter, with the CAD model, and of the paper's "
+            "scheme on the same stream; below each, near zero and with the thresholds in force. Numbers mark contacts"
+        )
     has_missed = any(contact.is_armed and contact.detected_s is None for contact in metrics.contacts)
     caption += ", a hollow mark one that was not detected" if has_missed else ""
     caption += ", a cross a false alarm." if metrics.false_alarms else "."
     return Drawing("fig5", "Figure 5 — error in (a) joint 1 and (b) joint 2", caption, figure)
+
+
+def _panels(figure: Figure, lanes: int) -> tuple[list[Axes], list[list[Axes]]]:
+    """Make, for each joint, a panel in full and one per lane near zero below it."""
+    if lanes == 1:
+        full = _stack(figure, (0.915, 0.475), 0.235)
+        return full, [[axes] for axes in _stack(figure, (0.655, 0.215), 0.135)]
+    full = _stack(figure, (0.93, 0.487), 0.18)
+    return full, [_stack(figure, (top, top - 0.113), 0.095) for top in (0.735, 0.292)]
+
+
+def _curves(axes: Axes, run: Run, metrics: Metrics, joint: int, shown: NDArray[np.bool_]) -> None:
+    """Draw a joint's residual of every model, against the paper's threshold."""
+    time_s = run.time_s()[shown]
+    _shade(axes, metrics.sections)
+    h = run.settings.detector.threshold_Nm[joint]
+    label = "threshold" if run.certified is None else "the paper's threshold"
+    for level in (-h, h):
+        axes.axhline(level, color=COLOURS["ink"], linewidth=0.8, dashes=(4, 2.5), label=label)
+    if run.has_cad:
+        cad = run.tau_ext_hat_cad[shown, joint]
+        plot(axes, time_s, cad, color=COLOURS["cad"], linewidth=0.7, label="with the CAD model")
+    if run.beside is not None:
+        beside = run.beside.tau_ext_hat[shown, joint]
+        plot(axes, time_s, beside, color=COLOURS["beside"], linewidth=0.7, label="the paper's scheme")
+    label = "with the identified parameters" if run.certified is None else "certified"
+    plot(axes, time_s, run.tau_ext_hat[shown, joint], color=COLOURS["identified"], linewidth=0.8, label=label)
 
 
 def _stack(figure: Figure, tops: Sequence[float], height: float) -> list[Axes]:
@@ -207,7 +236,7 @@ def parameter_label(name: str) -> str:
 
 
 def adaptation(run: Run, metrics: Metrics, section: Section, number: int) -> Drawing:
-    """Draw figure 6 or 7: each parameter over one adaptation, and the residual that ends it by eq. (15)."""
+    """Draw figure 6 or 7: each parameter over one adaptation, and the residual that ends it."""
     names = run.parameter_names
     columns = 4
     lines = -(-(len(names) + 1) // columns)
@@ -229,6 +258,11 @@ def adaptation(run: Run, metrics: Metrics, section: Section, number: int) -> Dra
         true, final = identified[name]
         if true is not None:
             axes.axhline(true, color=COLOURS["ink"], linewidth=0.9, dashes=(4, 2.5))
+        if run.certified is not None:
+            std = run.certified.theta_std[rows, column]
+            for sign in (-1.0, 1.0):
+                level = run.theta_hat[rows, column] + sign * std
+                plot(axes, time_s[rows], level, PANEL_BINS, color=COLOURS["identified"], linewidth=0.6, dashes=(1, 1.6))
         plot(axes, time_s[rows], run.theta_hat[rows, column], PANEL_BINS, color=COLOURS["identified"], linewidth=1.3)
         _head(axes, name, true, final)
         _fit(axes, run.theta_hat[rows, column], true)
@@ -246,16 +280,26 @@ def adaptation(run: Run, metrics: Metrics, section: Section, number: int) -> Dra
     payload_kg = metrics.payload_kg[section.label]
     payload = "" if payload_kg is None else f", {payload_kg:g} kg payload" if payload_kg else ", no payload"
     truth = "dashed the true values; " if identified and next(iter(identified.values()))[0] is not None else ""
-    end = (
-        f"it ended after {section.duration_s:.2f} s, when the residual had stayed within β for T"
-        if section.is_complete
-        else "it did not end"
-    )
+    end = _end_text(section, metrics)
+    band = "dotted one standard deviation of each; " if run.certified is not None else ""
     return Drawing(
         f"fig{6 + number}",
         f"Figure {6 + number} — model identification, {ordinal} adaptation (section {section.label}{payload})",
-        f"Identified parameters over time, {truth}{end}.",
+        f"Identified parameters over time, {truth}{band}{end}.",
         figure,
+    )
+
+
+def _end_text(section: Section, metrics: Metrics) -> str:
+    """Say how an adaptation ended."""
+    if not section.is_complete:
+        return "it did not end"
+    test_s = None if metrics.evidence is None else metrics.evidence.test_s[section.label]
+    if test_s is None:
+        return f"it ended after {section.duration_s:.2f} s, when the residual had stayed within β for T"
+    return (
+        f"frozen after {section.duration_s - test_s:.2f} s, and certified after {test_s:.2f} s more of motion that it "
+        "was not fitted to"
     )
 
 
@@ -279,14 +323,18 @@ def _fit(axes: Axes, values: Vector, true: float | None) -> None:
 def _ending(axes: Axes, run: Run, rows: NDArray[np.bool_], time_s: Vector) -> None:
     """Draw the larger residual of both joints against β, on a logarithmic ordinate."""
     largest = np.abs(run.tau_ext_hat[rows]).max(axis=1)
-    beta_Nm = run.settings.termination.beta_Nm
+    is_certified = run.certified is not None
+    beta_Nm = run.settings.certified.beta_Nm if is_certified else run.settings.termination.beta_Nm
     axes.set_yscale("log")
     plot(axes, time_s[rows], np.maximum(largest, 1e-4), PANEL_BINS, color=COLOURS["muted"], linewidth=0.8)
     axes.axhline(beta_Nm, color=COLOURS["alarm"], linewidth=0.9, dashes=(4, 2.5))
     high = float(np.nanmax(largest, initial=beta_Nm))
     axes.set_ylim(1e-3, max(3.0 * high, 5.0 * beta_Nm))
     axes.minorticks_off()
-    axes.set_title("eq. (15)")
+    testing = np.flatnonzero(rows & (run.state == SchemeState.CERTIFY))
+    if testing.size:
+        axes.axvline(time_s[testing[0]], color=COLOURS["muted"], linewidth=0.8)
+    axes.set_title("test" if is_certified else "eq. (15)")
     note(axes, f"residual, β = {beta_Nm:g} Nm")
 
 
@@ -302,8 +350,11 @@ def close_ups(run: Run, metrics: Metrics) -> Drawing:
         left=0.05, right=0.985, bottom=0.45 / height, top=1.0 - 0.62 / height, wspace=0.22, hspace=0.42
     )
     time_s = run.time_s()
+    view = _view(run)
+    beside = None if metrics.evidence is None else metrics.evidence.paper_beside
+    theirs = {} if beside is None else {contact.number: contact.detected_s for contact in beside.contacts}
     for contact, axes in zip(contacts, grid.flat, strict=False):
-        _close_up(axes, run, contact, time_s)
+        _close_up(axes, run, contact, time_s, view, theirs.get(contact.number))
     for axes in list(grid.flat)[len(contacts) :]:
         axes.set_axis_off()
     label_below(figure, "time since onset, ms" if run.truth else "time since detection, ms")
@@ -311,11 +362,32 @@ def close_ups(run: Run, metrics: Metrics) -> Drawing:
     legend_above(figure, handles, labels, height)
     more = f" The first {CLOSE_UPS} of {len(metrics.contacts)}." if len(metrics.contacts) > CLOSE_UPS else ""
     ideal = "; dotted, the true torque through the same filter" if run.truth is not None else ""
+    if run.certified is not None:
+        ideal = f", filter of {view.a_rad_s:g} rad/s{ideal}; dashed, where the paper's scheme detects"
     caption = f"Estimated external torque of both joints, Nm, around each contact{ideal}.{more}"
     return Drawing("contacts", "Contacts close up", caption, figure)
 
 
-def _close_up(axes: Axes, run: Run, contact: Contact, time_s: Vector) -> None:
+class _View(NamedTuple):
+    """The residual that close-ups show (n, 2), with its threshold (n, 2) and its filter's cut-off."""
+
+    tau_ext_hat: Vector
+    threshold: Vector
+    a_rad_s: float
+
+
+def _view(run: Run) -> _View:
+    """Choose the fastest bare channel of the bank, or the paper's one."""
+    if run.certified is None:
+        fixed = np.broadcast_to(np.array(run.settings.detector.threshold_Nm), run.tau_ext_hat.shape)
+        return _View(run.tau_ext_hat, fixed, run.a_rad_s)
+    cutoff, _ = bank_channels(run.settings)[-1]
+    return _View(run.certified.tau_ext[:, -1], run.certified.threshold[:, -1], cutoff)
+
+
+def _close_up(
+    axes: Axes, run: Run, contact: Contact, time_s: Vector, view: _View, paper_detected_s: float | None
+) -> None:
     at_s = _when(contact)
     delay_s = (contact.delay_ms or 0.0) * 1e-3
     after_s = max(_AFTER_S, 2.0 * delay_s)
@@ -323,15 +395,16 @@ def _close_up(axes: Axes, run: Run, contact: Contact, time_s: Vector) -> None:
         after_s = max(after_s, min(1.0, 1.5 * (contact.end_s - contact.onset_s)))
     rows = (time_s >= at_s - _BEFORE_S) & (time_s <= at_s + after_s)
     ms = (time_s[rows] - at_s) * 1e3
-    h = min(run.settings.detector.threshold_Nm)
+    onset = view.threshold[row_at(run, at_s)]
+    h = float(np.min(onset[np.isfinite(onset)], initial=max(run.settings.detector.threshold_Nm)))
     axes.axhspan(-h, h, color=COLOURS["grid"], linewidth=0.0, zorder=0.5, label="within the threshold")
-    levels = [run.tau_ext_hat[rows]]
+    levels = [view.tau_ext_hat[rows]]
     if run.truth is not None:
-        ideal_ms, ideal = _ideal(run, at_s, after_s)
+        ideal_ms, ideal = _ideal(run, at_s, after_s, view.a_rad_s)
         levels.append(ideal)
     for joint in range(JOINTS):
         colour = COLOURS[f"joint{joint + 1}"]
-        axes.plot(ms, run.tau_ext_hat[rows, joint], color=colour, linewidth=1.3, label=f"joint {joint + 1}")
+        axes.plot(ms, view.tau_ext_hat[rows, joint], color=colour, linewidth=1.3, label=f"joint {joint + 1}")
         if run.truth is not None:
             axes.plot(ideal_ms, ideal[:, joint], color=colour, linewidth=0.9, linestyle=(0, (1, 1.6)))
     if contact.onset_s is not None:
@@ -340,6 +413,9 @@ def _close_up(axes: Axes, run: Run, contact: Contact, time_s: Vector) -> None:
     if seen_ms > 0.0:
         axes.axvspan(0.0, seen_ms, color=COLOURS["fault"], linewidth=0.0, zorder=0)
     axes.axvline(seen_ms, color=COLOURS["alarm"], linewidth=1.2, label="detection")
+    if paper_detected_s is not None:
+        theirs_ms = (paper_detected_s - at_s) * 1e3
+        axes.axvline(theirs_ms, color=COLOURS["beside"], linewidth=1.0, dashes=(4, 2.5), label="the paper's")
     low, high = _limits(levels, h)
     axes.set_ylim(low, high)
     axes.set_xlim(-1e3 * _BEFORE_S, 1e3 * after_s)
@@ -357,13 +433,13 @@ def _limits(levels: list[Vector], h: float) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _ideal(run: Run, onset_s: float, after_s: float) -> tuple[Vector, Vector]:
+def _ideal(run: Run, onset_s: float, after_s: float, a_rad_s: float) -> tuple[Vector, Vector]:
     """Give time in ms and the true torque through the filter, Nm, around an onset."""
     truth = run.truth
     assert truth is not None
     time_s = run.time_of_s(truth.cycle)
     rows = np.flatnonzero((time_s >= onset_s - _BEFORE_S) & (time_s <= onset_s + after_s))
-    ideal = filtered(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, run.settings.filter.a_rad_s)
+    ideal = filtered(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, a_rad_s)
     return (time_s[rows] - onset_s) * 1e3, ideal
 
 

@@ -4,9 +4,8 @@ Pure functions from a run's arrays to frozen results. Times in s count from *mot
 Torques in Nm, joint arrays (2,), histories time-first (n, 2); `tau_ext_hat` has the filter's DC gain taken out, so
 that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
 
-**Sections** are lettered A, B, C, … in order: *adaptation* is a stay in ADAPT, *detection* lasts from its end to the
-announcement of a payload change (MONITOR, REACT, STOPPED), *payload* is a stay in PAYLOAD, *fault* is FAULT. The
-paper's experiment gives A to E.
+**Sections** are lettered A, B, C, … in order, see `adacd_hil.analysis.sections`. An adaptation's time is that of its
+section: up to MONITOR, the test of the frozen model and what a contact on the way costs included.
 
 **Frozen residual**: largest |tau_ext_hat| of each joint where nobody touches the arm. A cycle counts unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
@@ -15,109 +14,40 @@ model's residual is given, because theta_hat still moves. Without the truth, [de
 stands for the contact. After the request to finish the arm parks and stands, where friction may hold any torque up
 to F_c: those cycles don't count.
 
-**A detection** is a transition from MONITOR to REACT. It belongs to a true contact if it falls between the onset and
-one time constant after the true torque, filtered, is back within the threshold; else it is a false alarm. A true
-contact is *armed* if the scheme is in MONITOR at its onset; it is *missed* if it is armed and has no detection.
+**A detection** is a transition to REACT by a contact, in whatever state: the certified scheme detects while it adapts
+and while it parks, too. It belongs to a true contact if it falls between the onset and one time constant after the true
+torque, filtered, is back within the threshold; else it is a false alarm. A true contact is *armed* if the scheme is in
+MONITOR at its onset; it is *missed* if it is armed and has no detection.
+
+**Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
+those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.evidence`; the paper's scheme that ran
+beside it on the same stream: `adacd_hil.analysis.beside`.
 """
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adacd_hil.analysis.timing import CycleColumns, Cycles, TimingEvidence, collect_evidence, find_reactions
-from adacd_hil.config import Settings
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, FaultReason, SchemeState, Vector
-
-Mask = NDArray[np.bool_]
-
-SETTLING_TIME_CONSTANTS: Final = 10.0
-"""Time constants of the filter after which a contact counts as forgotten; e^-10 of 5 Nm is 0.2 mNm."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What the emulator knows, on its own cycles (m,): external torque (m, 2), contact, payload, parameters (m, 7)."""
-
-    cycle: Cycles
-    tau_ext: Vector
-    contact_link: Vector
-    contact_index: Vector
-    payload_kg: Vector
-    theta: Vector
-
-
-@dataclass(frozen=True)
-class Run:
-    """A run as plain arrays over its n cycles; `truth` is None on a real arm."""
-
-    cycle: Cycles
-    t_ns: Cycles
-    state: NDArray[np.uint8]
-    fault: NDArray[np.uint8]
-    tau_ext_hat: Vector
-    tau_ext_hat_cad: Vector
-    theta_hat: Vector
-    threshold: Vector
-    quiet_s: Vector
-    reports: tuple[ContactReport, ...]
-    timing: CycleColumns
-    truth: Truth | None
-    settings: Settings
-    metadata: Mapping[str, str]
-    frames: int | None
-    dropped: int | None
-    finish_cycle: int | None = None  # in which the user asked to finish; None if nobody did
-    contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the columns of `theta_hat`."""
-        return self.settings.estimator.parameter_names
-
-    @property
-    def has_cad(self) -> bool:
-        """Whether the configuration gives a CAD model."""
-        return len(self.settings.arm.cad_theta) > 0
-
-    @property
-    def zero_ns(self) -> int:
-        """Motion start: the first cycle in ADAPT, else the first cycle."""
-        if self.t_ns.size == 0:
-            return 0
-        adapting = self.state == SchemeState.ADAPT
-        return int(self.t_ns[int(np.argmax(adapting)) if adapting.any() else 0])
-
-    def time_s(self) -> Vector:
-        """Give the time of every cycle since motion start, s (n,)."""
-        # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
-        return np.asarray((self.t_ns - self.zero_ns) * 1e-9, dtype=np.float64)
-
-    def time_of_s(self, cycle: NDArray[Any]) -> Vector:
-        """Give the time of any cycle numbers since motion start, s; between logged cycles by interpolation."""
-        if self.cycle.size == 0:
-            return np.zeros(len(cycle))
-        return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Section:
-    """One part of a run; `is_complete` is False if the run ended, or failed, in it."""
-
-    label: str
-    kind: str  # "adaptation", "detection", "payload", "fault"
-    start_s: float
-    end_s: float
-    is_complete: bool
-
-    @property
-    def duration_s(self) -> float:
-        """Length in s."""
-        return self.end_s - self.start_s
+from adacd_hil.analysis.beside import SETTLING_TIME_CONSTANTS, Beside, evaluate_beside, largest_of
+from adacd_hil.analysis.evidence import Evidence, evaluate_certified, last_row
+from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.sections import Section, is_interrupted, rows_of, section_at, split_sections
+from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_reactions
+from adacd_hil.analysis.touches import (
+    Touch,
+    channels_at,
+    forgotten_s,
+    ideal_response,
+    row_at,
+    threshold_at,
+    true_contacts,
+)
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, FaultReason, Location, SchemeState, Vector
+from adacd_hil.scheme.classification import WINDOW_S
 
 
 @dataclass(frozen=True)
@@ -133,14 +63,19 @@ class Residual:
 class Contact:
     """A true contact and its detection, or on a real arm a detection alone.
 
+    state: of the scheme at the onset, on a real arm at the detection.
     law_ms: closed-form delay of a step of the largest torque up to the detection, the faster joint; None if never.
     ideal_ms: delay that the filter alone gives to the true torque as it was; None if never.
     link_at_alarm, link_detected: isolated at detection and at the end of the isolation window.
     torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
+    true_force_N: size of the true force, at whatever angle.
+    level to blind_deg: what the last report says, in the names of `records`; None where it doesn't say. A sigma is a
+    standard deviation.
     """
 
     number: int
     section: str | None
+    state: str
     link: int | None
     onset_s: float | None
     end_s: float | None
@@ -156,6 +91,20 @@ class Contact:
     tau_ext_Nm: tuple[float, float] | None
     tau_ext_peak_hat_Nm: tuple[float, float] | None
     torque_error_ratio: float | None
+    true_force_N: float | None
+    level: str | None
+    kind: str | None
+    reaction: str | None
+    location: str | None
+    is_two_sided: bool | None
+    tau_ext_peak_sigma_Nm: tuple[float | None, float | None] | None
+    impulse_Nm_s: tuple[float, float] | None
+    impulse_sigma_Nm_s: tuple[float | None, float | None] | None
+    force_N: float | None
+    force_sigma_N: float | None
+    lever_m: float | None
+    lever_sigma_m: float | None
+    blind_deg: float | None
 
 
 @dataclass(frozen=True)
@@ -170,10 +119,11 @@ class CycleStatistics:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """One line of *paper against measured*."""
+    """One line of *paper against measured*; `beside`: the paper's scheme on the same stream, None where none ran."""
 
     quantity: str
     paper: str
+    beside: str | None
     measured: str
 
 
@@ -196,19 +146,10 @@ class Metrics:
     timing: TimingEvidence
     frames: int | None
     dropped: int | None
+    evidence: Evidence | None
     paper: tuple[PaperRow, ...]
     verdict: str
     is_clean: bool
-
-
-class Touch(NamedTuple):
-    """A true contact: its rows [first, last] of the truth, and times since motion start."""
-
-    first: int
-    last: int
-    link: int
-    onset_s: float
-    end_s: float
 
 
 class Detection(NamedTuple):
@@ -227,7 +168,9 @@ def evaluate(run: Run) -> Metrics:
     owners = assign(run, touches, detections)
     sections = split_sections(run)
     contacts = _contacts(run, sections, touches, detections, owners)
-    residuals = frozen_residuals(run, sections, touches, detections)
+    free = untouched(run, touches, detections)
+    residuals = frozen_residuals(run, sections, free)
+    evidence = _evidence(run, sections, touches, free)
     adaptation_s = {
         section.label: section.duration_s if section.is_complete else None
         for section in sections
@@ -258,86 +201,24 @@ def evaluate(run: Run) -> Metrics:
         timing=timing_evidence(run),
         frames=run.frames,
         dropped=run.dropped,
-        paper=_paper_rows(run, sections, adaptation_s, residuals, contacts, payload_kg),
-        verdict=_verdict(run, contacts, false_s, missed, adaptation_s, payload_kg, fault, fault_s),
+        evidence=evidence,
+        paper=_paper_rows(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
+        verdict=_verdict(run, contacts, false_s, missed, adaptation_s, payload_kg, evidence, fault, fault_s),
         is_clean=fault is None and is_identified and missed == 0 and not has_false,
     )
 
 
-_KINDS: Final = {
-    SchemeState.ADAPT: "adaptation",
-    SchemeState.CERTIFY: "adaptation",
-    SchemeState.MONITOR: "detection",
-    SchemeState.REACT: "detection",
-    SchemeState.STOPPED: "detection",
-    SchemeState.PAYLOAD: "payload",
-    SchemeState.FAULT: "fault",
-}
-
-
-def section_label(index: int) -> str:
-    """Name a section by its place: A to Z, then AA, AB and so on."""
-    letter = chr(ord("A") + index % 26)
-    return letter if index < 26 else section_label(index // 26 - 1) + letter
-
-
-def split_sections(run: Run) -> tuple[Section, ...]:
-    """Split a run into lettered sections; what comes before the first ADAPT belongs to none."""
-    if run.state.size == 0:
-        return ()
-    kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[run.state]
-    starts = np.concatenate(([0], np.flatnonzero(kinds[1:] != kinds[:-1]) + 1))
-    time_s = run.time_s()
-    sections: list[Section] = []
-    for start, end in zip(starts, [*starts[1:], None], strict=True):
-        kind = str(kinds[start])
-        if not kind:
-            continue
-        end_s = float(time_s[-1] if end is None else time_s[end])
-        is_complete = end is not None and kinds[end] not in ("", "fault")  # "": begun again after a bus that failed
-        sections.append(Section(section_label(len(sections)), kind, float(time_s[start]), end_s, is_complete))
-    return tuple(sections)
-
-
-def _section_at(sections: Iterable[Section], time_s: float) -> str | None:
-    return next((section.label for section in sections if section.start_s <= time_s <= section.end_s), None)
-
-
-def _rows(run: Run, section: Section) -> Mask:
-    """Mark the cycles of a section; the last one of the run belongs to it, the first one of the next does not."""
-    time_s = run.time_s()
-    is_last = bool(section.end_s >= time_s[-1])
-    inside: Mask = (time_s >= section.start_s) & ((time_s <= section.end_s) if is_last else (time_s < section.end_s))
-    return inside
-
-
-def true_contacts(run: Run) -> tuple[Touch, ...]:
-    """Find the true contacts in the truth record; without one there are none to be known."""
-    truth = run.truth
-    if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
-        return ()
-    index = truth.contact_index
-    edges = np.flatnonzero(index[1:] != index[:-1]) + 1
-    starts = np.concatenate(([0], edges))
-    ends = np.concatenate((edges, [index.size]))
-    time_s = run.time_of_s(truth.cycle)
-    return tuple(
-        Touch(
-            int(start),
-            int(end) - 1,
-            int(truth.contact_link[start]),
-            float(time_s[start]),
-            float(time_s[min(end, index.size - 1)]),
-        )
-        for start, end in zip(starts, ends, strict=True)
-        if index[start] >= 0
-    )
+def _evidence(run: Run, sections: tuple[Section, ...], touches: tuple[Touch, ...], free: Mask) -> Evidence | None:
+    if run.certified is None:
+        return None
+    beside = None if run.beside is None else evaluate_beside(run, run.beside, sections, touches, free)
+    return evaluate_certified(run, run.certified, sections, free, beside)
 
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
-    """Find the transitions from MONITOR to REACT and the reports that belong to them by their cycle."""
+    """Find the transitions to REACT by a contact and the reports that belong to them by their cycle."""
     is_react = run.state == SchemeState.REACT
-    rows = np.flatnonzero(is_react[1:] & (run.state[:-1] == SchemeState.MONITOR)) + 1
+    rows = np.flatnonzero(is_react[1:] & ~is_interrupted(run.state[:-1])) + 1
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     time_s = run.time_s()
@@ -352,50 +233,11 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
     return tuple(detections)
 
 
-def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
-    """Give the closed-form delay of a torque step, t = -ln(1 - h / |tau|) / a; None if it never crosses."""
-    if not abs(tau_ext_Nm) > threshold_Nm:
-        return None
-    return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
-
-
-def filtered(tau_ext: Vector, cycle: Cycles, period_s: float, a_rad_s: float) -> Vector:
-    """Filter a true torque (n, 2) as an ideal detector would see it: first order, at rest at the first sample.
-
-    Each sample is held until the next one; cycle (n,): when they were taken, in periods.
-    """
-    response = np.zeros_like(tau_ext)
-    decays = np.exp(-a_rad_s * period_s * np.diff(cycle).astype(np.float64)).tolist()
-    for joint in range(tau_ext.shape[1]):
-        value = 0.0
-        for row, (sample, decay) in enumerate(zip(tau_ext[:-1, joint].tolist(), decays, strict=True), start=1):
-            value = sample + (value - sample) * decay
-            response[row, joint] = value
-    return response
-
-
-def _ideal_response(run: Run, touch: Touch) -> Vector:
-    """Filter a contact's true torque, from its first row to the one after its last."""
-    truth = run.truth
-    assert truth is not None
-    rows = slice(touch.first, touch.last + 2)
-    return filtered(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, run.settings.filter.a_rad_s)
-
-
-def threshold_at(run: Run, time_s: float) -> Vector:
-    """Give the threshold in force at a time, Nm (2,); the configured one where detection is off."""
-    row = min(int(np.searchsorted(run.time_s(), time_s)), len(run.cycle) - 1)
-    configured = np.array(run.settings.detector.threshold_Nm)
-    return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
-
-
 def assign(run: Run, touches: tuple[Touch, ...], detections: tuple[Detection, ...]) -> tuple[int | None, ...]:
     """Give for each detection the index of the true contact that explains it, or None."""
-    a = run.settings.filter.a_rad_s
-    windows = []
-    for touch in touches:
-        excess = np.max(np.abs(_ideal_response(run, touch)[-1]) / threshold_at(run, touch.onset_s))
-        windows.append((touch.onset_s, touch.end_s + (1.0 + math.log(max(1.0, excess))) / a))
+    windows = [
+        (touch.onset_s, forgotten_s(run, touch, run.a_rad_s, threshold_at(run, touch.onset_s))) for touch in touches
+    ]
     owners = []
     for detection in detections:
         fitting = [k for k, (start, end) in enumerate(windows) if start <= detection.detected_s <= end]
@@ -411,7 +253,7 @@ def _contacts(
     owners: tuple[int | None, ...],
 ) -> tuple[Contact, ...]:
     if run.truth is None:
-        return tuple(_unproven(number, sections, d) for number, d in enumerate(detections, start=1))
+        return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, start=1))
     first = {owner: detection for detection, owner in reversed(list(zip(detections, owners, strict=True)))}
     return tuple(_contact(run, number, sections, touch, first.get(number - 1)) for number, touch in _count(touches))
 
@@ -424,19 +266,53 @@ def _reported(detection: Detection | None) -> dict[str, Any]:
     """Give what the reports of a detection say."""
     alarm = detection.alarm if detection else None
     last = (detection.final or alarm) if detection else None
-    return {
+    said: dict[str, Any] = {
         "detected_s": detection.detected_s if detection else None,
         "link_at_alarm": alarm.link if alarm else None,
         "link_detected": last.link if last else None,
         "direction": last.direction if last else None,
         "tau_ext_peak_hat_Nm": last.tau_ext_peak if last else None,
+        "impulse_Nm_s": last.impulse if last else None,
     }
+    is_told = last is not None and last.location is not Location.NOT_SOUGHT
+    return said | (_told(last) if last is not None and is_told else dict.fromkeys(_TOLD))
 
 
-def _unproven(number: int, sections: tuple[Section, ...], detection: Detection) -> Contact:
+_TOLD = (
+    "level", "kind", "reaction", "location", "is_two_sided", "tau_ext_peak_sigma_Nm", "impulse_sigma_Nm_s",
+    "force_N", "force_sigma_N", "lever_m", "lever_sigma_m", "blind_deg",
+)  # fmt: skip
+"""Of a contact, what only the certified scheme tells."""
+
+
+def _told(report: ContactReport) -> dict[str, Any]:
+    has_force, has_lever = math.isfinite(report.force_sigma), math.isfinite(report.lever_sigma)
+    peak_1, peak_2 = map(_finite, report.tau_ext_peak_sigma)
+    impulse_1, impulse_2 = map(_finite, report.impulse_sigma)
+    values = (
+        report.level.name, report.kind.name, report.reaction.name, report.location.name, report.is_two_sided,
+        (peak_1, peak_2), (impulse_1, impulse_2),
+        report.force_N if has_force else None, _finite(report.force_sigma),
+        report.lever_m if has_lever else None, _finite(report.lever_sigma),
+        math.degrees(report.blind_rad),
+    )  # fmt: skip
+    return dict(zip(_TOLD, values, strict=True))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _state_at(run: Run, time_s: float) -> SchemeState:
+    """Give the state in the cycle before a time."""
+    return SchemeState(run.state[max(row_at(run, time_s) - 1, 0)])
+
+
+def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: Detection) -> Contact:
     return Contact(
         number=number,
-        section=_section_at(sections, detection.detected_s),
+        section=section_at(sections, detection.detected_s),
+        state=_state_at(run, detection.detected_s).name,
         link=None,
         onset_s=None,
         end_s=None,
@@ -447,6 +323,7 @@ def _unproven(number: int, sections: tuple[Section, ...], detection: Detection) 
         direction_ok=None,
         tau_ext_Nm=None,
         torque_error_ratio=None,
+        true_force_N=None,
         **_reported(detection),
     )
 
@@ -460,37 +337,41 @@ def _contact(
     tau_ext = truth.tau_ext[rows]
     since_s = run.time_of_s(truth.cycle[rows]) - touch.onset_s
     delay_s = detection.detected_s - touch.onset_s if detection else math.inf
-    threshold = threshold_at(run, touch.onset_s)
-    a = run.settings.filter.a_rad_s
     # What the host can have seen: up to the detection for the delay, up to the end of the window for the rest.
-    until_alarm = tau_ext[since_s <= delay_s]
-    until_final = tau_ext[since_s <= delay_s + run.settings.detector.isolation_window_s]
-    steps = [
-        delay
-        for joint in range(JOINTS)
-        if (delay := detection_delay_s(np.abs(until_alarm[:, joint]).max(), threshold[joint], a)) is not None
-    ]
-    over = np.flatnonzero((np.abs(_ideal_response(run, touch)) > threshold).any(axis=1))
+    until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
+    is_seen = since_s <= delay_s + _window_s(run)
+    until_final = tau_ext[is_seen]
+    channels = channels_at(run, touch.onset_s)
+    steps_s = [delay for channel in channels if (delay := channel.step_delay_s(until_alarm)) is not None]
+    is_over = [np.abs(ideal_response(run, touch, channel)) > channel.threshold for channel in channels]
+    over = np.flatnonzero(np.any(is_over, axis=(0, 2)))
     crossing_s = run.time_of_s(truth.cycle[touch.first + over[:1]])
     ideal_ms = float(crossing_s[0] - touch.onset_s) * 1e3 if over.size else None
     peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
     reported = _reported(detection)
-    row = min(int(np.searchsorted(run.time_s(), touch.onset_s)), len(run.cycle) - 1)
+    state = _state_at(run, touch.onset_s)
     return Contact(
         number=number,
-        section=_section_at(sections, touch.onset_s),
+        section=section_at(sections, touch.onset_s),
+        state=state.name,
         link=touch.link,
         onset_s=touch.onset_s,
         end_s=touch.end_s,
-        is_armed=bool(run.state[max(row - 1, 0)] == SchemeState.MONITOR),
+        is_armed=state is SchemeState.MONITOR,
         delay_ms=delay_s * 1e3 if detection else None,
-        law_ms=min(steps) * 1e3 if steps else None,
+        law_ms=min(steps_s) * 1e3 if steps_s else None,
         ideal_ms=ideal_ms,
         direction_ok=_is_direction_right(reported["direction"], until_final.sum(axis=0)),
         tau_ext_Nm=(float(peak[0]), float(peak[1])),
         torque_error_ratio=_torque_ratio(reported["tau_ext_peak_hat_Nm"], peak),
+        true_force_N=None if truth.force_N is None else float(truth.force_N[rows][is_seen].max()),
         **reported,
     )
+
+
+def _window_s(run: Run) -> float:
+    """Give how long after the detection a report is made final."""
+    return run.settings.detector.isolation_window_s if run.certified is None else WINDOW_S
 
 
 def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> bool | None:
@@ -511,7 +392,7 @@ def _torque_ratio(peak_hat: tuple[float, float] | None, peak: Vector) -> float |
 def untouched(run: Run, touches: tuple[Touch, ...], detections: tuple[Detection, ...]) -> Mask:
     """Mark the cycles (n,) that are free of contact, as the module's first lines define it."""
     time_s = run.time_s()
-    settling_s = SETTLING_TIME_CONSTANTS / run.settings.filter.a_rad_s
+    settling_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
     free = np.ones(time_s.size, dtype=np.bool_) if run.finish_cycle is None else run.cycle < run.finish_cycle
     if run.truth is None:
         windows = [(d.detected_s - settling_s, d.detected_s + settling_s) for d in detections]
@@ -525,32 +406,22 @@ def untouched(run: Run, touches: tuple[Touch, ...], detections: tuple[Detection,
     return free
 
 
-def frozen_residuals(
-    run: Run, sections: tuple[Section, ...], touches: tuple[Touch, ...], detections: tuple[Detection, ...]
-) -> dict[str, Residual]:
-    """Give the largest residual of each adaptation and detection section where nobody touches the arm."""
-    free = untouched(run, touches, detections)
+def frozen_residuals(run: Run, sections: tuple[Section, ...], free: Mask) -> dict[str, Residual]:
+    """Give the largest residual of each adaptation and detection section in the `free` cycles (n,)."""
     residuals = {}
     for section in sections:
         if section.kind not in ("adaptation", "detection"):
             continue
-        rows = free & _rows(run, section)
+        rows = free & rows_of(run, section)
         is_frozen = section.kind == "detection"
         if is_frozen:
             rows &= run.state == SchemeState.MONITOR
         residuals[section.label] = Residual(
-            identified=_largest(run.tau_ext_hat[rows]) if is_frozen else None,
-            cad=_largest(run.tau_ext_hat_cad[rows]) if run.has_cad else None,
+            identified=largest_of(run.tau_ext_hat[rows]) if is_frozen else None,
+            cad=largest_of(run.tau_ext_hat_cad[rows]) if run.has_cad else None,
             cycles=int(rows.sum()),
         )
     return residuals
-
-
-def _largest(residual: Vector) -> tuple[float, float] | None:
-    if residual.shape[0] == 0:
-        return None
-    largest = np.abs(residual).max(axis=0)
-    return float(largest[0]), float(largest[1])
 
 
 def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
@@ -559,9 +430,7 @@ def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, 
     for section in sections:
         if section.kind != "adaptation":
             continue
-        row = int(np.flatnonzero(_rows(run, section))[-1])
-        if section.is_complete:
-            row += 1  # the cycle that enters MONITOR still learns
+        row = last_row(run, section)
         theta = true_parameters(run, int(run.cycle[row]))
         found[section.label] = {
             name: (theta.get(name), float(run.theta_hat[row, column]))
@@ -583,7 +452,7 @@ def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None
     payloads: dict[str, float | None] = {}
     for section in sections:
         if section.kind == "adaptation":
-            row = int(np.flatnonzero(_rows(run, section))[-1])
+            row = int(np.flatnonzero(rows_of(run, section))[-1])
             payloads[section.label] = _payload_at(run, int(run.cycle[row]))
     return payloads
 
@@ -622,34 +491,110 @@ def _paper_rows(
     adaptation_s: dict[str, float | None],
     residuals: dict[str, Residual],
     contacts: tuple[Contact, ...],
+    false_alarms: int,
     payload_kg: dict[str, float | None],
+    evidence: Evidence | None,
 ) -> tuple[PaperRow, ...]:
     settings = run.settings
     times_s = list(adaptation_s.values())
-    frozen = [residuals[section.label] for section in sections if section.kind == "detection"]
-    adaptations = [section.label for section in sections if section.kind == "adaptation"]
+    detections = [section.label for section in sections if section.kind == "detection"]
+    frozen = [residuals[label] for label in detections]
+    identified, cad = [residual.identified for residual in frozen], [residual.cad for residual in frozen]
+    adaptations = list(adaptation_s)
     payload = payload_kg.get(adaptations[1]) if len(adaptations) > 1 else None
     law = {"least_squares": "least squares", "gradient": "gradient"}[settings.estimator.law]
     a, b = settings.filter.a_rad_s, settings.filter.b_rad_s
     within = "within ±0.15"
     seen = [contact.detected_s for contact in contacts if contact.detected_s is not None]
-    rows = [
-        ("First adaptation", "5.2 s", _seconds(times_s, 0)),
-        ("Adaptation after the payload change", "about 5.3 s", _seconds(times_s, 1)),
-        ("Payload", "1 kg", "–" if payload is None else f"{payload:g} kg"),
-        ("Frozen residual without payload, joints 1 / 2", within, _residual_text(frozen, 0, "identified")),
-        ("Frozen residual with payload, joints 1 / 2", within, _residual_text(frozen, 1, "identified")),
-        ("The CAD model's, without payload", "larger; joint 2 good", _residual_text(frozen, 0, "cad")),
-        ("The CAD model's, with payload", "much larger, both joints", _residual_text(frozen, 1, "cad")),
-        ("First contact detected at", "10 s", f"{seen[0]:.2f} s" if seen else "–"),
+    first = f"{seen[0]:.2f} s" if seen else "–"
+    kilograms = "–" if payload is None else f"{payload:g} kg"
+    settled = (
         ("Bound β of eq. (15)", "0.1 Nm", f"{settings.termination.beta_Nm:g} Nm"),
         ("Hold T of eq. (15)", "5 s", f"{settings.termination.hold_s:g} s"),
         ("Threshold, joints 1 / 2", "0.15 Nm", _pair(settings.detector.threshold_Nm)),
         ("Filter a / b", "10 / 10 rad/s", f"{a:g} / {b:g} rad/s"),
         ("Estimator", "least squares", law),
-        ("Control rate", "1 kHz", f"{1e3 / settings.bus.period_us:g} kHz"),
+    )
+    rate = f"{1e3 / settings.bus.period_us:g} kHz"
+    names = (
+        ("First adaptation", "5.2 s"),
+        ("Adaptation after the payload change", "about 5.3 s"),
+        ("Payload", "1 kg"),
+        ("Frozen residual without payload, joints 1 / 2", within),
+        ("Frozen residual with payload, joints 1 / 2", within),
+        ("The CAD model's, without payload", "larger; joint 2 good"),
+        ("The CAD model's, with payload", "much larger, both joints"),
+        ("First contact detected at", "10 s"),
+    )
+    measured = (
+        _seconds(times_s, 0),
+        _seconds(times_s, 1),
+        kilograms,
+        _residual_text(identified, 0),
+        _residual_text(identified, 1),
+        _residual_text(cad, 0),
+        _residual_text(cad, 1),
+        first,
+    )
+    if evidence is None:
+        plain = [(*name, value) for name, value in zip(names, measured, strict=True)]
+        plain += [*settled, ("Control rate", "1 kHz", rate)]
+        return tuple(PaperRow(quantity, paper, None, value) for quantity, paper, value in plain)
+    beside = _beside_values(evidence.paper_beside, detections, (kilograms, *measured[5:7]))
+    rows = [(*name, theirs, value) for name, theirs, value in zip(names, beside[:8], measured, strict=True)]
+    armed = [contact for contact in contacts if contact.is_armed]
+    found = [contact for contact in armed if contact.delay_ms is not None]
+    has_truth = run.truth is not None
+    rows += [
+        ("Contacts detected", "–", beside[8], f"{len(found)} of {len(armed)}" if has_truth else str(len(contacts))),
+        ("Median delay", "–", beside[9], _median_text([c.delay_ms for c in found if c.delay_ms is not None])),
+        ("False alarms", "–", beside[10], str(false_alarms) if has_truth else "–"),
     ]
+    ours = (
+        f"{settings.certified.beta_Nm:g} Nm, of the frozen model",
+        "test of " + (" and ".join("–" if t is None else f"{t:.2f} s" for t in evidence.test_s.values()) or "–"),
+        _threshold_text(evidence, detections),
+        f"{', '.join(f'{cutoff:g}' for cutoff in settings.certified.cutoffs_rad_s)} rad/s",
+        "least squares from a prior",
+    )
+    rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
+    margin = evidence.smallest_margin
+    rows.append(("Smallest threshold / residual", "–", "–", "–" if margin is None else f"{margin:.2f}"))
+    rows.append(("Control rate", "1 kHz", rate, rate))
     return tuple(PaperRow(*row) for row in rows)
+
+
+def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str, str, str]) -> tuple[str, ...]:
+    """Give the column of the paper's scheme on the same stream; same: payload and the CAD model's residuals."""
+    if beside is None:
+        return ("–",) * 11
+    times_s = list(beside.adaptation_s.values())
+    frozen = [beside.frozen_residual_max_Nm[label] for label in detections]
+    armed = [contact for contact in beside.contacts if contact.is_armed]
+    found = [contact for contact in armed if contact.detected_s is not None]
+    seen = [contact.detected_s for contact in beside.contacts if contact.detected_s is not None]
+    return (
+        _seconds(times_s, 0),
+        _seconds(times_s, 1),
+        same[0],
+        _residual_text(frozen, 0),
+        _residual_text(frozen, 1),
+        *same[1:],
+        f"{seen[0]:.2f} s" if seen else "–",
+        "–" if beside.missed is None else f"{len(found)} of {len(armed)}",
+        _median_text([contact.delay_ms for contact in found if contact.delay_ms is not None]),
+        "–" if beside.false_alarms is None else str(beside.false_alarms),
+    )
+
+
+def _threshold_text(evidence: Evidence, detections: list[str]) -> str:
+    """Say where the thresholds of the slowest channel lie: the smallest and the largest median of a section."""
+    found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
+    return f"{min(found):.3f} to {max(found):.3f} Nm" if found else "–"
+
+
+def _median_text(delays_ms: list[float]) -> str:
+    return f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else "–"
 
 
 def _seconds(times_s: list[float | None], index: int) -> str:
@@ -665,8 +610,8 @@ def _pair(values: tuple[float, float] | None) -> str:
     return f"{values[0]:g} Nm" if values[0] == values[1] else f"{values[0]:g} / {values[1]:g} Nm"
 
 
-def _residual_text(frozen: list[Residual], index: int, model: str) -> str:
-    values = getattr(frozen[index], model) if index < len(frozen) else None
+def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
+    values = frozen[index] if index < len(frozen) else None
     return "–" if values is None else f"{values[0]:.3f} / {values[1]:.3f} Nm"
 
 
@@ -677,13 +622,24 @@ def _verdict(
     missed: int,
     adaptation_s: dict[str, float | None],
     payload_kg: dict[str, float | None],
+    evidence: Evidence | None,
     fault: str | None,
     fault_s: float | None,
 ) -> str:
-    text = f"{_contacts_text(run, contacts, false_s, missed)}; {_identified_text(adaptation_s, payload_kg)}"
+    done = "identified" if evidence is None else "certified"
+    text = f"{_contacts_text(run, contacts, false_s, missed)}; {_identified_text(adaptation_s, payload_kg, done)}"
+    if evidence is not None and evidence.paper_beside is not None:
+        text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     if fault is not None:
         text = f"the run ended in FAULT ({fault}) at {fault_s:.2f} s; {text}"
     return text[:1].upper() + text[1:] + "."
+
+
+def _beside_text(times_s: list[float | None]) -> str:
+    if not any(time_s is not None for time_s in times_s):
+        return ""
+    took = " and ".join("did not end" if time_s is None else f"took {time_s:.2f} s" for time_s in times_s)
+    return f"; the paper's scheme on the same stream {took.replace(' and took', ' and')}"
 
 
 def _contacts_text(run: Run, contacts: tuple[Contact, ...], false_s: tuple[float, ...], missed: int) -> str:
@@ -699,8 +655,10 @@ def _contacts_text(run: Run, contacts: tuple[Contact, ...], false_s: tuple[float
     false = "none false" if not false_s else _number(len(false_s), "false alarm")
     if not armed and not false_s:
         false = "no false alarm"
-    disarmed = len(contacts) - len(armed)
-    outside = f", {disarmed} more while it was not armed" if disarmed else ""
+    disarmed = [contact for contact in contacts if not contact.is_armed]
+    outside = f", {len(disarmed)} more while it was not armed" if disarmed else ""
+    early = sum(contact.detected_s is not None for contact in disarmed)
+    outside += f" ({early} of them detected)" if early else ""
     return f"{found}{outside}, {false}"
 
 
@@ -708,13 +666,14 @@ def _number(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def _identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None]) -> str:
+def _identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], done: str) -> str:
+    """Say how long the model took to be `done`, identified or certified."""
     if not adaptation_s:
         return "the arm never moved to adapt"
     labels = list(adaptation_s)
     if adaptation_s[labels[0]] is None:
-        return "the model was not identified"
-    text = f"the model was identified in {adaptation_s[labels[0]]:.2f} s"
+        return f"the model was not {done}"
+    text = f"the model was {done} in {adaptation_s[labels[0]]:.2f} s"
     for before, label in itertools.pairwise(labels):
         old, new, time_s = payload_kg[before], payload_kg[label], adaptation_s[label]
         change = "the payload change"

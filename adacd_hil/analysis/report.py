@@ -18,18 +18,20 @@ from typing import Any, Final
 import numpy as np
 
 from adacd_hil.analysis.drawing import Drawing
+from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.figures import draw
-from adacd_hil.analysis.metrics import Contact, Metrics, Residual, Run, Truth, evaluate
+from adacd_hil.analysis.metrics import Contact, Metrics, Residual, evaluate
 from adacd_hil.analysis.page import NONE, Cell, document, embed, heading, make_table, number_text, wrap_section
+from adacd_hil.analysis.run import CertifiedStream, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import columns_of_series
 from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.analysis.timing_page import timing_section
 from adacd_hil.config import Settings, parse
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import RunLog, Series, read_log
-from adacd_hil.records import PARAMETER_UNITS, Request
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, Request
 
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 """Version of report.json; goes up when a key changes its meaning or disappears."""
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
@@ -62,11 +64,10 @@ class Report:
         lines = [self.metrics.verdict]
         if self.problem:
             lines.append(f"The log is not whole: {self.problem}")
-        rows = [("", "paper", "measured")]
-        rows += [(row.quantity, row.paper, row.measured) for row in self.metrics.paper]
-        lines += ["", *_columns(rows)]
+        lines += ["", *_columns([_paper_head(self.metrics), *_paper_cells(self.metrics)])]
         if self.metrics.contacts:
-            lines += ["", *_columns([_CONTACT_HEAD, *map(_contact_words, self.metrics.contacts)])]
+            head, rows = _contact_rows(self.metrics)
+            lines += ["", *_columns([head, *rows])]
         return "\n".join([*lines, "", f"Report: {self.html_path}"])
 
 
@@ -117,7 +118,7 @@ def write_run_report(run: Run, out_dir: Path, *, log_name: str, problem: str = "
 
 def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
     """Take what the metrics need out of a log and the emulator's own log. Raises LogError."""
-    scheme = log.scheme
+    scheme, settings = log.scheme, _settings(log)
     metadata = dict(log.metadata)
     if "arm.dbc" in log.attachments:
         metadata["dbc_sha256"] = hashlib.sha256(log.attachments["arm.dbc"]).hexdigest()
@@ -138,10 +139,39 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
         finish_cycle=_finish_cycle(scheme),
         contact_joints=scheme["contact_joints"],
         truth=_truth(truth_log),
-        settings=_settings(log),
+        settings=settings,
         metadata=metadata,
         frames=_count(log.summary, "frames"),
         dropped=_count(log.summary, "dropped"),
+        certified=_certified_stream(scheme, settings),
+        beside=_paper_stream(scheme),
+    )
+
+
+def _certified_stream(scheme: Series, settings: Settings) -> CertifiedStream | None:
+    """Take out what only the certified scheme records; None of a log without it."""
+    if "tau_ext_bank" not in scheme.fields:
+        return None
+    shape = (-1, settings.channel_count, JOINTS)
+    return CertifiedStream(
+        tau_ext=scheme["tau_ext_bank"].reshape(shape),
+        threshold=scheme["threshold_bank"].reshape(shape),
+        theta_further=scheme["theta_further"],
+        theta_std=scheme["theta_std"],
+        condition=scheme["condition"],
+        promotions=scheme["promotions"],
+    )
+
+
+def _paper_stream(scheme: Series) -> PaperStream | None:
+    """Take out what the paper's scheme beside records; None of a log without it."""
+    if "paper_is_armed" not in scheme.fields:
+        return None
+    return PaperStream(
+        is_armed=scheme["paper_is_armed"] > 0.5,
+        tau_ext_hat=scheme["paper_tau_ext_hat"],
+        threshold=scheme["paper_threshold"],
+        theta_hat=scheme["paper_theta_hat"],
     )
 
 
@@ -162,6 +192,7 @@ def _truth(log: RunLog | None) -> Truth | None:
         contact_index=truth["contact_index"],
         payload_kg=truth["payload"],
         theta=truth["theta"],
+        force_N=truth["contact_force"] if "contact_force" in truth.fields else None,
     )
 
 
@@ -204,6 +235,7 @@ def _as_json(
             "missed": metrics.missed,
             "parameters": metrics.parameters,
             "payload_kg": metrics.payload_kg,
+            "certified": None if metrics.evidence is None else _evidence_json(metrics.evidence),
             "fault": fault,
             "cycle": dataclasses.asdict(metrics.cycle),
             "timing": metrics.timing.as_json(),
@@ -219,6 +251,11 @@ def _as_json(
         }
     )
     return plain
+
+
+def _evidence_json(evidence: Evidence) -> dict[str, Any]:
+    """Give what only the certified scheme has; the keys are described in `adacd_hil.analysis.evidence`."""
+    return {**dataclasses.asdict(evidence), "smallest_margin": evidence.smallest_margin}
 
 
 def _plain(value: Any) -> Any:
@@ -272,6 +309,28 @@ def _contact_words(contact: Contact) -> tuple[str, ...]:
     )
 
 
+def _contact_rows(metrics: Metrics) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Give head and rows of the list of contacts, where it is known with the delay of the paper's scheme beside."""
+    rows = [_contact_words(contact) for contact in metrics.contacts]
+    beside = None if metrics.evidence is None else metrics.evidence.paper_beside
+    if beside is None or not beside.contacts:
+        return _CONTACT_HEAD, rows
+    delays = [number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts]
+    return (*_CONTACT_HEAD, "paper's ms"), [(*row, delay) for row, delay in zip(rows, delays, strict=True)]
+
+
+def _paper_head(metrics: Metrics) -> tuple[str, ...]:
+    if metrics.evidence is None:
+        return ("", "paper", "measured")
+    return ("", "paper (printed)", "paper's scheme, same stream", "certified")
+
+
+def _paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
+    if metrics.evidence is None:
+        return [(row.quantity, row.paper, row.measured) for row in metrics.paper]
+    return [(row.quantity, row.paper, row.beside or NONE, row.measured) for row in metrics.paper]
+
+
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Align rows of words for a terminal."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
@@ -289,8 +348,9 @@ def page(report: Report, run: Run, drawings: Sequence[Drawing], timing: Sequence
         figures.get("fig5", ""),
         wrap_section("Paper against measured", _paper_table(metrics)),
         wrap_section("Sections", _sections_table(metrics, run)),
-        wrap_section("Contacts", figures.get("contacts", ""), _contacts_table(metrics)),
-        wrap_section("Model identification", adaptations, _parameters_table(metrics, run)),
+        wrap_section("Margins", _margins_table(metrics.evidence)),
+        wrap_section("Contacts", figures.get("contacts", ""), _contacts_table(metrics), _cards(metrics)),
+        wrap_section("Model identification", adaptations, _parameters_table(metrics, run), _further_table(metrics)),
         timing_section(metrics.timing, timing),
         wrap_section("Run", _run_table(report)),
         _definitions(run),
@@ -326,15 +386,17 @@ def _tiles(metrics: Metrics) -> str:
     frozen = [max(r.identified) for r in metrics.frozen_residual_max_Nm.values() if r.identified is not None]
     links = [contact for contact in seen if contact.link is not None]
     right = sum(contact.link == contact.link_detected for contact in links)
-    has_truth = metrics.missed is not None
+    has_truth, evidence = metrics.missed is not None, metrics.evidence
     tiles = [
-        ("identified in", " · ".join(times_s) or NONE, "s"),
+        ("identified in" if evidence is None else "certified in", " · ".join(times_s) or NONE, "s"),
+        ("the paper's, same stream", _beside_times(evidence), "s"),
         ("contacts detected", f"{len(seen)} of {len(armed)}", "") if has_truth else ("detections", str(len(seen)), ""),
         ("false alarms", NONE if metrics.false_alarms is None else str(metrics.false_alarms), ""),
         ("link right", f"{right} of {len(links)}" if links else NONE, ""),
         ("median delay", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
         ("of which by law", number_text(float(np.median(laws_ms)), 1) if laws_ms else NONE, "ms"),
         ("largest frozen residual", number_text(max(frozen), 3) if frozen else NONE, "Nm"),
+        ("smallest margin", NONE if evidence is None else number_text(evidence.smallest_margin, 2), "×"),
     ]
     tiles = [tile for tile in tiles if tile[1] != NONE]
     cells = "".join(
@@ -345,8 +407,110 @@ def _tiles(metrics: Metrics) -> str:
 
 
 def _paper_table(metrics: Metrics) -> str:
-    rows = [(escape(row.quantity), escape(row.paper), (escape(row.measured), "strong")) for row in metrics.paper]
-    return make_table(("quantity", "paper", "measured"), rows, left=(0, 1, 2))
+    rows: list[Sequence[Cell]] = [
+        [*map(escape, cells[:-1]), (escape(cells[-1]), "strong")] for cells in _paper_cells(metrics)
+    ]
+    head = ("quantity", *_paper_head(metrics)[1:])
+    return make_table(head, rows, left=range(len(head)))
+
+
+def _margins_table(evidence: Evidence | None) -> str:
+    """Write threshold over residual of each channel and section."""
+    if evidence is None or not evidence.margins:
+        return ""
+    head = ("section", "filter, rad/s", "", "largest residual, Nm", "threshold, Nm", "margin")
+    rows: list[Sequence[Cell]] = []
+    for label, channels in evidence.margins.items():
+        for row in channels:
+            cutoff = f"{row.cutoff_rad_s:g}"
+            kind = "bare" if row.smoothing_rad_s is None else "smoothed"
+            margin = (_pair(row.margin, 1), "bad" if min(row.margin) < 1.0 else "strong")
+            pairs = (_pair(row.residual_max_Nm, 3), _pair(row.threshold_Nm, 3))
+            name = (label, "strong") if row is channels[0] else ""
+            rows.append((name, cutoff, kind, *pairs, margin))
+    note = (
+        "Joint 1 / joint 2, where nothing touches the arm. Threshold: median. Margin: the smallest threshold over "
+        "residual of any cycle; below 1 it would have been a false alarm. In an adaptation the threshold is as high as "
+        "the model is uncertain."
+    )
+    return make_table(head, rows, left=(0, 2)) + f'<p class="note">{note}</p>'
+
+
+def _cards(metrics: Metrics) -> str:
+    """Write what the reports say of each contact, with its uncertainty and the truth."""
+    told = [contact for contact in metrics.contacts if contact.location is not None]
+    return f'<div class="cards">{"".join(map(_card, told))}</div>' if told else ""
+
+
+_PLACES: Final = {
+    "KNOWN": "one contact on the link",
+    "LINK_1": "only the moment is known: the least force that has it",
+    "SINGULAR": "not known: the elbow stands square",
+    "UNCERTAIN": "too weak for a lever arm",
+    "BEYOND_TIP": "lever arm past the tip",
+    "INCONSISTENT": "no single contact without friction",
+}
+
+
+def _card(contact: Contact) -> str:
+    words = [contact.level, contact.kind if contact.kind != "UNKNOWN" else None, contact.reaction]
+    kind = " · ".join(word.lower().replace("_", " ") for word in words if word)
+    if contact.is_two_sided:
+        kind += " · two-sided"
+    lever_m, sigma_m = contact.lever_m, contact.lever_sigma_m
+    lever = _uncertain(_scaled(lever_m, 100.0), _scaled(sigma_m, 100.0), 1, "cm")
+    true_force = "" if contact.true_force_N is None else f", true {number_text(contact.true_force_N, 1)}"
+    entries = [
+        ("found after", number_text(contact.delay_ms, 0, "ms")),
+        ("force", _uncertain(contact.force_N, contact.force_sigma_N, 1, "N") + true_force),
+        ("lever arm", lever),
+        ("place", _PLACES.get(contact.location or "", NONE)),
+        ("blind within", number_text(contact.blind_deg, 1, "°")),
+    ]
+    peaks, peak_sigmas = contact.tau_ext_peak_hat_Nm or (), contact.tau_ext_peak_sigma_Nm or ()
+    impulses, impulse_sigmas = contact.impulse_Nm_s or (), contact.impulse_sigma_Nm_s or ()
+    for joint in range(len(peaks)):
+        peak = _uncertain(peaks[joint], peak_sigmas[joint], 2, "Nm")
+        impulse = _uncertain(impulses[joint], impulse_sigmas[joint], 3, "Nm s")
+        entries.append((f"joint {joint + 1}", f"peak {peak}, impulse {impulse}"))
+    link = number_text(contact.link_detected, 0)
+    items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries)
+    return f"<div><h3>{contact.number}  link {link}</h3><p>{escape(kind)}</p><dl>{items}</dl></div>"
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
+
+
+def _uncertain(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
+    """Write a value with its standard deviation; a dash where either is not known."""
+    if value is None or sigma is None:
+        return NONE
+    return f"{number_text(value, digits)} ± {number_text(sigma, digits)} {unit}"
+
+
+def _further_table(metrics: Metrics) -> str:
+    """Write all parameters of the certified scheme with the standard deviations that it gives them."""
+    if metrics.evidence is None or not metrics.evidence.estimates:
+        return ""
+    estimates = metrics.evidence.estimates
+    head = ["", "unit"]
+    for label in estimates:
+        head += [f"certified ({label})", "±"]
+    rows = []
+    for name in next(iter(estimates.values())):
+        cells: list[Cell] = [_symbol(name), escape(PARAMETER_UNITS.get(name, "Nm"))]
+        for found in estimates.values():
+            cells += [(number_text(found[name].value, 5), "strong"), number_text(found[name].std, 5)]
+        rows.append(cells)
+    note = '<p class="note">±: standard deviation that the scheme gives its own estimate.</p>'
+    return make_table(head, rows, left=(0, 1)) + note
+
+
+def _beside_times(evidence: Evidence | None) -> str:
+    if evidence is None or evidence.paper_beside is None:
+        return NONE
+    return " · ".join(number_text(time_s, 2) for time_s in evidence.paper_beside.adaptation_s.values()) or NONE
 
 
 _KINDS: Final = {
@@ -393,8 +557,9 @@ def _contacts_table(metrics: Metrics) -> str:
     if not metrics.contacts:
         return '<p class="note">None.</p>'
     rows: list[Sequence[Cell]] = []
-    for contact in metrics.contacts:
-        cells: list[Cell] = [escape(word) for word in _contact_words(contact)]
+    head, words = _contact_rows(metrics)
+    for contact, row in zip(metrics.contacts, words, strict=True):
+        cells: list[Cell] = [escape(word) for word in row]
         if contact.detected_s is None:
             cells[6] = (str(cells[6]), "bad")
         if contact.link is not None and contact.link_detected not in (None, contact.link):
@@ -406,7 +571,7 @@ def _contacts_table(metrics: Metrics) -> str:
     if metrics.false_alarms_s:
         times = ", ".join(number_text(time_s, 3) for time_s in metrics.false_alarms_s)
         note = f'<p class="note bad">False alarms at {times} s.</p>'
-    return make_table(_CONTACT_HEAD, rows, left=()) + note
+    return make_table(head, rows, left=()) + note
 
 
 def _symbol(name: str) -> str:
@@ -448,9 +613,29 @@ def _run_table(report: Report) -> str:
     return make_table(("", ""), [(escape(key), escape(value)) for key, value in rows], left=(0, 1))
 
 
+_CERTIFIED_DEFINITIONS: Final = (
+    (
+        "Certified",
+        "an adaptation lasts until detection is armed: fit, test of the frozen model on motion that it was not fitted "
+        "to, and what contacts on the way cost. Residual: of the slowest filter. Law and ideal: of the fastest channel "
+        "of the bank.",
+    ),
+    (
+        "Paper's scheme, same stream",
+        "it adapts beside, ends by eq. (15) and compares with its own thresholds, but decides nothing. Its detection "
+        "is the first sample over its threshold while it is armed, though the arm may already react to the other's.",
+    ),
+    (
+        "Force, lever arm, blind within",
+        "at right angles to the link, for one contact without friction; the lever arm counts from joint 2. A force "
+        "nearer to link 2's axis than the angle reads as one on link 1.",
+    ),
+)
+
+
 def _definitions(run: Run) -> str:
-    settling_s = 10.0 / run.settings.filter.a_rad_s
-    entries = (
+    settling_s = 10.0 / run.a_rad_s
+    entries: tuple[tuple[str, str], ...] = (
         ("Times", "count from motion start, the first cycle of the first adaptation."),
         (
             "Frozen residual",
@@ -476,5 +661,7 @@ def _definitions(run: Run) -> str:
             "torque, filter undone, over the true one, at the joint with more of it.",
         ),
     )
+    if run.certified is not None:
+        entries += _CERTIFIED_DEFINITIONS
     items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries)
     return f'<section class="definitions">\n<h2>How it is computed</h2>\n<dl>{items}</dl>\n</section>'

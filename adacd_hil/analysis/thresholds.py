@@ -25,6 +25,7 @@ from adacd_hil.analysis.false_alarms import (
     find_limits,
     gains,
     low_pass,
+    mean_square,
     resolution,
     white_noise,
 )
@@ -194,7 +195,7 @@ class ChannelRow:
     threshold: tuple[float, ...] = setting(low=0.0, meaning="per joint; Nm, but sigmas of likelihood and Nm s of cusum")
     limit: tuple[str, ...] = setting(meaning="what keeps it up, per joint; empty where it can't be split")
     achievable_Nm: tuple[float, ...] = setting(
-        unit="Nm", low=0.0, meaning="per joint, with lag and friction known exactly; empty where it can't be split"
+        unit="Nm", low=0.0, meaning="per joint, with an exact model; empty where it can't be split"
     )
 
 
@@ -306,12 +307,19 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
         moves = statistics.held_Nm[free, i] == 0.0
         x = low_pass(statistics.z[free, i], (_MODEL_RAD_S,), motion.period_s)[moves]
         direction = low_pass(np.sign(motion.dq[free, i]), (_MODEL_RAD_S,), motion.period_s)[moves]
+        velocity_LSB = resolution(motion.dq[free, i])
+        # the slope of the velocity's noise rules in single samples: nothing else is as fast
+        torque_gain, momentum_gain = gains((), motion.period_s, statistics.lag_s)
+        noise = white_noise(motion.tau_J[free, i])
+        fast = mean_square(statistics.z[free, i][moves]) - (torque_gain * noise) ** 2
+        rest = fast / momentum_gain**2 - (float(largest[i]) * velocity_LSB) ** 2 / 12.0
         sensing.append(
             Sensing(
-                torque_noise_Nm=max(white_noise(motion.tau_J[free, i]) ** 2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
+                torque_noise_Nm=max(noise**2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
                 torque_LSB_Nm=torque_LSB,
-                velocity_LSB_rad_s=resolution(motion.dq[free, i]),
+                velocity_LSB_rad_s=velocity_LSB,
                 mass_row_kg_m2=float(largest[i]),
+                momentum_noise_Nms=max(rest, 0.0) ** 0.5,
                 lag_error_s=float(statistics.lag_of_joint_s[i] - statistics.lag_s),
                 friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
             )

@@ -55,7 +55,7 @@ def _fail(line: str, code: ExitCode) -> None:
 
 _config = click.option(
     "--config",
-    default="paper",
+    default="certified",
     show_default=True,
     metavar="NAME|FILE",
     help=f"One of {builtin_names()}, or a TOML file.",

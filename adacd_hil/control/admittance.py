@@ -2,9 +2,8 @@
 
     mass ddq_d = tau_ext_hat (beyond its dead band) - drag dq_d
 
-It begins with the motion of that moment. What moves against the push, or without one, is braked with the largest
-acceleration. Acceleration, speed and position have bounds; speed toward a position limit is no larger than what can be
-braked before it.
+It begins with the motion of that moment, which the damper brakes. Acceleration, speed and position have bounds; speed
+toward a position limit is no larger than what can be braked before it.
 
 Shapes: vectors (2,). Units: rad, rad/s, rad/s², Nm.
 """
@@ -35,8 +34,6 @@ class Admittance:
             push = math.copysign(max(abs(tau) - self._deadband[i], 0.0), tau)
             step = self._acceleration_limit[i] * self._period_s
             wanted = speed + self._period_s * (push - self._drag[i] * speed) / self._mass[i]
-            if push * speed <= 0.0:
-                wanted += math.copysign(max(step - abs(wanted - speed), 0.0), -speed) if abs(speed) > step else 0.0
             limit = self._speed_limit[i]
             room = max(self._bound[i] - math.copysign(float(q_d[i]), wanted * float(q_d[i])), 0.0)
             limit = min(limit, math.sqrt(2.0 * self._acceleration_limit[i] * room))

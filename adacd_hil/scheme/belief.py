@@ -6,14 +6,15 @@ T_learn therefore counts with the variance
 
     R = sigma² 2 / (a T_learn),    sigma: what a good model leaves in the filtered residual, Nm rms,
 
-so that P means what it says.
+so that P means what it says. Friction of a joint that stands still is any torque up to the static one: what of it is in
+the filter counts as further deviation, so an arm at rest teaches next to nothing.
 
 **Payload.** One of mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this
 direction g by sigma_m² g g', and a little in each inertia for what is no point mass. All else stays known.
 
 **Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
 
-Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau (h, n).
+Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R (h, n).
 """
 
 from typing import Any
@@ -23,6 +24,11 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme import estimator
+
+_SWEEPS = 200
+"""Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
+_SETTLED = 1e-9
+"""Nm or Nm s/rad that the last sweep may still have moved one of them by."""
 
 
 @compiled
@@ -52,25 +58,29 @@ def wander(drift_std: Vector, elapsed_s: float, P: Vector) -> None:
 
 
 @compiled
-def learn(c: Any, m: Any, W_f: Vector, tau_f: Vector) -> bool:
+def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector) -> bool:
     """Put this sample into the ring, and correct the belief by the one that has waited long enough, if one has.
 
-    W_f (n, p), tau_f (n,): of the filter that is learnt from. Return whether the belief has changed.
+    W_f (n, p), tau_f (n,): of the filter that is learnt from. held (n,): torque in it that friction may have held at
+    standstill, Nm. Return whether the belief has changed.
     """
     m["since_learnt"] += 1.0
-    if m["since_learnt"] < c["learn_every"]:
+    if m["since_learnt"] < k["learn_every"]:
         return False
     m["since_learnt"] = 0.0
     place = int(m["ring_next"])
     has_waited = m["ring_used"] == m["ring_tau"].shape[0]
     if has_waited:
-        estimator.update(
-            m["ring_W"][place], m["ring_tau"][place], c["R"], True, m["belief"], m["P_belief"], m["v"], m["K"]
-        )
+        for i in range(tau_f.shape[0]):
+            R = m["ring_R"][place, i]
+            w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
+            estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W_f
     m["ring_tau"][place] = tau_f
+    for i in range(tau_f.shape[0]):
+        m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + held[i] ** 2)
     m["ring_next"] = (place + 1) % m["ring_tau"].shape[0]
     return bool(has_waited)
 
@@ -86,20 +96,23 @@ def discard(m: Any) -> None:
 def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
     """Move theta (p,) in place so that none of its parameters first .. last - 1 is negative.
 
-    Each that is goes to zero and takes the others along as P says they belong together: the nearest such theta in the
-    metric of P. P stays; it is no less uncertain for that.
+    To the nearest such theta in the metric of P, theta + P lambda with lambda >= 0: each one that is negative is pushed
+    to zero and takes the others along as P says they belong together; one that was taken further is let go again
+    (Hildreth's method). P stays; it is no less uncertain for that.
     """
-    for _ in range(last - first):
-        worst = first
+    pushed = np.zeros(last - first)
+    for _ in range(_SWEEPS):
+        moved = 0.0
         for j in range(first, last):
-            if theta[j] < theta[worst]:
-                worst = j
-        if theta[worst] >= 0.0 or not P[worst, worst] > 0.0:
+            if not P[j, j] > 0.0:
+                continue
+            push = max(-theta[j] / P[j, j], -pushed[j - first])
+            pushed[j - first] += push
+            for n in range(theta.shape[0]):
+                theta[n] += push * P[n, j]
+            moved = max(moved, abs(push) * P[j, j])
+        if moved < _SETTLED:
             break
-        share = theta[worst] / P[worst, worst]
-        for j in range(theta.shape[0]):
-            theta[j] -= share * P[j, worst]
-        theta[worst] = 0.0
     for j in range(first, last):
         theta[j] = max(theta[j], 0.0)
 

@@ -50,6 +50,7 @@ MONITOR = int(SchemeState.MONITOR)
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
+_OVER_SPEED = int(Observation.OVER_SPEED)
 _AT_REST = int(Observation.AT_REST)
 _UNLOADED = int(Observation.UNLOADED)
 _CONTACT = int(Observation.CONTACT)
@@ -123,7 +124,8 @@ def constants_of(settings: Settings) -> Structured:
         "payload_direction": belief.payload_direction(settings.arm.link_length_m, len(names)),
         "payload_std_kg": certified.payload_std_kg,
         "payload_inertia_std": certified.payload_inertia_std,
-        "R": certified.residual_Nm**2 * max(correlated, 1.0),
+        "correlated": max(correlated, 1.0),
+        "residual_Nm": certified.residual_Nm,
         "learn_every": certified.learn_every,
         "recover_cycles": round(certified.recover_s / period_s),
         "fit_cycles": [round(fit_s / period_s) for fit_s in certified.fit_s],
@@ -164,6 +166,7 @@ def new_memory(settings: Settings) -> Structured:
     columns, square = (JOINTS, count), (count, count)
     shapes: dict[str, tuple[int, ...]] = {
         "has_gap": (),
+        "is_steady": (),
         # bank
         "Y_p": columns,
         "Y_h": columns,
@@ -187,6 +190,7 @@ def new_memory(settings: Settings) -> Structured:
         "K": parameter,
         "ring_W": (waiting, *columns),
         "ring_tau": (waiting, JOINTS),
+        "ring_R": (waiting, JOINTS),
         "ring_used": (),
         "ring_next": (),
         "since_learnt": (),
@@ -221,6 +225,14 @@ def new_memory(settings: Settings) -> Structured:
         "rest_tau": joint,
         "rest_square": joint,
         "roughness": joint,
+        "dq_old": joint,
+        "ddq_old": joint,
+        "velocity_roughness": joint,
+        "unit": joint,
+        "strain": joint,
+        "used": joint,
+        "hold": joint,
+        "held": joint,
         # contact
         "history": (contact.WIDE_SAMPLES + 1, JOINTS),
         "wide_sigma": joint,
@@ -229,6 +241,9 @@ def new_memory(settings: Settings) -> Structured:
     memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
     memory["has_gap"] = 1.0
     memory["roughness"] = 1.0
+    memory["velocity_roughness"] = 1.0
+    memory["unit"] = 1.0
+    memory["strain"] = 1.0
     state = memory[0]
     prior_std = _by_kind(certified.prior_std, parameter_names(settings))
     prior = prior_of(settings)
@@ -270,6 +285,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)
     belief.discard(m)
+    m["unit"][:] = 1.0
     m["samples"] = 0.0
     m["recovering_cycles"] = 0.0
     m["q_low"][:] = np.inf
@@ -349,8 +365,10 @@ def observe(k: Any, out: Any) -> int:
         q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
         if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
             observation |= _NOT_A_NUMBER
-        if not (abs(q) <= k["position_limit_rad"][i] and abs(dq) <= k["velocity_limit_rad_s"][i]):
+        if not (abs(q) <= k["position_limit_rad"][i]):
             observation |= _OVER_LIMIT
+        if not (abs(dq) <= k["velocity_limit_rad_s"][i]):
+            observation |= _OVER_SPEED
         if not (abs(dq) < k["rest_velocity_rad_s"]):
             observation &= ~_AT_REST
         if not (abs(tau_J) < k["rest_torque_Nm"]):
@@ -382,7 +400,9 @@ def _filter(k: Any, m: Any, out: Any, periods: int) -> None:
     if m["has_gap"] != 0.0 or periods != 1 or not is_near:
         bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
         m["has_gap"] = 0.0
+        m["is_steady"] = 0.0
     else:
+        m["is_steady"] = 1.0
         decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
         if period_s == nominal_s:
             decay[:] = k["decay"]
@@ -397,7 +417,10 @@ def _filter(k: Any, m: Any, out: Any, periods: int) -> None:
     bank.fill_lag(cutoff, tau_J, m["tau_f"], base + q.shape[0], m["W_f"])
     bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
     bank.smooth(k["smoothing"], m["r"], m["y"])
+    if m["is_steady"] != 0.0:
+        sensitivity.follow_velocity_noise(k, m, dq)
     sensitivity.follow_standstill(dq, k["still_rad_s"], k["decay"], k["smoothing"], m["still"], m["still_smooth"])
+    sensitivity.follow_friction(k, m, _FIT)
     out["tau_f"][:] = m["tau_f"][_FIT]
     detector.predict(m["W_f"][_FIT], k["theta_cad"], out["tau_f_cad"])
     for i in range(q.shape[0]):
@@ -442,11 +465,14 @@ def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
 @compiled
 def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     """Learn, test or refine by this sample; return what that has come to."""
+    is_free_before = m["recovering_cycles"] == 0.0
     if is_touched:
         m["recovering_cycles"] = k["recover_cycles"]
     elif m["recovering_cycles"] > 0.0:
         m["recovering_cycles"] -= 1.0
     is_free = m["recovering_cycles"] == 0.0
+    if is_touched and is_free_before and mode & (LEARN | TEST):
+        sensitivity.strain(m)
     if not is_free:
         belief.discard(m)
     if mode & TEST:
@@ -454,7 +480,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if mode & REFINE:
         _refine(k, m, is_free)
         return 0
-    if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT]):
+    if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         _use_belief(m)
     return _FITTED if is_free and _gather_evidence(k, m, out) else 0
 
@@ -473,9 +499,10 @@ def _test(k: Any, m: Any) -> int:
 def _refine(k: Any, m: Any, is_free: bool) -> None:
     """Learn on beside the model in use, and let what was learnt take over after its test."""
     if not is_free:
-        refinement.restart(m)
         return
-    if belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT]):
+    sensitivity.follow_unit(k, m, _FIT)
+    sensitivity.relax(k, m)
+    if belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])
     refinement.test_candidate(k, m)
 

@@ -1,14 +1,18 @@
 """The thresholds of the certified scheme: what each channel of the bank may show without a contact.
 
-    h = sqrt((k_tau sigma_tau)² + nu² (M M')_ii + (k_m g)²) + F_c s
+    h = e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)²) + F_c s
 
 - sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
   that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
 - nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
-  counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.31 (s / 200) /
-  (1 + a / 650) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
-- g² = w (P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
-  parameter explains however long one learns. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
+  counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.335 (s / 200) /
+  (1 + a / 600) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
+- g² = w (u P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
+  parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
+  model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed,
+  too: a bound, since |F x| <= F |x|.
+- R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
+- e: 1, or more of a joint that has shown contacts while the arm learnt (`strain`).
 - s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
   where it is in the model, and as much more as these are uncertain.
 
@@ -25,10 +29,31 @@ from adacd_hil.config import CertifiedSettings
 from adacd_hil.records import Vector
 from adacd_hil.scheme import contact, friction
 
-_SMOOTHED_SHARE = 0.31 / 200.0
+SECOND_DIFFERENCE = 0.3
+"""Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, as below."""
+JUMP = 5.0
+"""Deviations of the noise as which a jump counts at most."""
+ROUGHNESS_S = 0.3
+"""Memory of the velocity's roughness."""
+STRAIN = 2.0
+LARGEST_STRAIN = 8.0
+"""A contact while learning doubles the thresholds, three times at most."""
+STRAIN_S = 10.0
+"""Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
+RELAXED = 0.6
+"""Share of its threshold that the residual must stay below for that."""
+UNIT_PEAK = 4.0
+"""Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
+SMALLEST_UNIT = 0.05
+LARGEST_UNIT = 9.0
+"""Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
+UNIT_S = 20.0
+"""Memory of the unit: some swings of a slow motion."""
+
+_SMOOTHED_SHARE = 0.335 / 200.0
 _VELOCITY_STD_SHARE = 0.12
 """Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
-_SMOOTHED_FALL_RAD_S = 650.0
+_SMOOTHED_FALL_RAD_S = 600.0
 
 
 def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, Vector]:
@@ -41,6 +66,10 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
     return {
         "torque_variance": certified.noise_sigmas**2 * sigma_squared,
         "velocity_variance": nu**2,
+        "velocity_noise_rad_s": np.array(certified.velocity_noise_rad_s),
+        "roughness_share": np.array(period_s / ROUGHNESS_S),
+        "strain_share": np.array(period_s / STRAIN_S),
+        "unit_share": np.array(period_s / UNIT_S),
         "velocity_std_rad_s": np.array(_VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
     }
 
@@ -58,21 +87,90 @@ def follow_standstill(
 
 
 @compiled
+def follow_velocity_noise(k: Any, m: Any, dq: Vector) -> None:
+    """Take one sample without a gap into the roughness (n,) of the velocity: its noise over the settings', squared.
+
+    Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
+    encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most.
+    """
+    floor = (SECOND_DIFFERENCE * k["velocity_noise_rad_s"]) ** 2
+    for i in range(dq.shape[0]):
+        ddq = dq[i] - m["dq_old"][i]
+        if floor > 0.0:
+            square = (ddq - m["ddq_old"][i]) ** 2 / floor
+            square = min(square, JUMP**2 * m["velocity_roughness"][i])
+            rough = m["velocity_roughness"][i] + k["roughness_share"] * (square - m["velocity_roughness"][i])
+            m["velocity_roughness"][i] = max(rough, 1.0)
+        m["ddq_old"][i] = ddq
+        m["dq_old"][i] = dq[i]
+
+
+@compiled
+def strain(m: Any) -> None:
+    """Doubt the thresholds of the joints that are over theirs now: a contact while learning may be the model's failure.
+
+    Once it may be a hand; again and again it is what no parameter explains, such as backlash. Then the arm is armed
+    with higher thresholds rather than never.
+    """
+    for i in range(m["strain"].shape[0]):
+        for c in range(m["y"].shape[0]):
+            if not (abs(m["y"][c, i]) <= m["h"][c, i]):
+                m["strain"][i] = min(STRAIN * m["strain"][i], LARGEST_STRAIN)
+                break
+
+
+@compiled
+def relax(k: Any, m: Any) -> None:
+    """Take one sample without contact into the strain (n,): it goes back while the residual leaves room for it."""
+    for i in range(m["strain"].shape[0]):
+        share = 0.0
+        for c in range(m["y"].shape[0]):
+            share = max(share, abs(m["y"][c, i]) / m["h"][c, i])
+        m["used"][i] = max(share, m["used"][i] * (1.0 - k["strain_share"]))
+        if m["used"][i] < RELAXED:
+            m["strain"][i] = max(m["strain"][i] * (1.0 - k["strain_share"]), 1.0)
+
+
+@compiled
+def follow_unit(k: Any, m: Any, fit: int) -> None:
+    """Take one sample without contact into the unit (n,) of the belief's variances."""
+    for i in range(m["unit"].shape[0]):
+        w = m["W_f"][fit, i]
+        believed = k["residual_Nm"] ** 2 + m["held"][i] ** 2
+        for j in range(w.shape[0]):
+            row = 0.0
+            for n in range(w.shape[0]):
+                row += m["P"][j, n] * w[n]
+            believed += w[j] * row
+        ratio = m["r"][fit, i] ** 2 / believed
+        unit = m["unit"][i] + k["unit_share"] * (UNIT_PEAK * ratio - m["unit"][i])
+        m["unit"][i] = min(max(unit, SMALLEST_UNIT), LARGEST_UNIT)
+
+
+@compiled
 def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
     """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
     filters = m["r"].shape[0]
     for i in range(h.shape[1]):
         momentum = 0.0
         for j in range(m["M"].shape[1]):
-            momentum += m["M"][i, j] ** 2
-        hold = k["standstill_share"] * _static_friction(k, m, i)
+            momentum += m["velocity_roughness"][j] * m["M"][i, j] ** 2
+        hold = m["hold"][i]
         for c in range(filters):
-            g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i]))
+            g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
             m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
             h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i], hold * m["still_smooth"][c, i])
             if c > 0:
                 bare = filters + c - 1
                 h[bare, i] = _threshold(k, m, bare, i, momentum, g, hold * m["still"][c, i])
+
+
+@compiled
+def follow_friction(k: Any, m: Any, fit: int) -> None:
+    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in filter `fit` now, Nm."""
+    for i in range(m["hold"].shape[0]):
+        m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i)
+        m["held"][i] = m["hold"][i] * m["still"][fit, i]
 
 
 @compiled
@@ -90,7 +188,7 @@ def _static_friction(k: Any, m: Any, joint: int) -> float:
 @compiled
 def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float, held: float) -> float:
     noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
-    return float(np.sqrt(noise + g * g) + held)
+    return float(m["strain"][joint] * np.sqrt(noise + g * g) + held)
 
 
 @compiled
@@ -106,7 +204,7 @@ def fill_wide(k: Any, m: Any, c: int) -> None:
     for i in range(m["r"].shape[1]):
         momentum = 0.0
         for j in range(m["M"].shape[1]):
-            momentum += m["M"][i, j] ** 2
+            momentum += m["velocity_roughness"][j] * m["M"][i, j] ** 2
         noise = k["torque_noise_Nm"] ** 2 * m["roughness"][i] / samples
         velocity = 2.0 * (k["velocity_std_rad_s"] / span_s) ** 2 * momentum
         doubt = m["doubt"][c, i] / k["model_sigmas"]
@@ -115,14 +213,14 @@ def fill_wide(k: Any, m: Any, c: int) -> None:
 
 
 @compiled
-def _doubt(k: Any, m: Any, w: Vector) -> float:
-    """Return w (P + D) w'."""
+def _doubt(k: Any, m: Any, w: Vector, unit: float) -> float:
+    """Return w (u P + D) w'."""
     total = 0.0
     for j in range(w.shape[0]):
         row = 0.0
         for n in range(w.shape[0]):
             row += m["P"][j, n] * w[n]
-        total += w[j] * row + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
+        total += unit * w[j] * row + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
     return max(total, 0.0)
 
 

@@ -273,7 +273,8 @@ class Supervisor:
         if state is self._state:
             return
         if state is SchemeState.REACT:
-            self._origin = self._state
+            # A test that was disturbed is worth nothing: the arm goes on with a new fit.
+            self._origin = SchemeState.ADAPT if self._state is SchemeState.CERTIFY else self._state
             self._is_latched = event is not SchemeEvent.CONTACT
         elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
             self._learning_cycles = 0

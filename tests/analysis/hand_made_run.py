@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.metrics import Run, Truth
+from adacd_hil.analysis.run import CertifiedStream, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import CycleColumns
 from adacd_hil.config import Settings, parse
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState
@@ -40,6 +40,7 @@ def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str
         contact_index=np.full(count, -1.0),
         payload_kg=np.zeros(count),
         theta=np.tile(THETA, (count, 1)),
+        force_N=np.zeros(count),
     )
     run = Run(
         cycle=cycle,
@@ -62,6 +63,42 @@ def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str
         dropped=0,
     )
     return replace(run, **changes)
+
+
+C = SchemeState.CERTIFY
+CERTIFIED_LIKE = (
+    (SchemeState.ENABLE, 50), (A, 600), (C, 400), (M, 4000), (P, 500), (A, 300), (C, 200), (M, 3000),
+)  # fmt: skip
+"""Row 50 is motion start, row 1050 enters MONITOR, 5050 PAYLOAD, 5550 ADAPT, 6050 MONITOR. The paper's scheme beside is
+armed from row 2050 and from row 7550 on."""
+
+
+def make_certified_run(*stays: tuple[SchemeState, int], **changes: Any) -> Run:
+    """Make a run of the certified scheme: thresholds 0.1 Nm in all channels, residuals of zero."""
+    run = make_run(*(stays or CERTIFIED_LIKE), **changes)
+    settings = parse(Settings, {"name": "hand-made", "scheme": "certified", "arm": {"cad_theta": list(CAD_THETA)}})
+    count, further = len(run.cycle), settings.further_count
+    rows = np.arange(count)
+    is_armed = (rows >= 2050) & ~((rows > 5550) & (rows < 7550))
+    return replace(
+        run,
+        settings=settings,
+        threshold=np.full((count, 2), 0.1),
+        certified=CertifiedStream(
+            tau_ext=np.zeros((count, settings.channel_count, 2)),
+            threshold=np.full((count, settings.channel_count, 2), 0.1),
+            theta_further=np.full((count, further), 0.001),
+            theta_std=np.full((count, 7 + further), 0.01),
+            condition=np.zeros(count),
+            promotions=np.zeros(count),
+        ),
+        beside=PaperStream(
+            is_armed=is_armed,
+            tau_ext_hat=np.zeros((count, 2)),
+            threshold=np.where(is_armed, 0.15, np.inf)[:, None].repeat(2, axis=1),
+            theta_hat=np.zeros((count, 7)),
+        ),
+    )
 
 
 def touch(run: Run, row: int, cycles: int, tau_ext: tuple[float, float], link: int = 1, index: int = 0) -> None:

@@ -5,11 +5,12 @@ from html.parser import HTMLParser
 from importlib import resources
 
 import matplotlib as mpl
+import numpy as np
 import pytest
-from hand_made_run import make_run, react, touch, touched_run
+from hand_made_run import make_certified_run, make_run, react, touch, touched_run
 
 from adacd_hil.analysis.drawing import COLOURS
-from adacd_hil.analysis.figures import CLOSE_UPS, draw, parameter_label
+from adacd_hil.analysis.figures import CLOSE_UPS, draw, parameter_label, residuals
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.records import SchemeState
@@ -69,6 +70,17 @@ def test_figure_5_draws_the_thresholds(drawings):
     axes = drawings["fig5"].figure.axes[0]
     levels = {line.get_ydata()[0] for line in axes.lines if line.get_label() == "threshold"}
     assert levels == {-0.15, 0.15}
+
+
+def test_figure_5_has_a_lane_with_its_thresholds_for_each_scheme_on_the_stream():
+    run = make_certified_run()
+    axes = residuals(run, evaluate(run)).figure.axes
+    levels = [
+        [float(np.nanmax(line.get_ydata())) for line in lane.lines if line.get_linewidth() == 0.7] for lane in axes
+    ]
+    lanes = [[level for level in of_lane if 0.0 < level < 1.0] for of_lane in levels]
+    assert sorted(level for of_lane in lanes for level in of_lane if of_lane) == [0.1, 0.1, 0.15, 0.15]
+    assert len(axes) == 6
 
 
 def test_figure_5_keeps_the_largest_residual():

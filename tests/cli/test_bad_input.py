@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from experiment_runs import adacd_hil, demo, emulator, other_contract, run_on_vcan, run_while_killing
+from experiment_runs import PAPER, adacd_hil, demo, emulator, other_contract, run_on_vcan, run_while_killing
 
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState
@@ -84,14 +84,14 @@ def test_a_folder_that_cant_be_written_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_bus_without_devices_says_who_is_missing(tmp_path: Path) -> None:
-    played = adacd_hil(tmp_path, "run", "-i", "virtual", "-c", "empty", "--out", str(tmp_path))
+    played = adacd_hil(tmp_path, "run", "-i", "virtual", "-c", "empty", *PAPER, "--out", str(tmp_path))
     assert played.status == BUS_MISSING
     (complaint,) = played.error_lines
     assert "no boot-up from Drive1 (node 1), Drive2 (node 2), Sensor1 (node 3), Sensor2 (node 4)" in complaint
 
 
 def test_a_run_that_never_started_leaves_a_readable_log_with_the_reason(tmp_path: Path) -> None:
-    adacd_hil(tmp_path, "run", "-i", "virtual", "-c", "empty", "--out", str(tmp_path))
+    adacd_hil(tmp_path, "run", "-i", "virtual", "-c", "empty", *PAPER, "--out", str(tmp_path))
     log = read_log(tmp_path / "run.mcap")
     assert log.is_complete
     assert any("no boot-up" in entry.event.message for entry in log.events)

@@ -121,8 +121,11 @@ def test_a_blow_that_ends_is_followed() -> None:
 
 def test_a_run_that_ends_while_the_arm_reacts_does_not_move_it() -> None:
     desired = monitoring(reacting("stop"))
-    desired.step(SchemeState.REACT, Reaction.STOP, (-3.0, 2.0), 300)
+    desired.step(SchemeState.REACT, Reaction.STOP, (-3.0, 2.0), 20)
+    moving = desired.dq_d.copy()
     desired.reference.park()
+    braking = desired.step(SchemeState.REACT, Reaction.STOP, (-3.0, 2.0), 300)
+    assert np.abs(braking[0, 1] - moving).max() < 0.02 < np.abs(moving).max()
     assert not desired.reference.is_parked(desired.cycle)
     course = desired.step(SchemeState.STOPPED, Reaction.STOP, cycles=300)
     assert np.ptp(course[:, 0], axis=0).max() == 0.0

@@ -27,7 +27,7 @@ WEIGHTS = np.random.default_rng(4).standard_normal((2, 2, 24))
 
 def statistics(z, held=None, settings=SETTINGS, block=1):
     constants = constants_of(settings, WEIGHTS, T)
-    peaks = np.zeros((-(-len(z) // block), len(settings.channels), 2))
+    peaks = np.full((-(-len(z) // block), len(settings.channels), 2), np.inf)
     record(constants, new_memory(constants), z, np.zeros(z.shape) if held is None else held, block, peaks)
     return {name: peaks[:, row] for row, name in enumerate(settings.channels)}
 
@@ -160,6 +160,13 @@ def test_the_stream_of_a_free_arm_is_zero_but_for_the_reversals():
     assert np.abs(z[1:][is_far]).max() < 2e-5
     assert held.max() == 0.15
     assert np.all((held > 0.0) == (np.abs(dq) < 2e-3))
+
+
+def test_nothing_is_predicted_of_the_friction_of_a_joint_that_stands_still():
+    dq = np.tile([1e-3, -1e-3], (50, 1))
+    z, held = make_stream(np.zeros((50, 2)), dq, np.zeros((50, 2)), THETA, np.full(50, T))
+    np.testing.assert_allclose(z[1:], np.tile([0.12e-3, -0.06e-3], (49, 1)), atol=1e-9)
+    np.testing.assert_array_equal(held, np.tile([0.15, 0.08], (50, 1)))
 
 
 def test_an_external_torque_comes_out_positive_when_it_pushes_toward_plus_q():

@@ -71,7 +71,7 @@ def test_events_are_numbered_in_order_of_precedence():
 SETTINGS = settings_with(
     safety={"commission_cycles": 20, "phase_timeout_s": 0.1},
     termination={"timeout_s": 1.0},
-    reaction={"clear_s": 0.2, "patience_s": 3.0},
+    reaction={"clear_s": 0.2, "patience_s": 3.0, "rebound_s": 0.1},
     bus={"max_age_cycles": 3},
 )
 REST_CYCLES = round(REST_HOLD_S / SETTINGS.bus.period_s)
@@ -184,6 +184,11 @@ def test_an_arm_that_is_not_well_while_its_drives_enable_faults(arm, observation
 def test_data_as_old_as_allowed_is_no_fault(state):
     run = run_in(state)
     assert run.step(GOOD._replace(age_q=(3, 3), age_tau_J=(3, 3))) is not SchemeState.FAULT
+
+
+@pytest.mark.parametrize("state", [state for state in POWERED if state is not SchemeState.REACT])
+def test_an_arm_that_is_too_fast_without_a_blow_faults(state):
+    assert run_in(state).step(observation=Observation.OVER_SPEED) is SchemeState.FAULT
 
 
 @pytest.mark.parametrize("state", POWERED)
@@ -425,6 +430,14 @@ def test_hands_that_change_the_payload_do_not_make_the_arm_forget_that_it_was_ch
     run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES)
     run.step(observation=Observation.AT_REST, request=Request.ACKNOWLEDGE)
     assert run.step(observation=Observation.AT_REST, cycles=2) is SchemeState.ADAPT
+
+
+def test_a_blow_may_throw_the_arm_faster_than_its_limit_for_a_moment():
+    run = run_in(SchemeState.MONITOR)
+    run.step(observation=COLLISION)
+    assert run.step(observation=COLLISION | Observation.OVER_SPEED, cycles=100) is SchemeState.REACT
+    assert run.step(observation=Observation.OVER_SPEED) is SchemeState.FAULT
+    assert run.supervisor.fault is FaultReason.LIMIT
 
 
 def test_the_joints_of_an_observation_are_beyond_its_flags():

@@ -22,7 +22,7 @@ STEP = np.stack([np.stack([np.ones(250), np.zeros(250)], 1), np.stack([np.zeros(
 def outcome_of(over: np.ndarray, tau_ext_hat: np.ndarray | None = None, phase: int = ARMED) -> Outcome:
     shape = (len(over), 2)
     tau = np.zeros(shape) if tau_ext_hat is None else tau_ext_hat
-    return Outcome(np.full(len(over), phase), over, tau, tau, np.full(shape, 0.1), (0,), np.zeros((1, 7)))
+    return Outcome(np.full(len(over), phase), over, tau, tau, np.full(shape, 0.1), np.sign(tau), (0,), np.zeros((1, 7)))
 
 
 def test_the_bound_of_a_step_in_white_noise_is_that_of_its_mean():

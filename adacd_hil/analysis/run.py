@@ -1,0 +1,118 @@
+"""A run as plain arrays: what the host recorded, what the emulator knows, and the streams of the certified scheme.
+
+Torques in Nm, joint arrays (2,), histories time-first (n, 2). Times in s count from *motion start*: the first cycle in
+ADAPT.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.timing import CycleColumns, Cycles
+from adacd_hil.config import Settings
+from adacd_hil.records import ContactReport, SchemeState, Vector
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the emulator knows, on its own cycles (m,): external torque (m, 2), contact, payload, parameters (m, 7)."""
+
+    cycle: Cycles
+    tau_ext: Vector
+    contact_link: Vector
+    contact_index: Vector
+    payload_kg: Vector
+    theta: Vector
+    force_N: Vector | None = None  # size of the contact force (m,)
+
+
+@dataclass(frozen=True)
+class CertifiedStream:
+    """What the block of the certified scheme has beyond the paper's, over n cycles.
+
+    tau_ext, threshold: of the bank (n, channels, 2): each filter smoothed, then all but the slowest bare. theta_further
+    (n, k): offsets, lags and friction terms; theta_std (n, p + k); condition, promotions (n,).
+    """
+
+    tau_ext: Vector
+    threshold: Vector
+    theta_further: Vector
+    theta_std: Vector
+    condition: Vector
+    promotions: Vector
+
+
+@dataclass(frozen=True)
+class PaperStream:
+    """The paper's scheme beside, over n cycles: is_armed (n,), its residual and threshold (n, 2), theta_hat (n, p)."""
+
+    is_armed: Mask
+    tau_ext_hat: Vector
+    threshold: Vector
+    theta_hat: Vector
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as plain arrays over its n cycles; `truth` is None on a real arm."""
+
+    cycle: Cycles
+    t_ns: Cycles
+    state: NDArray[np.uint8]
+    fault: NDArray[np.uint8]
+    tau_ext_hat: Vector
+    tau_ext_hat_cad: Vector
+    theta_hat: Vector
+    threshold: Vector
+    quiet_s: Vector
+    reports: tuple[ContactReport, ...]
+    timing: CycleColumns
+    truth: Truth | None
+    settings: Settings
+    metadata: Mapping[str, str]
+    frames: int | None
+    dropped: int | None
+    finish_cycle: int | None = None  # in which the user asked to finish; None if nobody did
+    contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
+    certified: CertifiedStream | None = None  # None of the paper's scheme
+    beside: PaperStream | None = None
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the columns of `theta_hat`."""
+        return self.settings.estimator.parameter_names
+
+    @property
+    def has_cad(self) -> bool:
+        """Whether the configuration gives a CAD model."""
+        return len(self.settings.arm.cad_theta) > 0
+
+    @property
+    def a_rad_s(self) -> float:
+        """Cut-off of the filter of `tau_ext_hat`: the bank's slowest, or the paper's."""
+        is_certified = self.certified is not None
+        return self.settings.certified.cutoffs_rad_s[0] if is_certified else self.settings.filter.a_rad_s
+
+    @property
+    def zero_ns(self) -> int:
+        """Motion start: the first cycle in ADAPT, else the first cycle."""
+        if self.t_ns.size == 0:
+            return 0
+        adapting = self.state == SchemeState.ADAPT
+        return int(self.t_ns[int(np.argmax(adapting)) if adapting.any() else 0])
+
+    def time_s(self) -> Vector:
+        """Give the time of every cycle since motion start, s (n,)."""
+        # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
+        return np.asarray((self.t_ns - self.zero_ns) * 1e-9, dtype=np.float64)
+
+    def time_of_s(self, cycle: NDArray[Any]) -> Vector:
+        """Give the time of any cycle numbers since motion start, s; between logged cycles by interpolation."""
+        if self.cycle.size == 0:
+            return np.zeros(len(cycle))
+        return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)

@@ -1,0 +1,158 @@
+"""True contacts, and what an ideal detector with the run's filters and thresholds makes of them."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.timing import Cycles
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, Vector
+
+
+class Touch(NamedTuple):
+    """A true contact: its rows [first, last] of the truth, and times since motion start."""
+
+    first: int
+    last: int
+    link: int
+    onset_s: float
+    end_s: float
+
+
+def true_contacts(run: Run) -> tuple[Touch, ...]:
+    """Find the true contacts in the truth record; without one there are none to be known."""
+    truth = run.truth
+    if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
+        return ()
+    index = truth.contact_index
+    edges = np.flatnonzero(index[1:] != index[:-1]) + 1
+    starts = np.concatenate(([0], edges))
+    ends = np.concatenate((edges, [index.size]))
+    time_s = run.time_of_s(truth.cycle)
+    return tuple(
+        Touch(
+            int(start),
+            int(end) - 1,
+            int(truth.contact_link[start]),
+            float(time_s[start]),
+            float(time_s[min(end, index.size - 1)]),
+        )
+        for start, end in zip(starts, ends, strict=True)
+        if index[start] >= 0
+    )
+
+
+def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
+    """Give the closed-form delay of a torque step, t = -ln(1 - h / |tau|) / a; None if it never crosses."""
+    if not abs(tau_ext_Nm) > threshold_Nm:
+        return None
+    return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
+
+
+def filtered(tau_ext: Vector, cycle: Cycles, period_s: float, a_rad_s: float) -> Vector:
+    """Filter a true torque (n, 2) as an ideal detector would see it: first order, at rest at the first sample.
+
+    Each sample is held until the next one; cycle (n,): when they were taken, in periods.
+    """
+    response = np.zeros_like(tau_ext)
+    decays = np.exp(-a_rad_s * period_s * np.diff(cycle).astype(np.float64)).tolist()
+    for joint in range(tau_ext.shape[1]):
+        value = 0.0
+        for row, (sample, decay) in enumerate(zip(tau_ext[:-1, joint].tolist(), decays, strict=True), start=1):
+            value = sample + (value - sample) * decay
+            response[row, joint] = value
+    return response
+
+
+def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
+    """Give the delay of a torque step behind two first-order low-passes; None if it never crosses.
+
+    The response 1 - (b e^(-a t) - a e^(-b t)) / (b - a) rises steadily, so that bisection finds the crossing.
+    """
+    if not abs(tau_ext_Nm) > threshold_Nm:
+        return None
+    wanted, a = threshold_Nm / abs(tau_ext_Nm), a_rad_s
+    b = b_rad_s if b_rad_s != a_rad_s else b_rad_s * (1.0 + 1e-6)
+    low_s, high_s = 0.0, 40.0 / min(a, b)
+    for _ in range(60):
+        middle_s = 0.5 * (low_s + high_s)
+        response = 1.0 - (b * math.exp(-a * middle_s) - a * math.exp(-b * middle_s)) / (b - a)
+        low_s, high_s = (middle_s, high_s) if response < wanted else (low_s, middle_s)
+    return high_s
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A filter with its threshold, Nm (2,): first order, and with `smoothing_rad_s` a second one behind it."""
+
+    cutoff_rad_s: float
+    smoothing_rad_s: float | None
+    threshold: Vector
+
+    def step_delay_s(self, tau_ext: Vector) -> float | None:
+        """Give how long steps of each joint's torque (2,) take over the threshold, the faster joint; None: never."""
+        delays_s = []
+        for joint in range(JOINTS):
+            tau, h = float(tau_ext[joint]), float(self.threshold[joint])
+            if self.smoothing_rad_s is None:
+                delays_s.append(detection_delay_s(tau, h, self.cutoff_rad_s))
+            else:
+                delays_s.append(two_pole_delay_s(tau, h, self.cutoff_rad_s, self.smoothing_rad_s))
+        return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
+
+    def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
+        """Filter a true torque (n, 2), at rest at the first sample; see `filtered`."""
+        response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
+        if self.smoothing_rad_s is None:
+            return response
+        return filtered(response, cycle, period_s, self.smoothing_rad_s)
+
+
+def bank_channels(settings: Settings) -> tuple[tuple[float, float | None], ...]:
+    """List cut-off and smoothing, rad/s, of the channels of the certified scheme's bank, in their order."""
+    cutoffs, smoothing = settings.certified.cutoffs_rad_s, settings.certified.smoothing_rad_s
+    return (*((cutoff, smoothing) for cutoff in cutoffs), *((cutoff, None) for cutoff in cutoffs[1:]))
+
+
+def threshold_at(run: Run, time_s: float) -> Vector:
+    """Give the threshold of `tau_ext_hat` in force at a time, Nm (2,); the configured one where detection is off."""
+    row = row_at(run, time_s)
+    configured = np.array(run.settings.detector.threshold_Nm)
+    return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
+
+
+def row_at(run: Run, time_s: float) -> int:
+    """Give the first cycle's row that is not before a time; the last one after the end."""
+    return min(int(np.searchsorted(run.time_s(), time_s)), len(run.cycle) - 1)
+
+
+def channels_at(run: Run, time_s: float) -> tuple[Channel, ...]:
+    """Give what detects at a time: the paper's one filter, or the bank with its thresholds."""
+    if run.certified is None:
+        return (Channel(run.a_rad_s, None, threshold_at(run, time_s)),)
+    thresholds = run.certified.threshold[row_at(run, time_s)]
+    return tuple(
+        Channel(cutoff, smoothing, threshold)
+        for (cutoff, smoothing), threshold in zip(bank_channels(run.settings), thresholds, strict=True)
+    )
+
+
+def ideal_response(run: Run, touch: Touch, channel: Channel) -> Vector:
+    """Filter a contact's true torque by a channel, from its first row to the one after its last (k, 2)."""
+    truth = run.truth
+    assert truth is not None
+    rows = slice(touch.first, touch.last + 2)
+    return channel.respond(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s)
+
+
+def forgotten_s(run: Run, touch: Touch, a_rad_s: float, threshold: Vector) -> float:
+    """Give when a detection can no longer stem from a contact.
+
+    One time constant after its true torque, filtered with `a_rad_s`, is back within the threshold (2,).
+    """
+    response = ideal_response(run, touch, Channel(a_rad_s, None, threshold))
+    excess = float(np.max(np.abs(response[-1]) / threshold))
+    return touch.end_s + (1.0 + math.log(max(1.0, excess))) / a_rad_s

@@ -1,0 +1,286 @@
+"""What a run of the certified scheme achieved, and the paper's scheme beside it, on runs whose answers are known."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hand_made_run import (
+    A,
+    C,
+    M,
+    P,
+    R,
+    S,
+    contact_report,
+    make_certified_run,
+    make_run,
+    react,
+    touch,
+)
+
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.report import Report, page
+from adacd_hil.analysis.sections import split_sections
+from adacd_hil.analysis.touches import Channel, two_pole_delay_s
+from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction
+
+
+def kinds(*stays):
+    return [(section.kind, section.is_complete) for section in split_sections(make_run(*stays))]
+
+
+def test_an_adaptation_lasts_until_its_model_is_certified():
+    assert evaluate(make_certified_run()).adaptation_s == pytest.approx({"A": 1.0, "D": 0.5})
+
+
+def test_a_contact_on_the_way_belongs_to_the_adaptation():
+    stays = ((A, 100), (R, 50), (A, 100), (C, 60), (R, 50), (S, 10), (C, 60), (M, 100))
+    assert kinds(*stays) == [("adaptation", True), ("detection", False)]
+
+
+def test_a_contact_while_parking_belongs_to_the_payload_change():
+    assert kinds((A, 10), (M, 10), (P, 10), (R, 10), (P, 10), (A, 10)) == [
+        ("adaptation", True), ("detection", True), ("payload", True), ("adaptation", False),
+    ]  # fmt: skip
+
+
+def test_an_adaptation_that_is_left_for_a_payload_change_has_not_come_to_its_end():
+    assert kinds((A, 10), (R, 10), (S, 10), (P, 10), (A, 10), (C, 10), (M, 10))[0] == ("adaptation", False)
+
+
+def test_a_contact_that_clears_leaves_the_detection_in_one_section():
+    assert kinds((A, 10), (M, 10), (R, 10), (M, 10)) == [("adaptation", True), ("detection", False)]
+
+
+def test_the_last_test_of_each_adaptation_and_their_number_are_told():
+    run = make_certified_run((A, 100), (C, 30), (A, 100), (C, 70), (M, 100))
+    evidence = evaluate(run).evidence
+    assert (evidence.tests, evidence.test_s) == ({"A": 2}, {"A": pytest.approx(0.07)})
+
+
+def touched_in_adaptation():
+    run = make_certified_run()
+    touch(run, 400, 100, (5.0, 0.0))
+    return react(run, 402, 50)
+
+
+def test_a_contact_that_is_detected_while_adapting_has_its_delay():
+    (contact,) = evaluate(touched_in_adaptation()).contacts
+    assert (contact.state, contact.is_armed, contact.delay_ms) == ("ADAPT", False, pytest.approx(2.0))
+
+
+def test_the_verdict_tells_what_was_detected_before_the_certificate():
+    assert evaluate(touched_in_adaptation()).verdict.startswith(
+        "No contact while detection was armed, 1 more while it was not armed (1 of them detected), no false alarm; "
+        "the model was certified in 1.00 s and again in 0.50 s after"
+    )
+
+
+def test_a_contact_that_is_not_detected_while_adapting_is_not_missed():
+    run = make_certified_run()
+    touch(run, 400, 100, (0.05, 0.0))
+    assert evaluate(run).missed == 0
+
+
+@pytest.mark.parametrize("row", [300, 800, 3000, 5200])
+def test_a_detection_without_contact_is_a_false_alarm_in_every_state(row):
+    assert evaluate(react(make_certified_run(), row, 20)).false_alarms == 1
+
+
+def margin_of(run, label, channel):
+    return evaluate(run).evidence.margins[label][channel].margin
+
+
+def test_the_margin_is_the_smallest_threshold_over_residual():
+    run = make_certified_run()
+    run.certified.tau_ext[2000, 4] = (0.05, -0.02)
+    run.certified.tau_ext[3000, 4, 0] = 0.08
+    run.certified.threshold[3000, 4, 0] = 0.4
+    assert margin_of(run, "B", 4) == pytest.approx((2.0, 5.0))
+    assert evaluate(run).evidence.smallest_margin == pytest.approx(2.0)
+
+
+def test_a_touch_is_no_small_margin():
+    run = make_certified_run()
+    touch(run, 2000, 100, (5.0, 0.0))
+    run.certified.tau_ext[2001:2100, 0, 0] = 5.0
+    assert margin_of(run, "B", 0) == (math.inf, math.inf)
+
+
+def test_margins_are_told_while_adapting_too():
+    run = make_certified_run()
+    run.certified.tau_ext[500, 1] = 0.025
+    assert margin_of(run, "A", 1) == pytest.approx((4.0, 4.0))
+
+
+def test_every_parameter_has_its_standard_deviation():
+    estimates = evaluate(make_certified_run()).evidence.estimates["D"]
+    assert list(estimates)[-2:] == ["stribeck1", "stribeck2"]
+    assert (estimates["lag1"].value, estimates["lag1"].std) == (0.001, 0.01)
+
+
+def test_promotions_are_counted_over_the_certificates():
+    run = make_certified_run()
+    run.certified.promotions[3000:5000] = 2.0
+    run.certified.promotions[8000:] = 1.0
+    assert evaluate(run).evidence.promotions == 3
+
+
+def beside(run):
+    return evaluate(run).evidence.paper_beside
+
+
+def test_the_papers_scheme_is_armed_later_on_the_same_stream():
+    assert beside(make_certified_run()).adaptation_s == pytest.approx({"A": 2.0, "D": 2.0})
+
+
+def test_a_papers_scheme_that_does_not_end_its_adaptation_has_no_time():
+    run = make_certified_run()
+    run.beside.is_armed[5551:] = False
+    assert beside(run).adaptation_s == {"A": pytest.approx(2.0), "D": None}
+
+
+def test_a_verdict_compares_with_the_papers_scheme():
+    assert evaluate(make_certified_run()).verdict.endswith(
+        "; the paper's scheme on the same stream took 2.00 s and 2.00 s."
+    )
+
+
+def touched_beside(row, crossing):
+    run = make_certified_run()
+    touch(run, row, 250, (5.0, 0.0))
+    run.beside.tau_ext_hat[crossing : row + 250, 0] = 1.0
+    return react(run, row + 1)
+
+
+def test_the_papers_scheme_detects_where_it_crosses_its_threshold():
+    theirs = beside(touched_beside(3000, 3005))
+    assert [(c.number, c.is_armed, c.delay_ms) for c in theirs.contacts] == [(1, True, pytest.approx(5.0))]
+    assert (theirs.missed, theirs.false_alarms) == (0, 0)
+
+
+def test_the_papers_scheme_does_not_detect_before_it_is_armed():
+    theirs = beside(touched_beside(1500, 1505))
+    assert [(c.is_armed, c.delay_ms) for c in theirs.contacts] == [(False, None)]
+    assert theirs.missed == 0
+
+
+def test_a_contact_below_the_papers_threshold_is_missed_by_it_alone():
+    run = touched_beside(3000, 3250)
+    assert (evaluate(run).missed, beside(run).missed) == (0, 1)
+
+
+def test_a_false_alarm_of_the_papers_scheme_counts_once():
+    run = make_certified_run()
+    run.beside.tau_ext_hat[3000:3010, 0] = 0.2
+    run.beside.tau_ext_hat[3500:3510, 1] = -0.2
+    run.beside.tau_ext_hat[4900:4910, 1] = 0.2
+    assert beside(run).false_alarms_s == pytest.approx((2.95, 4.85))
+
+
+def test_the_papers_scheme_raises_no_alarm_while_the_payload_is_changed():
+    run = make_certified_run()
+    run.beside.tau_ext_hat[5100:5500] = 0.5
+    assert beside(run).false_alarms == 0
+
+
+def test_the_papers_residual_counts_where_it_is_armed():
+    run = make_certified_run()
+    run.beside.tau_ext_hat[1500] = 0.09
+    run.beside.tau_ext_hat[3000] = (0.03, -0.04)
+    assert beside(run).frozen_residual_max_Nm["B"] == (0.03, 0.04)
+
+
+def reported(**said):
+    run = make_certified_run()
+    touch(run, 3000, 250, (6.0, 3.0), link=2)
+    run.truth.force_N[3000:3250] = 15.0
+    run.state[3002:3100] = R
+    made = contact_report(int(run.cycle[3002]), link=2, direction=(1, 1), location=Location.KNOWN, **said)
+    return evaluate(replace(run, reports=(made,))).contacts[0]
+
+
+def test_a_contact_says_what_its_report_says():
+    contact = reported(
+        level=ContactLevel.CONTACT, kind=ContactKind.HIT, reaction=Reaction.STOP, force_N=15.2, force_sigma=0.8,
+        lever_m=0.19, lever_sigma=0.01, blind_rad=0.1, impulse=(0.6, 0.3), impulse_sigma=(0.01, math.inf),
+    )  # fmt: skip
+    assert (contact.level, contact.kind, contact.reaction, contact.location) == ("CONTACT", "HIT", "STOP", "KNOWN")
+    assert (contact.force_N, contact.force_sigma_N, contact.true_force_N) == (15.2, 0.8, 15.0)
+    assert (contact.lever_m, contact.lever_sigma_m) == (0.19, 0.01)
+    assert contact.blind_deg == pytest.approx(5.73, abs=0.01)
+    assert (contact.impulse_Nm_s, contact.impulse_sigma_Nm_s) == ((0.6, 0.3), (0.01, None))
+
+
+def test_what_a_report_does_not_know_is_none():
+    contact = reported(force_N=3.0, lever_m=0.1)
+    assert (contact.force_N, contact.lever_m) == (None, None)
+
+
+def test_a_paper_report_says_nothing_of_force():
+    run = react(make_run(), 2000, tau_ext_peak=(5.0, 0.0))
+    touch(run, 1995, 100, (5.0, 0.0))
+    contact = evaluate(run).contacts[0]
+    assert (contact.location, contact.force_N, contact.kind) == (None, None, None)
+
+
+def test_a_step_behind_two_equal_low_passes_takes_as_long_as_it_should():
+    # 1 - (1 + x) exp(-x) is 0.5 at x = 1.67835.
+    assert two_pole_delay_s(-2.0, 1.0, 100.0, 100.0) == pytest.approx(0.0167835, rel=1e-4)
+
+
+@pytest.mark.parametrize("tau_ext_Nm", [0.0, 0.5, 1.0])
+def test_a_step_below_the_threshold_never_passes_two_low_passes(tau_ext_Nm):
+    assert two_pole_delay_s(tau_ext_Nm, 1.0, 10.0, 200.0) is None
+
+
+def test_a_fast_second_low_pass_changes_next_to_nothing():
+    bare, smoothed = (Channel(10.0, b, np.array([0.15, 0.15])) for b in (None, 1e5))
+    step = np.array([1.0, 0.1])
+    assert smoothed.step_delay_s(step) == pytest.approx(bare.step_delay_s(step), abs=2e-5)
+
+
+def test_the_law_is_that_of_the_fastest_channel():
+    run = make_certified_run()
+    touch(run, 3000, 250, (1.0, 0.0))
+    (contact,) = evaluate(react(run, 3001)).contacts
+    assert contact.law_ms == pytest.approx(-1e3 * math.log1p(-0.1) / 200.0)
+    assert contact.ideal_ms == pytest.approx(1.0)
+
+
+def report_of(run):
+    """Make a report without figures and files."""
+    folder = Path("nowhere")
+    return Report(evaluate(run), run.metadata, "run.mcap", "", True, folder / "a.html", folder / "a.json", ())
+
+
+def reported_run():
+    run = touched_beside(3000, 3005)
+    made = contact_report(int(run.cycle[3001]), location=Location.LINK_1, force_N=14.2, force_sigma=0.5)
+    return replace(run, reports=(made,))
+
+
+def test_the_text_puts_three_columns_side_by_side():
+    lines = report_of(reported_run()).as_text().splitlines()
+    assert lines[2].split("  ")[-1].strip() == "certified"
+    first = next(line for line in lines if line.startswith("First adaptation"))
+    assert first.split()[-6:] == ["5.2", "s", "2.00", "s", "1.00", "s"]
+
+
+def test_the_page_has_a_card_for_the_contact():
+    run = reported_run()
+    html = page(report_of(run), run, [], [])
+    assert "14.2 ± 0.5 N, true 0.0" in html
+    assert "only the moment is known" in html
+
+
+def test_the_page_marks_a_margin_below_one():
+    run = make_certified_run()
+    run.certified.tau_ext[3000, 4] = 0.2
+    assert '<td class="bad">0.5 / 0.5</td>' in page(report_of(run), run, [], [])
+
+
+def test_a_margin_without_bound_is_null_in_the_table():
+    assert report_of(make_certified_run()).as_json()["certified"]["smallest_margin"] is None

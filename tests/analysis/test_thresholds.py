@@ -1,0 +1,242 @@
+"""Thresholds and the comparison of the detectors, from a synthetic recording."""
+
+import json
+import math
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from adacd_hil.analysis import thresholds as module
+from adacd_hil.analysis.detector_comparison import (
+    STEPS_NM,
+    Comparison,
+    Row,
+    compare_detectors,
+    step_shape,
+    write_comparison,
+)
+from adacd_hil.analysis.thresholds import (
+    Thresholds,
+    compute_thresholds,
+    find_lag,
+    join_motions,
+    motion_from_log,
+    run_detectors,
+)
+from adacd_hil.cli.main import cli
+from adacd_hil.config import parse, read_toml
+from adacd_hil.log.errors import LogError
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme.detectors import DetectorSettings
+
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
+compiled_only = pytest.mark.skipif(INTERPRETED, reason="minutes of recording take minutes when interpreted")
+
+T = 1e-3
+THETA = np.array([0.3841, 0.06825, 0.04035, 0.12, 0.06, 0.15, 0.08])
+LAG_S = 1.5e-3
+RATES = np.array([1.7, 2.9])
+SETTINGS = DetectorSettings()
+
+
+def positions(t_s):
+    phase = np.outer(t_s, RATES)
+    return 0.6 * np.sin(phase), 0.6 * RATES * np.cos(phase), -0.6 * RATES**2 * np.sin(phase)
+
+
+def torque(q, dq, ddq):
+    """Closed form of the arm, vectorised."""
+    a1, a2, a3, fv1, fv2, fc1, fc2 = THETA
+    c2, s2 = np.cos(q[:, 1]), np.sin(q[:, 1])
+    coriolis = a2 * s2
+    tau1 = (a1 + 2 * a2 * c2) * ddq[:, 0] + (a3 + a2 * c2) * ddq[:, 1]
+    tau1 += -coriolis * (2 * dq[:, 0] * dq[:, 1] + dq[:, 1] ** 2)
+    tau2 = (a3 + a2 * c2) * ddq[:, 0] + a3 * ddq[:, 1] + coriolis * dq[:, 0] ** 2
+    return np.stack(
+        [tau1 + fv1 * dq[:, 0] + fc1 * np.sign(dq[:, 0]), tau2 + fv2 * dq[:, 1] + fc2 * np.sign(dq[:, 1])], axis=1
+    )
+
+
+def log_of(seconds, seed=1, **changes):
+    """A log in memory: the arm moves in MONITOR, its torque noisy, its velocity late and in steps of 5e-4 rad/s."""
+    count = round(seconds / T)
+    t_s = np.arange(count) * T
+    q, dq, ddq = positions(t_s)
+    generator = np.random.default_rng(seed)
+    late = positions(t_s - LAG_S)[1] + 2e-4 * generator.standard_normal((count, 2))
+    scheme = {
+        "q": q,
+        "dq": np.round(late / 5e-4) * 5e-4,
+        "tau_J": torque(q, dq, ddq) + 0.02 * generator.standard_normal((count, 2)),
+        "theta_hat": np.tile(THETA, (count, 1)),
+        "period_s": np.full((count, 1), T),
+        "cycle": np.arange(count),
+        "state": np.full(count, SchemeState.MONITOR, np.uint8),
+        "contact_joints": np.zeros(count, np.uint8),
+    }
+    for name, value in changes.items():
+        scheme[name] = value(scheme[name].copy())
+
+    class Series(dict):
+        def __len__(self):
+            return count
+
+    return SimpleNamespace(scheme=Series(scheme), path=Path("run.mcap"))
+
+
+@pytest.fixture(scope="module")
+def statistics():
+    return run_detectors(motion_from_log(log_of(120.0)), SETTINGS)
+
+
+@compiled_only
+def test_the_lag_of_the_velocity_is_identified():
+    lag_s, of_joint_s = find_lag(motion_from_log(log_of(30.0)))
+    np.testing.assert_allclose(lag_s, LAG_S, rtol=0.1)
+    np.testing.assert_allclose(of_joint_s, LAG_S, rtol=0.2)
+
+
+def between(first, last, value):
+    def change(column):
+        column[first:last] = value
+        return column
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "bad"),
+    [
+        ({"state": between(0, 3000, SchemeState.ADAPT)}, range(0, 3600)),
+        ({"contact_joints": between(5000, 5010, 2)}, range(4400, 5610)),
+        ({"tau_J": between(5000, 5001, np.nan)}, range(4400, 5601)),
+        ({"cycle": lambda cycle: cycle + (cycle >= 5000)}, range(4400, 5601)),
+        ({"period_s": between(5000, 5001, 3e-3)}, range(4400, 5601)),
+    ],
+)
+def test_what_is_near_a_contact_a_gap_or_another_state_does_not_count(changes, bad):
+    is_free = motion_from_log(log_of(10.0, **changes)).is_free
+    expected = np.ones(10_000, bool)
+    expected[:601] = False  # nobody knows what was before the first sample
+    expected[list(bad)] = False
+    np.testing.assert_array_equal(is_free, expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"state": between(0, None, SchemeState.ADAPT)}, "no motion in MONITOR"),
+        ({"period_s": between(0, None, 0.0)}, "no measured period"),
+    ],
+)
+def test_a_log_that_can_not_be_used_is_named(changes, words):
+    with pytest.raises(LogError, match=rf"run.mcap.*{words}"):
+        motion_from_log(log_of(2.0, **changes))
+
+
+def test_logs_of_different_periods_do_not_go_together():
+    slow = motion_from_log(log_of(2.0, period_s=lambda period: 2.0 * period))
+    with pytest.raises(LogError, match=r"1\.000 and 2\.000 ms"):
+        join_motions([motion_from_log(log_of(2.0)), slow])
+
+
+@pytest.mark.slow
+@compiled_only
+def test_thresholds_are_found_limited_by_noise_and_checked(statistics, tmp_path):
+    found = compute_thresholds(statistics, 1.0, ["a.mcap"])
+    rows = {(row.detector, row.channel): row for row in found.channels}
+    smooth = rows["smoothed bank", "smoothed 50"]
+    # sigma of the torque's noise in that channel is 2.9 mNm, of the velocity's 2.5e-4 rad/s less than that
+    assert all(3.5 * 0.0029 < threshold < 8.0 * 0.0029 for threshold in smooth.threshold)
+    assert smooth.limit == ("torque noise", "torque noise")
+    assert rows["bank", "first-order 200"].limit[0] in {"velocity noise", "velocity LSB"}
+    assert all(row.achievable_Nm[0] < 1.6 * row.threshold[0] for row in found.channels if row.achievable_Nm)
+    assert found.is_extrapolated
+    checked = [row for row in found.detectors if row.predicted_per_h is not None]
+    assert checked
+    assert all(0.4 < row.measured_per_h / row.predicted_per_h < 2.5 for row in checked)
+
+
+def test_a_step_is_seen_as_the_loop_makes_it():
+    shape = step_shape(40, 0.4e-3, 1.6e-3, T)
+    assert shape[0] == 0.0
+    fine = (np.arange(40_000) + 0.5) * 1e-6 - 0.4e-3
+    x = np.maximum(2.0 * fine / 1.6e-3, 0.0)
+    exact = (1.0 - (1.0 + x) * np.exp(-x)).reshape(40, 1000).mean(axis=1)
+    np.testing.assert_allclose(shape[1:], exact[:-1], atol=1e-6)
+
+
+@pytest.mark.slow
+@compiled_only
+def test_the_detectors_are_compared_at_one_rate(statistics, tmp_path):
+    comparison = compare_detectors(statistics, 1.0, onsets=12)
+    rows = {(row.detector, row.joint): row for row in comparison.rows}
+    for row in comparison.rows:
+        delays = np.array(row.delay_ms)
+        assert np.all(delays[1:] <= delays[:-1]), row
+        assert np.all(np.diff(row.roc) >= 0.0), row
+    # the paper's filter alone on 1 Nm: -ln(1 - h / 1) / 10 and the loop's lag
+    threshold = compute_thresholds(statistics, 1.0).channels[0].threshold[0]
+    law_ms = -math.log(1.0 - threshold) * 100.0 + 1.6
+    assert abs(rows["paper", 1].delay_ms[STEPS_NM.index(1.0)] - law_ms) < 1.0
+    assert comparison.ranking[0] in {"smoothed bank", "likelihood ratio", "cusum"}
+    paths = write_comparison(comparison, tmp_path / "new")
+    assert [path.name for path in paths] == ["detectors.json", "detectors.png", "detectors.svg"]
+    assert json.loads(paths[0].read_text())["ranking"][0] == comparison.ranking[0]
+    assert paths[1].read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in paths[2].read_text()
+
+
+def test_never_is_a_dash_and_null_and_the_worst_rank():
+    never = (math.inf,) * len(STEPS_NM)
+    fast, slow = (
+        Row(name, 1, delay, (0.0,) * len(STEPS_NM), (0.5,))
+        for name, delay in (("b", never), ("a", (3.0,) * len(never)))
+    )
+    comparison = Comparison(1.0, 2.0, (0.1,), (fast, slow), ())
+    assert comparison.ranking == ("a", "b")
+    assert comparison.table()[1][1][2] == "–"
+    assert comparison.as_json()["rows"][0]["delay_ms"][0] is None
+
+
+def run(monkeypatch, logs, *arguments):
+    known = dict(logs)
+    monkeypatch.setattr(module, "read_log", lambda path, topics: known[path.name])
+    return CliRunner().invoke(cli, ["thresholds", *known, *arguments])
+
+
+@pytest.mark.slow
+@compiled_only
+def test_the_command_prints_a_table_and_writes_toml(monkeypatch, tmp_path):
+    out = tmp_path / "new" / "thresholds.toml"
+    played = run(
+        monkeypatch, {"a.mcap": log_of(40.0), "b.mcap": log_of(30.0, 2)}, "--rate-per-h", "5", "--out", str(out)
+    )
+    assert played.exit_code == 0, played.output
+    assert "5 false alarms per hour, from 0.02 h of contact-free motion, extrapolated" in played.output
+    assert "smoothed 200" in played.output
+    assert "torque noise" in played.output
+    stored = parse(Thresholds, read_toml(out))
+    assert stored.logs == ("a.mcap", "b.mcap")
+    assert stored.rate_per_h == 5.0
+    assert len(stored.channels) >= 10
+
+
+@compiled_only
+def test_the_command_refuses_what_is_too_short(monkeypatch):
+    played = run(monkeypatch, {"a.mcap": log_of(20.0)})
+    assert played.exit_code == 1
+    assert played.stdout == ""
+    assert played.stderr.splitlines() == [
+        "adacd-hil: 19 s of contact-free motion are too few for a tail, at least 50 s that move are needed"
+    ]
+
+
+def test_the_command_names_a_log_that_is_not_there(tmp_path):
+    played = CliRunner().invoke(cli, ["thresholds", str(tmp_path / "none.mcap")])
+    assert (played.exit_code, played.stdout) == (1, "")
+    assert "none.mcap" in played.stderr

@@ -1,0 +1,182 @@
+"""The small 2R arm of `planar_arm` on the excitation: recorded and played, or in closed loop with the pipeline."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from planar_arm import ENCODER_LSB_RAD, THETA, TORQUE_LSB_NM, TORQUE_NOISE_NM, VELOCITY_LSB_RAD_S, advance
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings, load_settings
+from adacd_hil.control.excitation import Excitation
+from adacd_hil.records import ArmState, FaultReason, Request, SchemeOutput, SchemeState
+from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
+
+PERIOD_S = 1e-3
+SETTINGS = load_settings("certified", "P")
+SETTINGS = replace(SETTINGS, safety=replace(SETTINGS.safety, commission_cycles=10))
+NAMES = certified_kernel.parameter_names(SETTINGS)
+
+
+class Record(NamedTuple):
+    """What was measured (n, 2)."""
+
+    q: np.ndarray
+    dq: np.ndarray
+    tau_J: np.ndarray
+
+
+class Played(NamedTuple):
+    """What `certified_kernel.step_record` has made of a record."""
+
+    state: np.ndarray
+    observation: np.ndarray
+    y: np.ndarray
+    h: np.ndarray
+    theta: np.ndarray
+    constants: np.ndarray
+    memory: np.ndarray
+    block: np.ndarray
+
+    def begin_of(self, state: SchemeState, after: int = 0) -> int:
+        """Return the first sample from `after` on in this state."""
+        places = np.flatnonzero(self.state[after:] == state)
+        assert places.size, f"never in {state.name}"
+        return after + int(places[0])
+
+
+@compiled
+def follow(theta, q_d, dq_d, Kp, Kd, tau_ext, noise, q, dq, tau_J):
+    """Let the arm with parameters theta (n, 7) follow q_d under PD control; fill the measured q, dq, tau_J (n, 2)."""
+    at, speed = q_d[0].copy(), dq_d[0].copy()
+    tracked_q, tracked_dq = at.copy(), speed.copy()
+    tau, tau_next = np.zeros(2), np.zeros(2)
+    for k in range(q.shape[0]):
+        q[k] = np.round(at / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
+        dq[k] = np.round(tracked_dq / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S
+        tau_J[k] = np.round((tau + noise[k]) / TORQUE_LSB_NM) * TORQUE_LSB_NM
+        tau[:] = tau_next
+        tau_next[:] = Kp * (q_d[k] - q[k]) + Kd * (dq_d[k] - dq[k])
+        advance(at, speed, tracked_q, tracked_dq, tau + tau_ext[k], theta[k], PERIOD_S)
+
+
+def excitation_of(settings: Settings, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return q_d, dq_d (n, 2) of the excitation."""
+    excitation = Excitation(settings)
+    q_d, dq_d, ddq_d = (np.zeros((round(seconds / PERIOD_S), 2)) for _ in range(3))
+    for k in range(len(q_d)):
+        excitation.evaluate(k * PERIOD_S, q_d[k], dq_d[k], ddq_d[k])
+    return q_d, dq_d
+
+
+def record(theta, seconds, tau_ext=None, added=None, added_at_s=0.0, motion=None, seed=1) -> Record:
+    """Record the arm; added (7,): what a payload adds to its parameters from added_at_s on."""
+    q_d, dq_d = excitation_of(SETTINGS, seconds) if motion is None else motion
+    count = len(q_d)
+    thetas = np.tile(theta, (count, 1))
+    if added is not None:
+        thetas[round(added_at_s / PERIOD_S) :] += added
+    noise = TORQUE_NOISE_NM * np.random.default_rng(seed).standard_normal((count, 2))
+    q, dq, tau_J = (np.zeros((count, 2)) for _ in range(3))
+    Kp, Kd = np.array(SETTINGS.controller.Kp), np.array(SETTINGS.controller.Kd)
+    follow(thetas, q_d, dq_d, Kp, Kd, np.zeros((count, 2)) if tau_ext is None else tau_ext, noise, q, dq, tau_J)
+    return Record(q, dq, tau_J)
+
+
+def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS) -> Played:
+    """Play a record through the compiled step."""
+    count = len(measured.q)
+    constants, memory = certified_kernel.constants_of(settings), certified_kernel.new_memory(settings)
+    block = certified_kernel.new_block(settings)
+    state, observation, theta = np.zeros(count), np.zeros(count), np.zeros((count, len(NAMES)))
+    y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
+    certified_kernel.step_record(constants, memory, block, *measured, payload_at, state, observation, y, h, theta)
+    return Played(state, observation, y, h, theta, constants, memory, block)
+
+
+LEAD_S = 1.5
+BRAKE_RAD_S2 = 12.0
+MOVING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
+
+
+class ExcitedLoop:
+    """The arm under PD control, and the certified pipeline that watches it; one call of `step` is one period.
+
+    It moves on the excitation wherever the arm moves, brakes where it reacts, and is led back from there.
+    """
+
+    def __init__(self, settings: Settings = SETTINGS, theta: np.ndarray = THETA["P"], seed: int = 1):
+        self.settings = settings
+        self.pipeline = CertifiedPipeline(settings)
+        self.excitation = Excitation(settings)
+        self.theta = theta.copy()
+        self.random = np.random.default_rng(seed)
+        self.desired = np.zeros((3, 2))
+        self.excitation.evaluate(0.0, *self.desired)
+        self.corner = self.desired[0].copy()
+        self.q, self.dq = self.corner.copy(), np.zeros(2)
+        self.tracked_q, self.tracked_dq = self.q.copy(), np.zeros(2)
+        self.tau, self.tau_next, self.tau_ext = np.zeros(2), np.zeros(2), np.zeros(2)
+        self.away = np.zeros(2)
+        self.cycle = self.motion_cycles = 0
+        self.request = Request.NONE
+
+    def measure(self) -> ArmState:
+        tau_J = self.tau + TORQUE_NOISE_NM * self.random.standard_normal(2)
+        return arm_state(
+            self.cycle,
+            np.round(self.q / ENCODER_LSB_RAD) * ENCODER_LSB_RAD,
+            np.round(self.tracked_dq / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S,
+            np.round(tau_J / TORQUE_LSB_NM) * TORQUE_LSB_NM,
+        )
+
+    def move(self, output: SchemeOutput) -> None:
+        """Go on with the desired motion."""
+        if output.state not in MOVING:
+            q_d, dq_d, _ = self.desired
+            dq_d -= np.clip(dq_d, -BRAKE_RAD_S2 * PERIOD_S, BRAKE_RAD_S2 * PERIOD_S)
+            q_d += PERIOD_S * dq_d
+            return
+        if output.previous_state not in MOVING:
+            self.away = self.desired[0] - self.corner
+            self.motion_cycles = 0
+        at_s = self.motion_cycles * PERIOD_S
+        self.excitation.evaluate(at_s, *self.desired)
+        x = min(at_s / LEAD_S, 1.0)
+        self.desired[0] += self.away * (1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+        self.desired[1] -= self.away * 30.0 * x**2 * (1.0 - x) ** 2 / LEAD_S
+        self.motion_cycles += 1
+
+    def step(self) -> SchemeOutput:
+        arm = self.measure()
+        output = self.pipeline.step(arm, self.request)
+        self.request = Request.NONE
+        self.move(output)
+        controller = self.settings.controller
+        self.tau = self.tau_next
+        self.tau_next = controller.Kp * (self.desired[0] - arm.q) + controller.Kd * (self.desired[1] - arm.dq)
+        push = self.tau + self.tau_ext
+        advance(self.q, self.dq, self.tracked_q, self.tracked_dq, push, self.theta, PERIOD_S)
+        self.cycle += 1
+        return output
+
+    def run(self, cycles: int) -> list[SchemeOutput]:
+        return [self.step() for _ in range(cycles)]
+
+    def run_until(self, state: SchemeState, most_cycles: int = 5000) -> list[SchemeOutput]:
+        outputs = []
+        for _ in range(most_cycles):
+            outputs.append(self.step())
+            if outputs[-1].state is state:
+                return outputs
+        raise AssertionError(f"still in {outputs[-1].state.name} after {most_cycles} cycles")
+
+
+def arm_state(cycle, q=(0.0, 0.0), dq=(0.0, 0.0), tau_J=(0.0, 0.0), **changes) -> ArmState:
+    """Return what an enabled, healthy arm reports."""
+    state = ArmState(
+        cycle, cycle * 1_000_000, 1, np.array(q), np.array(dq), np.array(tau_J), (0, 0), (0, 0), is_enabled=True,
+        is_complete=True, fault=FaultReason.NONE,
+    )  # fmt: skip
+    return state._replace(**changes)

@@ -1,0 +1,146 @@
+"""The bank of filters against scipy and against `filters` alone."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from adacd_hil.scheme import bank, filters
+
+T = 1e-3
+CUTOFF = np.array([10.0, 50.0, 200.0])
+COLUMNS = 5
+
+
+class Bank:
+    """Filters at rest, for two joints and COLUMNS parameters."""
+
+    def __init__(self):
+        self.rates = np.zeros((3, 3))
+        bank.discretise(CUTOFF, T, *self.rates)
+        self.tau_old, self.tau_f = np.zeros((3, 2)), np.zeros((3, 2))
+        self.input_old, self.S, self.W_f = (np.zeros((3, 2, COLUMNS)) for _ in range(3))
+
+    def resume(self, Y_p, Y_h, tau_J):
+        bank.resume(CUTOFF, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.W_f)
+
+    def advance(self, Y_p, Y_h, tau_J):
+        bank.advance(CUTOFF, *self.rates, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.tau_f, self.W_f)
+
+    def run(self, Y_p, Y_h, tau_J):
+        """Go over samples (n, ...), the first of them after a gap; return tau_f (n, C, 2) and W_f (n, C, 2, p)."""
+        history = []
+        for k in range(len(tau_J)):
+            (self.advance if k else self.resume)(Y_p[k], Y_h[k], tau_J[k])
+            history.append((self.tau_f.copy(), self.W_f.copy()))
+        return tuple(np.array(values) for values in zip(*history, strict=True))
+
+
+def signals(count=200, seed=1):
+    random = np.random.default_rng(seed)
+    return [np.cumsum(random.standard_normal((count, *shape)), 0) for shape in ((2, COLUMNS), (2, COLUMNS), (2,))]
+
+
+def held_by_scipy(cutoff, samples):
+    """Filter straight lines between samples (n, ...) by cutoff / (s + cutoff), from zero."""
+    numerator, denominator, _ = scipy.signal.cont2discrete(([cutoff], [1.0, cutoff]), T, method="foh")
+    # From zero: not even the first sample's own weight.
+    start = -numerator.ravel()[0] * samples[:1]
+    return scipy.signal.lfilter(numerator.ravel(), denominator, samples, axis=0, zi=start)[0]
+
+
+@pytest.mark.parametrize("c", range(3))
+def test_each_filter_of_the_torque_is_the_one_that_scipy_has(c):
+    Y_p, Y_h, tau_J = signals()
+    tau_f, _ = Bank().run(Y_p, Y_h, tau_J)
+    np.testing.assert_allclose(tau_f[:, c], held_by_scipy(CUTOFF[c], tau_J), rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("c", range(3))
+def test_each_filter_of_the_regressor_differentiates_the_momentum(c):
+    """W_f = F (s Y_p + Y_h): a derivative of straight lines is constant in between."""
+    Y_p, Y_h, tau_J = signals()
+    _, W_f = Bank().run(Y_p, Y_h, tau_J)
+    decay = np.exp(-CUTOFF[c] * T)
+    rate = np.concatenate([np.zeros((1, 2, COLUMNS)), np.diff(Y_p, axis=0) / T])
+    derivative = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], rate, axis=0)
+    np.testing.assert_allclose(W_f[:, c], derivative + held_by_scipy(CUTOFF[c], Y_h), rtol=1e-8, atol=1e-8)
+
+
+def test_the_filters_do_not_know_of_each_other():
+    Y_p, Y_h, tau_J = signals()
+    tau_f, W_f = Bank().run(Y_p, Y_h, tau_J)
+    for c, a in enumerate(CUTOFF):
+        hold = filters.first_order_hold(a, a, T)
+        tau_old, alone_f = tau_J[0].copy(), np.zeros(2)
+        input_old, S, W_alone = (np.zeros((2, COLUMNS)) for _ in range(3))
+        filters.resume(a, a, Y_p[0], Y_h[0], tau_J[0], input_old, tau_old, S, W_alone)
+        for k in range(1, len(tau_J)):
+            filters.advance_torque(*hold, tau_old, tau_J[k], alone_f)
+            filters.advance_regressor(*hold, a, a, Y_p[k], Y_h[k], input_old, S, W_alone)
+        np.testing.assert_array_equal(tau_f[-1, c], alone_f)
+        np.testing.assert_array_equal(W_f[-1, c], W_alone)
+
+
+def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
+    _, _, tau_J = signals()
+    tau_J -= tau_J[0]
+    filtered, got = Bank(), []
+    none = np.zeros((2, COLUMNS))
+    for k, torque in enumerate(tau_J):
+        (filtered.advance if k else filtered.resume)(none, none, torque)
+        W_f = np.zeros((3, 2, COLUMNS))
+        bank.fill_lag(CUTOFF, torque, filtered.tau_f, 3, W_f)
+        got.append(W_f)
+    rate = np.concatenate([np.zeros((1, 2)), np.diff(tau_J, axis=0) / T])
+    for c, a in enumerate(CUTOFF):
+        decay = np.exp(-a * T)
+        expected = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], rate, axis=0)
+        columns = np.array(got)[:, c]
+        for joint in range(2):
+            np.testing.assert_allclose(columns[:, joint, 3 + joint], expected[:, joint], rtol=1e-9, atol=1e-9)
+            assert np.count_nonzero(np.delete(columns[:, joint], 3 + joint, axis=1)) == 0
+
+
+def test_a_push_toward_positive_q_is_a_positive_external_torque():
+    """The arm needs W theta, and the joint gives less: the environment gives the rest."""
+    random = np.random.default_rng(2)
+    W_f, theta = random.standard_normal((3, 2, COLUMNS)), random.standard_normal(COLUMNS)
+    tau_ext, tau_ext_hat = np.array([[0.5, 0.1], [0.6, 0.2], [0.7, 0.3]]), np.zeros((3, 2))
+    bank.estimate_external(W_f @ theta - tau_ext, W_f, theta, tau_ext_hat)
+    np.testing.assert_allclose(tau_ext_hat, tau_ext, atol=1e-12)
+
+
+def test_smoothed_channels_come_first_and_all_but_the_slowest_are_there_bare_too():
+    r = np.random.default_rng(3).standard_normal((100, 3, 2))
+    y, got, smoothing = np.zeros((5, 2)), [], np.exp(-0.2)
+    for row in r:
+        bank.smooth(smoothing, row, y)
+        got.append(y.copy())
+    smoothed = scipy.signal.lfilter([1.0 - smoothing], [1.0, -smoothing], r, axis=0)
+    np.testing.assert_allclose(np.array(got)[:, :3], smoothed, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(np.array(got)[:, 3:], r[:, 1:])
+
+
+def test_a_gap_leaves_every_residual_where_it_was_whatever_the_parameters():
+    Y_p, Y_h, tau_J = signals()
+    filtered = Bank()
+    filtered.run(Y_p, Y_h, tau_J)
+    before = filtered.tau_f.copy(), filtered.W_f.copy()
+    filtered.resume(Y_p[0] + 7.0, Y_h[0] - 5.0, tau_J[0] + 3.0)
+    np.testing.assert_array_equal(filtered.tau_f, before[0])
+    np.testing.assert_array_equal(filtered.W_f, before[1])
+
+
+def test_after_a_gap_the_residual_of_the_true_parameters_stays_zero():
+    """Momentum and torque jump in the gap; what acted meanwhile is cut out of time."""
+    theta = np.array([0.4, -0.2, 0.1, 0.3, 0.2])
+    t_s = np.arange(150) * T
+    slope = np.random.default_rng(4).standard_normal((2, COLUMNS))
+    Y_p = slope * t_s[:, None, None]
+    Y_h = np.tile(slope + 1.0, (len(t_s), 1, 1))
+    tau_J = np.tile((slope + slope + 1.0) @ theta, (len(t_s), 1))
+    filtered, residual = Bank(), np.zeros((3, 2))
+    for offset in (0.0, 8.0):
+        filtered.run(Y_p + offset, Y_h, tau_J)
+        bank.estimate_external(filtered.tau_f, filtered.W_f, theta, residual)
+        np.testing.assert_allclose(residual, 0.0, atol=1e-12)

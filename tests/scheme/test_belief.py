@@ -1,0 +1,152 @@
+"""The belief against the closed form of Bayesian linear regression, and what it does not learn."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+from excited_arm import NAMES, SETTINGS
+from planar_arm import PAYLOAD_1KG
+
+from adacd_hil.scheme import belief, certified_kernel
+
+CONSTANTS = certified_kernel.constants_of(SETTINGS)
+K = CONSTANTS[0]
+COUNT = len(NAMES)
+EVERY = SETTINGS.certified.learn_every
+WAITING = round(SETTINGS.certified.hold_back_s / (EVERY * SETTINGS.bus.period_s))
+
+
+def prior():
+    return certified_kernel.new_memory(SETTINGS)[0]
+
+
+def samples(count=400, seed=1):
+    random = np.random.default_rng(seed)
+    W_f = random.standard_normal((count, 2, COUNT))
+    return W_f, W_f @ random.standard_normal(COUNT) + 0.1 * random.standard_normal((count, 2))
+
+
+def teach(m, W_f, tau_f):
+    return [belief.learn(K, m, w, tau) for w, tau in zip(W_f, tau_f, strict=True)]
+
+
+def test_a_belief_begins_with_the_prior():
+    theta, P = np.full(3, 9.0), np.full((3, 3), 9.0)
+    belief.begin(np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]), theta, P)
+    assert theta.tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(P, np.diag([0.01, 0.04, 0.09]))
+
+
+def test_nothing_is_expected_of_an_arm_but_the_velocity_s_usual_lag():
+    expected = np.zeros(COUNT)
+    expected[[NAMES.index("lag1"), NAMES.index("lag2")]] = SETTINGS.certified.lag_s
+    np.testing.assert_array_equal(prior()["belief"], expected)
+
+
+def test_what_is_learnt_is_the_closed_form_of_every_fourth_sample_that_has_waited():
+    """P = (P0^-1 + sum W' W / R)^-1, theta = P (P0^-1 theta0 + sum W' tau / R)."""
+    W_f, tau_f = samples()
+    m = prior()
+    theta0, P0 = m["belief"].copy(), m["P_belief"].copy()
+    teach(m, W_f, tau_f)
+    learnt = slice(EVERY - 1, len(W_f) - WAITING * EVERY, EVERY)
+    R = float(K["R"])
+    information = np.linalg.inv(P0) + np.einsum("nij,nik->jk", W_f[learnt], W_f[learnt]) / R
+    correlation = np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W_f[learnt], tau_f[learnt]) / R
+    np.testing.assert_allclose(m["P_belief"], np.linalg.inv(information), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(m["belief"], np.linalg.solve(information, correlation), rtol=1e-7)
+
+
+def test_a_sample_counts_as_much_as_the_filter_leaves_it_new():
+    """Noise through a filter of cut-off a is correlated over 2 / a."""
+    a, learn_s = SETTINGS.certified.cutoffs_rad_s[0], EVERY * 1e-3
+    assert float(K["R"]) == pytest.approx(SETTINGS.certified.residual_Nm**2 * 2.0 / (a * learn_s))
+
+
+def test_the_belief_tells_when_it_has_changed():
+    W_f, tau_f = samples()
+    changed = np.flatnonzero(teach(prior(), W_f, tau_f))
+    np.testing.assert_array_equal(changed, np.arange((WAITING + 1) * EVERY - 1, len(W_f), EVERY))
+
+
+def test_a_sample_is_not_learnt_before_it_has_waited():
+    W_f, tau_f = samples()
+    touched = tau_f.copy()
+    at = 200 + EVERY - 1
+    touched[at:] += 5.0
+    untouched_belief, belief_hat = prior(), prior()
+    wait = WAITING * EVERY
+    for k in range(at + wait + 1):
+        assert np.array_equal(untouched_belief["belief"], belief_hat["belief"])
+        belief.learn(K, untouched_belief, W_f[k], tau_f[k])
+        belief.learn(K, belief_hat, W_f[k], touched[k])
+    assert np.max(np.abs(untouched_belief["belief"] - belief_hat["belief"])) > 1e-3
+
+
+def test_samples_that_wait_are_thrown_away_when_they_turn_out_to_be_a_touch():
+    W_f, tau_f = samples()
+    begin, flagged, end = 200, 200 + WAITING * EVERY, len(W_f)
+    beliefs = []
+    for torque in (0.0, 5.0):
+        m = prior()
+        touched = tau_f.copy()
+        touched[begin:flagged] += torque
+        teach(m, W_f[:flagged], touched[:flagged])
+        belief.discard(m)
+        teach(m, W_f[flagged:end], touched[flagged:end])
+        beliefs.append(m["belief"].copy())
+    np.testing.assert_array_equal(beliefs[0], beliefs[1])
+    assert np.max(np.abs(beliefs[0])) > 0.1
+
+
+def test_a_payload_widens_the_belief_along_one_direction():
+    P = np.zeros((COUNT, COUNT))
+    direction = belief.payload_direction((0.35, 0.30), COUNT)
+    belief.add_payload(direction, 3.0, 0.0, P)
+    np.testing.assert_allclose(direction[:7], PAYLOAD_1KG)
+    np.testing.assert_allclose(P, 9.0 * np.outer(direction, direction))
+    assert np.linalg.matrix_rank(P) == 1
+
+
+def test_a_payload_that_is_no_point_mass_touches_the_inertia_only():
+    P, direction = np.zeros((COUNT, COUNT)), belief.payload_direction((0.35, 0.30), COUNT)
+    belief.add_payload(direction, 0.0, 0.02, P)
+    np.testing.assert_allclose(np.diag(P), np.where(np.arange(COUNT) < 3, 0.02**2, 0.0))
+
+
+def test_a_wandering_parameter_becomes_less_certain_with_time():
+    P = np.diag([1.0, 2.0]) + 0.5
+    belief.wander(np.array([0.1, 0.0]), 4.0, P)
+    np.testing.assert_allclose(P, [[1.54, 0.5], [0.5, 2.5]])
+
+
+def random_covariance(random, count=5):
+    root = random.standard_normal((count, count))
+    return root @ root.T + np.eye(count)
+
+
+@pytest.mark.parametrize("negative", [1, 2, 3, 4])
+def test_physically_possible_friction_is_the_nearest_to_what_was_learnt(negative):
+    """In the metric of P, against a solver that we did not write."""
+    random = np.random.default_rng(negative)
+    for _ in range(5):
+        P, theta = random_covariance(random), np.abs(random.standard_normal(5))
+        theta[1 : 1 + negative] *= -1.0
+        root = np.linalg.cholesky(np.linalg.inv(P)).T
+        bounds = np.full(5, -np.inf), np.full(5, np.inf)
+        bounds[0][1:] = 0.0
+        expected = scipy.optimize.lsq_linear(root, root @ theta, bounds, method="bvls").x
+        belief.keep_non_negative(1, 5, theta, P)
+        np.testing.assert_allclose(theta, expected, atol=1e-6)
+
+
+def test_friction_that_is_possible_stays_as_it_is():
+    theta, P = np.array([-1.0, 0.2, 0.0, 0.3, 0.1]), random_covariance(np.random.default_rng(1))
+    before = theta.copy()
+    belief.keep_non_negative(1, 5, theta, P)
+    np.testing.assert_array_equal(theta, before)
+
+
+def test_friction_that_is_known_for_certain_to_be_negative_goes_to_zero_alone():
+    theta, P = np.array([0.4, -0.2]), np.diag([1.0, 0.0])
+    belief.keep_non_negative(1, 2, theta, P)
+    assert theta.tolist() == [0.4, 0.0]

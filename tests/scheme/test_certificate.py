@@ -1,0 +1,122 @@
+"""The evidence for a fit: each part of it can be the one that is missing, and is named."""
+
+import numpy as np
+import pytest
+from excited_arm import NAMES, SETTINGS
+
+from adacd_hil.records import PARAMETER_UNITS
+from adacd_hil.scheme import certificate, certified_kernel
+
+CONSTANTS = certified_kernel.constants_of(SETTINGS)
+K = CONSTANTS[0]
+FIT = SETTINGS.certified.fit_s
+TRAVEL, SPEED = float(K["travel_rad"]), float(K["velocity_rad_s"])
+
+
+def fitted_arm(**changes):
+    """Return the memory of an arm whose evidence is just complete, with some fields changed."""
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    m["samples"] = round(FIT[0] * 1e3)
+    m["P_belief"][:] = np.diag(np.array(K["enough_std"]) ** 2 * 0.999)
+    m["excitation"], m["condition"] = K["excitation_Nm2s"], K["condition"]
+    m["q_low"][:], m["q_high"][:] = -0.5001 * TRAVEL, 0.5001 * TRAVEL
+    m["dq_low"][:], m["dq_high"][:] = -SPEED, SPEED
+    for name, value in changes.items():
+        m[name] = value
+    return m
+
+
+def missing(m):
+    return certificate.describe_missing(K, m, NAMES, PARAMETER_UNITS)
+
+
+def uncertain(name, times):
+    j = NAMES.index(name)
+    P = np.array(fitted_arm()["P_belief"])
+    P[j, j] = (times * K["enough_std"][j]) ** 2
+    return P
+
+
+def test_an_arm_with_all_the_evidence_is_fitted():
+    assert certificate.is_complete(K, fitted_arm())
+    assert missing(fitted_arm()) == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"samples": round(FIT[0] * 1e3) - 1},
+        {"q_high": [0.49 * TRAVEL, 0.6 * TRAVEL]},
+        {"q_low": [-0.6 * TRAVEL, -0.49 * TRAVEL]},
+        {"dq_high": [SPEED, 0.99 * SPEED]},
+        {"dq_low": [-0.99 * SPEED, -SPEED]},
+        {"excitation": 0.99 * SETTINGS.certified.excitation_Nm2s},
+        {"excitation": np.nan},
+        {"condition": 1.01 * SETTINGS.certified.condition},
+        {"condition": np.inf},
+        {"condition": np.nan},
+        {"P_belief": uncertain("a2", 1.01)},
+        {"P_belief": uncertain("stribeck2", 1.01)},
+        {"P_belief": uncertain("offset1", np.nan)},
+    ],
+    ids=str,
+)
+def test_with_any_part_missing_it_is_not(changes):
+    assert not certificate.is_complete(K, fitted_arm(**changes))
+
+
+def test_a_payload_needs_neither_travel_nor_excitation_but_certain_parameters():
+    unmoved = {"is_payload": 1.0, "q_high": [-np.inf] * 2, "excitation": 0.0, "condition": np.inf}
+    samples = round(FIT[1] * 1e3)
+    assert certificate.is_complete(K, fitted_arm(**unmoved, samples=samples))
+    assert not certificate.is_complete(K, fitted_arm(**unmoved, samples=samples - 1))
+    assert not certificate.is_complete(K, fitted_arm(**unmoved, samples=samples, P_belief=uncertain("a1", 1.01)))
+
+
+def test_before_its_first_sample_an_arm_has_not_travelled_at_all():
+    memory = certified_kernel.new_memory(SETTINGS)
+    certified_kernel.begin_adaptation(CONSTANTS, memory, False)
+    lines = missing(memory[0])
+    assert "joint 1 has travelled 0.0 deg of 20: move it further" in lines
+    assert "joint 2 has moved at 0.0 to 0.0 deg/s, 10 both ways needed: move it back and forth" in lines
+
+
+def test_a_joint_that_has_moved_too_little_is_named_with_the_way_it_lacks():
+    line = missing(fitted_arm(q_low=[np.radians(-3.0), -TRAVEL], q_high=[np.radians(4.5), TRAVEL]))
+    assert line == ["joint 1 has travelled 7.5 deg of 20: move it further"]
+
+
+def test_a_joint_that_has_moved_one_way_only_is_to_move_back():
+    line = missing(fitted_arm(dq_low=[-SPEED, np.radians(2.0)], dq_high=[SPEED, np.radians(30.0)]))
+    assert line == ["joint 2 has moved at 0.0 to 30.0 deg/s, 10 both ways needed: move it back and forth"]
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("a1", "a1 is known to 0.06 kg m², 0.02 needed: accelerate joint 1 harder"),
+        ("a3", "a3 is known to 0.06 kg m², 0.02 needed: accelerate joint 2 harder"),
+        ("F_v2", "F_v2 is known to 0.12 Nm s/rad, 0.04 needed: move joint 2 at different speeds"),
+        ("F_c1", "F_c1 is known to 0.12 Nm, 0.04 needed: move joint 1 slowly in both directions"),
+        ("offset2", "offset2 is known to 0.12 Nm, 0.04 needed: move joint 2 in both directions, or tare the sensors"),
+        ("lag1", "lag1 is known to 0.012 s, 0.004 needed: accelerate joint 1 harder"),
+    ],
+)
+def test_a_parameter_that_is_not_known_is_named_with_value_bound_unit_and_motion(name, line):
+    assert missing(fitted_arm(P_belief=uncertain(name, 3.0))) == [line]
+
+
+def test_a_friction_term_that_is_not_known_asks_for_slow_motion():
+    (line,) = missing(fitted_arm(P_belief=uncertain("stribeck2", 3.0)))
+    assert line.startswith("stribeck2 is known to 0.6 Nm, 0.2 needed: move joint 2 slowly")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_parameter_has_a_unit_and_a_motion(name):
+    (line,) = missing(fitted_arm(P_belief=uncertain(name, 3.0)))
+    known, motion = line.split(" needed: ")
+    value, unit = known.removeprefix(f"{name} is known to ").split(", ")[0].split(" ", 1)
+    assert float(value) > 0.0
+    assert unit in ("kg m²", "Nm s/rad", "Nm", "s")
+    assert "joint" in motion
+    assert "{}" not in motion

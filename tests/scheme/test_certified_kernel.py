@@ -1,0 +1,411 @@
+"""The compiled step of the certified scheme, on motions in closed form and on an arm that follows the excitation."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from excited_arm import NAMES, PERIOD_S, SETTINGS, Record, excitation_of, play, record
+from planar_arm import PAYLOAD_1KG, THETA
+from smooth_motion import smooth_motion, torque_of
+
+from adacd_hil.records import PARAMETER_UNITS, SchemeState
+from adacd_hil.scheme import certificate, certified_kernel
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+
+COUNT = len(NAMES)
+OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
+LAGS = [NAMES.index("lag1"), NAMES.index("lag2")]
+SMOOTH = THETA["M"] * [1, 1, 1, 1, 1, 0, 0]  # Coulomb friction of a reversal is no straight line between samples
+TOUCH = slice(900, 1200)
+PAYLOAD_AT = 4800
+
+
+class Kernel:
+    """The step with its constants, memory and block, sample by sample."""
+
+    def __init__(self, settings=SETTINGS, theta=None, P=None):
+        self.constants = certified_kernel.constants_of(settings)
+        self.memory, self.block = certified_kernel.new_memory(settings), certified_kernel.new_block(settings)
+        certified_kernel.begin_adaptation(self.constants, self.memory, False)
+        self.m, self.out = self.memory[0], self.block[0]
+        if theta is not None:
+            self.m["theta"][: len(theta)] = theta
+            self.m["theta"][len(theta) :] = 0.0
+        if P is not None:
+            self.m["P"][:] = P
+
+    def step(self, q, dq, tau_J, mode=0, is_complete=1, periods=1, period_s=0.0):
+        self.out["q"][:], self.out["dq"][:], self.out["tau_J"][:] = q, dq, tau_J
+        self.out["period_s"][0] = period_s
+        return certified_kernel.step(self.constants, self.memory, self.block, is_complete, periods, mode)
+
+    def run(self, q, dq, tau_J, mode=0, period_s=None):
+        """Return observations (n,) and bare residuals (n, C, 2)."""
+        observations, residuals = [], []
+        for k in range(len(q)):
+            each_s = 0.0 if period_s is None else period_s[k]
+            observations.append(self.step(q[k], dq[k], tau_J[k], mode, period_s=each_s))
+            residuals.append(self.m["r"].copy())
+        return np.array(observations), np.array(residuals)
+
+
+@pytest.fixture(scope="module")
+def free():
+    """An untouched arm: learnt from zero, tested, monitored, and 1 kg fitted while it stands in its corner."""
+    measured = record(THETA["P"], 7.2, added=PAYLOAD_1KG, added_at_s=PAYLOAD_AT * PERIOD_S)
+    return measured, play(measured, PAYLOAD_AT)
+
+
+@pytest.fixture(scope="module")
+def touched():
+    """The same arm, with 1 Nm on joint 1 for 0.3 s while it learns."""
+    tau_ext = np.zeros((4800, 2))
+    tau_ext[TOUCH, 0] = 1.0
+    measured = record(THETA["P"], 4.8, tau_ext=tau_ext)
+    return measured, play(measured)
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    """A motion in closed form without noise, and its torque."""
+    q, dq, ddq = smooth_motion(np.arange(600) * PERIOD_S)
+    return q, dq, torque_of(q, dq, ddq, SMOOTH)
+
+
+def test_the_true_parameters_leave_no_residual_in_any_filter(smooth):
+    _, residual = Kernel(theta=SMOOTH).run(*smooth)
+    assert np.max(np.abs(smooth[2])) > 1.0
+    assert np.max(np.abs(residual)) < 2e-4
+
+
+def test_a_push_toward_positive_q_is_seen_in_each_filter_as_large_as_it_is(smooth):
+    """An arm that moves like this while 0.5 Nm push needs 0.5 Nm less of its joint."""
+    q, dq, tau_J = smooth
+    tau_ext = np.array([0.5, -0.3])
+    _, residual = Kernel(theta=SMOOTH).run(q, dq, tau_J - tau_ext)
+    cutoffs = np.array(SETTINGS.certified.cutoffs_rad_s)
+    shown = 1.0 - np.exp(-cutoffs * (len(q) - 1) * PERIOD_S)
+    np.testing.assert_allclose(residual[-1], np.outer(shown, tau_ext), atol=2e-3)
+
+
+def test_a_push_on_the_arm_itself_is_seen_with_its_sign_and_size(free):
+    """The arm of the simulation is pushed, not its torque sensor. Within what the scheme says that it knows."""
+    tau_ext = np.zeros((4800, 2))
+    tau_ext[3000:3300, 0], tau_ext[3600:3900, 1] = 1.0, -0.5
+    pushed = play(record(THETA["P"], 4.8, tau_ext=tau_ext))
+    wide = pushed.y[:, 3]
+    assert wide[3200, 0] == pytest.approx(1.0, abs=pushed.h[3200, 3, 0])
+    assert wide[3800, 1] == pytest.approx(-0.5, abs=pushed.h[3800, 3, 1])
+    joints = pushed.observation.astype(int) >> CONTACT_SHIFT
+    assert joints[3100] & 0b01
+    assert joints[3700] & 0b10
+    first = int(np.flatnonzero(joints[3000:])[0])
+    assert first <= 20
+
+
+def test_a_gap_is_cut_out_of_time(smooth):
+    q, dq, tau_J = smooth
+    kernel = Kernel(theta=SMOOTH)
+    _, before = kernel.run(q[:300], dq[:300], tau_J[:300])
+    kernel.step(q[450], dq[450], tau_J[450], periods=150)
+    np.testing.assert_allclose(kernel.m["r"], before[-1], atol=1e-12)
+    _, after = kernel.run(q[451:], dq[451:], tau_J[451:])
+    assert np.max(np.abs(after)) < 2e-4
+
+
+def test_what_was_lost_is_a_gap_for_the_sample_after_it(smooth):
+    q, dq, tau_J = smooth
+    kernel = Kernel(theta=SMOOTH)
+    kernel.run(q[:300], dq[:300], tau_J[:300])
+    before = kernel.m["r"].copy()
+    kernel.step(q[299] + 9.0, dq[299], tau_J[299] + 9.0, is_complete=0)
+    np.testing.assert_array_equal(kernel.m["r"], before)
+    kernel.step(q[302], dq[302], tau_J[302])
+    np.testing.assert_allclose(kernel.m["r"], before, atol=1e-12)
+
+
+def test_a_sample_that_is_no_number_is_told_and_filtered_by_nobody(smooth):
+    q, dq, tau_J = smooth
+    kernel = Kernel(theta=SMOOTH)
+    kernel.run(q[:50], dq[:50], tau_J[:50])
+    before = kernel.m["r"].copy()
+    for place in range(3):
+        values = [q[50].copy(), dq[50].copy(), tau_J[50].copy()]
+        values[place][1] = np.nan
+        assert kernel.step(*values) & Observation.NOT_A_NUMBER
+        np.testing.assert_array_equal(kernel.m["r"], before)
+
+
+def test_the_measured_period_counts():
+    """SYNCs up to 0.3 ms late: with the nominal period in place of theirs the residual is ten times as large."""
+    late_s = np.random.default_rng(5).uniform(0.0, 3e-4, 600)
+    t_s = np.arange(600) * PERIOD_S + late_s
+    q, dq, ddq = smooth_motion(t_s)
+    tau_J = torque_of(q, dq, ddq, SMOOTH)
+    largest = []
+    for period_s in (np.diff(t_s, prepend=t_s[0] - PERIOD_S), None):
+        _, residual = Kernel(theta=SMOOTH).run(q, dq, tau_J, period_s=period_s)
+        largest.append(np.max(np.abs(residual[:, 1])))
+    assert largest[0] < 5e-4
+    assert largest[1] > 10.0 * largest[0]
+
+
+@pytest.mark.parametrize("period_s", [0.4e-3, 1.6e-3])
+def test_an_interval_far_from_the_period_is_a_gap(smooth, period_s):
+    q, dq, tau_J = smooth
+    kernel = Kernel(theta=SMOOTH)
+    kernel.run(q[:300], dq[:300], tau_J[:300] + 1.0)
+    before = kernel.m["r"].copy()
+    kernel.step(q[300], dq[300], tau_J[300], period_s=period_s)
+    np.testing.assert_allclose(kernel.m["r"], before, atol=1e-12)
+
+
+LEARNT_S = 3.0
+
+
+def learnt(delay_s=0.0, offset=(0.0, 0.0)):
+    """Return theta after LEARN on a smooth motion whose q and dq are older than tau_J."""
+    t_s = np.arange(round(LEARNT_S / PERIOD_S)) * PERIOD_S
+    tau_J = torque_of(*smooth_motion(t_s, 2.0), SMOOTH) + np.array(offset)
+    q, dq, _ = smooth_motion(t_s - delay_s, 2.0)
+    open_minded = replace(SETTINGS.certified, prior_std=(1.0, 0.5, 0.5, 10.0, 0.3, 0.01, 0.2))
+    kernel = Kernel(replace(SETTINGS, certified=open_minded))
+    kernel.run(q, dq, tau_J, certified_kernel.LEARN)
+    return kernel.m["theta"].copy()
+
+
+def test_the_lag_of_the_velocity_is_identified():
+    theta = learnt(delay_s=3e-3)
+    np.testing.assert_allclose(theta[LAGS], 3e-3, atol=2e-4)
+    np.testing.assert_allclose(theta[:3], SMOOTH[:3], rtol=0.01)
+
+
+def test_the_offsets_of_the_torque_sensors_are_identified():
+    theta = learnt(offset=(0.15, -0.1))
+    np.testing.assert_allclose(theta[OFFSETS], [0.15, -0.1], atol=0.005)
+    np.testing.assert_allclose(theta[:3], SMOOTH[:3], rtol=0.01)
+
+
+def test_an_arm_is_armed_two_and_a_half_seconds_from_zero(free):
+    _, played = free
+    assert played.state[0] == SchemeState.ADAPT
+    assert played.begin_of(SchemeState.MONITOR) * PERIOD_S <= 2.5
+    assert not np.any(played.observation.astype(int)[:PAYLOAD_AT] & Observation.REFUTED)
+
+
+def test_an_arm_with_a_payload_is_armed_after_another_second(free):
+    _, played = free
+    again = played.begin_of(SchemeState.MONITOR, PAYLOAD_AT)
+    assert played.state[PAYLOAD_AT] == SchemeState.ADAPT
+    assert (again - PAYLOAD_AT) * PERIOD_S <= 1.0
+
+
+def test_an_untouched_arm_is_never_said_to_be_touched(free):
+    _, played = free
+    assert not np.any(played.observation.astype(int) & Observation.CONTACT)
+    assert np.all(np.abs(played.y) <= played.h)
+
+
+def test_what_is_armed_leaves_little_of_unseen_motion(free):
+    _, played = free
+    armed = played.state == SchemeState.MONITOR
+    assert np.max(np.abs(played.y[armed, 0])) < 0.04
+
+
+def test_the_parameters_stand_still_while_they_are_tested(free):
+    _, played = free
+    begin, end = played.begin_of(SchemeState.CERTIFY), played.begin_of(SchemeState.MONITOR)
+    assert end - begin == round(SETTINGS.certified.test_s[0] / PERIOD_S)
+    assert np.ptp(played.theta[begin:end], axis=0).max() == 0.0
+
+
+def test_friction_that_is_frozen_is_possible(free):
+    _, played = free
+    friction = played.theta[played.begin_of(SchemeState.CERTIFY), 3:7]
+    assert np.all(friction >= 0.0)
+
+
+def test_the_mass_at_the_tip_is_found(free):
+    _, played = free
+    added = played.theta[-1, :3] - played.theta[PAYLOAD_AT - 1, :3]
+    np.testing.assert_allclose(added, PAYLOAD_1KG[:3], atol=0.01)
+
+
+def test_what_is_not_the_payload_s_stays_known(free):
+    """Friction and offsets go on from where they were."""
+    _, played = free
+    before, begun = played.theta[PAYLOAD_AT - 1], played.theta[PAYLOAD_AT]
+    np.testing.assert_array_equal(begun, before)
+
+
+def test_detection_is_alive_long_before_the_certificate(free):
+    """A tenth of a second after the start no torque could be told from the arm's own; half a second later 1 Nm can."""
+    _, played = free
+    assert np.all(np.min(played.h[100:120], axis=1) > 1.0)
+    assert np.all(np.min(played.h[600:1400], axis=1) < 1.0)
+
+
+def test_the_same_record_gives_the_same_bits(free):
+    measured, played = free
+    again = play(measured, PAYLOAD_AT)
+    for first, second in zip(played, again, strict=True):
+        assert first.tobytes() == second.tobytes()
+
+
+def test_a_touch_while_it_learns_is_flagged_in_fifty_milliseconds(touched):
+    _, played = touched
+    assert played.state[TOUCH.start] == SchemeState.ADAPT
+    flagged = np.flatnonzero(played.observation.astype(int) & Observation.CONTACT)
+    assert TOUCH.start < flagged[0] <= TOUCH.start + 50
+    assert (int(played.observation[flagged[0]]) >> CONTACT_SHIFT) & 0b01
+
+
+def filtered_regressor(measured):
+    """Return W_f (n, 2, p) of the slow filter over a record."""
+    kernel, rows = Kernel(), []
+    for sample in zip(*measured, strict=True):
+        kernel.step(*sample)
+        rows.append(kernel.m["W_f"][0].copy())
+    return np.array(rows)
+
+
+def test_a_touch_while_it_learns_is_not_learnt(free, touched):
+    """The torque that is predicted for the same motion: at the flag as without the touch, and with the certificate."""
+    (measured, untouched), (_, played) = free, touched
+    motion = filtered_regressor(Record(*(values[:2400] for values in measured)))
+    flagged = int(np.flatnonzero(played.observation.astype(int) & Observation.CONTACT)[0])
+    armed = [p.theta[p.begin_of(SchemeState.MONITOR)] for p in (untouched, played)]
+    for theta, reference in ((played.theta[flagged], untouched.theta[flagged]), (armed[1], armed[0])):
+        assert np.max(np.abs(motion @ (theta - reference))) <= 0.02
+
+
+def test_after_a_touch_it_begins_anew_from_nothing_and_is_armed(touched):
+    _, played = touched
+    over = np.flatnonzero(played.observation.astype(int) & Observation.CONTACT)
+    begins = int(over[0]) + round(SETTINGS.certified.recover_s / PERIOD_S) + 1
+    np.testing.assert_array_equal(played.theta[begins], certified_kernel.prior_of(SETTINGS))
+    assert played.state[begins] == SchemeState.ADAPT
+    assert played.begin_of(SchemeState.MONITOR) - begins <= 2500
+
+
+def test_an_arm_that_stands_still_gets_no_certificate_and_the_reason_names_it():
+    q_d, dq_d = excitation_of(SETTINGS, 4.0)
+    standing = record(THETA["P"], 4.0, motion=(np.tile(q_d[0], (4000, 1)), 0.0 * dq_d))
+    played = play(standing)
+    assert np.all(played.state == SchemeState.ADAPT)
+    lines = certificate.describe_missing(played.constants[0], played.memory[0], NAMES, PARAMETER_UNITS)
+    assert sum("has travelled 0.0 deg of 20: move it further" in line for line in lines) == 2
+    assert any(line.startswith("a1 is known to ") and "kg m², 0.02 needed" in line for line in lines)
+
+
+def test_one_joint_that_stands_still_is_the_one_that_is_named():
+    q_d, dq_d = excitation_of(SETTINGS, 4.0)
+    q_d[:, 1], dq_d[:, 1] = q_d[0, 1], 0.0
+    played = play(record(THETA["P"], 4.0, motion=(q_d, dq_d)))
+    assert SchemeState.MONITOR not in played.state
+    lines = certificate.describe_missing(played.constants[0], played.memory[0], NAMES, PARAMETER_UNITS)
+    assert not any(line.startswith("joint 1") for line in lines)
+    assert any(line.startswith("joint 2 has travelled") for line in lines)
+
+
+def noisy_rest(std, mode, count=2000):
+    kernel = Kernel()
+    noise = std * np.random.default_rng(6).standard_normal((count, 2))
+    kernel.run(np.zeros((count, 2)), np.zeros((count, 2)), noise, mode)
+    return kernel
+
+
+def test_a_sensor_that_is_found_noisier_at_rest_raises_its_thresholds():
+    noise = SETTINGS.certified.torque_noise_Nm * np.array([3.0, 0.5])
+    kernel = noisy_rest(noise, certified_kernel.MEASURE)
+    np.testing.assert_allclose(kernel.m["roughness"], [9.0, 1.0], rtol=0.1)
+
+
+def test_only_at_rest_is_the_sensors_noise_measured():
+    assert noisy_rest(0.5, 0, 50).m["roughness"].tolist() == [1.0, 1.0]
+
+
+def test_without_watching_nothing_is_a_contact_and_no_threshold_is_in_force():
+    kernel = Kernel(theta=SMOOTH, P=np.zeros((COUNT, COUNT)))
+    for _ in range(100):
+        found = kernel.step([0.0, 0.0], [0.0, 0.0], [-5.0, 0.0])
+    assert not found & Observation.CONTACT
+    assert np.all(np.isinf(kernel.out["threshold"]))
+    assert np.all(np.isinf(kernel.out["threshold_bank"]))
+
+
+def certain(tau_J, mode=certified_kernel.WATCH, count=60):
+    """Return the observations of an arm at rest whose model is certain, and its kernel."""
+    kernel = Kernel(theta=SMOOTH, P=np.zeros((COUNT, COUNT)))
+    rest = np.zeros((count, 2))
+    found, _ = kernel.run(rest, rest, np.tile(tau_J, (count, 1)), mode)
+    return found, kernel
+
+
+def test_contact_and_collision_are_two_levels():
+    for torque_Nm, is_collision in ((-0.5, False), (-4.0, True)):
+        found, _ = certain([torque_Nm, 0.0])
+        assert found[-1] & Observation.CONTACT
+        assert bool(found[-1] & Observation.COLLISION) is is_collision
+    assert not certain([-0.01, 0.0])[0][-1] & Observation.CONTACT
+
+
+def test_a_lost_sample_keeps_the_contact_that_was_there():
+    _, kernel = certain([-1.0, 0.0])
+    found = kernel.step([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], certified_kernel.WATCH, is_complete=0)
+    assert found & Observation.CONTACT
+
+
+def test_a_frozen_model_that_fails_its_test_is_refuted():
+    kernel = Kernel(theta=SMOOTH)
+    certified_kernel.begin_test(kernel.constants, kernel.memory)
+    rest = np.zeros((400, 2))
+    beta = SETTINGS.certified.beta_Nm
+    found, residual = kernel.run(rest, rest, np.tile([0.0, -2.0 * beta], (400, 1)), certified_kernel.TEST)
+    refuted = (found & Observation.REFUTED) != 0
+    np.testing.assert_array_equal(refuted, np.abs(residual[:, 0, 1]) > beta)
+    assert refuted.any()
+    assert not np.any(found[refuted] & Observation.CERTIFIED)
+
+
+def test_a_contact_restarts_the_test_of_a_candidate():
+    kernel = Kernel(theta=SMOOTH, P=np.zeros((COUNT, COUNT)))
+    certified_kernel.begin_refinement(kernel.memory)
+    rest, mode = np.zeros(2), certified_kernel.WATCH | certified_kernel.REFINE
+    for _ in range(100):
+        kernel.step(rest, rest, rest, mode)
+    assert kernel.m["candidate_cycles"] == 100.0
+    recover = round(SETTINGS.certified.recover_s / PERIOD_S)
+    while not kernel.step(rest, rest, [-2.0, 0.0], mode) & Observation.CONTACT:
+        pass
+    assert kernel.m["candidate_cycles"] == 0.0
+    assert kernel.m["ring_used"] == 0.0
+    assert kernel.m["recovering_cycles"] == recover
+
+
+SHORT_RECORD = """
+import sys
+import numpy as np
+from excited_arm import play, record
+from planar_arm import THETA
+
+played = play(record(THETA["P"], 0.3))
+np.savez(sys.argv[1], y=played.y, h=played.h, theta=played.theta, observation=played.observation)
+"""
+
+
+@pytest.mark.slow
+def test_without_the_compiler_the_numbers_are_the_same(tmp_path):
+    path = tmp_path / "uncompiled.npz"
+    here = Path(__file__).parent
+    folders = os.pathsep.join([str(here), str(here.parents[1]), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": folders}
+    subprocess.run([sys.executable, "-c", SHORT_RECORD, str(path)], env=environment, check=True, timeout=200)
+    uncompiled, played = np.load(path), play(record(THETA["P"], 0.3))
+    assert np.max(np.abs(played.theta)) > 0.01
+    for name in ("y", "h", "theta", "observation"):
+        np.testing.assert_allclose(getattr(played, name), uncompiled[name], rtol=1e-9, atol=1e-11)

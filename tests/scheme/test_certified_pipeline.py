@@ -1,0 +1,316 @@
+"""The certified pipeline: in closed loop with a small arm, and on recorded samples."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from excited_arm import PERIOD_S, SETTINGS, ExcitedLoop, arm_state, play, record
+from planar_arm import PAYLOAD_1KG, THETA
+
+from adacd_hil.records import ContactLevel, FaultReason, Reaction, Request, SchemeState, certified_layout, scheme_layout
+from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.observation import CONTACT_SHIFT
+from adacd_hil.scheme.pipeline import Pipeline
+
+PLACES = certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count).slices
+BEFORE = 12
+"""Cycles at rest until the first in which an arm learns."""
+PRIOR = certified_kernel.prior_of(SETTINGS)
+
+
+def names(outputs):
+    return [state.name for state, _ in itertools.groupby(output.state for output in outputs)]
+
+
+def first_in(outputs, state):
+    return next(k for k, output in enumerate(outputs) if output.state is state)
+
+
+def column(outputs, name):
+    return np.array([output.block[PLACES[name]] for output in outputs])
+
+
+def reports_of(outputs):
+    return [output.contact for output in outputs if output.contact is not None]
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """Certified from zero; pushed while it monitors; 1 kg fitted; certified again."""
+    loop = ExcitedLoop()
+    learnt = loop.run_until(SchemeState.MONITOR) + loop.run(300)
+    loop.tau_ext[0] = 1.0
+    pushed = loop.run(150)
+    loop.tau_ext[0] = 0.0
+    pushed += loop.run_until(SchemeState.MONITOR) + loop.run(100)
+    loop.request = Request.PAYLOAD
+    fitted = loop.run(400)
+    loop.theta = loop.theta + PAYLOAD_1KG
+    loop.request = Request.PAYLOAD_CHANGED
+    fitted += loop.run_until(SchemeState.MONITOR)
+    return learnt, pushed, fitted
+
+
+@pytest.fixture(scope="module")
+def interrupted():
+    """Pushed with 1 Nm for 0.3 s while it learns, then certified."""
+    loop = ExcitedLoop()
+    outputs = loop.run(711)
+    loop.tau_ext[0] = 1.0
+    outputs += loop.run(300)
+    loop.tau_ext[0] = 0.0
+    return outputs + loop.run_until(SchemeState.MONITOR)
+
+
+@pytest.fixture(scope="module")
+def streamed():
+    """The same samples through this pipeline, the paper's, and the compiled step on its own."""
+    samples = record(THETA["P"], 6.5, seed=4)
+    at_rest = [arm_state(cycle, samples.q[0]) for cycle in range(BEFORE)]
+    moving = [arm_state(BEFORE + k, *values) for k, values in enumerate(zip(*samples, strict=True))]
+    pipelines = CertifiedPipeline(SETTINGS), Pipeline(replace(SETTINGS, scheme="paper"))
+    outputs = [[pipeline.step(arm) for arm in at_rest + moving] for pipeline in pipelines]
+    return at_rest + moving, *outputs, play(samples)
+
+
+def test_an_arm_learns_is_tested_and_monitors(whole):
+    learnt, _, _ = whole
+    assert names(learnt) == ["COMMISSION", "ENABLE", "ADAPT", "CERTIFY", "MONITOR"]
+    assert (first_in(learnt, SchemeState.MONITOR) - first_in(learnt, SchemeState.ADAPT)) * PERIOD_S <= 2.5
+
+
+def test_nothing_is_fed_forward_before_the_certificate(whole):
+    learnt, _, _ = whole
+    armed = first_in(learnt, SchemeState.MONITOR)
+    assert not any(output.is_model_valid for output in learnt[:armed])
+    assert not any(np.any(output.theta_ff) for output in learnt[:armed])
+    assert all(output.is_model_valid for output in learnt[armed:])
+
+
+def test_what_is_fed_forward_is_what_passed_the_test(whole):
+    learnt, _, _ = whole
+    armed = first_in(learnt, SchemeState.MONITOR)
+    tested = first_in(learnt, SchemeState.CERTIFY)
+    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[tested + 1].theta_hat)
+    np.testing.assert_array_equal(learnt[armed].theta_ff, learnt[armed].theta_hat)
+
+
+def test_a_push_while_it_monitors_is_reacted_to_and_clears(whole):
+    _, pushed, _ = whole
+    assert names(pushed) == ["MONITOR", "REACT", "MONITOR"]
+    reacting = pushed[first_in(pushed, SchemeState.REACT)]
+    assert first_in(pushed, SchemeState.REACT) <= 20
+    assert reacting.contact_joints & 0b01
+    assert reacting.reaction is Reaction.STOP
+    assert pushed[-1].reaction is Reaction.NONE
+    assert pushed[-1].is_model_valid
+
+
+def test_its_report_begins_with_the_reaction_and_becomes_final(whole):
+    _, pushed, _ = whole
+    reports = reports_of(pushed)
+    begin = pushed[first_in(pushed, SchemeState.REACT)].cycle
+    assert [report.is_final for report in reports[:-1]] == [False] * (len(reports) - 1)
+    assert len(reports) > 1
+    assert reports[-1].is_final
+    assert {report.cycle for report in reports} == {begin}
+    assert (reports[-1].link, reports[-1].direction, reports[-1].level) == (1, (1, 0), ContactLevel.CONTACT)
+    assert abs(reports[-1].tau_ext_peak[0] - 1.0) < 0.3
+
+
+def test_a_push_leaves_the_model_in_use_as_it_was(whole):
+    learnt, pushed, _ = whole
+    theta = column(pushed, "theta_hat")
+    np.testing.assert_array_equal(theta, np.tile(theta[0], (len(theta), 1)))
+    np.testing.assert_array_equal(theta[0], learnt[-1].theta_hat)
+
+
+def test_a_payload_is_learnt_on_top_of_the_certified_arm_in_a_second(whole):
+    _, pushed, fitted = whole
+    assert names(fitted) == ["PAYLOAD", "ADAPT", "CERTIFY", "MONITOR"]
+    begin, armed = first_in(fitted, SchemeState.ADAPT), first_in(fitted, SchemeState.MONITOR)
+    assert (armed - begin) * PERIOD_S <= 1.0
+    np.testing.assert_array_equal(fitted[begin + 1].theta_hat, pushed[-1].theta_hat)
+    np.testing.assert_allclose(fitted[-1].theta_hat[:3] - pushed[-1].theta_hat[:3], PAYLOAD_1KG[:3], atol=0.02)
+
+
+def test_while_the_payload_is_learnt_the_model_before_it_is_fed_forward(whole):
+    _, pushed, fitted = whole
+    for output in fitted[:-1]:
+        np.testing.assert_array_equal(output.theta_ff, pushed[-1].theta_ff)
+    np.testing.assert_array_equal(fitted[-1].theta_ff, fitted[-1].theta_hat)
+
+
+def test_a_touch_while_it_learns_is_flagged_reacted_to_and_reported(interrupted):
+    assert names(interrupted)[2:] == ["ADAPT", "REACT", "ADAPT", "CERTIFY", "MONITOR"]
+    assert first_in(interrupted, SchemeState.REACT) - 711 <= 50
+    reports = reports_of(interrupted)
+    assert (reports[0].is_final, reports[-1].is_final) == (False, True)
+    assert reports[-1].link == 1
+    assert reports[-1].direction[0] == 1
+
+
+def again_in(outputs, state, after):
+    """Return the first output in a state once `after` has been seen."""
+    begin = first_in(outputs, after)
+    return begin + first_in(outputs[begin:], state)
+
+
+def test_after_a_touch_it_learns_anew_from_nothing(interrupted):
+    again = again_in(interrupted, SchemeState.ADAPT, SchemeState.REACT)
+    theta = np.concatenate([interrupted[again + 1].theta_hat, interrupted[again + 1].block[PLACES["theta_further"]]])
+    np.testing.assert_array_equal(theta, PRIOR)
+    before = interrupted[first_in(interrupted, SchemeState.REACT)].theta_hat
+    assert np.max(np.abs(before)) > 0.01
+    assert interrupted[again + 1].block[PLACES["excitation"]] == 0.0
+
+
+def test_what_is_certified_after_a_touch_is_as_good_as_without_one(whole, interrupted):
+    """By what its parameters differ in: inertia as large as 5 % of the arm's."""
+    untouched = whole[0][-1].theta_hat
+    np.testing.assert_allclose(interrupted[-1].theta_hat[:3], untouched[:3], atol=0.01)
+
+
+def test_a_certificate_is_of_the_attempt_that_passed(interrupted):
+    armed = first_in(interrupted, SchemeState.MONITOR)
+    assert not any(output.is_model_valid for output in interrupted[:armed])
+    assert interrupted[armed].is_model_valid
+
+
+def test_a_model_that_fails_its_test_is_learnt_anew_from_nothing():
+    strict = replace(SETTINGS, certified=replace(SETTINGS.certified, beta_Nm=0.001))
+    loop = ExcitedLoop(strict)
+    outputs = loop.run_until(SchemeState.CERTIFY) + loop.run_until(SchemeState.ADAPT) + loop.run(1)
+    assert names(outputs)[2:] == ["ADAPT", "CERTIFY", "ADAPT"]
+    np.testing.assert_array_equal(outputs[-1].theta_hat, PRIOR[:7])
+    assert not outputs[-1].is_model_valid
+
+
+def test_the_pipeline_decides_as_the_compiled_step_does_on_the_same_samples(streamed):
+    """The step alone begins with its filters at rest; an arm that stood still for a moment has thresholds for that."""
+    _, outputs, _, played = streamed
+    moving = outputs[BEFORE:]
+    np.testing.assert_array_equal([output.previous_state for output in moving], played.state)
+    np.testing.assert_array_equal(column(moving, "theta_hat")[1:], played.theta[1:, :7])
+    joints = played.observation.astype(int) >> CONTACT_SHIFT
+    np.testing.assert_array_equal([output.contact_joints for output in moving], joints)
+    bank = column(moving, "tau_ext_bank").reshape(played.y.shape)
+    np.testing.assert_allclose(bank, played.y, atol=1e-9)
+
+
+def test_the_paper_beside_gives_the_bits_of_the_paper_alone(streamed):
+    _, outputs, paper, _ = streamed
+    assert paper[-1].state is SchemeState.MONITOR
+    alone = scheme_layout(7).slices
+    blocks = np.array([output.block for output in paper])
+    for beside, name in (("paper_tau_ext_hat", "tau_ext_hat"), ("paper_theta_hat", "theta_hat")):
+        assert column(outputs, beside).tobytes() == np.ascontiguousarray(blocks[:, alone[name]]).tobytes()
+    armed = np.array([output.state is SchemeState.MONITOR for output in paper])
+    np.testing.assert_array_equal(column(outputs, "paper_is_armed")[:, 0], armed)
+    np.testing.assert_array_equal(column(outputs, "paper_threshold")[armed][1:], blocks[armed][1:, alone["threshold"]])
+
+
+def test_this_scheme_is_armed_while_the_paper_s_still_adapts(streamed):
+    _, outputs, paper, _ = streamed
+    armed = first_in(outputs, SchemeState.MONITOR)
+    assert first_in(paper, SchemeState.MONITOR) - armed > 2500
+    assert np.all(np.isinf(column(outputs, "paper_threshold")[armed]))
+
+
+def test_the_same_samples_give_the_same_bits(streamed):
+    arms, outputs, _, _ = streamed
+    pipeline = CertifiedPipeline(SETTINGS)
+    again = [pipeline.step(arm) for arm in arms[:2500]]
+    assert again[-1].state is SchemeState.MONITOR
+    assert all(one.block.tobytes() == two.block.tobytes() for one, two in zip(again, outputs, strict=False))
+
+
+def test_an_output_is_not_changed_by_the_next_cycle():
+    pipeline = CertifiedPipeline(SETTINGS)
+    first = pipeline.step(arm_state(0, q=(0.1, 0.2)))
+    kept = first.block.copy(), first.tau_ext_hat.copy()
+    for cycle in range(1, 20):
+        pipeline.step(arm_state(cycle, q=(0.3, 0.4), tau_J=(0.5, 0.5)))
+    np.testing.assert_array_equal(first.block, kept[0])
+    np.testing.assert_array_equal(first.tau_ext_hat, kept[1])
+
+
+def test_the_block_is_laid_out_as_the_records_say():
+    pipeline = CertifiedPipeline(SETTINGS)
+    outputs = [pipeline.step(arm_state(k, (0.1, 0.2), (0.03, 0.04), (0.5, 0.6))) for k in range(30)]
+    block = outputs[-1].block
+    assert block.shape == (certified_layout(7, 6, 5).size,)
+    for name, value in (("q", [0.1, 0.2]), ("dq", [0.03, 0.04]), ("tau_J", [0.5, 0.6])):
+        assert block[PLACES[name]].tolist() == value
+    bank = block[PLACES["tau_ext_bank"]].reshape(5, 2)
+    assert np.all(bank < 0.0)
+    assert bank[4, 1] < bank[3, 1] < bank[0, 1]  # a faster filter sees more of the step
+    np.testing.assert_array_equal(block[PLACES["theta_std"]][:2], SETTINGS.certified.prior_std[0])
+    assert np.all(np.isfinite(block[PLACES["threshold_bank"]]))
+
+
+def test_detection_is_off_until_the_drives_are_to_be_enabled():
+    pipeline = CertifiedPipeline(SETTINGS)
+    outputs = [pipeline.step(arm_state(k, is_enabled=False)) for k in range(20)]
+    assert outputs[-1].state is SchemeState.ENABLE
+    is_off = np.isinf(column(outputs, "threshold_bank")).all(1)
+    enabled = first_in(outputs, SchemeState.ENABLE)
+    assert is_off[: enabled + 1].all()
+    assert not is_off[enabled + 1 :].any()
+
+
+def test_the_sensors_noise_is_measured_while_the_arm_is_commissioned_and_never_later():
+    pipeline = CertifiedPipeline(SETTINGS)
+    noise = 0.08 * np.random.default_rng(3).standard_normal((400, 2))
+    restless = [pipeline.step(arm_state(k, dq=(0.06, 0.06), tau_J=noise[k])) for k in range(400)]
+    assert restless[-1].state is SchemeState.COMMISSION
+    roughness = pipeline._memory[0]["roughness"]
+    np.testing.assert_allclose(roughness, (0.08 / SETTINGS.certified.torque_noise_Nm) ** 2, rtol=0.2)
+    rest = [pipeline.step(arm_state(400 + k)) for k in range(BEFORE)]
+    assert rest[-1].state is SchemeState.ADAPT
+    before = roughness.copy()
+    for k in range(50):
+        pipeline.step(arm_state(412 + k, tau_J=5.0 * noise[k]))
+    np.testing.assert_array_equal(roughness, before)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"q": np.array([np.nan, 0.0])}, FaultReason.NOT_A_NUMBER),
+        ({"tau_J": np.array([0.0, np.inf])}, FaultReason.NOT_A_NUMBER),
+        ({"q": np.array([1.4, 0.0])}, FaultReason.LIMIT),
+        ({"is_enabled": False}, FaultReason.DRIVE),
+        ({"fault": FaultReason.SENSOR}, FaultReason.SENSOR),
+    ],
+)
+def test_a_learning_arm_that_is_not_well_faults(changes, reason):
+    pipeline = CertifiedPipeline(SETTINGS)
+    assert [pipeline.step(arm_state(k)).state for k in range(12)][-1] is SchemeState.ADAPT
+    assert pipeline.step(arm_state(12)._replace(**changes)).fault is reason
+
+
+def test_an_arm_that_stands_still_says_what_it_waits_for():
+    timeout = replace(SETTINGS.termination, timeout_s=0.5)
+    pipeline = CertifiedPipeline(replace(SETTINGS, termination=timeout))
+    outputs = [pipeline.step(arm_state(k)) for k in range(520)]
+    assert outputs[-1].fault is FaultReason.ADAPT_TIMEOUT
+    assert "joint 2 has travelled 0.0 deg of 20: move it further" in pipeline.describe_missing()
+
+
+def test_nothing_compiles_in_the_cycle():
+    pipeline = CertifiedPipeline(SETTINGS)
+    pipeline.compile()
+    before = compiled_versions()
+    strided, frozen = np.zeros((2, 2))[:, 0], np.zeros(2)
+    frozen.flags.writeable = False
+    for cycle, vector in enumerate([np.zeros(2), strided, frozen]):
+        pipeline.step(arm_state(cycle)._replace(q=vector, dq=vector, tau_J=vector, is_complete=np.bool_(True)))
+    assert compiled_versions() == before
+
+
+def compiled_versions():
+    steps = certified_kernel.step, certified_kernel.begin_adaptation, certified_kernel.begin_test
+    return [len(getattr(function, "signatures", ())) for function in steps]

@@ -1,0 +1,99 @@
+"""A candidate beside the model in use: when it takes over."""
+
+import numpy as np
+import pytest
+from excited_arm import NAMES, SETTINGS
+
+from adacd_hil.scheme import certified_kernel, refinement
+
+CONSTANTS = certified_kernel.constants_of(SETTINGS)
+K = CONSTANTS[0]
+COUNT = len(NAMES)
+TRUE = np.array([0.4, 0.07, 0.04, 0.1, 0.05, 0.1, 0.08, 0.02, -0.01, 0.001, 0.001, 0.0, 0.0])
+CYCLES = 20
+
+
+class Refined:
+    """A memory in which a test of `candidate` ends after CYCLES samples of the true arm, while `frozen` is in use."""
+
+    def __init__(self, candidate, frozen):
+        self.m = certified_kernel.new_memory(SETTINGS)[0]
+        self.m["theta"][:] = frozen
+        self.m["belief"][:] = candidate
+        self.m["P_belief"][:] = 0.25 * np.eye(COUNT)
+        self.m["h"][:] = 0.5
+        refinement.restart(self.m)
+        self.m["candidate_cycles"] = K["refine_cycles"] - CYCLES
+        self.random = np.random.default_rng(1)
+
+    def sample(self, tau_ext=0.0):
+        m = self.m
+        m["W_f"][:] = 0.3 * self.random.standard_normal(m["W_f"].shape)
+        m["tau_f"][:] = m["W_f"] @ TRUE - tau_ext
+        m["r"][:] = m["W_f"] @ m["theta"] - m["tau_f"]
+        return refinement.test_candidate(K, m)
+
+    def run(self):
+        return [self.sample() for _ in range(CYCLES)]
+
+
+def off_by(share):
+    return TRUE * (1.0 + share)
+
+
+def test_a_candidate_that_explains_the_motion_better_takes_over_at_the_end_of_its_test():
+    refined = Refined(off_by(0.05), off_by(0.2))
+    assert refined.run() == [False] * (CYCLES - 1) + [True]
+    np.testing.assert_array_equal(refined.m["theta"], off_by(0.05))
+    np.testing.assert_array_equal(refined.m["P"], 0.25 * np.eye(COUNT))
+    assert refined.m["promotions"] == 1.0
+
+
+def test_what_takes_over_is_what_a_payload_will_be_put_on():
+    refined = Refined(off_by(0.05), off_by(0.2))
+    refined.run()
+    np.testing.assert_array_equal(refined.m["certified"], off_by(0.05))
+    np.testing.assert_array_equal(refined.m["P_certified"], 0.25 * np.eye(COUNT))
+
+
+def test_a_worse_candidate_leaves_the_model_as_it_is():
+    refined = Refined(off_by(0.2), off_by(0.05))
+    assert not any(refined.run())
+    np.testing.assert_array_equal(refined.m["theta"], off_by(0.05))
+    assert refined.m["promotions"] == 0.0
+
+
+def test_a_candidate_that_no_arm_can_have_does_not_take_over():
+    """Better in the residual, but its mass matrix is not positive definite."""
+    impossible = TRUE.copy()
+    impossible[2] = -1e-3
+    refined = Refined(impossible, off_by(0.9))
+    refined.m["h"][:] = 100.0
+    assert not any(refined.run())
+    np.testing.assert_array_equal(refined.m["theta"], off_by(0.9))
+
+
+@pytest.mark.parametrize("channel", [0, 3, 4])
+def test_a_candidate_that_would_have_raised_an_alarm_does_not_take_over(channel):
+    """By the thresholds of the bare filters, and of the slowest one's only channel."""
+    refined = Refined(off_by(0.05), off_by(0.2))
+    refined.m["h"][channel] = 1e-4
+    assert not any(refined.run())
+    assert refined.m["promotions"] == 0.0
+
+
+@pytest.mark.parametrize("channel", [1, 2])
+def test_the_smoothed_channels_of_fast_filters_have_no_say(channel):
+    refined = Refined(off_by(0.05), off_by(0.2))
+    refined.m["h"][channel] = 1e-4
+    assert refined.run()[-1]
+
+
+def test_after_a_test_the_next_begins_with_the_belief_as_it_is_then():
+    refined = Refined(off_by(0.2), off_by(0.05))
+    refined.sample()
+    refined.m["belief"][:] = off_by(0.01)
+    [refined.sample() for _ in range(CYCLES - 1)]
+    np.testing.assert_array_equal(refined.m["candidate"], off_by(0.01))
+    sums = ("candidate_cycles", "candidate_square", "frozen_square", "candidate_worst")
+    assert [float(refined.m[name]) for name in sums] == [0.0] * 4

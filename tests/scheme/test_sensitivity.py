@@ -1,0 +1,192 @@
+"""The thresholds against their formula, computed by other means, and against noise that is filtered here."""
+
+import numpy as np
+import pytest
+import scipy.signal
+from excited_arm import NAMES, SETTINGS
+
+from adacd_hil.scheme import certified_kernel, sensitivity
+
+CERTIFIED = SETTINGS.certified
+T = SETTINGS.bus.period_s
+CUTOFFS = np.array(CERTIFIED.cutoffs_rad_s)
+CHANNELS = [(a, True) for a in CUTOFFS] + [(a, False) for a in CUTOFFS[1:]]
+COULOMB = NAMES.index("F_c1")
+STRIBECK = NAMES.index("stribeck1")
+CONSTANTS = certified_kernel.constants_of(SETTINGS)
+K = CONSTANTS[0]
+
+
+def known_arm(seed=1):
+    """Return the memory of an arm of which something is known, in some motion."""
+    random = np.random.default_rng(seed)
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    m["theta"][:] = random.uniform(0.05, 0.5, len(NAMES))
+    root = 0.02 * random.standard_normal((len(NAMES), len(NAMES)))
+    m["P"][:] = root @ root.T
+    m["W_f"][:] = random.standard_normal(m["W_f"].shape)
+    m["M"][:] = [[0.4, 0.1], [0.1, 0.05]]
+    m["roughness"][:] = 1.0, 2.5
+    return m
+
+
+def thresholds_of(m):
+    h = np.zeros((len(CHANNELS), 2))
+    sensitivity.fill_thresholds(K, m, h)
+    return h
+
+
+def noise_of(m):
+    """Return what white torque noise and the velocity's quantisation leave in each channel (5, 2), Nm², by formula."""
+    nu = CERTIFIED.velocity_noise_rad_s
+    momentum = np.diag(m["M"] @ m["M"].T)
+    variance = []
+    for a, is_smooth in CHANNELS:
+        s = CERTIFIED.smoothing_rad_s
+        width = a * s / (a + s) if is_smooth else a
+        share = 0.31 * s / 200.0 / (1.0 + a / 650.0) if is_smooth else 1.0
+        torque = (CERTIFIED.noise_sigmas * CERTIFIED.torque_noise_Nm) ** 2 * width * T / 2.0 * m["roughness"]
+        variance.append(torque + (share * nu * a) ** 2 * momentum)
+    return np.array(variance)
+
+
+def doubt_of(m):
+    """Return k_m g of each filter and joint (3, 2), Nm."""
+    P = m["P"] + np.diag((np.array(K["model_error"]) * m["theta"]) ** 2)
+    return CERTIFIED.model_sigmas * np.sqrt(np.einsum("cij,jk,cik->ci", m["W_f"], P, m["W_f"]))
+
+
+def test_a_moving_arm_s_thresholds_are_noise_and_doubt_in_quadrature():
+    m = known_arm()
+    g = doubt_of(m)
+    m["doubt"][:] = g  # as after a while of the same motion
+    bare = np.concatenate([g, g[1:]])
+    np.testing.assert_allclose(thresholds_of(m), np.sqrt(noise_of(m) + bare**2), rtol=1e-10)
+
+
+def test_the_doubt_of_a_smoothed_channel_follows_the_motion_as_slowly_as_its_residual():
+    m = known_arm()
+    m["doubt"][:] = 0.0
+    h = thresholds_of(m)
+    followed = (1.0 - np.exp(-CERTIFIED.smoothing_rad_s * T)) * doubt_of(m)
+    expected = np.sqrt(noise_of(m) + np.concatenate([followed, doubt_of(m)[1:]]) ** 2)
+    np.testing.assert_allclose(h, expected, rtol=1e-10)
+
+
+def test_what_is_not_known_raises_the_threshold_of_the_joint_that_it_shows_in():
+    m = known_arm()
+    m["W_f"][:] = 0.0
+    m["W_f"][:, 1, COULOMB + 1] = 1.0
+    before = thresholds_of(m)
+    m["P"][COULOMB + 1, COULOMB + 1] += 1.0
+    rise = thresholds_of(m) - before
+    assert np.all(rise[:, 1] > 0.1)
+    np.testing.assert_allclose(rise[:, 0], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_threshold_is_below_the_noise_of_its_channel(seed):
+    m = known_arm(seed)
+    m["still"][:] = m["still_smooth"][:] = np.random.default_rng(seed).uniform(0.0, 1.0, (3, 2))
+    assert np.all(thresholds_of(m) >= np.sqrt(noise_of(m)))
+
+
+def test_a_joint_at_rest_may_hold_what_static_friction_is_believed_to_hold():
+    """Coulomb and Stribeck friction, and a standard deviation of each, in the share of the filter that is of rest."""
+    m = known_arm()
+    m["W_f"][:] = 0.0
+    moving = thresholds_of(m)
+    m["still"][:] = 0.5
+    m["still_smooth"][:] = 0.25
+    places = np.array([[COULOMB, STRIBECK], [COULOMB + 1, STRIBECK + 1]])
+    held = m["theta"][places].sum(1) + np.sqrt(np.diag(m["P"])[places]).sum(1)
+    share = np.array([0.25, 0.25, 0.25, 0.5, 0.5])[:, None]
+    np.testing.assert_allclose(thresholds_of(m) - moving, CERTIFIED.standstill_share * share * held, rtol=1e-10)
+
+
+def test_friction_that_was_learnt_negative_holds_nothing():
+    m = known_arm()
+    m["still"][:] = m["still_smooth"][:] = 1.0
+    m["P"][:] = 0.0
+    m["W_f"][:] = 0.0
+    m["theta"][[COULOMB, COULOMB + 1, STRIBECK, STRIBECK + 1]] = -0.2
+    np.testing.assert_allclose(thresholds_of(m), np.sqrt(noise_of(m)), rtol=1e-10)
+
+
+def test_standstill_fills_a_filter_in_its_own_time():
+    still, smooth = np.zeros((3, 2)), np.zeros((3, 2))
+    decay, smoothing = np.exp(-CUTOFFS * T), np.exp(-CERTIFIED.smoothing_rad_s * T)
+    dq = np.array([0.0, -0.9 * CERTIFIED.still_rad_s])
+    for _ in range(100):
+        sensitivity.follow_standstill(dq, CERTIFIED.still_rad_s, decay, smoothing, still, smooth)
+    np.testing.assert_allclose(still, np.tile(1.0 - np.exp(-CUTOFFS * 0.1)[:, None], (1, 2)), rtol=1e-12)
+    assert np.all(smooth < still)
+    np.testing.assert_allclose(smooth[1], 0.991, atol=0.002)  # 1 - (200 e^-5 - 50 e^-20) / 150
+    dq = np.array([1.1, -1.1]) * CERTIFIED.still_rad_s
+    before = still.copy()
+    sensitivity.follow_standstill(dq, CERTIFIED.still_rad_s, decay, smoothing, still, smooth)
+    np.testing.assert_allclose(still, before * decay[:, None], rtol=1e-12)
+
+
+@pytest.mark.parametrize("channel", range(5))
+def test_white_torque_noise_through_a_channel_is_as_large_as_its_constant_says(channel):
+    """Within an eighth: the formula is of continuous time."""
+    a, is_smooth = CHANNELS[channel]
+    numerator, denominator, _ = scipy.signal.cont2discrete(([a], [1.0, a]), T, method="foh")
+    impulse = np.zeros(4000)
+    impulse[0] = 1.0
+    response = scipy.signal.lfilter(numerator.ravel(), denominator, impulse)
+    if is_smooth:
+        fall = np.exp(-CERTIFIED.smoothing_rad_s * T)
+        response = scipy.signal.lfilter([1.0 - fall], [1.0, -fall], response)
+    std = CERTIFIED.noise_sigmas * CERTIFIED.torque_noise_Nm * np.sqrt(np.sum(response**2))
+    assert np.sqrt(K["torque_variance"][channel]) == pytest.approx(std, rel=0.125)
+
+
+def test_a_bare_filter_multiplies_the_velocity_s_error_by_its_cut_off_and_a_smoothed_one_by_less():
+    nu = np.sqrt(K["velocity_variance"])
+    np.testing.assert_allclose(nu[3:], CERTIFIED.velocity_noise_rad_s * CUTOFFS[1:])
+    assert np.all(nu[1:3] < 0.31 * nu[3:])
+
+
+def test_a_velocity_without_noise_leaves_the_torque_s():
+    constants = sensitivity.noise_constants(CERTIFIED.__class__(velocity_noise_rad_s=0.0), T)
+    assert not np.any(constants["velocity_variance"])
+    np.testing.assert_allclose(constants["torque_variance"], K["torque_variance"])
+
+
+def test_the_undone_filter_s_deviation_is_that_of_a_mean_of_five_samples():
+    m = known_arm()
+    m["doubt"][:] = 0.3
+    m["h"][:] = [[0.5, 0.6], [0.3, 0.7], [0.4, 0.2], [0.9, 0.9], [0.8, 0.8]]
+    sensitivity.fill_wide(K, m, 1)
+    torque = CERTIFIED.torque_noise_Nm**2 * m["roughness"] / 5.0
+    velocity = 2.0 * (0.12 * CERTIFIED.velocity_noise_rad_s / (5.0 * T)) ** 2 * np.diag(m["M"] @ m["M"].T)
+    model = (0.3 / CERTIFIED.model_sigmas) ** 2
+    np.testing.assert_allclose(m["wide_sigma"], np.sqrt(torque + velocity + model), rtol=1e-10)
+    np.testing.assert_array_equal(m["wide_threshold"], [0.3, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "joints"),
+    [
+        ((0, 0), 1.01, 0b01),
+        ((4, 0), -1.01, 0b01),
+        ((2, 1), 1.01, 0b10),
+        ((3, 1), np.nan, 0b10),
+        ((1, 0), 1.0, 0b00),
+        ((1, 0), -1.0, 0b00),
+    ],
+)
+def test_a_joint_is_over_in_any_channel_and_what_is_no_number_is_over(place, value, joints):
+    y, h = np.zeros((5, 2)), np.ones((5, 2))
+    y[place] = value
+    assert sensitivity.joints_over(y, h) == joints
+
+
+def test_a_threshold_that_is_no_number_is_exceeded():
+    assert sensitivity.joints_over(np.zeros((5, 2)), np.full((5, 2), np.nan)) == 0b11
+
+
+def test_both_joints_can_be_over_at_once():
+    assert sensitivity.joints_over(np.array([[2.0, 0.0], [0.0, -2.0]]), np.ones((2, 2))) == 0b11

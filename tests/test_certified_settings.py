@@ -1,0 +1,130 @@
+"""What the certified scheme's settings refuse, what follows from them, and the block that carries its numbers."""
+
+import numpy as np
+import pytest
+
+from adacd_hil.config import ConfigError, Settings, load_settings, merge, parse, to_toml
+from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
+from adacd_hil.scheme import certified_kernel
+
+SEVEN = [0.1] * 7
+AT_REST = {"period_s": 2.0, "cosine": [[0.1], [0.2]], "sine": [[0.0], [0.0]]}
+
+
+def certified(**sections):
+    base = {"scheme": "certified", "estimator": {"P0": [1.0] * 7}}
+    return parse(Settings, merge(base, sections))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"cutoffs_rad_s": [10.0]}, r"`certified.cutoffs_rad_s` has 1 values, at least 2 expected"),
+        ({"cutoffs_rad_s": [50.0, 10.0]}, r"`certified.cutoffs_rad_s` = \(50.0, 10.0\) must go from slow to fast"),
+        ({"cutoffs_rad_s": [0.5, 10.0]}, r"`certified.cutoffs_rad_s\[0\]` = 0.5 rad/s is below 1 rad/s"),
+        ({"prior_std": SEVEN[:6]}, "`certified.prior_std` has 6 values, 7 expected: inertia kg m²"),
+        ({"enough_std": [*SEVEN, 0.1]}, "`certified.enough_std` has 8 values, 7 expected"),
+        ({"drift_std": [-1.0, *SEVEN[1:]]}, r"`certified.drift_std\[0\]` = -1.0 is below 0"),
+        ({"model_error": [2.0, *SEVEN[1:]]}, r"`certified.model_error\[0\]` = 2.0 is above 1"),
+        ({"friction_terms": ["stribek"]}, r"friction_terms\[0\]` = 'stribek' .*did you mean 'stribeck'"),
+        ({"hold_back_s": -0.01}, "`certified.hold_back_s` = -0.01 s is below 0 s"),
+        ({"cutoff_rad_s": [10.0]}, "did you mean `certified.cutoffs_rad_s`"),
+    ],
+)
+def test_settings_that_the_scheme_cannot_work_with_are_refused(values, message):
+    with pytest.raises(ConfigError, match=message):
+        certified(certified=values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"sine": [[0.0], [0.002]], "cosine": [[0.0], [0.0]]}, "excitation of joint 2 does not begin at rest"),
+        (AT_REST, "excitation of joint 1 does not begin at rest: .*of n² cosine_n = 0.1, each within 0.001"),
+        ({"cosine": [[], [0.0]]}, "joint 2 has 1 values in `excitation.cosine`, 0 in `excitation.sine`"),
+        ({"period_s": -1.0}, "`excitation.period_s` = -1.0 s is below 0 s"),
+    ],
+)
+def test_an_excitation_that_does_not_begin_at_rest_is_refused(values, message):
+    with pytest.raises(ConfigError, match=message):
+        certified(excitation=values)
+
+
+def test_an_excitation_whose_harmonics_cancel_at_the_start_is_taken():
+    harmonics = {"cosine": [[0.4, -0.1], [0.0, 0.0]], "sine": [[0.2, -0.1], [0.2, -0.1]]}
+    assert certified(excitation=harmonics).excitation.cosine[0] == (0.4, -0.1)
+
+
+def test_the_scheme_estimates_offsets_lags_and_the_chosen_friction_terms():
+    settings = certified(certified={"friction_terms": ["load", "width"]})
+    kinds = ("offset1", "offset2", "lag1", "lag2", "load1", "load2", "width1", "width2")
+    assert settings.further_names == kinds
+    assert settings.further_count == 8
+    assert certified_kernel.parameter_names(settings) == PARAMETER_NAMES + kinds
+
+
+def test_the_paper_s_scheme_has_no_bank_and_nothing_further():
+    paper = load_settings("paper", "P")
+    assert (paper.scheme, paper.further_count, paper.filter_count, paper.channel_count) == ("paper", 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("cutoffs", "channels"), [([10.0, 50.0], 3), ([10.0, 50.0, 200.0], 5), ([5.0, 9.0, 50.0, 99.0], 7)]
+)
+def test_each_filter_is_a_channel_and_all_but_the_slowest_are_two(cutoffs, channels):
+    settings = certified(certified={"cutoffs_rad_s": cutoffs})
+    assert (settings.filter_count, settings.channel_count) == (len(cutoffs), channels)
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_the_certified_configuration_differs_from_the_paper_s_in_scheme_and_excitation_only(profile):
+    ours, paper = load_settings("certified", profile), load_settings("paper", profile)
+    changed = [name for name in ours.__dataclass_fields__ if getattr(ours, name) != getattr(paper, name)]
+    assert changed == ["name", "scheme", "excitation"]
+    assert ours.scheme == "certified"
+
+
+def test_settings_read_back_from_a_log_are_the_same():
+    import tomllib
+
+    settings = load_settings("certified", "M")
+    assert parse(Settings, tomllib.loads(to_toml(settings))) == settings
+
+
+def test_every_parameter_of_the_scheme_has_a_unit():
+    terms = ["stribeck", "load", "asymmetric", "width"]
+    names = certified_kernel.parameter_names(certified(certified={"friction_terms": terms}))
+    assert {name: PARAMETER_UNITS[name] for name in names if name in PARAMETER_UNITS}.keys() == set(names)
+
+
+def test_the_certified_block_begins_as_the_paper_s():
+    """So whoever reads the paper's fields reads them from either."""
+    paper, certified_one = scheme_layout(7), certified_layout(7, 6, 5)
+    assert certified_one.fields[: len(paper.fields)] == paper.fields
+
+
+def test_the_certified_block_has_a_place_for_each_channel_and_parameter():
+    layout = certified_layout(9, 4, 3)
+    sizes = {field.name: field.size for field in layout.fields}
+    expected = {
+        "theta_hat": 9,
+        "tau_ext_bank": 6,
+        "threshold_bank": 6,
+        "theta_further": 4,
+        "theta_std": 13,
+        "condition": 1,
+        "promotions": 1,
+        "paper_is_armed": 1,
+        "paper_tau_ext_hat": 2,
+        "paper_threshold": 2,
+        "paper_theta_hat": 9,
+    }
+    assert {name: sizes[name] for name in expected} == expected
+    assert layout.size == scheme_layout(9).size + sum(expected.values()) - 9
+    places = np.concatenate([np.arange(layout.size)[place] for place in layout.slices.values()])
+    np.testing.assert_array_equal(places, np.arange(layout.size))
+
+
+def test_the_number_of_the_certifying_state_is_appended():
+    """Older logs keep their meaning."""
+    assert SchemeState.CERTIFY == max(SchemeState) == 9
