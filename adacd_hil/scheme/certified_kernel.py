@@ -306,6 +306,8 @@ def begin_test(constants: Structured, memory: Structured) -> None:
     _use_belief(m)
     belief.discard(m)
     m["tested"] = 0.0
+    m["dq_low"][:] = np.inf
+    m["dq_high"][:] = -np.inf
 
 
 @compiled
@@ -476,7 +478,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if not is_free:
         belief.discard(m)
     if mode & TEST:
-        return _test(k, m)
+        return _test(k, m, out["dq"])
     if mode & REFINE:
         _refine(k, m, is_free)
         return 0
@@ -486,13 +488,18 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
 
 
 @compiled
-def _test(k: Any, m: Any) -> int:
-    """Take this sample into the test of the frozen model; return what that has come to."""
+def _test(k: Any, m: Any, dq: Vector) -> int:
+    """Take this sample into the test of the frozen model; return what that has come to. A joint that rests proves none."""
     m["tested"] += 1.0
-    for i in range(m["y"].shape[1]):
+    termination.widen(dq, m["dq_low"], m["dq_high"])
+    has_moved = True
+    for i in range(dq.shape[0]):
         if not (abs(m["r"][_FIT, i]) <= k["beta_Nm"]):
             return _REFUTED
-    return _CERTIFIED if m["tested"] >= k["test_cycles"][int(m["is_payload"])] else 0
+        fastest = max(m["dq_high"][i], -m["dq_low"][i])
+        has_moved = has_moved and fastest >= k["velocity_rad_s"]
+    is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
+    return _CERTIFIED if is_long and has_moved else 0
 
 
 @compiled

@@ -7,6 +7,7 @@ that is not in the table leaves the state as it is. One event per cycle: the fir
 
 A collision is latched: REACT -> STOPPED until the user acknowledges. So are a host that was late, a contact that has
 grown into a collision, and one that has lasted too long. Any other contact clears itself: REACT -> where it came from.
+From CERTIFY that is ADAPT: the fit is forgotten, and an arm that still stands would pass a test of no model at all.
 
 A request is kept until it can be served, but only in the states of `_KEPT_IN`; elsewhere it is dropped, so that an
 acknowledgement given too early can't release the next stop.
@@ -218,7 +219,7 @@ class Supervisor:
 
     @property
     def origin(self) -> SchemeState:
-        """Where REACT was entered from last: where the arm goes on after REACT or STOPPED."""
+        """Where the arm goes on after REACT or STOPPED: where it came from, but from a broken test to learn anew."""
         return self._origin
 
     @property
@@ -273,7 +274,6 @@ class Supervisor:
         if state is self._state:
             return
         if state is SchemeState.REACT:
-            # A test that was disturbed is worth nothing: the arm goes on with a new fit.
             self._origin = SchemeState.ADAPT if self._state is SchemeState.CERTIFY else self._state
             self._is_latched = event is not SchemeEvent.CONTACT
         elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):

@@ -331,6 +331,8 @@ def test_only_at_rest_is_the_sensors_noise_measured():
 
 def test_without_watching_nothing_is_a_contact_and_no_threshold_is_in_force():
     kernel = Kernel(theta=SMOOTH, P=np.zeros((COUNT, COUNT)))
+    kernel.step([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], certified_kernel.WATCH)
+    assert np.all(np.isfinite(kernel.out["threshold_bank"]))
     for _ in range(100):
         found = kernel.step([0.0, 0.0], [0.0, 0.0], [-5.0, 0.0])
     assert not found & Observation.CONTACT

@@ -81,6 +81,13 @@ def test_an_arm_learns_is_tested_and_monitors(whole):
     assert (first_in(learnt, SchemeState.MONITOR) - first_in(learnt, SchemeState.ADAPT)) * PERIOD_S <= 2.5
 
 
+def test_each_test_of_a_fit_takes_its_whole_time(whole):
+    learnt, _, fitted = whole
+    for outputs, test_s in zip((learnt, fitted), SETTINGS.certified.test_s, strict=True):
+        tested = [output for output in outputs if output.state is SchemeState.CERTIFY]
+        assert len(tested) == round(test_s / PERIOD_S)
+
+
 def test_nothing_is_fed_forward_before_the_certificate(whole):
     learnt, _, _ = whole
     armed = first_in(learnt, SchemeState.MONITOR)
@@ -188,6 +195,22 @@ def test_a_model_that_fails_its_test_is_learnt_anew_from_nothing():
     assert not outputs[-1].is_model_valid
 
 
+def test_a_test_that_a_touch_has_broken_off_is_no_certificate_for_an_arm_that_then_stands_still():
+    """The fit is forgotten; at rest no model at all would pass the test."""
+    loop = ExcitedLoop()
+    loop.run_until(SchemeState.CERTIFY)
+    loop.run(300)
+    loop.tau_ext[0] = 1.0
+    assert names(loop.run_until(SchemeState.REACT)) == ["CERTIFY", "REACT"]
+    loop.tau_ext[0] = 0.0
+    outputs = loop.run_until(SchemeState.ADAPT)
+    standing = arm_state(0, loop.q, tau_J=loop.tau)
+    outputs += [loop.pipeline.step(standing._replace(cycle=loop.cycle + k)) for k in range(1000)]
+    assert names(outputs) == ["REACT", "ADAPT"]
+    np.testing.assert_array_equal(outputs[-1].theta_ff, 0.0)
+    assert not outputs[-1].is_model_valid
+
+
 def test_the_pipeline_decides_as_the_compiled_step_does_on_the_same_samples(streamed):
     """The step alone begins with its filters at rest; an arm that stood still for a moment has thresholds for that."""
     _, outputs, _, played = streamed
@@ -210,6 +233,20 @@ def test_the_paper_beside_gives_the_bits_of_the_paper_alone(streamed):
     armed = np.array([output.state is SchemeState.MONITOR for output in paper])
     np.testing.assert_array_equal(column(outputs, "paper_is_armed")[:, 0], armed)
     np.testing.assert_array_equal(column(outputs, "paper_threshold")[armed][1:], blocks[armed][1:, alone["threshold"]])
+
+
+def test_both_schemes_count_by_the_stamps(streamed):
+    """SYNCs that are late: each scheme's numbers are those of the measured intervals, bit for bit the same beside."""
+    arms, nominal, _, _ = streamed
+    late_ns = np.random.default_rng(5).integers(0, 200_000, 600)
+    late = [arm._replace(t_ns=arm.t_ns + int(ns)) for arm, ns in zip(arms, late_ns, strict=False)]
+    pipelines = CertifiedPipeline(SETTINGS), Pipeline(replace(SETTINGS, scheme="paper"))
+    outputs, paper = ([pipeline.step(arm) for arm in late] for pipeline in pipelines)
+    alone = np.array([output.block[scheme_layout(7).slices["tau_ext_hat"]] for output in paper])
+    np.testing.assert_array_equal(column(outputs, "paper_tau_ext_hat"), alone)
+    np.testing.assert_array_equal(column(outputs, "period_s")[1:, 0], (1_000_000 + np.diff(late_ns)) * 1e-9)
+    for name in ("tau_ext_hat", "paper_tau_ext_hat"):
+        assert np.max(np.abs(column(outputs, name) - column(nominal[:600], name))) > 1e-5
 
 
 def test_this_scheme_is_armed_while_the_paper_s_still_adapts(streamed):

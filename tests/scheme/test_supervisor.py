@@ -305,12 +305,17 @@ def test_each_step_returns_the_state_that_it_leads_to():
 TOUCHABLE = [SchemeState[name] for name in ORIGINS]
 
 
+def goes_on_in(state):
+    """Return where an arm goes on that was touched in a state: where it was, but a test of a fit is broken off."""
+    return SchemeState.ADAPT if state is SchemeState.CERTIFY else state
+
+
 @pytest.mark.parametrize("state", TOUCHABLE)
 @pytest.mark.parametrize(("observation", "is_latched"), [(CONTACT, False), (COLLISION, True)])
 def test_a_touch_is_reacted_to_wherever_it_is_found(state, observation, is_latched):
     run = run_in(state)
     assert run.step(observation=observation) is SchemeState.REACT
-    assert run.supervisor.origin is state
+    assert run.supervisor.origin is goes_on_in(state)
     assert run.supervisor.is_latched is is_latched
 
 
@@ -330,7 +335,7 @@ def test_a_contact_that_has_cleared_lets_the_arm_go_on_where_it_was(state):
     run = run_in(state)
     run.step(observation=CONTACT | Observation.AT_REST, cycles=500)
     assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES - 1) is SchemeState.REACT
-    assert run.step(observation=Observation.AT_REST) is state
+    assert run.step(observation=Observation.AT_REST) is goes_on_in(state)
 
 
 @pytest.mark.parametrize("state", TOUCHABLE)
@@ -339,7 +344,7 @@ def test_an_acknowledged_collision_lets_the_arm_go_on_where_it_was(state):
     run.step(observation=COLLISION)
     assert run.step(observation=Observation.AT_REST, cycles=CLEAR_CYCLES) is SchemeState.STOPPED
     assert run.step(cycles=1000) is SchemeState.STOPPED
-    assert run.step(request=Request.ACKNOWLEDGE) is state
+    assert run.step(request=Request.ACKNOWLEDGE) is goes_on_in(state)
 
 
 def test_a_contact_that_comes_back_clears_anew():
