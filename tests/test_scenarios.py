@@ -87,6 +87,22 @@ def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None
     assert deviations(cast.scenario.expect, outcome) == ()
 
 
+@pytest.mark.slow
+def test_a_certified_host_comes_to_what_is_expected_of_it(tmp_path: Path) -> None:
+    cast = resolve("certified", "push-during-adaptation", None, None)
+    outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))
+    expected = cast.scenario.expected_of("certified")
+    assert expected is not None
+    assert expected != cast.scenario.expect
+    assert deviations(expected, outcome) == ()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_expectation_of_a_certified_host_is_there_because_it_is_another(name: str) -> None:
+    scenario = load_scenario(name)
+    assert scenario.expect_certified != scenario.expect
+
+
 def test_the_user_of_a_scenario_only_acknowledges_and_finishes() -> None:
     settings, scenario = resolve("paper", "power-loss-and-return", None, None)
     assert [(entry.at_s, entry.request) for entry in settings.operator.script] == [(scenario.lasts_s, "finish")]
@@ -130,5 +146,8 @@ def test_the_logs_of_a_short_scenario_name_it_and_its_faults(tmp_path: Path) -> 
 def test_the_documentation_lists_it_with_what_is_expected(name: str) -> None:
     scenario = load_scenario(name)
     page = Path(__file__).parent.parent / "docs" / "emulator" / "scenarios.md"
-    assert scenario.expect is not None
-    assert f"| `{name}` | {scenario.about} | {scenario.expect.text} |" in page.read_text(encoding="utf-8").splitlines()
+    paper, certified = (
+        expected.text for scheme in ("paper", "certified") if (expected := scenario.expected_of(scheme))
+    )
+    text = paper if certified == paper else f"{paper}; `certified`: {certified}"
+    assert f"| `{name}` | {scenario.about} | {text} |" in page.read_text(encoding="utf-8").splitlines()

@@ -53,6 +53,7 @@ class Reference:
         self._approach_rad_s = float(np.radians(settings.trajectory.approach_deg_s))
         self._corner = -self._amplitude
         self._follows_thrown = settings.reaction.start == "measured"
+        self._has_model = False
         self._thrown_cycles = round(THROWN_S / self._period_s)
         self._slow_share = settings.reaction.slow_share
         self._admittance = Admittance(settings)
@@ -162,6 +163,8 @@ class Reference:
         """Choose the motion of a state that begins in this cycle."""
         state, previous, cycle = output.state, self._state, arm.cycle
         self._state = state
+        if state is SchemeState.REACT:
+            self._has_model = previous is SchemeState.MONITOR
         was_on_path = previous in _FOLLOWING or (previous is SchemeState.REACT and self._reaction in _ON_PATH)
         has_excited = self._excitation.is_on and previous in _LEARNING and state is SchemeState.MONITOR
         is_moving_on = state in _FOLLOWING and was_on_path and not has_excited
@@ -205,8 +208,11 @@ class Reference:
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
         """Tell whether a blow that ends has made the arm faster than planned, away from what it has hit.
 
-        While it is still pushed the controller resists.
+        While it is still pushed the controller resists; also while it learns, because an adaptation that begins anew
+        forgets the push that goes on.
         """
+        if not self._has_model:
+            return False
         along = float(tau_ext_hat @ self._push)
         self._strongest = max(self._strongest, along)
         if along > ENDING * self._strongest:

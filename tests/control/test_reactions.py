@@ -119,6 +119,17 @@ def test_a_blow_that_ends_is_followed() -> None:
     np.testing.assert_allclose(thrown[0, 1], desired.dq, atol=0.1)
 
 
+def test_an_arm_that_learns_resists_a_push_whose_torque_it_forgets() -> None:
+    desired = Desired(reacting("withdraw"))
+    desired.step(SchemeState.CERTIFY, cycles=500)
+    desired.step(SchemeState.REACT, Reaction.WITHDRAW, (-3.0, -1.0), 10)
+    desired.follows = False
+    desired.q, desired.dq = desired.q - 0.02, np.array([-2.0, -4.0])
+    course = desired.step(SchemeState.REACT, Reaction.WITHDRAW, (-0.05, -0.02), 50)
+    assert np.abs(course[:, 0] - desired.q).max(axis=1).min() > 0.01
+    assert np.abs(course[:, 1]).max() < np.radians(120.0)
+
+
 def test_a_run_that_ends_while_the_arm_reacts_does_not_move_it() -> None:
     desired = monitoring(reacting("stop"))
     desired.step(SchemeState.REACT, Reaction.STOP, (-3.0, 2.0), 20)
