@@ -42,6 +42,8 @@ STRAIN_S = 10.0
 """Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
 RELAXED = 0.6
 """Share of its threshold that the residual must stay below for that."""
+AGREES = 0.4
+"""Share of its threshold that the smoothed channel has at least when the bare one finds a push: 0.5 to 0.75."""
 UNIT_PEAK = 4.0
 """Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
 SMALLEST_UNIT = 0.05
@@ -226,10 +228,19 @@ def _doubt(k: Any, m: Any, w: Vector, unit: float) -> float:
 
 @compiled
 def joints_over(y: Vector, h: Vector) -> int:
-    """Return the joints that are over their threshold in any channel, as bits; what is not a number counts as over."""
+    """Return the joints that are over their threshold in any channel, as bits; what is not a number counts as over.
+
+    A bare channel needs the smoothed one of its filter to agree, see AGREES. A push makes them rise together; what a step
+    of the encoder or a gear's play leaves for a sample or two is in the bare one alone.
+    """
+    filters = (y.shape[0] + 1) // 2
     joints = 0
     for c in range(y.shape[0]):
         for i in range(y.shape[1]):
-            if not (abs(y[c, i]) <= h[c, i]):
+            is_over = not (abs(y[c, i]) <= h[c, i])
+            if is_over and c >= filters:
+                smoothed = c - filters + 1
+                is_over = not (abs(y[smoothed, i]) <= AGREES * h[smoothed, i])
+            if is_over:
                 joints |= 1 << i
     return joints
