@@ -454,7 +454,7 @@ class CertifiedSettings:
         (0.85, 0.4), unit="s", low=0.05, high=600.0, meaning="test of the frozen model: of the arm, with a payload"
     )
     beta_Nm: float = setting(
-        0.06, unit="Nm", low=1e-3, high=100.0, meaning="test: largest |tau_ext_hat| of the slowest filter"
+        0.1, unit="Nm", low=1e-3, high=100.0, meaning="test: largest |tau_ext_hat| of the slowest filter"
     )
     excitation_Nm2s: float = setting(
         5e-5, unit="Nm² s", low=0.0, high=1e6, meaning="smallest eigenvalue of the scaled information matrix"

@@ -52,14 +52,14 @@ class Setup:
     is_blocking: bool
     messages: tuple[ToldMessage, ...]
     parameter_count: int
-    further_count: int
-    channel_count: int
     epoch_ns: int
     part_bytes: int
     part_ns: int
     may_rotate: bool
     attachments: dict[str, bytes]
     metadata: dict[str, str]
+    further_count: int = 0
+    channel_count: int = 0
 
     def to_json(self) -> bytes:
         """Write it."""

@@ -230,8 +230,8 @@ def _doubt(k: Any, m: Any, w: Vector, unit: float) -> float:
 def joints_over(y: Vector, h: Vector) -> int:
     """Return the joints that are over their threshold in any channel, as bits; what is not a number counts as over.
 
-    A bare channel needs the smoothed one of its filter to agree, see AGREES. A push makes them rise together; what a step
-    of the encoder or a gear's play leaves for a sample or two is in the bare one alone.
+    A bare channel needs the smoothed one of its filter to agree, see AGREES. A push makes them rise together; what a
+    step of the encoder or a gear's play leaves for a sample or two is in the bare one alone.
     """
     filters = (y.shape[0] + 1) // 2
     joints = 0
