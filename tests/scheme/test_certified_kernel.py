@@ -435,7 +435,7 @@ def test_a_test_in_which_a_joint_rests_proves_nothing(speeds):
 
 
 def test_an_arm_that_rests_teaches_no_offset_where_friction_holds():
-    """A certified arm for 4 s with 0.1 Nm that its friction may hold; if it certainly had none, it were an offset."""
+    """A certified arm for 2 s with 0.1 Nm that its friction may hold; if it certainly had none, it were an offset."""
     learnt = []
     for coulomb_Nm, stribeck_std_Nm in ((0.1, 0.15), (0.0, 0.0)):
         kernel = Kernel()
@@ -446,11 +446,12 @@ def test_an_arm_that_rests_teaches_no_offset_where_friction_holds():
         m["P_belief"][:] = m["P"][:] = np.diag(std**2)
         certified_kernel.begin_refinement(kernel.memory)
         kernel.m["still"][:] = kernel.m["still_smooth"][:] = 1.0
-        for _ in range(4000):
+        m["h"][:] = 1.0
+        for _ in range(2000):
             kernel.step([0.0, 0.0], [0.0, 0.0], [0.1, -0.1], certified_kernel.REFINE)
         learnt.append(m["belief"][OFFSETS].copy())
     assert np.all(np.abs(learnt[0]) < 0.01)
-    np.testing.assert_allclose(learnt[1], [0.1, -0.1], atol=0.02)
+    np.testing.assert_allclose(learnt[1], [0.1, -0.1], atol=0.035)
 
 
 SHORT_RECORD = """
