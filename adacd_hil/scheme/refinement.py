@@ -3,7 +3,7 @@
 The belief goes on learning where nothing touches the arm. Every so often its mean is frozen as a candidate and runs
 beside the model in use on motion that neither was fitted to. It takes over if it explains that motion better and would
 have raised no alarm. So friction that warms up, and a model that was armed early, are followed, but a touch is not:
-a contact ends the test, and what is left below the thresholds can't move a candidate by more than that.
+a contact pauses the test, and what is left below the thresholds can't move a candidate by more than that.
 """
 
 from typing import Any

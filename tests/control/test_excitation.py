@@ -44,8 +44,8 @@ def test_velocity_and_acceleration_are_those_of_the_position():
 def test_it_keeps_to_the_trajectory_s_corners_and_to_the_speeds_it_was_made_for():
     q_d, dq_d, ddq_d = (np.max(np.abs(np.degrees(values)), axis=0) for values in motion(np.arange(2400) * 1e-3))
     assert np.all(q_d <= 1.01 * np.array(SETTINGS.trajectory.amplitude_deg))
-    assert np.all(dq_d <= 105.0)
-    assert np.all(ddq_d <= [720.0, 920.0])
+    assert np.all(dq_d <= [100.5, 120.5])
+    assert np.all(ddq_d <= [705.0, 905.0])
 
 
 def test_each_joint_travels_and_moves_both_ways():

@@ -84,11 +84,14 @@ def record(theta, seconds, tau_ext=None, added=None, added_at_s=0.0, motion=None
     return Record(q, dq, tau_J)
 
 
-def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS) -> Played:
-    """Play a record through the compiled step."""
+def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS, at_rest: int = 0) -> Played:
+    """Play a record through the compiled step, after samples at rest where it begins."""
     count = len(measured.q)
     constants, memory = certified_kernel.constants_of(settings), certified_kernel.new_memory(settings)
     block = certified_kernel.new_block(settings)
+    block["q"] = measured.q[0]
+    for _ in range(at_rest):
+        certified_kernel.step(constants, memory, block, 1, 1, certified_kernel.WATCH)
     state, observation, theta = np.zeros(count), np.zeros(count), np.zeros((count, len(NAMES)))
     y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
     certified_kernel.step_record(constants, memory, block, *measured, payload_at, state, observation, y, h, theta)

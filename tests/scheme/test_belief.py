@@ -1,5 +1,7 @@
 """The belief against the closed form of Bayesian linear regression, and what it does not learn."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -25,8 +27,9 @@ def samples(count=400, seed=1):
     return W_f, W_f @ random.standard_normal(COUNT) + 0.1 * random.standard_normal((count, 2))
 
 
-def teach(m, W_f, tau_f):
-    return [belief.learn(K, m, w, tau) for w, tau in zip(W_f, tau_f, strict=True)]
+def teach(m, W_f, tau_f, held=0.0):
+    held = np.broadcast_to(held, tau_f.shape).copy()
+    return [belief.learn(K, m, *sample) for sample in zip(W_f, tau_f, held, strict=True)]
 
 
 def test_a_belief_begins_with_the_prior():
@@ -43,23 +46,29 @@ def test_nothing_is_expected_of_an_arm_but_the_velocity_s_usual_lag():
 
 
 def test_what_is_learnt_is_the_closed_form_of_every_fourth_sample_that_has_waited():
-    """P = (P0^-1 + sum W' W / R)^-1, theta = P (P0^-1 theta0 + sum W' tau / R)."""
+    """P = (P0^-1 + sum W' W / R)^-1, theta = P (P0^-1 theta0 + sum W' tau / R).
+
+    R of each joint's sample is that of a good model's residual and of what friction may have held then.
+    """
     W_f, tau_f = samples()
+    held = np.random.default_rng(2).uniform(0.0, 0.1, tau_f.shape)
     m = prior()
     theta0, P0 = m["belief"].copy(), m["P_belief"].copy()
-    teach(m, W_f, tau_f)
+    teach(m, W_f, tau_f, held)
     learnt = slice(EVERY - 1, len(W_f) - WAITING * EVERY, EVERY)
-    R = float(K["R"])
-    information = np.linalg.inv(P0) + np.einsum("nij,nik->jk", W_f[learnt], W_f[learnt]) / R
-    correlation = np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W_f[learnt], tau_f[learnt]) / R
+    a, learn_s = SETTINGS.certified.cutoffs_rad_s[0], EVERY * 1e-3  # noise through a filter is correlated over 2 / a
+    R = (SETTINGS.certified.residual_Nm**2 + held[learnt] ** 2) * 2.0 / (a * learn_s)
+    information = np.linalg.inv(P0) + np.einsum("nij,ni,nik->jk", W_f[learnt], 1.0 / R, W_f[learnt])
+    correlation = np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W_f[learnt], tau_f[learnt] / R)
     np.testing.assert_allclose(m["P_belief"], np.linalg.inv(information), rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(m["belief"], np.linalg.solve(information, correlation), rtol=1e-7)
 
 
-def test_a_sample_counts_as_much_as_the_filter_leaves_it_new():
-    """Noise through a filter of cut-off a is correlated over 2 / a."""
-    a, learn_s = SETTINGS.certified.cutoffs_rad_s[0], EVERY * 1e-3
-    assert float(K["R"]) == pytest.approx(SETTINGS.certified.residual_Nm**2 * 2.0 / (a * learn_s))
+def test_samples_closer_than_their_noise_changes_count_for_less_but_never_for_more_than_one():
+    a = SETTINGS.certified.cutoffs_rad_s[0]
+    for every, correlated in ((EVERY, 2.0 / (a * EVERY * 1e-3)), (100, 2.0), (300, 1.0)):
+        settings = replace(SETTINGS, certified=replace(SETTINGS.certified, learn_every=every))
+        assert float(certified_kernel.constants_of(settings)["correlated"][0]) == pytest.approx(correlated)
 
 
 def test_the_belief_tells_when_it_has_changed():
@@ -77,8 +86,8 @@ def test_a_sample_is_not_learnt_before_it_has_waited():
     wait = WAITING * EVERY
     for k in range(at + wait + 1):
         assert np.array_equal(untouched_belief["belief"], belief_hat["belief"])
-        belief.learn(K, untouched_belief, W_f[k], tau_f[k])
-        belief.learn(K, belief_hat, W_f[k], touched[k])
+        belief.learn(K, untouched_belief, W_f[k], tau_f[k], np.zeros(2))
+        belief.learn(K, belief_hat, W_f[k], touched[k], np.zeros(2))
     assert np.max(np.abs(untouched_belief["belief"] - belief_hat["belief"])) > 1e-3
 
 

@@ -89,6 +89,19 @@ def test_the_smoothed_channels_of_fast_filters_have_no_say(channel):
     assert refined.run()[-1]
 
 
+def test_a_joint_that_rests_has_no_say_in_which_model_is_better():
+    """At rest friction may hold any torque: here the model in use happens to fit joint 1, and it does not count."""
+    refined = Refined(off_by(0.05), off_by(0.2))
+    refined.m["still"][0, 0] = 1.1 * refinement.MOVING
+    refined.sample()
+    m = refined.m
+    squares = [(m["W_f"][0, 1] @ (theta - TRUE)) ** 2 for theta in (off_by(0.05), off_by(0.2))]
+    np.testing.assert_allclose([m["candidate_square"], m["frozen_square"]], squares, rtol=1e-10)
+    m["still"][:] = 1.0
+    refined.sample()
+    np.testing.assert_allclose([m["candidate_square"], m["frozen_square"]], squares, rtol=1e-10)
+
+
 def test_after_a_test_the_next_begins_with_the_belief_as_it_is_then():
     refined = Refined(off_by(0.2), off_by(0.05))
     refined.sample()

@@ -81,6 +81,24 @@ def test_only_the_last_report_names_the_kind():
     assert kinds == [ContactKind.UNKNOWN, ContactKind.UNKNOWN, ContactKind.HIT]
 
 
+def test_the_peak_of_a_push_is_the_push_and_not_the_ringing_when_the_arm_begins_to_react():
+    tau = np.zeros((300, 2))
+    tau[50:, 0] = 3.0
+    tau[70:80, 0] *= 1.0 + 0.2 * np.cos(np.pi * np.arange(10) / 2.5)
+    final = play(tau, 55, joints=1)[0][-1]
+    assert np.max(tau) == pytest.approx(3.6)
+    assert final.tau_ext_peak[0] == pytest.approx(3.0, rel=0.05)
+
+
+@pytest.mark.parametrize("duration", [20, 50, 100])
+def test_the_peak_of_a_blow_is_that_of_its_half_sine_however_short_it_is(duration):
+    """As the scheme sees it, each sample a mean of five."""
+    tau = course(force_N=15.0, duration=duration)
+    seen = np.stack([np.convolve(tau[:, i], np.full(5, 0.2))[: len(tau)] for i in range(2)], axis=1)
+    final = play(seen, 56)[0][-1]
+    np.testing.assert_allclose(final.tau_ext_peak, np.max(tau, axis=0), rtol=0.05)
+
+
 def test_a_fault_ends_the_report():
     reporter = ContactReporter(SETTINGS)
     reporter.observe(Q, np.ones(2), SIGMA, THRESHOLD)

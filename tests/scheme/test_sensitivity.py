@@ -27,11 +27,15 @@ def known_arm(seed=1):
     m["W_f"][:] = random.standard_normal(m["W_f"].shape)
     m["M"][:] = [[0.4, 0.1], [0.1, 0.05]]
     m["roughness"][:] = 1.0, 2.5
+    m["velocity_roughness"][:] = 1.5, 3.0
+    m["unit"][:] = 0.5, 2.0
+    m["strain"][:] = 1.0, 2.0
     return m
 
 
 def thresholds_of(m):
     h = np.zeros((len(CHANNELS), 2))
+    sensitivity.follow_friction(K, m, 0)
     sensitivity.fill_thresholds(K, m, h)
     return h
 
@@ -39,12 +43,12 @@ def thresholds_of(m):
 def noise_of(m):
     """Return what white torque noise and the velocity's quantisation leave in each channel (5, 2), Nm², by formula."""
     nu = CERTIFIED.velocity_noise_rad_s
-    momentum = np.diag(m["M"] @ m["M"].T)
+    momentum = np.diag(m["M"] @ np.diag(m["velocity_roughness"]) @ m["M"].T)
     variance = []
     for a, is_smooth in CHANNELS:
         s = CERTIFIED.smoothing_rad_s
         width = a * s / (a + s) if is_smooth else a
-        share = 0.31 * s / 200.0 / (1.0 + a / 650.0) if is_smooth else 1.0
+        share = 0.335 * s / 200.0 / (1.0 + a / 600.0) if is_smooth else 1.0
         torque = (CERTIFIED.noise_sigmas * CERTIFIED.torque_noise_Nm) ** 2 * width * T / 2.0 * m["roughness"]
         variance.append(torque + (share * nu * a) ** 2 * momentum)
     return np.array(variance)
@@ -52,8 +56,9 @@ def noise_of(m):
 
 def doubt_of(m):
     """Return k_m g of each filter and joint (3, 2), Nm."""
-    P = m["P"] + np.diag((np.array(K["model_error"]) * m["theta"]) ** 2)
-    return CERTIFIED.model_sigmas * np.sqrt(np.einsum("cij,jk,cik->ci", m["W_f"], P, m["W_f"]))
+    D = np.diag((np.array(K["model_error"]) * m["theta"]) ** 2)
+    believed, unexplained = (np.einsum("cij,jk,cik->ci", m["W_f"], P, m["W_f"]) for P in (m["P"], D))
+    return CERTIFIED.model_sigmas * np.sqrt(m["unit"] * believed + unexplained)
 
 
 def test_a_moving_arm_s_thresholds_are_noise_and_doubt_in_quadrature():
@@ -61,7 +66,7 @@ def test_a_moving_arm_s_thresholds_are_noise_and_doubt_in_quadrature():
     g = doubt_of(m)
     m["doubt"][:] = g  # as after a while of the same motion
     bare = np.concatenate([g, g[1:]])
-    np.testing.assert_allclose(thresholds_of(m), np.sqrt(noise_of(m) + bare**2), rtol=1e-10)
+    np.testing.assert_allclose(thresholds_of(m), m["strain"] * np.sqrt(noise_of(m) + bare**2), rtol=1e-10)
 
 
 def test_the_doubt_of_a_smoothed_channel_follows_the_motion_as_slowly_as_its_residual():
@@ -70,7 +75,7 @@ def test_the_doubt_of_a_smoothed_channel_follows_the_motion_as_slowly_as_its_res
     h = thresholds_of(m)
     followed = (1.0 - np.exp(-CERTIFIED.smoothing_rad_s * T)) * doubt_of(m)
     expected = np.sqrt(noise_of(m) + np.concatenate([followed, doubt_of(m)[1:]]) ** 2)
-    np.testing.assert_allclose(h, expected, rtol=1e-10)
+    np.testing.assert_allclose(h, m["strain"] * expected, rtol=1e-10)
 
 
 def test_what_is_not_known_raises_the_threshold_of_the_joint_that_it_shows_in():
@@ -110,7 +115,7 @@ def test_friction_that_was_learnt_negative_holds_nothing():
     m["P"][:] = 0.0
     m["W_f"][:] = 0.0
     m["theta"][[COULOMB, COULOMB + 1, STRIBECK, STRIBECK + 1]] = -0.2
-    np.testing.assert_allclose(thresholds_of(m), np.sqrt(noise_of(m)), rtol=1e-10)
+    np.testing.assert_allclose(thresholds_of(m), m["strain"] * np.sqrt(noise_of(m)), rtol=1e-10)
 
 
 def test_standstill_fills_a_filter_in_its_own_time():
@@ -161,10 +166,118 @@ def test_the_undone_filter_s_deviation_is_that_of_a_mean_of_five_samples():
     m["h"][:] = [[0.5, 0.6], [0.3, 0.7], [0.4, 0.2], [0.9, 0.9], [0.8, 0.8]]
     sensitivity.fill_wide(K, m, 1)
     torque = CERTIFIED.torque_noise_Nm**2 * m["roughness"] / 5.0
-    velocity = 2.0 * (0.12 * CERTIFIED.velocity_noise_rad_s / (5.0 * T)) ** 2 * np.diag(m["M"] @ m["M"].T)
+    velocity = 2.0 * (0.12 * CERTIFIED.velocity_noise_rad_s / (5.0 * T)) ** 2 * m["M"] ** 2 @ m["velocity_roughness"]
     model = (0.3 / CERTIFIED.model_sigmas) ** 2
     np.testing.assert_allclose(m["wide_sigma"], np.sqrt(torque + velocity + model), rtol=1e-10)
     np.testing.assert_array_equal(m["wide_threshold"], [0.3, 0.2])
+
+
+FLOOR_RAD_S = sensitivity.SECOND_DIFFERENCE * CERTIFIED.velocity_noise_rad_s
+
+
+def after_a_swing(noise, count=2000):
+    """Return the memory after a fast swing, 4 rad/s and 28 rad/s² at most, seen with white noise (n, 2) of dq."""
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    swing = 4.0 * np.sin(7.0 * T * np.arange(count))
+    for dq in swing[:, None] + noise:
+        sensitivity.follow_velocity_noise(K, m, dq)
+    return m
+
+
+def test_velocity_noise_is_seen_in_the_second_difference_and_motion_is_not():
+    assert np.all(after_a_swing(np.zeros((2000, 2)))["velocity_roughness"] == 1.0)
+    noise = np.random.default_rng(3).standard_normal((2000, 2)) * FLOOR_RAD_S * [0.2, 8.0]
+    roughness = after_a_swing(noise)["velocity_roughness"]
+    assert 1.0 <= roughness[0] < 1.2
+    assert roughness[1] == pytest.approx(6.0 * 8.0**2, rel=0.3)  # a second difference has 1 + 4 + 1 times the variance
+
+
+def test_a_coarse_encoder_raises_the_thresholds_of_all_that_its_joint_s_momentum_shows_in():
+    fine, coarse = known_arm(), known_arm()
+    for m in (fine, coarse):
+        m["W_f"][:] = 0.0
+        m["roughness"][:] = 0.0
+    counts = 0.02 * np.round(np.sin(5.0 * T * np.arange(2000)) / 0.02)
+    coarse["velocity_roughness"][:] = after_a_swing(np.outer(counts, [0.0, 1.0]))["velocity_roughness"]
+    fine["velocity_roughness"][:] = 1.0
+    assert coarse["velocity_roughness"][0] == 1.0
+    rise = thresholds_of(coarse) / thresholds_of(fine)
+    expected = np.sqrt(coarse["M"] ** 2 @ coarse["velocity_roughness"] / np.sum(coarse["M"] ** 2, axis=1))
+    np.testing.assert_allclose(rise, np.tile(expected, (5, 1)), rtol=1e-10)
+    assert np.all(rise > 1.5)
+
+
+def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
+    """Its second difference is a rise and a fall."""
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    for dq in (0.0, 0.0, 3.0, 3.0, 3.0):
+        sensitivity.follow_velocity_noise(K, m, np.array([dq, 0.0]))
+    share = T / sensitivity.ROUGHNESS_S
+    most = (1.0 + share * (sensitivity.JUMP**2 - 1.0)) ** 2
+    np.testing.assert_allclose(m["velocity_roughness"], [most * (1.0 - share), 1.0], rtol=1e-10)
+
+
+def test_a_contact_doubles_the_strain_of_the_joints_that_are_over_and_three_times_at_most():
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    m["h"][:] = 1.0
+    m["y"][3, 1] = -1.1
+    strains = []
+    for _ in range(4):
+        sensitivity.strain(m)
+        strains.append(m["strain"].tolist())
+    assert strains == [[1.0, 2.0], [1.0, 4.0], [1.0, 8.0], [1.0, 8.0]]
+
+
+def relaxed(share, count, strain=8.0):
+    """Return the memory after samples that show this share of the threshold."""
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    m["strain"][:] = strain
+    m["h"][:] = 0.5
+    m["y"][2] = 0.5 * share
+    for _ in range(count):
+        sensitivity.relax(K, m)
+    return m
+
+
+def test_strain_goes_back_over_ten_seconds_where_the_residual_leaves_room_and_never_below_one():
+    left = 8.0 * (1.0 - T / sensitivity.STRAIN_S) ** 1000
+    np.testing.assert_allclose(relaxed(np.array([0.59, -0.61]), 1000)["strain"], [left, 8.0], rtol=1e-10)
+    assert relaxed(np.zeros(2), 1000, 1.05)["strain"].tolist() == [1.0, 1.0]
+
+
+def test_a_peak_of_the_residual_holds_the_strain_for_a_while():
+    m = relaxed(np.array([0.9, -0.9]), 1)
+    m["y"][:] = 0.0
+    count = round(np.log(0.9 / sensitivity.RELAXED) * sensitivity.STRAIN_S / T)
+    for _ in range(count - 2):
+        sensitivity.relax(K, m)
+    assert m["strain"].tolist() == [8.0, 8.0]
+    for _ in range(4):
+        sensitivity.relax(K, m)
+    assert np.all(m["strain"] < 8.0)
+
+
+def units_after(share, count, unit=1.0):
+    """Return the unit after samples whose squared residual is this share (2,) of what is believed."""
+    m = known_arm()
+    m["unit"][:] = unit
+    m["held"][:] = 0.0, 0.3
+    believed = CERTIFIED.residual_Nm**2 + m["held"] ** 2 + np.einsum("ij,jk,ik->i", m["W_f"][0], m["P"], m["W_f"][0])
+    m["r"][0] = np.sqrt(share * believed)
+    for _ in range(count):
+        sensitivity.follow_unit(K, m, 0)
+    return m["unit"].copy()
+
+
+def test_the_unit_follows_the_residual_over_twenty_seconds():
+    left = (1.0 - T / sensitivity.UNIT_S) ** 1000
+    target = sensitivity.UNIT_PEAK * np.array([0.1, 1.0])
+    np.testing.assert_allclose(units_after(np.array([0.1, 1.0]), 1000), target + left * (1.0 - target), rtol=1e-10)
+
+
+def test_the_unit_keeps_to_its_bounds():
+    assert units_after(np.zeros(2), 200, 1.005 * sensitivity.SMALLEST_UNIT).tolist() == [sensitivity.SMALLEST_UNIT] * 2
+    assert units_after(np.full(2, 1e9), 1).tolist() == [sensitivity.LARGEST_UNIT] * 2
 
 
 @pytest.mark.parametrize(
