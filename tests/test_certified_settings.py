@@ -77,10 +77,10 @@ def test_each_filter_is_a_channel_and_all_but_the_slowest_are_two(cutoffs, chann
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
-def test_the_certified_configuration_differs_from_the_paper_s_in_scheme_and_excitation_only(profile):
+def test_the_certified_configuration_differs_from_the_paper_s_in_scheme_excitation_and_rebound_only(profile):
     ours, paper = load_settings("certified", profile), load_settings("paper", profile)
     changed = [name for name in ours.__dataclass_fields__ if getattr(ours, name) != getattr(paper, name)]
-    assert changed == ["name", "scheme", "excitation"]
+    assert changed == ["name", "scheme", "reaction", "excitation"]
     assert ours.scheme == "certified"
 
 

@@ -7,7 +7,7 @@ T_learn therefore counts with the variance
     R = sigma² 2 / (a T_learn),    sigma: what a good model leaves in the filtered residual, Nm rms,
 
 so that P means what it says. Friction of a joint that stands still is any torque up to the static one: what of it is in
-the filter counts as further deviation, so an arm at rest teaches next to nothing.
+the filter counts as further deviation, and a joint that mostly rests teaches nothing.
 
 **Payload.** One of mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this
 direction g by sigma_m² g g', and a little in each inertia for what is no point mass. All else stays known.
@@ -74,6 +74,8 @@ def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector) -> bool:
         for i in range(tau_f.shape[0]):
             R = m["ring_R"][place, i]
             w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
+            if np.inf == R:
+                continue
             estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
     else:
         m["ring_used"] += 1.0

@@ -42,6 +42,8 @@ STRAIN_S = 10.0
 """Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
 RELAXED = 0.6
 """Share of its threshold that the residual must stay below for that."""
+RESTING = 0.2
+"""Share of standstill in a filter's memory from which on a joint counts as resting."""
 AGREES = 0.4
 """Share of its threshold that the smoothed channel has at least when the bare one finds a push: 0.5 to 0.75."""
 UNIT_PEAK = 4.0
@@ -144,6 +146,8 @@ def follow_unit(k: Any, m: Any, fit: int) -> None:
             for n in range(w.shape[0]):
                 row += m["P"][j, n] * w[n]
             believed += w[j] * row
+        if not np.isfinite(believed):
+            continue
         ratio = m["r"][fit, i] ** 2 / believed
         unit = m["unit"][i] + k["unit_share"] * (UNIT_PEAK * ratio - m["unit"][i])
         m["unit"][i] = min(max(unit, SMALLEST_UNIT), LARGEST_UNIT)
@@ -169,10 +173,14 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
 
 @compiled
 def follow_friction(k: Any, m: Any, fit: int) -> None:
-    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in filter `fit` now, Nm."""
+    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in filter `fit` now, Nm.
+
+    Friction at rest is no noise that averages out: of a joint that mostly rested it is inf, so nothing is learnt.
+    """
     for i in range(m["hold"].shape[0]):
         m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i)
-        m["held"][i] = m["hold"][i] * m["still"][fit, i]
+        share = m["still"][fit, i]
+        m["held"][i] = m["hold"][i] * share if share < RESTING else np.inf
 
 
 @compiled
@@ -238,7 +246,7 @@ def joints_over(y: Vector, h: Vector) -> int:
     for c in range(y.shape[0]):
         for i in range(y.shape[1]):
             is_over = not (abs(y[c, i]) <= h[c, i])
-            if is_over and c >= filters:
+            if is_over and c >= filters and np.isfinite(y[c, i]):
                 smoothed = c - filters + 1
                 is_over = not (abs(y[smoothed, i]) <= AGREES * h[smoothed, i])
             if is_over:

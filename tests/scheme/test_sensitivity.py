@@ -284,7 +284,7 @@ def test_the_unit_keeps_to_its_bounds():
     ("place", "value", "joints"),
     [
         ((0, 0), 1.01, 0b01),
-        ((4, 0), -1.01, 0b01),
+        ((1, 0), -1.01, 0b01),
         ((2, 1), 1.01, 0b10),
         ((3, 1), np.nan, 0b10),
         ((1, 0), 1.0, 0b00),
@@ -294,6 +294,13 @@ def test_the_unit_keeps_to_its_bounds():
 def test_a_joint_is_over_in_any_channel_and_what_is_no_number_is_over(place, value, joints):
     y, h = np.zeros((5, 2)), np.ones((5, 2))
     y[place] = value
+    assert sensitivity.joints_over(y, h) == joints
+
+
+@pytest.mark.parametrize(("smoothed", "joints"), [(0.0, 0b00), (0.39, 0b00), (-0.41, 0b01)])
+def test_a_bare_channel_alone_finds_no_push(smoothed, joints):
+    y, h = np.zeros((5, 2)), np.ones((5, 2))
+    y[4, 0], y[2, 0] = -1.5, smoothed
     assert sensitivity.joints_over(y, h) == joints
 
 
