@@ -495,6 +495,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     """
     m["tested"] += 1.0
     termination.widen(dq, m["dq_low"], m["dq_high"])
+    sensitivity.follow_unit(k, m, _FIT, k["unit_test_share"])
     has_moved = True
     for i in range(dq.shape[0]):
         if not (abs(m["r"][_FIT, i]) <= k["beta_Nm"]):
@@ -510,7 +511,7 @@ def _refine(k: Any, m: Any, is_free: bool) -> None:
     """Learn on beside the model in use, and let what was learnt take over after its test."""
     if not is_free:
         return
-    sensitivity.follow_unit(k, m, _FIT)
+    sensitivity.follow_unit(k, m, _FIT, k["unit_share"])
     sensitivity.relax(k, m)
     if belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])

@@ -53,6 +53,8 @@ LARGEST_UNIT = 9.0
 """Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
 UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
+UNIT_TEST_S = 0.3
+"""The same while a frozen model is tested, which begins with a unit of 1: a third of the test."""
 
 _SMOOTHED_SHARE = 0.335 / 200.0
 _VELOCITY_STD_SHARE = 0.12
@@ -74,6 +76,7 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
         "roughness_share": np.array(period_s / ROUGHNESS_S),
         "strain_share": np.array(period_s / STRAIN_S),
         "unit_share": np.array(period_s / UNIT_S),
+        "unit_test_share": np.array(period_s / UNIT_TEST_S),
         "velocity_std_rad_s": np.array(_VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
     }
 
@@ -136,8 +139,8 @@ def relax(k: Any, m: Any) -> None:
 
 
 @compiled
-def follow_unit(k: Any, m: Any, fit: int) -> None:
-    """Take one sample without contact into the unit (n,) of the belief's variances."""
+def follow_unit(k: Any, m: Any, fit: int, share: float) -> None:
+    """Take one sample without contact into the unit (n,) of the belief's variances; share: what it counts."""
     for i in range(m["unit"].shape[0]):
         w = m["W_f"][fit, i]
         believed = k["residual_Nm"] ** 2 + m["held"][i] ** 2
@@ -149,7 +152,7 @@ def follow_unit(k: Any, m: Any, fit: int) -> None:
         if not np.isfinite(believed):
             continue
         ratio = m["r"][fit, i] ** 2 / believed
-        unit = m["unit"][i] + k["unit_share"] * (UNIT_PEAK * ratio - m["unit"][i])
+        unit = m["unit"][i] + share * (UNIT_PEAK * ratio - m["unit"][i])
         m["unit"][i] = min(max(unit, SMALLEST_UNIT), LARGEST_UNIT)
 
 

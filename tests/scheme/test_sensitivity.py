@@ -265,7 +265,7 @@ def units_after(share, count, unit=1.0):
     believed = CERTIFIED.residual_Nm**2 + m["held"] ** 2 + np.einsum("ij,jk,ik->i", m["W_f"][0], m["P"], m["W_f"][0])
     m["r"][0] = np.sqrt(share * believed)
     for _ in range(count):
-        sensitivity.follow_unit(K, m, 0)
+        sensitivity.follow_unit(K, m, 0, K["unit_share"])
     return m["unit"].copy()
 
 
