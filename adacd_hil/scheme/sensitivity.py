@@ -30,7 +30,7 @@ from adacd_hil.records import Vector
 from adacd_hil.scheme import contact, friction
 
 SECOND_DIFFERENCE = 0.36
-"""Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s as below, and a fifth."""
+"""Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, a fifth to spare."""
 JUMP = 5.0
 """Deviations of the noise as which a jump counts at most."""
 ROUGHNESS_S = 0.3
@@ -54,7 +54,7 @@ LARGEST_UNIT = 9.0
 UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
 UNIT_TEST_S = 0.6
-"""The same while a frozen model is tested, which begins with a unit of 1 and ends near a quarter of it if all is well."""
+"""The same while a frozen model is tested: begun with a unit of 1 it ends near a quarter of it if all is well."""
 
 _SMOOTHED_SHARE = 0.335 / 200.0
 _VELOCITY_STD_SHARE = 0.12
