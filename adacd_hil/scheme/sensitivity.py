@@ -30,7 +30,7 @@ from adacd_hil.records import Vector
 from adacd_hil.scheme import contact, friction
 
 SECOND_DIFFERENCE = 0.36
-"""Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, a fifth to spare."""
+"""Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""
 JUMP = 5.0
 """Deviations of the noise as which a jump counts at most."""
 ROUGHNESS_S = 0.3
