@@ -206,7 +206,7 @@ class Cycle:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
         exchange = self._exchange
-        for source in (self._master, exchange.troubles, exchange.late_commands, self._evidence):
+        for source in (self._master, exchange.troubles, exchange.late_commands, self._evidence, self._pipeline):
             for event in source.take_events():
                 recorder.event(t_ns, event)
         if output.state is not self._state:

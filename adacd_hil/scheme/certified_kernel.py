@@ -231,6 +231,7 @@ def new_memory(settings: Settings) -> Structured:
         "unit": joint,
         "strain": joint,
         "used": joint,
+        "peak_share": joint,
         "hold": joint,
         "held": joint,
         # contact

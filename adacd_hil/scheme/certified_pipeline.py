@@ -11,6 +11,7 @@ from adacd_hil.config import Settings
 from adacd_hil.records import (
     PARAMETER_UNITS,
     ArmState,
+    Event,
     Request,
     SchemeOutput,
     SchemeState,
@@ -18,6 +19,7 @@ from adacd_hil.records import (
     scheme_layout,
 )
 from adacd_hil.scheme import certificate, certified_kernel, kernel
+from adacd_hil.scheme.margin import MarginWatch
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.regressor import inverse_dynamics
 from adacd_hil.scheme.supervisor import Supervisor
@@ -69,6 +71,12 @@ class CertifiedPipeline:
         self._is_payload = False
         self._has_forgotten = False
         self._refined = 0.0
+        self._peak_share = self._memory[0]["peak_share"]
+        self._margin = MarginWatch(self._peak_share.size)
+        self._second = round(1.0 / settings.bus.period_s)
+        self._monitored = 0
+        self._has_warned = False
+        self._events: list[Event] = []
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
@@ -115,6 +123,7 @@ class CertifiedPipeline:
             self._has_certificate,
         )
         self._forget_if_disturbed(state)
+        self._watch_margin(state)
         return SchemeOutput(
             cycle=arm.cycle,
             state=state,
@@ -129,6 +138,24 @@ class CertifiedPipeline:
             block=block,
             reaction=touch.reaction,
         )
+
+    def take_events(self) -> list[Event]:
+        """Return what is worth a line since the last call: a margin that has shrunk."""
+        events, self._events = self._events, []
+        return events
+
+    def _watch_margin(self, state: SchemeState) -> None:
+        """Judge once a second of monitoring how far the residuals stayed below their thresholds."""
+        self._monitored += 1 if state is SchemeState.MONITOR else 0
+        if self._monitored < self._second:
+            return
+        self._monitored = 0
+        self._margin.add(self._peak_share.copy())
+        self._peak_share[:] = 0.0
+        warning = self._margin.warning
+        if warning and not self._has_warned:
+            self._events.append(Event("warning", "margin", warning))
+        self._has_warned = bool(warning)
 
     def _measure(self, t_ns: int) -> float:
         """Return the time since the cycle before, s; 0 where that is unknown or not to be used."""
@@ -146,6 +173,7 @@ class CertifiedPipeline:
             certified_kernel.begin_test(self._constants, self._memory)
         elif state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
             certified_kernel.begin_refinement(self._memory)
+            self._margin.restart()
             self._has_certificate = True
             self._feed_forward()
 

@@ -11,7 +11,16 @@ adaptation has finished and its mass matrix is positive definite everywhere. It 
 import numpy as np
 
 from adacd_hil.config import Settings
-from adacd_hil.records import ArmState, ContactReport, Reaction, Request, SchemeOutput, SchemeState, scheme_layout
+from adacd_hil.records import (
+    ArmState,
+    ContactReport,
+    Event,
+    Reaction,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    scheme_layout,
+)
 from adacd_hil.scheme import kernel
 from adacd_hil.scheme.contact import Isolation
 from adacd_hil.scheme.observation import CONTACT_SHIFT
@@ -61,6 +70,10 @@ class Pipeline:
 
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for. The paper's condition is one: eq. (15)."""
+        return []
+
+    def take_events(self) -> list[Event]:
+        """Return what is worth a line since the last call: nothing, the paper watches no margin."""
         return []
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:

@@ -133,6 +133,7 @@ def relax(k: Any, m: Any) -> None:
         share = 0.0
         for c in range(m["y"].shape[0]):
             share = max(share, abs(m["y"][c, i]) / m["h"][c, i])
+        m["peak_share"][i] = max(m["peak_share"][i], share)
         m["used"][i] = max(share, m["used"][i] * (1.0 - k["strain_share"]))
         if m["used"][i] < RELAXED:
             m["strain"][i] = max(m["strain"][i] * (1.0 - k["strain_share"]), 1.0)

@@ -8,7 +8,6 @@ import scipy.signal
 import scipy.stats
 
 from adacd_hil.analysis.false_alarms import (
-    MarginWatch,
     Sensing,
     Tail,
     TooLittleMotionError,
@@ -24,6 +23,7 @@ from adacd_hil.analysis.false_alarms import (
     resolution,
     white_noise,
 )
+from adacd_hil.scheme.margin import MarginWatch
 
 BLOCK_S = 0.1
 T = 1e-3

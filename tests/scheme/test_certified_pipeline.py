@@ -1,6 +1,7 @@
 """The certified pipeline: in closed loop with a small arm, and on recorded samples."""
 
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from adacd_hil.records import ContactLevel, FaultReason, Reaction, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme import certified_kernel
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.margin import MarginWatch
 from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.pipeline import Pipeline
 
@@ -351,3 +353,18 @@ def test_nothing_compiles_in_the_cycle():
 def compiled_versions():
     steps = certified_kernel.step, certified_kernel.begin_adaptation, certified_kernel.begin_test
     return [len(getattr(function, "signatures", ())) for function in steps]
+
+
+def test_a_margin_that_shrinks_is_said_once():
+    pipeline = CertifiedPipeline(SETTINGS)
+    pipeline._margin = MarginWatch(2, memory_blocks=5.0)
+    said = []
+    for share in (0.4,) * 10 + (0.9,) * 10:
+        for _ in range(1000):
+            pipeline._memory[0]["peak_share"][1] = share
+            pipeline._watch_margin(SchemeState.MONITOR)
+        said.append([event.message for event in pipeline.take_events()])
+    lines = [line for second in said for line in second]
+    assert (len(lines), said[:10]) == (1, [[]] * 10)
+    assert re.fullmatch(r"joint 2: margin \d\.\d x, was 2\.5 x", lines[0])
+    assert pipeline.take_events() == []
