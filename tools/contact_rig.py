@@ -79,7 +79,6 @@ class Rig:
         kernel.begin_adaptation(self._constants, self._memory, self._block)
         self._block[0]["theta_hat"][:] = self._theta
         self._collision_Nm = np.array(settings.detector.collision_Nm)
-        self._velocity_limit = settings.arm.velocity_limit_rad_s
         self._touch = Touch(settings)
         self._q_d, self._dq_d, self._ddq_d = np.zeros(2), np.zeros(2), np.zeros(2)
         self._tau_d, self._tau_c = np.zeros(2), np.zeros(2)

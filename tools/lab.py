@@ -71,11 +71,6 @@ class Recording:
     tau_ext: NDArray[np.float64]
     theta: NDArray[np.float64]
 
-    @property
-    def t_s(self) -> NDArray[np.float64]:
-        """Time of each sample (n,)."""
-        return np.arange(len(self.q)) * PERIOD_S
-
 
 @dataclass(frozen=True)
 class _Experiment(Scenario):
