@@ -1,30 +1,56 @@
 """The one door to numba: `compiled` turns a numeric function into machine code, float64, no fast-math.
 
-The on-disk cache is keyed by the text of every module of both packages. numba alone looks only at the file of the
-function itself, and would go on using the old code of an edited callee and the old value of an edited constant.
+The on-disk cache is keyed by the text of every module with compiled functions and of all that these import. numba alone
+looks only at the file of the function itself, and would go on using the old code of an edited callee and the old value
+of an edited constant.
 """
 
 import hashlib
 import os
+import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
 _PACKAGES = ("adacd_hil", "firmware_sim")
+_IMPORT = re.compile(r"^\s*from\s+((?:adacd_hil|firmware_sim)[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)", re.MULTILINE)
+_NAME = re.compile(r"\w+")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _source_digest() -> str:
-    """Digest the sources of all modules."""
-    root = Path(__file__).resolve().parent.parent
-    digest = hashlib.sha256()
+def _imports(text: str) -> Iterator[str]:
+    """Name what a module imports of the packages: modules and, as they may be modules, names in them."""
+    for module, names in _IMPORT.findall(text):
+        yield module
+        yield from (f"{module}.{name}" for name in _NAME.findall(names))
+
+
+def compiled_sources(root: Path) -> dict[str, bytes]:
+    """Return the text of every module below `root` that compiles functions and of all modules they import, by name."""
+    texts = {}
     for package in _PACKAGES:
         for path in sorted((root / package).rglob("*.py")):
-            digest.update(path.read_bytes())
+            name = ".".join(path.relative_to(root).with_suffix("").parts)
+            texts[name.removesuffix(".__init__")] = path.read_bytes()
+    waiting = [name for name, text in texts.items() if b"adacd_hil.compiled" in text]
+    found: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name in texts and name not in found:
+            found.add(name)
+            waiting.extend(_imports(texts[name].decode()))
+    return {name: texts[name] for name in sorted(found)}
+
+
+def _source_digest() -> str:
+    """Digest the sources that compiled code may depend on."""
+    digest = hashlib.sha256()
+    for name, text in compiled_sources(Path(__file__).resolve().parent.parent).items():
+        digest.update(name.encode() + b"\0" + text)
     return digest.hexdigest()[:16]
 
 
