@@ -237,6 +237,27 @@ class ArmState(NamedTuple):
     is_late: bool = False
 
 
+class ArmBatch(NamedTuple):
+    """ArmStates of n consecutive cycles, as columns.
+
+    cycle, t_ns, periods (n,) int64; q, dq, tau_J (n, 2); age_q, age_tau_J (n, 2) int64; is_enabled, is_complete,
+    is_late (n,) bool; fault (n,) uint8 of FaultReason.
+    """
+
+    cycle: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    periods: NDArray[np.int64]
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+    age_q: NDArray[np.int64]
+    age_tau_J: NDArray[np.int64]
+    is_enabled: NDArray[np.bool_]
+    is_complete: NDArray[np.bool_]
+    fault: NDArray[np.uint8]
+    is_late: NDArray[np.bool_]
+
+
 class ArmCommand(NamedTuple):
     """What the arm is told in one cycle."""
 
