@@ -1,107 +1,17 @@
 """`adacd-hil`: the commands. Each parses, calls one function, prints."""
 
-import functools
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from adacd_hil import __version__
-from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
-from adacd_hil.config import ConfigError, builtin_names
-from adacd_hil.log.errors import LogError
-from adacd_hil.wire.bus import BusError, BusMissingError
-from adacd_hil.wire.codec import CodecError
+from adacd_hil.cli.exit_codes import EPILOG, ExitCode
+from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
-
-_CODES = (
-    (ConfigError, ExitCode.USAGE),
-    (CodecError, ExitCode.USAGE),
-    (BusMissingError, ExitCode.BUS_MISSING),
-    (BusError, ExitCode.SAFETY_STOP),
-    (LogError, ExitCode.FAILURE),
-    (OSError, ExitCode.FAILURE),
-)
-
-
-def _explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Turn what a command raises into one line and its exit code."""
-
-    @functools.wraps(command)
-    def run(*args: Any, **kwargs: Any) -> None:
-        try:
-            code = command(*args, **kwargs)
-        except KeyboardInterrupt:
-            _fail("interrupted", ExitCode.INTERRUPTED)
-        except CommandError as error:
-            _fail(str(error), error.code)
-        except tuple(kind for kind, _ in _CODES) as error:
-            _fail(str(error), next(code for kind, code in _CODES if isinstance(error, kind)))
-        else:
-            sys.exit(code)
-
-    return run
-
-
-def _fail(line: str, code: ExitCode) -> None:
-    print(f"adacd-hil: {line}", file=sys.stderr)
-    sys.exit(code)
-
-
-_config = click.option(
-    "--config",
-    default="certified",
-    show_default=True,
-    metavar="NAME|FILE",
-    help=f"One of {builtin_names()}, or a TOML file.",
-)
-_profile = click.option(
-    "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
-)
-_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
-_clock = functools.partial(
-    click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
-)
-
-
-_BUS_OPTIONS = (  # last first: click lists them the other way round
-    click.option(
-        "--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the configuration's."
-    ),
-    _profile,
-    _config,
-    click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."),
-    click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0."),
-    click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan."),
-)
-
-
-def _on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Give a command the options of a bus; it takes them as a `Connection` before its own."""
-
-    @functools.wraps(command)
-    def connect(
-        interface: str,
-        channel: str,
-        bitrate: int | None,
-        config: str,
-        profile: str | None,
-        dbc: Path | None,
-        **own: Any,
-    ) -> ExitCode:
-        from adacd_hil.cli.connection import Connection
-
-        return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
-
-    explained: Callable[..., None] = _explained(connect)
-    for option in _BUS_OPTIONS:
-        explained = option(explained)
-    return explained
 
 
 @click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
@@ -111,7 +21,7 @@ def cli() -> None:
 
 
 @cli.command(epilog=EPILOG)
-@_config
+@config_option
 @click.option(
     "--scenario",
     default="paper",
@@ -121,10 +31,10 @@ def cli() -> None:
 )
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/demo"), show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
-@_clock(default="lockstep")
-@_profile
-@_json
-@_explained
+@clock_option(default="lockstep")
+@profile_option
+@json_option
+@explained
 def demo(
     config: str, scenario: str, out: Path, seed: int | None, clock: str, profile: str | None, as_json: bool
 ) -> ExitCode:
@@ -141,11 +51,11 @@ def demo(
 
 
 @cli.command(epilog=EPILOG)
-@_on_bus
+@on_bus
 @click.option("--tare", type=click.Path(path_type=Path, dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/run"), show_default=True)
-@_clock(default="realtime")
-@_json
+@clock_option(default="realtime")
+@json_option
 def run(connection: "Connection", tare: Path | None, out: Path, clock: str, as_json: bool) -> ExitCode:
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
@@ -160,13 +70,13 @@ def run(connection: "Connection", tare: Path | None, out: Path, clock: str, as_j
 
 
 @cli.command(epilog=EPILOG)
-@_on_bus
+@on_bus
 @click.option("--poses", type=click.IntRange(1, 50), help="Poses to measure in; default: tare.poses.")
 @click.option("--seconds", type=click.FloatRange(0.1, 600.0), help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default=Path("tare.toml"), show_default=True)
-@_clock(default="realtime")
-@_json
+@clock_option(default="realtime")
+@json_option
 def tare(
     connection: "Connection",
     poses: int | None,
@@ -191,8 +101,8 @@ def tare(
 @cli.command(epilog=EPILOG)
 @click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder; default: beside each log.")
-@_json
-@_explained
+@json_option
+@explained
 def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
     """Report logs: HTML, PNG and JSON. The emulator's truth.mcap beside a log is joined to it."""
     from adacd_hil.cli.report import report_logs
@@ -220,8 +130,8 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
     type=click.Path(path_type=Path, file_okay=False),
     help="Compare the detectors; JSON, PNG and SVG go here.",
 )
-@_json
-@_explained
+@json_option
+@explained
 def thresholds(
     logs: tuple[Path, ...], rate_per_h: float, out: Path | None, report: Path | None, as_json: bool
 ) -> ExitCode:
@@ -237,8 +147,8 @@ def thresholds(
 
 
 @cli.command(epilog=EPILOG)
-@_config
-@_profile
+@config_option
+@profile_option
 @click.option(
     "--seconds",
     type=click.FloatRange(0.0, 86_400.0),
@@ -248,8 +158,8 @@ def thresholds(
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Where the climbs begin.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write a configuration with it here.")
-@_json
-@_explained
+@json_option
+@explained
 def excitation(
     config: str, profile: str | None, seconds: float, seed: int, out: Path | None, as_json: bool
 ) -> ExitCode:
@@ -268,7 +178,7 @@ def excitation(
 @click.option(
     "--dbc", default="arm", show_default=True, metavar="NAME|FILE", help="The contract: the package's, or a file."
 )
-@_config
+@config_option
 @click.option(
     "--period-us",
     type=click.IntRange(min=100, max=1_000_000),
@@ -281,8 +191,8 @@ def excitation(
 @click.option(
     "--arms", type=click.IntRange(1, 7), help="Arms of this contract on the bus; default: the configuration's."
 )
-@_json
-@_explained
+@json_option
+@explained
 def budget(
     dbc: str,
     config: str,
@@ -301,11 +211,11 @@ def budget(
 
 
 @cli.command(epilog=EPILOG)
-@_on_bus
+@on_bus
 @click.option(
     "--seconds", type=click.FloatRange(0.1, 600.0), default=1.5, show_default=True, help="How long to listen."
 )
-@_json
+@json_option
 def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
     """Find the nodes on a bus: what they are, what they send, and whether that is the configured arm.
 
@@ -319,7 +229,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 
 
 @cli.command(epilog=EPILOG)
-@_on_bus
+@on_bus
 @click.option(
     "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
 )
@@ -327,7 +237,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
     "--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: nothing holds the arm."
 )
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for a log; default: none.")
-@_json
+@json_option
 def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
     """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
 
@@ -342,9 +252,9 @@ def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: P
 
 
 @cli.command(epilog=EPILOG)
-@_on_bus
+@on_bus
 @click.option("--move", "is_moving", is_flag=True, help="Ask for each joint to be moved by hand, to check its signs.")
-@_json
+@json_option
 def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode:
     """Check host, bus and arm one by one, and say what to do about what is wrong. The drives are never enabled.
 
@@ -359,11 +269,11 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 
 
 @cli.command(epilog=EPILOG)
-@_on_bus
+@on_bus
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
 @click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
 @click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
-@_json
+@json_option
 def monitor(
     connection: "Connection", node_id: int | None, once: bool, seconds: float | None, as_json: bool
 ) -> ExitCode:

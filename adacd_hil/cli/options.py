@@ -1,0 +1,99 @@
+"""Options and error handling that the commands share."""
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.config import ConfigError, builtin_names
+from adacd_hil.log.errors import LogError
+from adacd_hil.wire.bus import BusError, BusMissingError
+from adacd_hil.wire.codec import CodecError
+
+_CODES = (
+    (ConfigError, ExitCode.USAGE),
+    (CodecError, ExitCode.USAGE),
+    (BusMissingError, ExitCode.BUS_MISSING),
+    (BusError, ExitCode.SAFETY_STOP),
+    (LogError, ExitCode.FAILURE),
+    (OSError, ExitCode.FAILURE),
+)
+
+
+def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
+    """Turn what a command raises into one line and its exit code."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            code = command(*args, **kwargs)
+        except KeyboardInterrupt:
+            _fail("interrupted", ExitCode.INTERRUPTED)
+        except CommandError as error:
+            _fail(str(error), error.code)
+        except tuple(kind for kind, _ in _CODES) as error:
+            _fail(str(error), next(code for kind, code in _CODES if isinstance(error, kind)))
+        else:
+            sys.exit(code)
+
+    return run
+
+
+def _fail(line: str, code: ExitCode) -> None:
+    print(f"adacd-hil: {line}", file=sys.stderr)
+    sys.exit(code)
+
+
+config_option = click.option(
+    "--config",
+    default="certified",
+    show_default=True,
+    metavar="NAME|FILE",
+    help=f"One of {builtin_names()}, or a TOML file.",
+)
+profile_option = click.option(
+    "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
+clock_option = functools.partial(
+    click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
+)
+
+
+_BUS_OPTIONS = (  # last first: click lists them the other way round
+    click.option(
+        "--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the configuration's."
+    ),
+    profile_option,
+    config_option,
+    click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."),
+    click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0."),
+    click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan."),
+)
+
+
+def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
+    """Give a command the options of a bus; it takes them as a `Connection` before its own."""
+
+    @functools.wraps(command)
+    def connect(
+        interface: str,
+        channel: str,
+        bitrate: int | None,
+        config: str,
+        profile: str | None,
+        dbc: Path | None,
+        **own: Any,
+    ) -> ExitCode:
+        from adacd_hil.cli.connection import Connection
+
+        return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
+
+    decorated: Callable[..., None] = explained(connect)
+    for option in _BUS_OPTIONS:
+        decorated = option(decorated)
+    return decorated
