@@ -15,8 +15,12 @@ acknowledgement given too early can't release the next stop.
 
 from types import MappingProxyType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from adacd_hil.config import Settings
-from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
+from adacd_hil.records import ArmBatch, ArmState, FaultReason, Request, SchemeState
+from adacd_hil.scheme.calm import NEVER, ArmFinding, Calm, findings_of
 from adacd_hil.scheme.observation import Observation
 from adacd_hil.scheme.transitions import TRANSITIONS, SchemeEvent, next_state
 
@@ -62,6 +66,46 @@ _KEPT_IN = MappingProxyType(
     }
 )
 """Where a request waits to be served. FINISH is the control layer's."""
+
+_RAISED_BY = MappingProxyType(
+    {
+        SchemeEvent.COLLISION: _COLLISION,
+        SchemeEvent.CONTACT: _CONTACT,
+        SchemeEvent.LATE: int(ArmFinding.LATE),
+        SchemeEvent.COMPLETE: int(ArmFinding.COMPLETE),
+        SchemeEvent.ENABLED: int(ArmFinding.ENABLED),
+        SchemeEvent.ADAPTED: _ADAPTED,
+        SchemeEvent.FITTED: _FITTED,
+        SchemeEvent.CERTIFIED: _CERTIFIED,
+        SchemeEvent.REFUTED: _REFUTED,
+    }
+)
+"""Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
+_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _NOT_A_NUMBER | _OVER_LIMIT | _OVER_SPEED
+"""Findings without which `_check` finds nothing in an arm that is enabled."""
+
+
+def _calm_in(state: SchemeState) -> tuple[int, int]:
+    """Return the findings that matter in a state, and what they have to be to leave it as it is."""
+    watched, expected = 0, 0
+    for event in TRANSITIONS[state]:
+        watched |= _RAISED_BY.get(event, 0)
+    if state in _CHECKED or state is SchemeState.COMMISSION:
+        watched |= _NOT_WELL
+    if state in POWERED:
+        expected |= int(ArmFinding.ENABLED)
+    if state is SchemeState.COMMISSION:
+        expected |= int(ArmFinding.COMPLETE) | _REST_UNLOADED
+    return watched | expected, expected
+
+
+_CALM = MappingProxyType({state: _calm_in(state) for state in SchemeState})
+
+
+def _run_at_end(holds: NDArray[np.bool_], before: int) -> int:
+    """Count for how many cycles something has held without a break up to the last; `before`: up to the first."""
+    breaks = np.flatnonzero(~holds)
+    return holds.size - int(breaks[-1]) - 1 if breaks.size else before + holds.size
 
 
 def _verdict(state: SchemeState, observation: int) -> SchemeEvent:
@@ -146,6 +190,45 @@ class Supervisor:
         if event is not SchemeEvent.NONE:
             self._enter(next_state(self._state, event, self._origin), event)
         return self._state
+
+    def findings(self, arms: ArmBatch) -> NDArray[np.int64]:
+        """Return what the arm says of itself in each cycle, bits of `ArmFinding` (n,)."""
+        return findings_of(arms, self._max_age_cycles)
+
+    def calm(self, is_reporting: bool) -> Calm:
+        """Return bounds within which cycles without a request change nothing here but what `pass_by` counts.
+
+        They may be too narrow: a cycle outside is one for `step`. is_reporting: as for `step`, the same all the time.
+        """
+        watched, expected = _CALM[self._state]
+        cycles = NEVER
+        limit = self._limits.get(self._state)
+        periods = NEVER if limit is None else limit[0] - self._spent
+        match self._state:
+            case SchemeState.COMMISSION:
+                cycles = self._commission_cycles - self._commissioned_cycles
+            case SchemeState.MONITOR | SchemeState.STOPPED if self._pending:
+                cycles = 0
+            case SchemeState.PAYLOAD if self._pending:
+                cycles = self._rest_cycles - self._still_cycles
+            case SchemeState.REACT:
+                if not self._is_latched:
+                    watched |= _COLLISION
+                    periods = self._patience_cycles - self._phase_cycles
+                if not is_reporting:
+                    to_rest = self._rest_cycles - self._still_cycles
+                    cycles = to_rest if self._is_latched else self._clear_cycles - self._cleared_cycles
+        return Calm(watched, expected, cycles - 1, periods)
+
+    def pass_by(self, observations: NDArray[np.int64], periods: NDArray[np.int64]) -> None:
+        """Count calm cycles; observations (n,), periods (n,)."""
+        elapsed = int(periods.sum())
+        self._phase_cycles += elapsed
+        self._learning_cycles += elapsed if self._state in _LEARNING else 0
+        self._still_cycles = _run_at_end(observations & _AT_REST != 0, self._still_cycles)
+        self._cleared_cycles = _run_at_end(observations & _ANY_CONTACT == 0, self._cleared_cycles)
+        if self._state is SchemeState.COMMISSION:
+            self._commissioned_cycles += observations.size
 
     def _has_grown(self, arm: ArmState, observation: int) -> bool:
         """Tell whether a contact that would clear itself has become one to be acknowledged."""
@@ -243,10 +326,14 @@ class Supervisor:
     def _overdue(self) -> FaultReason:
         """Return the timeout of a phase that has taken too long, or NONE. A learning arm's clock stops in REACT."""
         limit = self._limits.get(self._state)
-        cycles = self._learning_cycles if self._state in _LEARNING else self._phase_cycles
-        if limit is None or cycles < limit[0]:
+        if limit is None or self._spent < limit[0]:
             return FaultReason.NONE
         return limit[1]
+
+    @property
+    def _spent(self) -> int:
+        """Periods that count towards this phase's timeout."""
+        return self._learning_cycles if self._state in _LEARNING else self._phase_cycles
 
     def _check(self, arm: ArmState, observation: int) -> FaultReason:
         """Return why the arm must not go on, or NONE."""
