@@ -50,8 +50,8 @@ class Recorded(NamedTuple):
 class TouchWatch(NamedTuple):
     """What of a contact goes on in every cycle.
 
-    rows: of `report.ContactHistory`, written: how many have been. way, least_Nm: below which the filtered external torque
-    along the way of a withdrawal has to be judged.
+    rows: of `report.ContactHistory`; written: how many have been. least_Nm: of the filtered external torque along the
+    way of a withdrawal, below which that has to be judged.
     """
 
     rows: Vector
