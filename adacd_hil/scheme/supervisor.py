@@ -208,8 +208,11 @@ class Supervisor:
         match self._state:
             case SchemeState.COMMISSION:
                 cycles = self._commission_cycles - self._commissioned_cycles
-            case SchemeState.MONITOR | SchemeState.STOPPED if self._pending:
+            case SchemeState.MONITOR | SchemeState.STOPPED if Request.PAYLOAD in self._pending:
                 cycles = 0
+            case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
+                watched |= _CONTACT
+                expected |= _CONTACT
             case SchemeState.PAYLOAD:
                 waits_for_rest = bool(self._pending)
             case SchemeState.REACT if self._is_latched:
