@@ -13,16 +13,17 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
-from adacd_hil.control.deadline import DeadlineWatch
 from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.floating import Floating
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import Pacer, Recurrence, Tick
+from adacd_hil.control.realtime import Pacer, Tick
 from adacd_hil.control.reference import Reference
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.deadline import DeadlineWatch
 from adacd_hil.device.network import Master
+from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import (
