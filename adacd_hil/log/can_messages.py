@@ -28,7 +28,7 @@ class TimedMessage(can.Message):
     """A message that knows its time in whole nanoseconds, besides python-can's `timestamp`."""
 
     def __init__(self, t_ns: int, **fields: Any) -> None:
-        super().__init__(timestamp=t_ns * 1e-9, **fields)
+        super().__init__(timestamp=t_ns / 1_000_000_000, **fields)
         self.t_ns = t_ns
 
 
@@ -36,7 +36,7 @@ def time_ns(message: can.Message) -> int:
     """Return the time of a message: in whole nanoseconds if it knows it and nobody has changed `timestamp` since."""
     seconds = message.timestamp or 0.0
     t_ns = getattr(message, "t_ns", None)
-    if t_ns is not None and t_ns * 1e-9 == seconds:
+    if t_ns is not None and t_ns / 1_000_000_000 == seconds:
         return int(t_ns)
     whole, rest = divmod(seconds, 1.0)
     return int(whole) * 1_000_000_000 + round(rest * 1e9)

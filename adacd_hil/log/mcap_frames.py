@@ -9,9 +9,10 @@ of the MCAP channel, of which a topic may have several:
 | bit_rate_switch, error_state_indicator | "0" or "1", of all its FD frames; without them 1 and 0, as on our bus |
 """
 
+import contextlib
 import io
-import os
 import struct
+import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -41,6 +42,7 @@ RATE_SWITCH_KEY = "bit_rate_switch"
 ERROR_STATE_KEY = "error_state_indicator"
 SENT = "to_can_bus"
 _RECORD_HEAD = struct.Struct("<BQ")
+_FOOTER = struct.Struct("<BQQQI")
 _MESSAGE_START = struct.Struct("<BQH")
 _NAME_BYTES = struct.Struct("<I")
 _MAX_CHUNK = 1 << 30
@@ -86,56 +88,90 @@ class _Source(NamedTuple):
 class McapFrames:
     """The frames of a log with all its parts: iterate once; `channels`, `epoch_ns` and `problem` grow meanwhile."""
 
-    def __init__(self, path: Path) -> None:
-        """Look at the file. Raises LogError when it can't be read or isn't MCAP."""
+    def __init__(self, source: Path | IO[bytes]) -> None:
+        """Look at the file, or take an open one, of one part. Raises LogError when it can't be read or isn't MCAP."""
         self.channels: list[str] = []
         self.epoch_ns = 0
         self.problem = ""
         self._bus = ""
+        self._schemas: dict[int, Schema] = {}
+        self._sources: dict[int, _Source | None] = {}
+        self._files = _parts(source) if isinstance(source, Path) else [source]
+        first = self._files[0]
         try:
-            self._paths = list(find_parts(path).values()) or [path]
-            with self._paths[0].open("rb") as file:
-                magic = file.read(len(MAGIC))
+            if isinstance(first, Path):
+                with first.open("rb") as file:
+                    _check_magic(file, str(first))
+            else:
+                _check_magic(first, "the file")
+                first.seek(0)
         except OSError as error:
-            raise LogError(f"log {path} can't be read: {error.strerror}") from None
-        if not magic or not MAGIC.startswith(magic):
-            raise LogError(f"{path} is not an MCAP file")
+            raise LogError(f"log {source} can't be read: {error.strerror or error}") from None
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Give the frames of each chunk, (n,) of RECORDED_FRAME_DTYPE."""
-        for path in self._paths:
+        for source in self._files:
+            if not isinstance(source, Path):
+                yield from self._read(source, "the file")
+                continue
             try:
-                with path.open("rb") as file:
-                    yield from self._read(file, path)
+                with source.open("rb") as file:
+                    yield from self._read(file, source.name)
             except OSError as error:
-                self._note(f"{path.name} can't be read: {error.strerror}")
+                self._note(f"{source.name} can't be read: {error.strerror or error}")
 
     def _note(self, problem: str) -> None:
         self.problem = self.problem or problem
 
-    def _read(self, file: IO[bytes], path: Path) -> Iterator[NDArray[Any]]:
+    def _read(self, file: IO[bytes], name: str) -> Iterator[NDArray[Any]]:
         """Walk over the records of a part."""
-        size = os.fstat(file.fileno()).st_size
-        self._schemas: dict[int, Schema] = {}
-        self._sources: dict[int, _Source | None] = {}
-        position = len(file.read(len(MAGIC)))
+        size = file.seek(0, io.SEEK_END)
+        file.seek(0)
+        self._schemas, self._sources = {}, {}
+        crc = zlib.crc32(file.read(len(MAGIC)))
+        position = len(MAGIC)
         opcode = 0
         while opcode != Opcode.FOOTER:
             head = file.read(_RECORD_HEAD.size)
             position += len(head)
             opcode, length = _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else (0, 0)
             if opcode == 0 or length > size - position:
-                self._note(f"{path.name} is cut after {size} bytes")
+                self._note(f"{name} is cut after {size} bytes")
                 return
             body = file.read(length)
             position += length
+            if opcode == Opcode.DATA_END and int.from_bytes(body[:4], "little") not in (0, crc):
+                self._note(f"{name}: the data section fails its CRC")
+            crc = zlib.crc32(body, zlib.crc32(head, crc))
+            if opcode == Opcode.CHUNK and not self._sources:
+                self._define_from_summary(file, size)
+                file.seek(position)
             try:
                 frames = self._take(opcode, head + body)
             except _DAMAGE:
-                self._note(f"{path.name} is damaged at byte {position - length}")
+                self._note(f"{name} is damaged at byte {position - length}")
                 continue
             if len(frames):
                 yield frames
+        if file.read(len(MAGIC)) != MAGIC:
+            self._note(f"{name} is cut after {size} bytes")
+
+    def _define_from_summary(self, file: IO[bytes], size: int) -> None:
+        """Take in the definitions that the end of the file repeats, for the case that their chunk is damaged."""
+        place = size - len(MAGIC) - _FOOTER.size
+        file.seek(max(place, 0))
+        footer = file.read(_FOOTER.size)
+        opcode, _, position, _, _ = _FOOTER.unpack(footer) if len(footer) == _FOOTER.size else (0, 0, 0, 0, 0)
+        if opcode != Opcode.FOOTER or not 0 < position <= place:
+            return
+        file.seek(position)
+        summary = file.read(place - position)
+        position = 0
+        with contextlib.suppress(*_DAMAGE):
+            while position < len(summary):
+                opcode, length = _RECORD_HEAD.unpack_from(summary, position)
+                position += _RECORD_HEAD.size + length
+                self._define(opcode, summary[position - length : position])
 
     def _take(self, opcode: int, record: bytes) -> NDArray[Any]:
         """Take in a record outside chunks, or a chunk; return the frames in it."""
@@ -206,6 +242,18 @@ class McapFrames:
         places = np.concatenate([starts for _, starts in groups])
         frames: NDArray[Any] = np.concatenate([frames for frames, _ in groups])[np.argsort(places)]
         return frames
+
+
+def _parts(path: Path) -> list[Path | IO[bytes]]:
+    try:
+        return list(find_parts(path).values()) or [path]
+    except OSError:
+        return [path]
+
+
+def _check_magic(file: IO[bytes], name: str) -> None:
+    if file.read(len(MAGIC)) != MAGIC:
+        raise LogError(f"{name} is not an MCAP file")
 
 
 def _unpack(
