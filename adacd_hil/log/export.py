@@ -18,8 +18,8 @@ from adacd_hil.log.tables import Tables, event_columns, frame_columns, series_co
 from adacd_hil.wire.codec import Codec
 
 _EVENTS = "/events"
-_RAW = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
-"""Frames: as a table only when asked for by name."""
+_RAW = ("to_can_bus", "from_can_bus", "to_can_bus_fd", "from_can_bus_fd")
+"""Ends of the topics of frames: tables only when asked for by name."""
 
 
 class TableSummary(NamedTuple):
@@ -44,7 +44,7 @@ def export_tables(
     Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
     """
     topics = _topics(path) if path.suffix.lower() == ".mcap" else []
-    if any(topic not in _RAW for topic in topics):
+    if not all(map(_is_raw, topics)):
         return _export_topics(path, out, kind, choose_topics(topics, wanted), progress)
     return _export_frames(path, out, kind, wanted, codec, progress)
 
@@ -52,7 +52,7 @@ def export_tables(
 def choose_topics(topics: Collection[str], wanted: Collection[str]) -> list[str]:
     """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest."""
     if not wanted:
-        return [topic for topic in topics if topic not in _RAW]
+        return [topic for topic in topics if not _is_raw(topic)]
     chosen: list[str] = []
     for pattern in wanted:
         slashed = "/" + pattern.strip("/")
@@ -62,6 +62,10 @@ def choose_topics(topics: Collection[str], wanted: Collection[str]) -> list[str]
             raise LogError(f"the log has no topic {pattern}{f', did you mean {near[0]}' if near else ''}")
         chosen += found
     return list(dict.fromkeys(chosen))
+
+
+def _is_raw(topic: str) -> bool:
+    return topic.rsplit("/", 1)[-1] in _RAW
 
 
 def _export_topics(
