@@ -73,3 +73,8 @@ numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
 def compiled(function: Function) -> Function:
     """Compile `function` at its first call; division by zero gives inf or nan, as in numpy."""
     return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
+def released(function: Function) -> Function:
+    """Compile `function` as `compiled` does; while it runs, other threads of Python go on. For what takes long."""
+    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy", nogil=True)(function))
