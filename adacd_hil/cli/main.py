@@ -9,6 +9,7 @@ import click
 from adacd_hil import __version__
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
 from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
+from adacd_hil.cli.play_command import play
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -285,6 +286,9 @@ def monitor(
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     return watch(connection, node_id, listened_s, listened_s is None, as_json)
+
+
+cli.add_command(play)
 
 
 def main() -> None:
