@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil import __version__
+from adacd_hil.cli.compare_command import compare
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
 from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
 from adacd_hil.cli.play_command import play
+from adacd_hil.cli.replay_command import replay
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -289,6 +291,8 @@ def monitor(
 
 
 cli.add_command(play)
+cli.add_command(replay)
+cli.add_command(compare)
 
 
 def main() -> None:
