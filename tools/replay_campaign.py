@@ -62,7 +62,7 @@ def _judge(name: str, path: Path, played_s: float) -> bool | None:
         return None
     print(f"{name}: {_verdict(found)}; {spent}", flush=True)
     for mismatch in found.mismatches[:_SHOWN]:
-        print(f"    {mismatch.line}", flush=True)
+        print(f"    {mismatch.line(found.zero_ns)}", flush=True)
     return found.is_identical and found.is_whole
 
 

@@ -18,6 +18,7 @@ from adacd_hil.records import SchemeState
 
 NMT_ID, RESET_COMMUNICATION = 0x000, 0x82
 """What an attempt begins with on the bus. Source: CiA 301 (4.2), clause 7.2.8.3.1."""
+SYNC_ID, SYNC_OVERFLOW = 0x080, 240
 
 Places = NDArray[np.int64]
 
@@ -59,6 +60,7 @@ class AttemptSplitter:
         self._has_begun = False
         self._is_exact = False
         self._last = (-1, 0, int(SchemeState.INIT))  # cycle, overruns and state before
+        self._tail = np.zeros(0, np.uint8)  # counters of the SYNCs after that cycle
 
     def split(self, piece: Piece) -> Iterator[Stretch]:
         """Give the stretches of the next piece."""
@@ -104,18 +106,26 @@ class AttemptSplitter:
         steps = np.diff(number, prepend=self._last[0])
         is_begin = np.zeros(len(number), np.bool_)
         is_begin[list(begins)] = True
-        is_gap = (steps != 1 + skipped) & ~is_begin
+        is_jump = steps != 1 + skipped
+        is_cut = is_begin & (scheme["previous_state"] != SchemeState.INIT)  # its first cycles are missing
+        is_gap = is_jump & (~is_begin | is_cut)
         if not self._has_begun and not is_begin[0]:
             is_gap[0] = False
-        periods = np.where(is_gap, np.maximum(steps, 1), np.maximum(1 + skipped, 1))
+        periods = np.where(is_gap & ~is_begin, np.maximum(steps, 1), np.maximum(1 + skipped, 1))
         cuts = np.flatnonzero(is_begin | is_gap).tolist()
         bounds = sorted({0, *cuts, len(number)})
         places = [begins.get(row, int(np.searchsorted(frames["cycle_t_ns"], t_ns[row]))) for row in bounds[:-1]]
         places[0] = begins.get(0, 0)
+        for row, place in begins.items():
+            before = frames[: np.searchsorted(frames["cycle_t_ns"], t_ns[row - 1], "right")] if row else frames[:0]
+            counters = _sync_counters(frames[len(before) : place])
+            last = int(number[row - 1]) if row else self._last[0]
+            periods[row] -= _skipped(counters if row else np.concatenate((self._tail, counters)), last)
+        periods = np.maximum(periods, 1)
         for start, end, first, last in zip(bounds[:-1], bounds[1:], places, [*places[1:], len(frames)], strict=True):
             if is_begin[start]:
                 self._has_begun = self._is_exact = True
-            elif is_gap[start]:
+            if is_gap[start]:
                 self._is_exact = False
                 self.gaps.append(Gap(int(number[start]), int(t_ns[start]), int(steps[start] - 1 - skipped[start])))
             if not self._has_begun:
@@ -130,6 +140,7 @@ class AttemptSplitter:
                 scheme=Series(scheme[start:end], self._epoch_ns),
             )
         self._last = (int(number[-1]), int(overruns[-1]), int(scheme["state"][-1]))
+        self._tail = _sync_counters(frames[np.searchsorted(frames["cycle_t_ns"], t_ns[-1], "right") :])
 
 
 def _paired(piece: Piece) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -151,6 +162,18 @@ def _join(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
             width = frames[name].shape[1:]
             part[name][(slice(None), *map(slice, width))] = frames[name]
     return joined
+
+
+def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
+    is_sync = (frames["can_id"] == SYNC_ID) & ~frames["is_error"] & (frames["length"] > 0)
+    return np.asarray(frames["data"][is_sync, 0])
+
+
+def _skipped(counters: NDArray[np.uint8], last: int) -> int:
+    """Count the periods that were skipped between a cycle and the last of the SYNCs that came after it."""
+    if counters.size == 0:
+        return 0
+    return (int(counters[-1]) - 1 - last) % SYNC_OVERFLOW - counters.size
 
 
 def _resets(frames: NDArray[Any]) -> Places:

@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.attempts import NMT_ID, RESET_COMMUNICATION, Places, Stretch
-from adacd_hil.analysis.replay_source import LogSource, Part
+from adacd_hil.analysis.replay_source import FRAME_TOPICS, LogSource, Part
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.frame_log import read_frames
 from adacd_hil.log.reader import Series
 from adacd_hil.log.recorded_frames import as_logged
-from adacd_hil.log.stream import Piece
+from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.wire.codec import Codec
 
 SYNC_OVERFLOW: Final = 240
@@ -33,8 +33,6 @@ FEEDBACK_SHARE: Final = 0.7
 """Part of the period in which the host awaits its feedback in real time."""
 _REALTIME: Final = (0.9, 1.1)
 """Median interval of SYNC over the period, of a bus that runs in real time; in lockstep it runs as fast as it can."""
-_WALL_NS: Final = 10**18
-"""Times beyond it are counted from 1970."""
 _DISABLE_CYCLES: Final = 20
 _CYCLIC: Final = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 _NOWHERE: Final = np.int64(2**62)
@@ -143,7 +141,7 @@ class RecordingAgainstLog(LogSource):
         super().__init__(against)
         self._recording = load_recording(path, self.settings, self.codec)
         self._recorded = path
-        self._is_aligned = False
+        self._align(_find_cycle(self._recording, self.codec, against))
         self._given = 0
         self._missing = 0
 
@@ -151,9 +149,6 @@ class RecordingAgainstLog(LogSource):
         """Put the recording's frames in place of the log's, and leave out the cycles that it lacks."""
         cycles = piece.series["/cycle"]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
-        if number.size and not self._is_aligned:
-            self._is_aligned = True
-            self._align(int(number[0]), int(t_ns[0]))
         recording = self._recording
         is_there = np.isin(number, recording.number)
         self._missing += int((~is_there).sum())
@@ -169,13 +164,10 @@ class RecordingAgainstLog(LogSource):
         self._given = end
         return piece._replace(series=series, frames=frames)
 
-    def _align(self, cycle: int, t_ns: int) -> None:
-        """Let the recording's numbers be the run's: the counter tells them but for multiples of 240."""
+    def _align(self, cycle: int) -> None:
+        """Let the recording's numbers be the run's, given the cycle that it begins with."""
         recording = self._recording
-        first_ns, wanted = int(recording.t_ns[0]), cycle
-        if recording.is_realtime and min(first_ns, t_ns + self._stream.epoch_ns) > _WALL_NS:
-            wanted += round((first_ns - t_ns - self._stream.epoch_ns) / self.settings.bus.period_ns)
-        shift = SYNC_OVERFLOW * round((wanted - int(recording.number[0])) / SYNC_OVERFLOW)
+        shift = cycle - int(recording.number[0])
         self._recording = recording._replace(
             number=recording.number + shift, owner=recording.owner + shift, since=recording.since + shift
         )
@@ -188,6 +180,33 @@ class RecordingAgainstLog(LogSource):
         if self._recording.problem:
             notes.insert(0, self._recording.problem)
         return notes
+
+
+def _find_cycle(recording: Recording, codec: Codec, against: Path) -> int:
+    """Return the cycle of the run that a recording begins with: where the devices answered the same, bit for bit.
+
+    The counter tells the cycle but for multiples of 240. Where no cycle fits, it is the nearest to the run's first.
+    """
+    wanted = _answers(recording.frames[recording.owner == recording.number[0]], codec)
+    first = int(recording.number[0])
+    for piece in LogStream(against, (*FRAME_TOPICS, "/cycle")):
+        cycles = piece.series["/cycle"]
+        number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
+        for row in np.flatnonzero((number - first) % SYNC_OVERFLOW == 0).tolist():
+            ends = np.searchsorted(piece.frames["cycle_t_ns"], (t_ns[row], t_ns[row] + 1))
+            if wanted and wanted == _answers(piece.frames[slice(*ends.tolist())], codec):
+                return int(number[row])
+    return first
+
+
+def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
+    """Return the data of the first cyclic frame of each device."""
+    answers: dict[int, bytes] = {}
+    for can_id in (codec.message(name).can_id for name in _CYCLIC):
+        mine = frames[(frames["can_id"] == can_id) & ~frames["is_error"]]
+        if len(mine):
+            answers[can_id] = mine["data"][0, : int(mine["length"][0])].tobytes()
+    return answers
 
 
 class RecordingAlone:

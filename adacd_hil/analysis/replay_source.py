@@ -82,8 +82,8 @@ class LogSource:
             )
         for gap in splitter.gaps[:SHOWN]:
             notes.append(
-                f"{gap.missing} cycles with their frames are missing before cycle {gap.cycle} ({gap.t_ns * 1e-9:.3f} "
-                "s): what follows in that attempt is replayed but can't be compared"
+                f"{gap.missing} cycles with their frames are missing before cycle {gap.cycle}: what follows in that "
+                "attempt is replayed but can't be compared"
             )
         if len(splitter.gaps) > SHOWN:
             notes.append(f"and {len(splitter.gaps) - SHOWN} more gaps")

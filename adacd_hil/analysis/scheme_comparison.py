@@ -46,10 +46,10 @@ class Mismatch(NamedTuple):
         """Topic, field and place."""
         return f"{self.topic}.{self.field}" + (f"[{self.place}]" if self.place else "")
 
-    @property
-    def line(self) -> str:
-        """All of it in one line."""
-        return f"cycle {self.cycle}, {self.t_ns * 1e-9:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
+    def line(self, zero_ns: int = 0) -> str:
+        """Say all of it in one line, with the time since `zero_ns`."""
+        time_s = (self.t_ns - zero_ns) * 1e-9
+        return f"cycle {self.cycle}, {time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
 
 
 def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:

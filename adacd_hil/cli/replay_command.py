@@ -167,7 +167,7 @@ def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int) 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""
     lines = [f"{path}: {_verdict(own)}: {own.compared} of {own.cycles} cycles{attempts} compared"]
-    lines += [f"  {mismatch.line}" for mismatch in own.mismatches[:shown]]
+    lines += [f"  {mismatch.line(own.zero_ns)}" for mismatch in own.mismatches[:shown]]
     if own.mismatch_count > shown:
         lines.append(f"  … {own.mismatch_count} in all: " + _counts(own))
     lines += [f"  {note}" for note in own.notes]
