@@ -4,6 +4,11 @@ from collections.abc import Mapping
 
 RECOVERED = "recovered"
 """The ending of a recovered log."""
+CUT = "cut"
+"""The ending of a stretch of a log."""
+MERGED = "merged"
+"""The ending of several logs in one."""
+PLANNED_ENDINGS = ("closed", "continued", RECOVERED, CUT, MERGED)
 LOST_KEY = "lost"
 """Of the summary of a recovered log: what was lost, in words; missing when nothing was."""
 DROPPED_KEY = "dropped"
