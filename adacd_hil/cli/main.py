@@ -8,6 +8,7 @@ import click
 
 from adacd_hil import __version__
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
+from adacd_hil.cli.log_command import log
 from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
 
 if TYPE_CHECKING:
@@ -285,6 +286,9 @@ def monitor(
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     return watch(connection, node_id, listened_s, listened_s is None, as_json)
+
+
+cli.add_command(log)
 
 
 def main() -> None:

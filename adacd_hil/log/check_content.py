@@ -6,7 +6,7 @@ import struct
 import numpy as np
 from mcap.records import Channel, Schema
 
-from adacd_hil.log.cdr import ENCAPSULATION, payload_dtype
+from adacd_hil.log.cdr import ENCAPSULATION, MessageType, payload_dtype
 from adacd_hil.log.check_definitions import DefinitionCheck
 from adacd_hil.log.chunk_contents import Contents
 from adacd_hil.log.errors import LogError
@@ -29,8 +29,7 @@ _ANY = -1
 _OWN_TEXT = b"# Written by adacd-hil."
 _LAST_ENCAPSULATION = 0x0D
 """DDS-XTypes 7.6.3.1.2."""
-_SIZES = {CAN_FRAME.name: CAN_FRAME_DTYPE.itemsize, JOINT_STATE.name: JOINT_STATE_DTYPE.itemsize}
-_OURS = {CAN_FRAME.name: CAN_FRAME, FD_FRAME.name: FD_FRAME, JOINT_STATE.name: JOINT_STATE, LOG.name: LOG}
+_SIZES = ((CAN_FRAME, CAN_FRAME_DTYPE.itemsize), (JOINT_STATE, JOINT_STATE_DTYPE.itemsize))
 
 
 class ContentCheck:
@@ -66,19 +65,11 @@ class ContentCheck:
         """Note what the payloads of a channel must be."""
         self._described.add(channel.id)
         self._is_cdr[channel.id] = channel.message_encoding == "cdr"
-        if schema is None or schema.encoding != "ros2msg" or channel.message_encoding != "cdr":
-            return
-        ours = _OURS.get(schema.name)
-        if ours is not None and ours.text.encode() == schema.data:
-            self._sizes[channel.id] = _SIZES.get(schema.name, _ANY)
-            if ours is FD_FRAME:
-                self._fd_frames.add(channel.id)
-            elif ours is LOG:
-                self._logs.add(channel.id)
-            return
-        if schema.data.startswith(_OWN_TEXT):
-            with contextlib.suppress(LogError):  # its size varies
-                self._sizes[channel.id] = payload_dtype(schema.data.decode("utf-8", "replace")).itemsize
+        self._sizes[channel.id] = _ANY if (size := payload_size(channel, schema)) is None else size
+        if schema is not None and _is_own(channel, schema, FD_FRAME):
+            self._fd_frames.add(channel.id)
+        elif schema is not None and _is_own(channel, schema, LOG):
+            self._logs.add(channel.id)
 
     def _check_order(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
         order = np.argsort(contents.channels, kind="stable")
@@ -116,6 +107,24 @@ class ContentCheck:
             count = np.count_nonzero(is_wrong)
             text = f"{count} messages of a chunk aren't as their schemas say, the first on {channel.topic}"
             self._findings.add("cdr", text, offset)
+
+
+def payload_size(channel: Channel, schema: Schema | None) -> int | None:
+    """Return how long the payloads of a channel are, where we wrote its schema and they have one size."""
+    if schema is None or channel.message_encoding != "cdr":
+        return None
+    for own, size in _SIZES:
+        if _is_own(channel, schema, own):
+            return size
+    if schema.encoding == "ros2msg" and schema.data.startswith(_OWN_TEXT):
+        with contextlib.suppress(LogError):  # its size varies
+            return payload_dtype(schema.data.decode("utf-8", "replace")).itemsize
+    return None
+
+
+def _is_own(channel: Channel, schema: Schema, own: MessageType) -> bool:
+    is_named = channel.message_encoding == "cdr" and schema.encoding == "ros2msg" and schema.name == own.name
+    return is_named and schema.data == own.text.encode()
 
 
 def _is_fd_frame(payload: bytes) -> bool:

@@ -50,6 +50,7 @@ class LogCopy:
         self.file = ChunkedFile(self._target, LIBRARY)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels = 0
+        self._metadata: set[str] = set()
 
     def source(self, prefix: str = "", topics: frozenset[str] | None = None) -> "Source":
         """Begin to copy from another log: put `prefix` before its topics, copy only `topics` if given."""
@@ -59,9 +60,11 @@ class LogCopy:
         """Add an attachment."""
         self.file.attach(attachment)
 
-    def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Add a metadata record."""
-        self.file.add_metadata(name, metadata)
+    def add_all_metadata(self, records: Mapping[str, dict[str, str]]) -> None:
+        """Add the metadata records whose names are new."""
+        for name in [name for name in records if name not in self._metadata]:
+            self._metadata.add(name)
+            self.file.add_metadata(name, records[name])
 
     def add(self, messages: Messages) -> None:
         """Add messages."""

@@ -140,7 +140,7 @@ class _Work:
         elif item.name not in self._metadata:
             self._metadata[item.name] = item.metadata
             self._is_vouched |= is_vouched and item.name == RUN_METADATA
-            self._copy.add_metadata(item.name, item.metadata)
+            self._copy.add_all_metadata({item.name: item.metadata})
 
     def finish(self, parts: dict[int, Path]) -> Recovery:
         """End the log."""

@@ -6,8 +6,6 @@ message indexes have no CRC of their own; indexes are made anew, metadata are ta
 """
 
 import contextlib
-import os
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,9 +19,8 @@ from numpy.typing import NDArray
 from adacd_hil.log.chunk_contents import Contents, message_contents, read_contents
 from adacd_hil.log.definitions import Definitions
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_walk import MAGIC
+from adacd_hil.log.file_end import crc_of, read_end
 from adacd_hil.log.record_scan import (
-    HEAD,
     ChunkError,
     Gap,
     RawRecord,
@@ -33,9 +30,7 @@ from adacd_hil.log.record_scan import (
     scan,
 )
 
-_BLOCK = 1 << 20
-_FOOTER = HEAD.size + 20
-_DATA_END = HEAD.size + 4
+_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _NOTES = 20
 """Damages that are told one by one."""
 
@@ -119,34 +114,15 @@ class Salvage:
 
     def _look_at_end(self, file: IO[bytes]) -> None:
         """Take the summary where its CRC fits, and compare the CRC of the data section."""
-        size = os.fstat(file.fileno()).st_size
-        place = size - len(MAGIC) - _FOOTER
-        tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
-        if place < len(MAGIC) or not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER:
+        end = read_end(file)
+        if end is None:
             return
-        footer = parse(Opcode.FOOTER, tail[HEAD.size : _FOOTER])
-        end = footer.summary_start or place
-        if not len(MAGIC) < end <= place:
-            return
-        data_end = _read(file, end - _DATA_END, _DATA_END)
-        stored = int.from_bytes(data_end[HEAD.size :], "little")
-        has_crc = data_end[0] == Opcode.DATA_END and stored != 0
-        self.is_vouched = has_crc and stored == _crc_of(file, 0, end - _DATA_END)
-        crc = _crc_of(file, end, place + _FOOTER - 4)
-        if footer.summary_start and footer.summary_crc == crc:
-            with contextlib.suppress(LogError):  # written wrong: of no use
-                self._take_summary(_read(file, end, place - end))
-
-    def _take_summary(self, data: bytes) -> None:
-        position = 0
-        while position + HEAD.size <= len(data):
-            opcode, length = HEAD.unpack_from(data, position)
-            record = RawRecord(position, opcode, data[position + HEAD.size : position + HEAD.size + length])
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.definitions.take((record,))
-            elif opcode == Opcode.STATISTICS:
-                self._statistics = parse(opcode, record.body)
-            position = record.end
+        self.is_vouched = end.data_crc != 0 and end.data_crc == crc_of(file, 0, end.data_end)
+        with contextlib.suppress(LogError):  # written wrong: of no use
+            self.definitions.take(record for record in end.summary if record.opcode in _DEFINITIONS)
+            for record in end.summary:
+                if record.opcode == Opcode.STATISTICS:
+                    self._statistics = parse(record.opcode, record.body)
 
     def __iter__(self) -> Iterator[Attachment | Metadata | Contents]:
         with self._path.open("rb") as file:
@@ -171,7 +147,7 @@ class Salvage:
                 yield from self._give(message_contents(record))
             elif opcode == Opcode.MESSAGE:
                 self._left_out += 1
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and self.is_vouched:
+            elif opcode in _DEFINITIONS and self.is_vouched:
                 self.definitions.take((record,))
             elif opcode == Opcode.ATTACHMENT:
                 if not attachment_crc_fits(record.body):
@@ -230,7 +206,7 @@ class Salvage:
     def _doubt(self, file: IO[bytes]) -> None:
         """Say so when the CRC of the data section fails though nothing was found that is wrong."""
         stored = int.from_bytes(self._data_end.body, "little")
-        if stored and stored != _crc_of(file, 0, self._data_end.offset):
+        if stored and stored != crc_of(file, 0, self._data_end.offset):
             self.losses.is_doubtful = True
             self.losses.note(f"{self._path.name}: fails the CRC of the whole, nothing shows where: perhaps in metadata")
 
@@ -252,21 +228,3 @@ class Salvage:
             losses.metadata = max(0, statistics.metadata_count - self._saved_metadata)
             return
         losses.messages = None if losses.bytes or losses.is_cut else self._left_out
-
-
-def _read(file: IO[bytes], place: int, count: int) -> bytes:
-    file.seek(place)
-    return file.read(count)
-
-
-def _crc_of(file: IO[bytes], start: int, end: int) -> int:
-    """Compute the CRC of a stretch of a file."""
-    crc = 0
-    file.seek(start)
-    while start < end:
-        block = file.read(min(_BLOCK, end - start))
-        if not block:
-            break
-        crc = zlib.crc32(block, crc)
-        start += len(block)
-    return crc
