@@ -48,7 +48,8 @@ class DefinitionCheck:
                 ("metadata", "metadata"),
             )
             self._compare(name, known, channel, pairs, offset)
-        if channel.schema_id and channel.schema_id not in self.schemas:
+        is_defined = channel.schema_id in self.schemas or (is_summary and channel.schema_id in self.summary_schemas)
+        if channel.schema_id and not is_defined:
             text = f"{name} ({channel.topic}) has the schema {channel.schema_id}, which is not defined"
             self._findings.add("undefined-schema", text, offset)
         self._place(name, channel.id in self.channels, offset, is_summary)

@@ -136,11 +136,11 @@ class _FileCheck:
     def _judge(self, record: RawRecord) -> None:
         opcode = record.opcode
         if opcode not in set(Opcode):
-            self._findings.add("unknown-record", f"a {name_of(opcode)} of {len(record.body)} bytes", record.offset)
+            self._findings.add("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)
             return
         if opcode in (_DATA if self._is_summary else _SUMMARY):
             where = "summary" if self._is_summary else "data section"
-            self._findings.add("place", f"a {name_of(opcode)} in the {where}", record.offset)
+            self._findings.add("place", f"{name_of(opcode)} in the {where}", record.offset)
             return
         if self._is_summary:
             self._summary.record(record)

@@ -14,6 +14,7 @@ from adacd_hil.log.chunked_file import INDEX_ENTRY
 from adacd_hil.log.mcap_walk import MESSAGE_HEAD
 from adacd_hil.log.record_scan import HEAD, RawRecord
 
+_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _START = struct.Struct("<BQ")
 _MESSAGE = np.dtype(
     {
@@ -51,17 +52,18 @@ def read_contents(data: bytes) -> Contents:
     """Find the records of an opened chunk."""
     definitions, strangers = [], []
     starts: list[int] = []
-    unpack = _START.unpack_from
+    unpack, add = _START.unpack_from, starts.append
+    message, head, least = int(Opcode.MESSAGE), HEAD.size, MESSAGE_HEAD - HEAD.size
     position, size = 0, len(data)
-    while position + HEAD.size <= size:
+    while position + head <= size:
         opcode, length = unpack(data, position)
-        end = position + HEAD.size + length
-        if end > size or (opcode == Opcode.MESSAGE and end < position + MESSAGE_HEAD):
+        end = position + head + length
+        if end > size or (opcode == message and length < least):
             break
-        if opcode == Opcode.MESSAGE:
-            starts.append(position)
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            definitions.append(RawRecord(position, opcode, data[position + HEAD.size : end]))
+        if opcode == message:
+            add(position)
+        elif opcode in _DEFINITIONS:
+            definitions.append(RawRecord(position, opcode, data[position + head : end]))
         else:
             strangers.append(opcode)
         position = end

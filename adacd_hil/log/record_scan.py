@@ -130,7 +130,7 @@ class _Scan:
             record = RawRecord(position, head[0], self._read(position + HEAD.size, head[1]))
             yield record
             position = record.end
-            if record.opcode == Opcode.FOOTER and self._read(position, len(MAGIC) + 1) == MAGIC:
+            if record.opcode == Opcode.FOOTER and self._read(position, len(MAGIC)) == MAGIC:
                 yield Trailer(position)
                 return
 
