@@ -20,6 +20,8 @@ from adacd_hil.log.mcap_file import ENDING_KEY, RUN_METADATA
 from adacd_hil.log.reader import LoggedContact, read_log
 from adacd_hil.log.summary import CUT, DROPPED_KEY, count_frames
 
+_CENTURY_S = 3.2e9
+
 
 class Stretch(NamedTuple):
     """What is cut out: seconds since the start of the log."""
@@ -122,7 +124,9 @@ def _times(contents: Contents, is_ours: bool) -> NDArray[np.int64]:
 
 
 def _is_within(times: NDArray[np.int64], start_ns: int, stretch: Stretch) -> NDArray[np.bool_]:
-    first_ns = start_ns + round(stretch.start_s * 1e9)
-    if stretch.end_s == float("inf"):
-        return np.asarray(times >= first_ns)
-    return np.asarray((times >= first_ns) & (times < start_ns + round(stretch.end_s * 1e9)))
+    first_ns, end_ns = (start_ns + _nanoseconds(bound_s) for bound_s in stretch)
+    return np.asarray((times >= first_ns) & (times < end_ns))
+
+
+def _nanoseconds(seconds: float) -> int:
+    return round(min(max(seconds, -_CENTURY_S), _CENTURY_S) * 1e9)

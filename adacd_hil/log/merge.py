@@ -146,7 +146,7 @@ class _Log:
 
 
 def _merge(logs: Sequence[_Log], copy: LogCopy) -> None:
-    """Add the messages of all logs in the order of their keys, of equal ones those of the earlier log first."""
+    """Add the messages of all logs in the order of their keys."""
     while rest := [log for log in logs if log.messages is not None]:
         bound = min(int(log.keys[-1]) for log in rest)
         counts = [int(np.searchsorted(log.keys, bound, side="right")) for log in rest]
