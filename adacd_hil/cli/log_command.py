@@ -1,0 +1,154 @@
+"""`adacd-hil log`: logs at a glance, checked, recovered, cut and merged."""
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.options import explained, json_option
+
+_log_argument = click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
+_out_option = click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE")
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+@click.group("log")
+def log() -> None:
+    """Look at logs, check, recover, cut and merge them. A log is named by its first part."""
+
+
+@log.command(epilog="Exit status: 0 done; 1 a log can't be read; 2 wrong usage; 3 a log is cut or lacks a part.")
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@json_option
+@explained
+def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
+    """Show what logs hold: topics, rates, attachments, the run, its contacts and faults.
+
+    A folder stands for the logs in it.
+    """
+    from adacd_hil.cli import log_text
+    from adacd_hil.log.check import find_logs
+    from adacd_hil.log.info import read_info
+
+    found = [read_info(path) for path in find_logs(logs)]
+    if as_json:
+        print(json.dumps([log_text.info_as_json(entry) for entry in found], indent=2))
+    else:
+        print("\n\n".join(log_text.info_as_text(entry) for entry in found))
+    return ExitCode.PARTIAL if any(entry.problems for entry in found) else ExitCode.OK
+
+
+@log.command(epilog="Exit status: 0 clean; 1 an error, or a log can't be read; 2 wrong usage; 3 warnings only.")
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@json_option
+@explained
+def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
+    """Check logs: the rules of `mcap doctor`, all CRCs, indexes against records, and what our own logs promise.
+
+    A folder stands for the logs in it. docs/log-tools.md lists the rules.
+    """
+    from adacd_hil.cli import log_text
+    from adacd_hil.log.check import check_log, find_logs
+
+    checked = [check_log(path, _tell) for path in find_logs(logs)]
+    if as_json:
+        print(json.dumps([log_text.check_as_json(entry) for entry in checked], indent=2))
+    else:
+        print("\n".join(log_text.check_as_text(entry) for entry in checked))
+    if any(entry.errors for entry in checked):
+        return ExitCode.FAILURE
+    return ExitCode.PARTIAL if any(entry.warnings for entry in checked) else ExitCode.OK
+
+
+@log.command(
+    epilog="Exit status: 0 nothing was lost; 1 nothing to save, or the log can't be read; 2 wrong usage; 3 with loss."
+)
+@_log_argument
+@_out_option
+@json_option
+@explained
+def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
+    """Save everything intact of a cut or damaged log, before and after the damage, to one whole file.
+
+    --out: default NAME.recovered.mcap. The log itself stays as it is. No message is saved that no CRC vouches for.
+    """
+    from adacd_hil.cli import log_text
+    from adacd_hil.log.recover import recover as recover_log
+
+    recovery = recover_log(log, out, _tell)
+    as_table = log_text.recovery_as_json(recovery)
+    print(json.dumps(as_table, indent=2) if as_json else log_text.recovery_as_text(recovery))
+    return ExitCode.PARTIAL if recovery.is_lossy else ExitCode.OK
+
+
+@log.command(epilog="Exit status: 0 done; 1 nothing there, or the log is damaged; 2 wrong usage.")
+@_log_argument
+@click.option("--from", "from_s", type=float, help="Begin here, s since the start of the log.")
+@click.option("--until", "until_s", type=float, help="End before here, s since the start of the log.")
+@click.option("--contact", type=click.IntRange(min=1), help="Cut around this contact, numbered from 1.")
+@click.option(
+    "--around",
+    "around_s",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="s before and after the contact.",
+)
+@click.option("--topic", "topics", multiple=True, help="Take only this topic; can be given more than once.")
+@_out_option
+@json_option
+@explained
+def cut(
+    log: Path,
+    from_s: float | None,
+    until_s: float | None,
+    contact: int | None,
+    around_s: float,
+    topics: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> ExitCode:
+    """Cut a stretch out of a log, whole cycles, with attachments and metadata. --out: default NAME.cut.mcap."""
+    from adacd_hil.log.cut import Stretch, default_out, find_contact
+    from adacd_hil.log.cut import cut as cut_log
+
+    if contact is not None and (from_s is not None or until_s is not None):
+        raise CommandError("--contact says where to cut: without --from and --until", ExitCode.USAGE)
+    if from_s is not None and until_s is not None and from_s >= until_s:
+        raise CommandError(f"--from {from_s:g} s is not before --until {until_s:g} s", ExitCode.USAGE)
+    if contact is not None:
+        stretch = find_contact(log, contact, around_s)
+    else:
+        stretch = Stretch(float("-inf") if from_s is None else from_s, float("inf") if until_s is None else until_s)
+    done = cut_log(log, out or default_out(log), stretch, topics, _tell)
+    result = {"out": str(done.out), "from_s": _finite(stretch.start_s), "until_s": _finite(stretch.end_s)}
+    result["messages"] = done.messages
+    print(json.dumps(result, indent=2) if as_json else f"{done.out}: {done.messages} messages")
+    return ExitCode.OK
+
+
+def _finite(value: float) -> float | str | None:
+    return None if value in (float("inf"), float("-inf")) else value
+
+
+@log.command(epilog="Exit status: 0 done; 1 a log is damaged or can't be read; 2 wrong usage.")
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default=Path("merged.mcap"), show_default=True)
+@click.option("--prefix", "has_prefix", is_flag=True, help="Put each log's name before its topics, as /NAME/topic.")
+@json_option
+@explained
+def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) -> ExitCode:
+    """Merge logs into one by their log times: of several hosts, of a run and the emulator, or of one log's parts."""
+    from adacd_hil.log.merge import merge as merge_logs
+
+    done = merge_logs(logs, out, has_prefix, _tell)
+    if done.shared and not has_prefix:
+        _tell(f"topics of more than one log, told apart by their channels only: {', '.join(done.shared)}")
+    result = {"out": str(done.out), "logs": list(done.names), "messages": done.messages, "shared": list(done.shared)}
+    print(json.dumps(result, indent=2) if as_json else f"{done.out}: {done.messages} messages")
+    return ExitCode.OK

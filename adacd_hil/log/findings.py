@@ -1,0 +1,110 @@
+"""What a check of a log finds: rules that are broken, where, and how gravely."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import NamedTuple
+
+_TOLD = 10
+"""Findings of one rule in one file that are told one by one; the rest are counted."""
+
+
+class Severity(StrEnum):
+    """`error`: the file is damaged or written wrong. `warning`: it lacks something, or readers may stumble over it."""
+
+    ERROR = "error"
+    WARNING = "warning"
+
+
+class Finding(NamedTuple):
+    """One place where a rule is broken. `offset`: byte of the file, -1 for the file as a whole."""
+
+    file: str
+    severity: Severity
+    rule: str
+    text: str
+    offset: int = -1
+
+
+@dataclass
+class Findings:
+    """The findings of one file."""
+
+    file: str
+    found: list[Finding] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
+    """All findings by rule, those that aren't told too."""
+
+    def add(self, rule: str, text: str, offset: int = -1) -> None:
+        """Add a finding of a rule of `RULES`."""
+        self.counts[rule] += 1
+        if self.counts[rule] <= _TOLD:
+            self.found.append(Finding(self.file, RULES[rule].severity, rule, text, offset))
+
+    def count(self, severity: Severity) -> int:
+        """Count all findings of a severity."""
+        return sum(count for rule, count in self.counts.items() if RULES[rule].severity is severity)
+
+
+class Rule(NamedTuple):
+    """A rule. `origin`: "doctor" when `mcap doctor` has it, "" when it is our own."""
+
+    severity: Severity
+    demand: str
+    origin: str = ""
+
+
+_ERROR, _WARNING = Severity.ERROR, Severity.WARNING
+RULES: dict[str, Rule] = {
+    # the file
+    "magic": Rule(_ERROR, "the file begins and ends with MCAP's magic, and nothing follows", "doctor"),
+    "record": Rule(_ERROR, "every byte belongs to a record that can be read", "doctor"),
+    "header": Rule(_ERROR, "one Header, before all else"),
+    "data-end": Rule(_ERROR, "one DataEnd", "doctor"),
+    "footer": Rule(_ERROR, "one Footer", "doctor"),
+    "place": Rule(_ERROR, "each kind of record is in its section"),
+    "library": Rule(_WARNING, "the Header says what wrote the file", "doctor"),
+    "profile": Rule(_WARNING, "the Header's profile is empty, ros1 or ros2", "doctor"),
+    "unknown-record": Rule(_WARNING, "every kind of record is known", "doctor"),
+    # CRCs
+    "chunk-crc": Rule(_ERROR, "every chunk can be opened and fits its CRC", "doctor"),
+    "data-crc": Rule(_ERROR, "the data section fits its CRC", "doctor"),
+    "summary-crc": Rule(_ERROR, "the summary fits its CRC", "doctor"),
+    "attachment-crc": Rule(_ERROR, "every attachment fits its CRC"),
+    "no-crc": Rule(_WARNING, "chunks, attachments, data section and summary have CRCs"),
+    # definitions
+    "schema-id": Rule(_ERROR, "no schema has the number 0", "doctor"),
+    "schema-encoding": Rule(_ERROR, "a schema with data names its encoding", "doctor"),
+    "empty-schema": Rule(_WARNING, "a schema isn't empty", "doctor"),
+    "redefinition": Rule(_ERROR, "definitions of one number are equal", "doctor"),
+    "duplicate": Rule(_WARNING, "the data section defines each number once", "doctor"),
+    "undefined-schema": Rule(_ERROR, "the schema of a channel is defined before it", "doctor"),
+    "undefined-channel": Rule(_ERROR, "the channel of a message is defined before it", "doctor"),
+    "summary-only": Rule(_ERROR, "what the summary defines, the data section defines too", "doctor"),
+    "unused-summary-only": Rule(_WARNING, "the same, in a file without messages"),
+    # chunks and indexes
+    "chunk-record": Rule(_ERROR, "a chunk holds schemas, channels and messages, whole ones", "doctor"),
+    "chunk-times": Rule(_ERROR, "a chunk's times are those of its earliest and latest message", "doctor"),
+    "chunk-size": Rule(_ERROR, "a chunk is as large as it says", "doctor"),
+    "message-index": Rule(_ERROR, "the message indexes behind a chunk have exactly its messages"),
+    "no-message-index": Rule(_WARNING, "a chunk has message indexes"),
+    "unindexed-messages": Rule(_WARNING, "a file with indexes has no messages outside chunks", "doctor"),
+    "chunk-index": Rule(_ERROR, "one chunk index for each chunk, and all it says is so", "doctor"),
+    "no-chunk-index": Rule(_WARNING, "the summary has chunk indexes"),
+    "summary-channels": Rule(_ERROR, "the summary defines the channels and schemas that it needs", "doctor"),
+    "attachment-index": Rule(_ERROR, "one index for each attachment, and all it says is so"),
+    "metadata-index": Rule(_ERROR, "one index for each metadata record, and all it says is so"),
+    "summary-offset": Rule(_ERROR, "summary offsets and Footer say where the groups are"),
+    "statistics": Rule(_ERROR, "at most one Statistics, and all its counts and times are so", "doctor"),
+    # messages
+    "order": Rule(_WARNING, "log_time doesn't run backwards within a channel", "doctor"),
+    "schema-text": Rule(_ERROR, "the text of a ros2msg schema can be read"),
+    "cdr": Rule(_ERROR, "a cdr message begins with its encapsulation and is as long as its schema says"),
+    # our logs
+    "missing-part": Rule(_ERROR, "a log has all its parts"),
+    "foreign-part": Rule(_ERROR, "the parts of a log are of one run"),
+    "counts": Rule(_ERROR, "the summary's counts of messages and frames are so"),
+    "ending": Rule(_WARNING, "the summary says why the log ended, and that it was meant to"),
+    "dropped": Rule(_WARNING, "no packet was dropped on the way to the log"),
+    "lost": Rule(_WARNING, "nothing was lost before the log was recovered"),
+}

@@ -1,0 +1,156 @@
+"""`adacd-hil log` on small logs: what it prints and how it ends."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from adacd_hil.cli.main import cli
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "log"))
+
+from made_log import SUMMARY, make_log
+from recorded_run import make_run, record
+
+WHOLE = make_log()
+
+
+def call(*arguments):
+    result = CliRunner().invoke(cli, ["log", *map(str, arguments)])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def write(path, data=WHOLE):
+    path.write_bytes(data)
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A run of 200 cycles, with contacts and events."""
+    path = tmp_path_factory.mktemp("recorded") / "run.mcap"
+    record(path, make_run(200, has_fd=True))
+    return path
+
+
+def test_check_says_whether_a_log_is_clean(tmp_path):
+    clean, bad = write(tmp_path / "a.mcap"), write(tmp_path / "b.mcap", WHOLE[:-3])
+    dropped = write(tmp_path / "c.mcap", make_log(summary={**SUMMARY, "dropped": "4"}))
+    assert call("check", clean)[:2] == (0, f"{clean}: clean; 20 messages in 1 files\n")
+    code, out, _ = call("check", dropped)
+    assert (code, out.splitlines()) == (
+        3,
+        [
+            "warning: c.mcap: 4 packets were dropped on the way to the log (dropped)",
+            f"{dropped}: 0 errors, 1 warnings; 20 messages in 1 files",
+        ],
+    )
+    code, out, err = call("check", tmp_path, "--json")
+    assert code == 1
+    assert [(entry["path"], entry["errors"]) for entry in json.loads(out)] == [
+        (str(clean), 0),
+        (str(bad), 2),
+        (str(dropped), 0),
+    ]
+    assert err.splitlines() == ["checking a.mcap", "checking b.mcap", "checking c.mcap"]
+    assert call("check", tmp_path / "none.mcap")[0] == 1
+
+
+def test_findings_that_are_not_told_are_counted(tmp_path):
+    path = write(tmp_path / "a.mcap", make_log(chunks=[(n, n + 1) for n in range(30)], make_payload=lambda n: b""))
+    assert "and 20 more of these" in call("check", path)[1].splitlines()
+
+
+def test_recover_says_what_was_lost(tmp_path):
+    path = write(tmp_path / "a.mcap")
+    code, out, _ = call("recover", path)
+    saved = f"{tmp_path / 'a.recovered.mcap'}: 20 messages, 2 attachments"
+    assert (code, out.splitlines()) == (0, [saved, "nothing was lost"])
+    path.write_bytes(WHOLE[:700])
+    code, out, _ = call("recover", path, "--out", tmp_path / "b.mcap", "--json")
+    result = json.loads(out)
+    assert (code, result["messages"], result["lost"]) == (3, 10, "the end, an unknown number of messages")
+    assert call("recover", path)[1].splitlines()[-1] == "lost: the end, an unknown number of messages"
+    path.write_bytes(WHOLE[:30])
+    code, out, err = call("recover", path)
+    assert (code, out, err.splitlines()[-1]) == (1, "", f"adacd-hil: {path}: nothing to save")
+    assert call("recover")[0] == 2
+
+
+def test_info_shows_a_run_at_a_glance(recorded):
+    code, out, _ = call("info", recorded, "--json")
+    (info,) = json.loads(out)
+    assert code == 0
+    assert (info["cycles"], info["dropped"], info["ending"]) == (200, 0, "closed")
+    assert info["frames"] == 200 * 9 + 80
+    assert (info["contacts"], info["collisions"]) == (4, 4)
+    assert (info["events"], len(info["faults"])) == ({"info": 2, "warning": 2, "error": 1}, 1)
+    assert info["duration_s"] == pytest.approx(0.199, abs=0.006)
+    topics = {topic["topic"]: topic for topic in info["topics"]}
+    assert (topics["/cycle"]["messages"], topics["/cycle"]["bytes"]) == (200, 200 * 124)
+    assert topics["/cycle"]["rate_hz"] == pytest.approx(1000, rel=0.05)
+    assert topics["/from_can_bus_fd"]["bytes"] is None
+    assert info["metadata"]["name"] == "Prüfung"
+    assert info["attachments"]["run.toml"] == 11
+    text = call("info", recorded)[1]
+    assert "200 cycles, closed" in text
+    assert "4 contacts, 4 of them collisions; 1 errors, 2 warnings" in text
+
+
+def test_info_of_a_cut_log_shows_what_is_there(recorded, tmp_path):
+    whole, cut = json.loads(call("info", recorded, "--json")[1])[0], tmp_path / "run.mcap"
+    cut.write_bytes(recorded.read_bytes()[:-30])
+    code, out, _ = call("info", cut, "--json")
+    (info,) = json.loads(out)
+    assert code == 3
+    assert info["problems"] == ["run.mcap is cut or damaged: `adacd-hil log check` says how"]
+    for key in (
+        "messages",
+        "cycles",
+        "frames",
+        "contacts",
+        "events",
+        "metadata",
+        "attachments",
+        "start_ns",
+        "duration_s",
+    ):
+        assert info[key] == whole[key], key
+    sizes = {topic["topic"]: topic["bytes"] for topic in info["topics"]}
+    for topic in whole["topics"]:
+        assert topic["bytes"] in (None, sizes[topic["topic"]]), topic
+
+
+def test_cut_takes_a_stretch_by_time_or_contact(recorded, tmp_path):
+    out = tmp_path / "out.mcap"
+    code, text, _ = call("cut", recorded, "--from", "0.05", "--until", "0.1", "--out", out, "--json")
+    assert (code, json.loads(text)["from_s"], json.loads(text)["until_s"]) == (0, 0.05, 0.1)
+    assert json.loads(call("info", out, "--json")[1])[0]["cycles"] == 50
+    assert call("check", out)[0] == 0
+    code, text, _ = call("cut", recorded, "--contact", "2", "--around", "0.01", "--out", out)
+    assert code == 0
+    (info,) = json.loads(call("info", out, "--json")[1])
+    assert (info["cycles"], info["contacts"]) == (20, 1)  # the second is of cycle 70
+    code, text, _ = call("cut", recorded, "--out", out, "--json")
+    assert (json.loads(text)["from_s"], json.loads(text)["until_s"]) == (None, None)
+
+
+@pytest.mark.parametrize(
+    "options", [("--contact", "1", "--from", "1"), ("--from", "2", "--until", "1"), ("--contact", "0")]
+)
+def test_a_stretch_that_makes_no_sense_is_wrong_usage(options, recorded, tmp_path):
+    assert call("cut", recorded, *options, "--out", tmp_path / "out.mcap")[0] == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_merge_names_the_topics_that_more_than_one_log_has(tmp_path):
+    paths = [write(tmp_path / f"{name}.mcap") for name in "xy"]
+    out = tmp_path / "out.mcap"
+    code, text, err = call("merge", *paths, "--out", out)
+    assert (code, text) == (0, f"{out}: 40 messages\n")
+    assert err.splitlines()[-1] == "topics of more than one log, told apart by their channels only: /a, /b"
+    code, text, err = call("merge", *paths, "--out", out, "--prefix", "--json")
+    assert json.loads(text) == {"out": str(out), "logs": ["x", "y"], "messages": 40, "shared": []}
+    assert err.splitlines() == ["merging x, y"]

@@ -1,0 +1,184 @@
+"""Small logs made by hand, and surgery on their records that leaves everything else as it must be."""
+
+import io
+import struct
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, MetadataIndex, Schema
+from mcap.records import SummaryOffset as GroupOffset
+
+from adacd_hil.log.cdr import ENCAPSULATION, Member, number_type
+from adacd_hil.log.chunked_file import ChunkedFile, encode
+from adacd_hil.log.mcap_file import LIBRARY
+from adacd_hil.log.mcap_walk import MAGIC
+
+HEAD = struct.Struct("<BQ")
+MESSAGE = struct.Struct("<BQHIQQ")
+TYPE = number_type("adacd_hil_msgs/msg/Number", (Member("cycle", "uint64"), Member("value", "float64")))
+MILLISECOND = 1_000_000
+ATTACHMENTS = {"config.toml": b"x = 1\n", "arm.dbc": b"VERSION"}
+RUN = {"epoch_ns": "0", "parameter_count": "7", "name": "Prüfung"}
+SUMMARY = {"messages": "20", "frames": "0", "dropped": "0", "ending": "closed"}
+
+
+class MemoryTarget(io.BytesIO):
+    """What a ChunkedFile is written to."""
+
+    def write(self, data, packets=0):
+        return super().write(data)
+
+
+def payload(number, value=0.5):
+    return ENCAPSULATION + struct.pack("<IIQd", 0, number, number, value)
+
+
+def message(channel, log_time, data, publish_time=None):
+    publish_time = log_time if publish_time is None else publish_time
+    return MESSAGE.pack(Opcode.MESSAGE, 22 + len(data), channel, 0, log_time, publish_time) + data
+
+
+def make_log(
+    topics=("/a", "/b"),
+    chunks=((0, 5), (5, 10)),
+    run=RUN,
+    summary=SUMMARY,
+    attachments=ATTACHMENTS,
+    text=TYPE.text,
+    make_payload=payload,
+    times=lambda number: (number * MILLISECOND, number * MILLISECOND),
+    library=LIBRARY,
+    profile="",
+):
+    """Make a log: in each chunk a message of every topic for each of its numbers; `times`: log and publish time."""
+    target = MemoryTarget()
+    file = ChunkedFile(target, library, profile)
+    for name, data in attachments.items():
+        file.attach(Attachment(create_time=0, log_time=0, name=name, media_type="text/plain", data=data))
+    if run is not None:
+        file.add_metadata("run", run)
+    file.define_schema(Schema(id=1, name=TYPE.name, encoding="ros2msg", data=text.encode()))
+    for number, topic in enumerate(topics, start=1):
+        fields = {"fields": " ".join(TYPE.fields)}
+        file.define_channel(Channel(id=number, topic=topic, message_encoding="cdr", metadata=fields, schema_id=1))
+    for start, stop in chunks:
+        rows = [
+            (channel, *times(number), number) for number in range(start, stop) for channel in range(1, len(topics) + 1)
+        ]
+        records = [message(channel, log, make_payload(number), publish) for channel, log, publish, number in rows]
+        file.add(
+            np.frombuffer(b"".join(records), np.uint8),
+            np.array([row[0] for row in rows], np.uint16),
+            np.array([row[1] for row in rows], np.int64),
+            np.cumsum([len(record) for record in records]),
+            np.empty(0, np.int64),
+        )
+        file.flush()
+    if summary is not None:
+        file.add_metadata("summary", summary)
+    file.complete()
+    return target.getvalue()
+
+
+@dataclass
+class Part:
+    """A record of a log; `offset`: where it was, -1 for a new one."""
+
+    opcode: int
+    body: bytes
+    offset: int = -1
+
+    @property
+    def data(self):
+        return HEAD.pack(self.opcode, len(self.body)) + self.body
+
+    def read(self, kind):
+        return kind.read(ReadDataStream(io.BytesIO(self.body)))
+
+    def put(self, place, form, value):
+        """Overwrite a number in the body."""
+        body = bytearray(self.body)
+        struct.pack_into(form, body, place, value)
+        self.body = bytes(body)
+
+
+def new(record):
+    """Make a part of one of mcap's records."""
+    data = encode(record)
+    return Part(data[0], data[9:])
+
+
+def take_apart(data):
+    parts = []
+    position = len(MAGIC)
+    while position < len(data) - len(MAGIC):
+        opcode, length = HEAD.unpack_from(data, position)
+        parts.append(Part(opcode, data[position + 9 : position + 9 + length], position))
+        position += 9 + length
+    return parts
+
+
+def kinds(parts, opcode):
+    return [part for part in parts if part.opcode == opcode]
+
+
+def put_together(parts, has_right_crcs=True):
+    """Write a log of parts: what pointed to a part points to where it is, and both sections fit their CRCs."""
+    position, places = len(MAGIC), {}
+    for part in parts:
+        places[part.offset] = position
+        position += len(part.data)
+    for part in parts:
+        if part.offset >= 0:
+            _move(part, places)
+    if has_right_crcs:
+        _set_crcs(parts)
+    return MAGIC + b"".join(part.data for part in parts) + MAGIC
+
+
+def _move(part, places):
+    def at(place):
+        return places.get(place, place)
+
+    if part.opcode == Opcode.CHUNK_INDEX:
+        index = part.read(ChunkIndex)
+        index.chunk_start_offset = at(index.chunk_start_offset)
+        index.message_index_offsets = {channel: at(place) for channel, place in index.message_index_offsets.items()}
+        part.body = new(index).body
+    elif part.opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+        index = part.read(AttachmentIndex if part.opcode == Opcode.ATTACHMENT_INDEX else MetadataIndex)
+        index.offset = at(index.offset)
+        part.body = new(index).body
+    elif part.opcode == Opcode.SUMMARY_OFFSET:
+        group = part.read(GroupOffset)
+        group.group_start = at(group.group_start)
+        part.body = new(group).body
+    elif part.opcode == Opcode.FOOTER:
+        footer = part.read(Footer)
+        footer.summary_start, footer.summary_offset_start = at(footer.summary_start), at(footer.summary_offset_start)
+        part.body = new(footer).body
+
+
+def _set_crcs(parts):
+    crc = zlib.crc32(MAGIC)
+    for part in parts:
+        if part.opcode == Opcode.DATA_END:
+            part.put(0, "<I", crc)
+            crc = 0
+        elif part.opcode == Opcode.FOOTER:
+            part.put(16, "<I", zlib.crc32(part.data[:-4], crc))
+        else:
+            crc = zlib.crc32(part.data, crc)
+
+
+def rechunk(part, edit):
+    """Change what a chunk holds."""
+    import zstandard
+
+    chunk = part.read(Chunk)
+    data = edit(zstandard.decompress(chunk.data))
+    chunk.data, chunk.uncompressed_size, chunk.uncompressed_crc = zstandard.compress(data), len(data), zlib.crc32(data)
+    part.body = new(chunk).body

@@ -1,0 +1,261 @@
+"""Stretches of logs, and several logs as one: the same messages, whole cycles, nothing out of order."""
+
+import numpy as np
+import pytest
+from made_log import ATTACHMENTS, MILLISECOND, RUN, SUMMARY, kinds, make_log, put_together, take_apart
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+
+from adacd_hil.log.check import check_log
+from adacd_hil.log.cut import Stretch, contacts_begun, cut, find_contact
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.merge import log_names, merge
+from adacd_hil.log.reader import LoggedContact, read_log
+from adacd_hil.records import ContactReport
+
+INFINITE = float("inf")
+CYCLES = 300
+LATE_NS = 5_000_000_000
+
+
+def read(path):
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = reader.iter_messages(log_time_order=False)
+        messages = [
+            (channel.topic, message.log_time, message.publish_time, message.data) for _, channel, message in found
+        ]
+        attachments = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
+        return messages, attachments, {record.name: record.metadata for record in reader.iter_metadata()}
+
+
+def write(path, **options):
+    path.parent.mkdir(exist_ok=True, parents=True)
+    path.write_bytes(make_log(**options))
+    return path
+
+
+def frame_times(number):
+    """A message logged before its cycle, as a frame is that was stamped late."""
+    return number * MILLISECOND + LATE_NS - 300_000, number * MILLISECOND + LATE_NS
+
+
+@pytest.fixture
+def log_path(tmp_path):
+    chunks = tuple((start, start + 50) for start in range(0, CYCLES, 50))
+    summary = {**SUMMARY, "messages": str(2 * CYCLES), "dropped": "2"}
+    return write(tmp_path / "run.mcap", chunks=chunks, times=frame_times, summary=summary)
+
+
+def test_a_stretch_has_its_cycles_whole_and_all_that_explains_them(log_path, tmp_path):
+    out = tmp_path / "out.mcap"
+    done = cut(log_path, out, Stretch(0.040, 0.1205))
+    messages, attachments, metadata = read(out)
+    assert messages == [message for message in read(log_path)[0] if 40 <= (message[2] - LATE_NS) / MILLISECOND <= 120]
+    assert done.messages == len(messages) == 2 * 81
+    assert (attachments, metadata["run"]) == (ATTACHMENTS, RUN)
+    assert metadata["summary"] == {
+        "frames": "0",
+        "messages": "162",
+        "dropped": "2",
+        "ending": "cut",
+        "source": "run.mcap",
+        "from_s": "0.04",
+        "until_s": "0.1205",
+    }
+    assert {finding.rule for finding in check_log(out).findings} == {"dropped"}
+
+
+def test_an_open_end_takes_the_rest(log_path, tmp_path):
+    assert cut(log_path, tmp_path / "all.mcap", Stretch(-INFINITE, INFINITE)).messages == 2 * CYCLES
+    assert cut(log_path, tmp_path / "end.mcap", Stretch(0.290, INFINITE)).messages == 20
+    assert cut(log_path, tmp_path / "start.mcap", Stretch(-INFINITE, 0.010)).messages == 20
+
+
+def test_only_the_asked_topics_are_taken(log_path, tmp_path):
+    out = tmp_path / "out.mcap"
+    cut(log_path, out, Stretch(0.0, 0.1), topics=("/b",))
+    assert {topic for topic, *_ in read(out)[0]} == {"/b"}
+    with make_reader(out.open("rb"))._stream as file:
+        file.seek(0)
+        assert [channel.topic for channel in make_reader(file).get_summary().channels.values()] == ["/b"]
+
+
+@pytest.mark.parametrize(
+    ("stretch", "topics", "text"),
+    [
+        (Stretch(7.0, 8.0), (), "has no message from 7 to 8 s"),
+        (Stretch(0.0, 1.0), ("/c",), "has no topic /c; it has /a, /b"),
+    ],
+)
+def test_a_stretch_of_nothing_is_an_error_and_leaves_no_file(stretch, topics, text, log_path, tmp_path):
+    with pytest.raises(LogError, match=text):
+        cut(log_path, tmp_path / "out.mcap", stretch, topics)
+    assert list(tmp_path.iterdir()) == [log_path]
+
+
+def test_of_a_strangers_log_messages_are_taken_by_log_time(tmp_path):
+    log = write(tmp_path / "x.mcap", run=None, summary=None, times=lambda number: (number * MILLISECOND, 0))
+    out = tmp_path / "out.mcap"
+    assert cut(log, out, Stretch(0.002, 0.004)).messages == 4
+
+
+def spoil_chunk(data):
+    chunk = kinds(take_apart(data), Opcode.CHUNK)[-1]
+    return data[: chunk.offset + 60] + b"\xff" + data[chunk.offset + 61 :]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        spoil_chunk,
+        lambda data: data[:-1],
+        lambda data: data[: len(data) // 2],
+        lambda data: data.replace(b"x = 1", b"x = 2"),
+    ],
+)
+def test_a_damaged_log_is_recovered_first(spoil, log_path, tmp_path):
+    log_path.write_bytes(spoil(log_path.read_bytes()))
+    for work in (
+        lambda out: cut(log_path, out, Stretch(-INFINITE, INFINITE)),
+        lambda out: merge([log_path], out),
+    ):
+        with pytest.raises(LogError, match=r"is damaged or cut at byte \d+: recover it first$"):
+            work(tmp_path / "out.mcap")
+        assert list(tmp_path.iterdir()) == [log_path]
+
+
+def test_a_log_is_not_overwritten_by_what_is_made_of_it(log_path):
+    before = log_path.read_bytes()
+    with pytest.raises(LogError, match="is the log itself"):
+        cut(log_path, log_path, Stretch(-INFINITE, INFINITE))
+    with pytest.raises(LogError, match="is one of the logs"):
+        merge([log_path], log_path)
+    assert log_path.read_bytes() == before
+
+
+def report(cycle, is_final):
+    return LoggedContact(cycle * MILLISECOND, ContactReport(cycle, 2, (1, 1), (0.0, 0.0), (0.0, 0.0), is_final))
+
+
+def test_contacts_are_counted_by_the_cycle_that_they_began_in():
+    reports = [
+        report(3, False),
+        report(3, False),
+        report(3, True),
+        report(9, False),
+        report(20, False),
+        report(20, True),
+    ]
+    assert [contact.report.cycle for contact in contacts_begun(reports)] == [3, 9, 20]
+
+
+def test_an_unknown_contact_is_an_error(log_path):
+    with pytest.raises(LogError, match=r"has 0 contacts: there is no contact 1$"):
+        find_contact(log_path, 1, 1.0)
+
+
+def test_logs_are_merged_by_time_and_keep_their_own_order(tmp_path):
+    first = write(tmp_path / "a.mcap", topics=("/a", "/x"), times=frame_times)
+    second = write(
+        tmp_path / "b.mcap",
+        topics=("/b", "/x"),
+        chunks=((0, 3), (3, 4), (4, 10)),
+        times=lambda number: (number * MILLISECOND + LATE_NS + 1000, number),
+    )
+    out = tmp_path / "out.mcap"
+    done = merge([first, second], out)
+    messages = read(out)[0]
+    assert done.messages == len(messages) == 40
+    assert done.shared == ("/x",)
+    assert [message[1] for message in messages] == sorted(message[1] for message in messages)
+    for path in (first, second):
+        own = read(path)[0]
+        assert [message for message in messages if message in own] == own
+    assert check_log(out).findings == []
+
+
+def test_a_log_that_runs_backwards_between_topics_keeps_its_order(tmp_path):
+    path = tmp_path / "a.mcap"
+    data = make_log(times=lambda number: (10**9 + number * MILLISECOND, 0))
+    parts = take_apart(data)
+    path.write_bytes(put_together(parts))
+    other = write(tmp_path / "b.mcap", topics=("/c",), times=lambda number: (10**9 + number * MILLISECOND // 2, 0))
+    out = tmp_path / "out.mcap"
+    merge([path, other], out)
+    assert [message for message in read(out)[0] if message[0] != "/c"] == read(path)[0]
+
+
+def test_what_logs_say_of_themselves_is_kept_apart(tmp_path):
+    first = write(tmp_path / "a" / "run.mcap", summary={**SUMMARY, "dropped": "1"})
+    second = write(
+        tmp_path / "b" / "run.mcap",
+        run={**RUN, "name": "other"},
+        attachments={"config.toml": b"x = 2\n", "arm.dbc": ATTACHMENTS["arm.dbc"]},
+    )
+    out = tmp_path / "out.mcap"
+    done = merge([first, second], out, has_prefix=True)
+    messages, attachments, metadata = read(out)
+    assert done.names == ("a_run", "b_run")
+    assert {topic for topic, *_ in messages} == {"/a_run/a", "/a_run/b", "/b_run/a", "/b_run/b"}
+    assert attachments == {**ATTACHMENTS, "b_run/config.toml": b"x = 2\n"}
+    assert (metadata["run"], metadata["run:b_run"]["name"]) == (RUN, "other")
+    assert (metadata["summary"]["dropped"], metadata["summary"]["ending"]) == ("1", "merged")
+
+
+def test_logs_of_one_name_are_told_apart(tmp_path):
+    assert log_names([tmp_path / "a.mcap", tmp_path / "b.mcap"]) == ("a", "b")
+    assert log_names([tmp_path / "a.mcap", tmp_path / "a.mcap"])[0].endswith("_a_1")
+
+
+def write_parts(folder):
+    for number, ending in enumerate(("continued", "closed")):
+        name = f"run_{number:03d}.mcap" if number else "run.mcap"
+        chunks = ((10 * number, 10 * number + 10),)
+        run = {**RUN, "part": str(number)}
+        write(folder / name, chunks=chunks, run=run, times=frame_times, summary={**SUMMARY, "ending": ending})
+    return folder / "run.mcap"
+
+
+def test_parts_are_one_log(tmp_path):
+    path = write_parts(tmp_path)
+    whole = read(path)[0] + read(tmp_path / "run_001.mcap")[0]
+    merge([path, tmp_path / "run_001.mcap"], tmp_path / "merged.mcap")
+    cut(path, tmp_path / "cut.mcap", Stretch(-INFINITE, INFINITE))
+    for out in (tmp_path / "merged.mcap", tmp_path / "cut.mcap"):
+        messages, attachments, metadata = read(out)
+        assert (messages, attachments, metadata["run"]) == (whole, ATTACHMENTS, RUN)
+        assert check_log(out).findings == []
+        assert read_log(out).problem == ""
+
+
+def test_parts_that_are_missing_or_of_another_run_are_an_error(tmp_path):
+    path = write_parts(tmp_path)
+    (tmp_path / "run_001.mcap").rename(tmp_path / "run_002.mcap")
+    with pytest.raises(LogError, match=r"run_001\.mcap is missing: recover the log first$"):
+        merge([path], tmp_path / "out.mcap")
+    (tmp_path / "run_002.mcap").unlink()
+    write(tmp_path / "run_001.mcap", run={**RUN, "name": "other"})
+    with pytest.raises(LogError, match=r"its parts are of different runs$"):
+        merge([path], tmp_path / "out.mcap")
+
+
+def test_many_logs_of_random_times_are_merged_as_a_sort_would(tmp_path):
+    generator = np.random.default_rng(3)
+    paths = []
+    for number in range(4):
+        times = np.sort(generator.integers(0, 60, 40)).tolist()
+        chunks = tuple((start, start + 8) for start in range(0, 40, 8))
+        paths.append(
+            write(
+                tmp_path / f"{number}.mcap",
+                topics=(f"/{number}",),
+                chunks=chunks,
+                times=lambda place, times=times: (times[place], 0),
+            )
+        )
+    merge(paths, tmp_path / "out.mcap")
+    merged = read(tmp_path / "out.mcap")[0]
+    assert [message[1] for message in merged] == sorted(message[1] for message in merged)
+    for number, path in enumerate(paths):
+        assert [message for message in merged if message[0] == f"/{number}"] == read(path)[0]

@@ -1,0 +1,112 @@
+"""Damages logs and kills runs, and looks at what `log check` and `log recover` make of it.
+
+    python tools/damage_campaign.py                      1000 damaged logs, 20 killed runs
+    python tools/damage_campaign.py --logs 1000 --kills 0
+    python tools/damage_campaign.py --kills 200 --logs 0 --seed 7 --json
+
+A log of random numbers is cut, has bits flipped or stretches zeroed, at places that the seed chooses: check must find
+it, and recover must save every intact chunk and no message that the log never had. A run of the experiment in real time
+loses its writer, its control process or both by SIGKILL at moments that the seed chooses: recover must save all but the
+last 0.3 s, cycle for cycle.
+
+Exit status: 0 all as it must be, 1 something isn't, 2 wrong usage.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+sys.path[:0] = [str(Path(__file__).resolve().parent.parent), str(Path(__file__).resolve().parent)]
+
+from damage_trials import DamageResult, Undamaged, make_undamaged, run_trial  # noqa: E402
+from kill_trials import LOSS_BOUND_S, KillResult, kill_trial  # noqa: E402
+
+REPORT_EVERY = 100
+
+
+def damaged_logs(count: int, seed: int, jobs: int, folder: Path) -> list[DamageResult]:
+    """Damage `count` logs."""
+    if not count:
+        return []
+    whole = make_undamaged(folder)
+    results = []
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(_trial, whole, seed + index, folder / str(index)) for index in range(count)]
+        for future in futures:
+            results.append(future.result())
+            _tell_violations(results[-1].seed, results[-1].violations)
+            if len(results) % REPORT_EVERY == 0:
+                print(f"{len(results)} of {count} damaged logs", file=sys.stderr)
+    return results
+
+
+def _trial(whole: Undamaged, seed: int, folder: Path) -> DamageResult:
+    return run_trial(whole, seed, folder)
+
+
+def killed_runs(count: int, seed: int, folder: Path) -> list[KillResult]:
+    """Kill `count` runs."""
+    results = []
+    for index in range(count):
+        result = kill_trial(seed + index, folder / f"kill{index}")
+        results.append(result)
+        _tell_violations(result.seed, result.violations)
+        line = f"{result.victim} killed after {result.cycles} cycles, lost {result.lost_s:.3f} s"
+        print(f"{index + 1} of {count} killed runs: {line}", file=sys.stderr)
+    return results
+
+
+def _tell_violations(seed: int, violations: Sequence[str]) -> None:
+    for violation in violations:
+        print(f"seed {seed}: {violation}", file=sys.stderr)
+
+
+def summary(logs: Sequence[DamageResult], kills: Sequence[KillResult]) -> dict[str, Any]:
+    """Sum up."""
+    statuses = Counter(str(result.exit_status) for result in logs)
+    return {
+        "damaged_logs": len(logs),
+        "by_kind": dict(Counter(result.kind for result in logs)),
+        "found_by_check": sum(result.found for result in logs),
+        "recover_exit_status": dict(sorted(statuses.items())),
+        "killed_runs": len(kills),
+        "by_victim": dict(Counter(result.victim for result in kills)),
+        "most_lost_s": max((result.lost_s for result in kills), default=0.0),
+        "bound_s": LOSS_BOUND_S,
+        "violations": sum(bool(result.violations) for result in (*logs, *kills)),
+    }
+
+
+def main() -> int:
+    """Run the command line; return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--logs", type=int, default=1000, help="logs to damage")
+    parser.add_argument("--kills", type=int, default=20, help="runs to kill, one at a time")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("-j", "--jobs", type=int, default=2, help="processes that damage logs")
+    parser.add_argument("--json", action="store_true", help="print every trial")
+    arguments = parser.parse_args()
+    if min(arguments.logs, arguments.kills, arguments.seed) < 0 or arguments.jobs < 1:
+        parser.error("counts and seed are 0 or more, jobs 1 or more")
+    with tempfile.TemporaryDirectory() as name:
+        logs = damaged_logs(arguments.logs, arguments.seed, arguments.jobs, Path(name))
+        kills = killed_runs(arguments.kills, arguments.seed, Path(name))
+    totals = summary(logs, kills)
+    if arguments.json:
+        trials = {"logs": [asdict(result) for result in logs], "kills": [asdict(result) for result in kills]}
+        print(json.dumps({**totals, **trials}, indent=1))
+    else:
+        print("\n".join(f"{key}: {value}" for key, value in totals.items()))
+    return 1 if totals["violations"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,125 @@
+"""Runs of the experiment in real time that are killed, for tools/damage_campaign.py: what recover must save of each.
+
+The host and the emulated arm are one process, the writer of the log is another. What was on the way when the processes
+died is told by the wall clock, which the log's times are of.
+"""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from damage_trials import messages_of
+
+from adacd_hil.log.check import check_log
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import read_log
+from adacd_hil.log.recover import recover
+
+VICTIMS = ("writer", "control", "both")
+LOSS_BOUND_S = 0.3
+MOST_S = 4.0
+"""Latest moment to kill, after the first cycles are on the disk."""
+START_S = 120.0
+"""Longest until then: everything is compiled before."""
+ROOT = Path(__file__).resolve().parent.parent
+_DEMO = "from adacd_hil.cli.main import main; main()"
+
+
+@dataclass(frozen=True)
+class KillResult:
+    """One killed run. `cycles`: saved; `lost_s`: from the last of them to the kill."""
+
+    seed: int
+    victim: str
+    cycles: int
+    lost_s: float
+    exit_status: int
+    violations: list[str]
+
+
+def kill_trial(seed: int, folder: Path) -> KillResult:
+    """Start a run, kill it, recover its log, judge the result."""
+    victim = VICTIMS[seed % len(VICTIMS)]
+    wait_s = float(np.random.default_rng(seed).uniform(0.0, MOST_S))
+    command = [sys.executable, "-c", _DEMO, "demo", "--clock", "realtime", "--out", str(folder)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        path = folder / "run.mcap"
+        try:
+            writer = _wait_for_cycles(process, path)
+            time.sleep(wait_s)
+            killed_ns = time.time_ns()
+            for pid in {"writer": [writer], "control": [process.pid], "both": [process.pid, writer]}[victim]:
+                os.kill(pid, signal.SIGKILL)
+            _wait_for_end(writer)
+        finally:
+            process.kill()
+    return _judge(seed, victim, killed_ns, path)
+
+
+def _wait_for_cycles(process: "subprocess.Popen[bytes]", path: Path) -> int:
+    """Wait until cycles are on the disk; return the pid of the log's writer."""
+    end_s = time.monotonic() + START_S
+    while time.monotonic() < end_s and process.poll() is None:
+        time.sleep(0.1)
+        if path.exists() and len(read_log(path, ("/cycle",)).cycle):
+            return _writer_of(process.pid, path)
+    raise RuntimeError(f"{path}: no cycle within {START_S:g} s")
+
+
+def _writer_of(control: int, path: Path) -> int:
+    """Find the child that has the log open."""
+    children = Path(f"/proc/{control}/task/{control}/children").read_text().split()
+    for child in map(int, children):
+        links = (link.resolve() for link in Path(f"/proc/{child}/fd").iterdir())
+        if path.resolve() in links:
+            return child
+    raise RuntimeError(f"{path}: nobody has it open")
+
+
+def _wait_for_end(pid: int) -> None:
+    try:
+        descriptor = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return
+    select.select([descriptor], [], [], START_S)
+    os.close(descriptor)
+
+
+def _judge(seed: int, victim: str, killed_ns: int, path: Path) -> KillResult:
+    before = messages_of(path)  # whatever mcap's reader finds up to the damage
+    checked = check_log(path)
+    violations = []
+    if victim != "control" and not checked.errors:
+        violations.append("check finds nothing")
+    if victim == "control" and checked.errors:
+        violations.append(f"the writer ended the log, and check finds {checked.findings[0].text}")
+    try:
+        recovery = recover(path)
+    except LogError as error:
+        return KillResult(seed, victim, 0, 0.0, 1, [str(error)])
+    log = read_log(recovery.out)
+    cycle = log.cycle["cycle"]
+    if log.problem or check_log(recovery.out).errors:
+        violations.append("the recovered log fails its check")
+    if messages_of(recovery.out) != before:
+        violations.append("the recovered log has other messages than mcap's reader finds before the damage")
+    missing = int(cycle[-1] - cycle[0]) + 1 - len(cycle)
+    skipped = int(log.cycle["overruns"][-1] - log.cycle["overruns"][0])  # by a host that was late
+    if missing != skipped:
+        violations.append(f"{missing} cycles are missing in between, of which the host skipped {skipped}")
+    topics = {name: len(log.topics[name]) for name in ("/scheme", "/control", "/joint_states")}
+    if any(abs(count - len(cycle)) > 1 for count in topics.values()):
+        violations.append(f"{len(cycle)} cycles, but {topics}")
+    lost_s = (killed_ns - int(log.cycle.records["publish_time"][-1])) * 1e-9
+    if lost_s > LOSS_BOUND_S:
+        violations.append(f"lost {lost_s:.3f} s, more than {LOSS_BOUND_S:g} s")
+    if victim != "control" and not recovery.is_lossy:
+        violations.append("recover says that nothing was lost")
+    return KillResult(seed, victim, len(cycle), lost_s, 3 if recovery.is_lossy else 0, violations)
