@@ -15,6 +15,7 @@ from hand_made_run import A, M, like_an_old_log, make_run, react, touched_run
 
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report import write_report, write_run_report
+from adacd_hil.analysis.report_reading import Source
 from adacd_hil.analysis.timing_page import timing_section
 from adacd_hil.config import to_toml
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_scheme, pack_truth
@@ -29,7 +30,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), log_name="run.mcap")
+    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), Source("run.mcap"))
 
 
 @pytest.fixture(scope="module")
@@ -126,21 +127,21 @@ def test_the_table_in_the_file_is_the_reports(report, table):
 
 def test_a_real_arm_has_null_where_only_the_truth_could_tell(tmp_path):
     run = react(make_run(has_truth=False), 3000)
-    table = write_run_report(run, tmp_path, log_name="run.mcap").as_json()
+    table = write_run_report(run, tmp_path, Source("run.mcap")).as_json()
     assert [table[key] for key in ("false_alarms", "false_alarms_s", "missed")] == [None] * 3
 
 
 def test_a_value_that_is_not_finite_becomes_null(tmp_path):
     run = make_run((A, 100), (M, 100))
     run.tau_ext_hat[150, 0] = float("nan")
-    table = write_run_report(run, tmp_path, log_name="run.mcap").as_json()
+    table = write_run_report(run, tmp_path, Source("run.mcap")).as_json()
     assert table["frozen_residual_max_Nm"]["B"]["identified"] == [None, 0.0]
 
 
 def test_a_fault_is_in_the_table(tmp_path):
     run = make_run((A, 100), (SchemeState.FAULT, 5))
     run.fault[100:] = FaultReason.DATA_AGE
-    assert write_run_report(run, tmp_path, log_name="run.mcap").as_json()["fault"] == {
+    assert write_run_report(run, tmp_path, Source("run.mcap")).as_json()["fault"] == {
         "reason": "DATA_AGE",
         "at_s": 0.1,
     }
@@ -155,7 +156,7 @@ def test_the_text_ends_with_the_place_of_the_page(report):
 
 
 def test_the_text_says_what_the_log_lacks(report):
-    text = replace(report, problem="cut after 12 s").as_text()
+    text = replace(report, source=Source("run.mcap", "cut after 12 s")).as_text()
     assert text.splitlines()[1] == "The log is not whole: cut after 12 s"
 
 
@@ -234,7 +235,7 @@ def test_a_run_with_a_missed_contact_looks_bad(html):
 
 
 def test_a_run_without_fault_looks_good(tmp_path):
-    html = write_run_report(make_run(), tmp_path, log_name="run.mcap").html_path.read_text(encoding="utf-8")
+    html = write_run_report(make_run(), tmp_path, Source("run.mcap")).html_path.read_text(encoding="utf-8")
     assert '<header class="good">' in html
 
 
@@ -287,12 +288,12 @@ def test_a_run_without_a_reaction_has_dashes_for_its_latency():
 
 
 def test_the_page_says_what_the_log_lacks(tmp_path):
-    report = write_run_report(make_run((A, 10)), tmp_path, log_name="run.mcap", problem="cut after 12 s")
+    report = write_run_report(make_run((A, 10)), tmp_path, Source("run.mcap", "cut after 12 s"))
     assert "The log is not whole: cut after 12 s" in report.html_path.read_text(encoding="utf-8")
 
 
 def test_the_page_says_how_many_packets_were_dropped(tmp_path):
-    report = write_run_report(replace(make_run((A, 10)), dropped=3), tmp_path, log_name="run.mcap")
+    report = write_run_report(replace(make_run((A, 10)), dropped=3), tmp_path, Source("run.mcap"))
     assert "3 packets are not in the log" in report.html_path.read_text(encoding="utf-8")
 
 
@@ -300,7 +301,7 @@ def test_metadata_cannot_become_markup(tmp_path):
     run = make_run((A, 10))
     evil = '<script>alert("1")</script>'
     run = replace(run, metadata={**run.metadata, "config": evil, "profile": evil, evil: evil})
-    html = write_run_report(run, tmp_path, log_name=evil, problem=evil).html_path.read_text(encoding="utf-8")
+    html = write_run_report(run, tmp_path, Source(evil, evil)).html_path.read_text(encoding="utf-8")
     assert "<script" not in html
 
 
@@ -308,12 +309,12 @@ def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
     run = make_run((A, 1))
     names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
     run = replace(run, **{name: getattr(run, name)[:0] for name in names})
-    page = Page(write_run_report(run, tmp_path, log_name="run.mcap").html_path.read_text(encoding="utf-8"))
+    page = Page(write_run_report(run, tmp_path, Source("run.mcap")).html_path.read_text(encoding="utf-8"))
     assert page.unbalanced == []
 
 
 def test_the_same_run_gives_the_same_page(html, tmp_path):
-    again = write_run_report(touched_run(), tmp_path, log_name="run.mcap")
+    again = write_run_report(touched_run(), tmp_path, Source("run.mcap"))
     assert again.html_path.read_text(encoding="utf-8") == html
 
 
@@ -324,7 +325,7 @@ def test_the_page_is_small(html):
 def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(LogError, match=r"report in .*taken can't be written"):
-        write_run_report(make_run((A, 10)), tmp_path / "taken", log_name="run.mcap")
+        write_run_report(make_run((A, 10)), tmp_path / "taken", Source("run.mcap"))
 
 
 def record(path, run, attachments):
@@ -370,7 +371,7 @@ def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
     record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
     record_truth(tmp_path / "truth.mcap", run)
     from_files = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path / "a").as_json()
-    from_memory = write_run_report(run, tmp_path / "b", log_name="run.mcap").as_json()
+    from_memory = write_run_report(run, tmp_path / "b", Source("run.mcap")).as_json()
     assert without_cycle_times(from_files) == without_cycle_times(from_memory)
 
 
