@@ -21,7 +21,9 @@ from adacd_hil.analysis.report_tables import (
     sections_table,
 )
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.timeline import timeline
 from adacd_hil.analysis.timing_page import timing_section
+from adacd_hil.analysis.traces_page import SCRIPTS, STYLES, traces_section
 
 
 def report_page(
@@ -30,20 +32,24 @@ def report_page(
     """Write the page. drawings, timing: the figures of the run and of its times."""
     figures = {drawing.name: embed(drawing) for drawing in drawings}
     adaptations = "".join(figure for name, figure in figures.items() if name.removeprefix("fig") not in (name, "5"))
+    traces = traces_section(run, metrics)
     parts = [
         _header(metrics, run, source),
         _tiles(metrics),
+        timeline(run, metrics),
         figures.get("fig5", ""),
         wrap_section("Paper against measured", paper_table(metrics)),
         wrap_section("Sections", sections_table(metrics, run)),
         wrap_section("Margins", margins_table(metrics.evidence)),
-        wrap_section("Contacts", figures.get("contacts", ""), contacts_table(metrics), contact_cards(metrics)),
+        wrap_section("Contacts", figures.get("contacts", ""), contacts_table(metrics), contact_cards(metrics, run)),
         wrap_section("Model identification", adaptations, parameters_table(metrics, run), further_table(metrics)),
+        traces,
         timing_section(metrics.timing, timing),
         wrap_section("Run", run_table(metrics, run.metadata, source)),
         definitions(run),
     ]
-    return document(f"{_name(run, source)} – run report", parts)
+    title = f"{_name(run, source)} – run report"
+    return document(title, parts, STYLES, SCRIPTS) if traces else document(title, parts)
 
 
 def _name(run: Run, source: Source) -> str:

@@ -8,14 +8,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.run import CertifiedStream, PaperStream, Run, Truth
+from adacd_hil.analysis.run import CertifiedStream, Motion, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import columns_of_series
 from adacd_hil.config import Settings, parse
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import JOINTS, Request
 
-RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact")
+RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact", "/events")
 """Of a run's log, what a report reads."""
 
 
@@ -69,6 +69,8 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
         dropped=_count(log.summary, "dropped"),
         certified=_certified_stream(scheme, settings),
         beside=_paper_stream(scheme),
+        motion=Motion(scheme["q"], scheme["dq"], scheme["tau_J"]),
+        events=tuple(log.events),
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from string import ascii_letters
 from typing import Final
 
 from adacd_hil.analysis.evidence import Evidence
@@ -104,7 +105,8 @@ def _judged(values: tuple[float, float] | None, threshold: tuple[float, float]) 
 
 
 def _symbol(name: str) -> str:
-    stem, index = (name[0], name[1:]) if "_" not in name else name.split("_", 1)
+    """Write a parameter's name with its index below: F_v1, a1, offset1."""
+    stem, index = name.split("_", 1) if "_" in name else (name.rstrip("0123456789"), name.lstrip(ascii_letters))
     return f"<i>{escape(stem)}</i><sub>{escape(index)}</sub>"
 
 
