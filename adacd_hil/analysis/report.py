@@ -1,4 +1,6 @@
-"""The report of a run: one self-contained HTML page, the same numbers as JSON, and the paper's figures as PNG.
+"""The report of a run: one self-contained HTML page, the same numbers as JSON and CSV, and the paper's figures as PNG.
+
+Where it is asked for, it is printed, too: report.pdf and report.png have the words and all figures.
 
 The same log gives the same bytes.
 """
@@ -11,8 +13,10 @@ from typing import Any, Final
 
 from adacd_hil.analysis.figures import draw
 from adacd_hil.analysis.metrics import Metrics, evaluate
+from adacd_hil.analysis.report_csv import report_tables
 from adacd_hil.analysis.report_json import report_json
 from adacd_hil.analysis.report_page import report_page
+from adacd_hil.analysis.report_print import report_pdf, report_png
 from adacd_hil.analysis.report_reading import Source, read_run
 from adacd_hil.analysis.report_words import align_columns, contact_rows, paper_cells, paper_head
 from adacd_hil.analysis.run import Run
@@ -46,26 +50,30 @@ class Report:
 
     def as_text(self) -> str:
         """Give the verdict, what the paper had, the contacts and where the report is, for a terminal."""
-        lines = [self.metrics.verdict]
-        if self.source.problem:
-            lines.append(f"The log is not whole: {self.source.problem}")
-        lines += ["", *align_columns([paper_head(self.metrics), *paper_cells(self.metrics)])]
-        if self.metrics.contacts:
-            head, rows = contact_rows(self.metrics)
-            lines += ["", *align_columns([head, *rows])]
+        lines = [self.metrics.verdict, *_tables(self.metrics, self.source)]
         return "\n".join([*lines, "", f"Report: {self.html_path}"])
 
 
-def write_report(log_path: Path, truth_path: Path | None, out_dir: Path) -> Report:
+def _tables(metrics: Metrics, source: Source) -> list[str]:
+    """Give what the log lacks, what the paper had and the contacts, line by line."""
+    lines = [f"The log is not whole: {source.problem}"] if source.problem else []
+    lines += ["", *align_columns([paper_head(metrics), *paper_cells(metrics)])]
+    if metrics.contacts:
+        head, rows = contact_rows(metrics)
+        lines += ["", *align_columns([head, *rows])]
+    return lines
+
+
+def write_report(log_path: Path, truth_path: Path | None, out_dir: Path, *, is_printed: bool = False) -> Report:
     """Read a log, and the emulator's truth if there is one, and write the report into `out_dir`.
 
     Raises LogError when a log can't be read or the report can't be written.
     """
     run, source = read_run(log_path, truth_path)
-    return write_run_report(run, out_dir, source)
+    return write_run_report(run, out_dir, source, is_printed=is_printed)
 
 
-def write_run_report(run: Run, out_dir: Path, source: Source) -> Report:
+def write_run_report(run: Run, out_dir: Path, source: Source, *, is_printed: bool = False) -> Report:
     """Write the report of a run that is in memory. Raises LogError when it can't be written."""
     metrics = evaluate(run)
     drawings = draw(run, metrics)
@@ -79,13 +87,22 @@ def write_run_report(run: Run, out_dir: Path, source: Source) -> Report:
         json_path=out_dir / JSON_NAME,
         figure_paths=tuple(out_dir / f"{name}.png" for name in pngs),
     )
+    table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
+    texts = {
+        **report_tables(run, metrics),
+        report.json_path.name: table + "\n",
+        report.html_path.name: report_page(metrics, run, source, drawings, timing),
+    }
+    files = {f"{name}.png": png for name, png in pngs.items()}
+    files |= {name: text.encode() for name, text in texts.items()}
+    if is_printed:
+        shown, verdict = [*drawings, *timing], (metrics.verdict, metrics.is_clean)
+        files["report.pdf"] = report_pdf(*verdict, _tables(metrics, source), shown)
+        files["report.png"] = report_png(*verdict, shown)
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
-        for name, png in pngs.items():
-            (out_dir / f"{name}.png").write_bytes(png)
-        text = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
-        report.json_path.write_text(text + "\n", encoding="utf-8")
-        report.html_path.write_text(report_page(metrics, run, source, drawings, timing), encoding="utf-8")
+        for name, content in files.items():
+            (out_dir / name).write_bytes(content)
     except OSError as error:
         raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
     return report
