@@ -18,7 +18,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from io import RawIOBase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,9 +61,9 @@ class Seen(NamedTuple):
 class Tab:
     """A page in a browser, spoken to in Chromium's DevTools protocol, one command at a time."""
 
-    def __init__(self, commands: int, answers: int) -> None:
+    def __init__(self, commands: int, answers: RawIOBase) -> None:
         self._commands = commands
-        self._answers = os.fdopen(answers, "rb", buffering=0)
+        self._answers = answers
         self._rest = b""
         self._session: str | None = None
         self._count = 0
@@ -121,10 +122,10 @@ def open_tab(program: str) -> Iterator[Tab]:
         os.close(command_end)
         os.close(answer_end)
         try:
-            yield Tab(commands, answers)
+            with os.fdopen(answers, "rb", buffering=0) as told:
+                yield Tab(commands, told)
         finally:
-            with suppress(OSError):
-                os.close(commands)  # Chromium ends when nobody speaks to it
+            os.close(commands)  # Chromium ends when nobody speaks to it
             try:
                 process.wait(10)
             except subprocess.TimeoutExpired:

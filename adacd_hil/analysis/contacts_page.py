@@ -102,15 +102,17 @@ def _found(contact: Contact) -> list[tuple[str, str]]:
 
 
 def _torques(contact: Contact) -> list[tuple[str, str]]:
-    peaks, peak_sigmas = contact.tau_ext_peak_hat_Nm or (), contact.tau_ext_peak_sigma_Nm or ()
-    impulses, impulse_sigmas = contact.impulse_Nm_s or (), contact.impulse_sigma_Nm_s or ()
+    """Give each joint's peak and impulse; a peak without its deviation where that is not told."""
+    unknown = (None, None)
+    impulses = contact.impulse_Nm_s or unknown
+    impulse_sigmas = contact.impulse_sigma_Nm_s or unknown
+    peak_sigmas = contact.tau_ext_peak_sigma_Nm or unknown
     entries = []
-    for joint in range(len(peaks)):
-        peak = uncertain_text(peaks[joint], peak_sigmas[joint], 2, "Nm")
-        if peak == NONE:
-            peak = number_text(peaks[joint], 2, "Nm")
-        impulse = uncertain_text(impulses[joint], impulse_sigmas[joint], 3, "Nm s") if impulses else NONE
-        entries.append((f"joint {joint + 1}", f"peak {peak}" + ("" if impulse == NONE else f", impulse {impulse}")))
+    for joint, peak_Nm in enumerate(contact.tau_ext_peak_hat_Nm or ()):
+        peak = uncertain_text(peak_Nm, peak_sigmas[joint], 2, "Nm")
+        impulse = uncertain_text(impulses[joint], impulse_sigmas[joint], 3, "Nm s")
+        words = f"peak {number_text(peak_Nm, 2, 'Nm') if peak == NONE else peak}"
+        entries.append((f"joint {joint + 1}", words if impulse == NONE else f"{words}, impulse {impulse}"))
     return entries
 
 

@@ -274,7 +274,8 @@ def test_the_text_puts_three_columns_side_by_side():
 def test_the_page_has_a_card_for_the_contact():
     run = reported_run()
     html = report_page(evaluate(run), run, Source("run.mcap"), [], [])
-    assert "14.2 ± 0.5 N, true 0.0" in html
+    assert "<dt>force</dt><dd>14.2 ± 0.5 N</dd>" in html
+    assert "<dt>truth</dt><dd>link 1, 0.0 N</dd>" in html
     assert "only the moment is known" in html
 
 
