@@ -5,6 +5,7 @@ the page's own CSS variables and which carries no style, script, date or referen
 """
 
 import io
+import math
 import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -15,9 +16,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from adacd_hil.records import Vector
@@ -34,6 +37,7 @@ COLOURS: Final = {
     "joint1": "#00856a",
     "joint2": "#8a4fa3",
     "alarm": "#c4342d",
+    "good": "#1b7a43",
     "bar": "#7d8a97",
     "queue_receive": "#2a6f97",
     "queue_transmit": "#b0611a",
@@ -59,6 +63,7 @@ _STYLE: Final[dict[Any, Any]] = {
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "axes.titlepad": 5.0,
+    "axes.titley": 1.0,  # said, it need not be sought among ticks: a fifth of the time to draw
     "axes.labelsize": 8.5,
     "axes.labelcolor": COLOURS["muted"],
     "axes.edgecolor": COLOURS["rule"],
@@ -125,6 +130,9 @@ class Drawing:
         return _fragment(out.getvalue(), self.name, f"{self.title}. {self.caption}")
 
 
+_SUPERSCRIPTS: Final = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
     """Choose the rows that keep the smallest and the largest value of each of `bins` equal parts, and both ends.
 
@@ -148,6 +156,16 @@ def plot(axes: Axes, x: Vector, y: Vector, bins: int = _ENVELOPE_BINS, **look: A
     """Draw a curve by the rows of its envelope."""
     rows = envelope(y, bins)
     axes.plot(x[rows], y[rows], **look)
+
+
+def label_decades(axis: Axis) -> None:
+    """Label a logarithmic axis by words: as mathematics its labels take ten times as long to draw."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _decade_text(value)))
+
+
+def _decade_text(value: float) -> str:
+    power = round(math.log10(value))
+    return f"{value:g}" if power < 3 else "10" + str(power).translate(_SUPERSCRIPTS)
 
 
 def note(axes: Axes, text: str, colour: str = COLOURS["muted"]) -> None:

@@ -13,7 +13,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.drawing import COLOURS, PANEL_BINS, PAPER, Drawing, label_below, legend_above, note, plot, style
+from adacd_hil.analysis.drawing import (
+    COLOURS,
+    PANEL_BINS,
+    PAPER,
+    Drawing,
+    label_below,
+    label_decades,
+    legend_above,
+    note,
+    plot,
+    style,
+)
 from adacd_hil.analysis.metrics import Contact, Metrics
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.sections import Section
@@ -178,17 +189,10 @@ def _pad(axes: Axes, identified: Vector, cad: Vector, h: float) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
 
 
-def _when(contact: Contact) -> float:
-    """Give a contact's onset, or its detection where the onset is not known, s."""
-    at_s = contact.onset_s if contact.onset_s is not None else contact.detected_s
-    assert at_s is not None
-    return at_s
-
-
 def _mark(axes: Axes, metrics: Metrics) -> None:
     lane = ("data", "axes fraction")
     for contact in metrics.contacts:
-        at_s = _when(contact)
+        at_s = contact.at_s
         is_seen = contact.detected_s is not None
         face = COLOURS["alarm"] if is_seen else "none"
         axes.plot(
@@ -331,6 +335,7 @@ def _ending(axes: Axes, run: Run, rows: NDArray[np.bool_], time_s: Vector) -> No
     high = float(np.nanmax(largest, initial=beta_Nm))
     axes.set_ylim(1e-3, max(3.0 * high, 5.0 * beta_Nm))
     axes.minorticks_off()
+    label_decades(axes.yaxis)
     testing = np.flatnonzero(rows & (run.state == SchemeState.CERTIFY))
     if testing.size:
         axes.axvline(time_s[testing[0]], color=COLOURS["muted"], linewidth=0.8)
@@ -388,7 +393,7 @@ def _view(run: Run) -> _View:
 def _close_up(
     axes: Axes, run: Run, contact: Contact, time_s: Vector, view: _View, paper_detected_s: float | None
 ) -> None:
-    at_s = _when(contact)
+    at_s = contact.at_s
     delay_s = (contact.delay_ms or 0.0) * 1e-3
     after_s = max(_AFTER_S, 2.0 * delay_s)
     if contact.detected_s is None and contact.end_s is not None and contact.onset_s is not None:

@@ -106,6 +106,13 @@ class Contact:
     lever_sigma_m: float | None
     blind_deg: float | None
 
+    @property
+    def at_s(self) -> float:
+        """Its onset, or its detection where the onset is not known."""
+        at_s = self.onset_s if self.onset_s is not None else self.detected_s
+        assert at_s is not None
+        return at_s
+
 
 @dataclass(frozen=True)
 class CycleStatistics:

@@ -1,10 +1,12 @@
 """A self-contained HTML page and its parts: sections, tables, figures, numbers.
 
-The page needs nothing from outside and allows nothing: no script, no inline style, no request (content security
-policy). It follows the reader's light or dark scheme and prints in the light one.
+The page needs nothing from outside and allows nothing but what it brings: its styles and scripts by their digests, no
+inline style, no request (content security policy). It follows the reader's light or dark scheme and prints in the
+light one.
 """
 
 import hashlib
+import json
 import math
 import re
 from base64 import b64encode
@@ -20,20 +22,49 @@ _UNIT: Final = re.compile(r"(?<=\d) (?=(?:s|kg|%)(?!\w))")
 """The space between a number and its unit, where a line must not end."""
 
 
-def document(title: str, parts: Iterable[str]) -> str:
-    """Write the page around its parts, empty ones left out."""
-    style = resources.files("adacd_hil.analysis").joinpath("report.css").read_text(encoding="utf-8").strip()
-    digest = b64encode(hashlib.sha256(f"\n{style}\n".encode()).digest()).decode()
-    policy = f"default-src 'none'; style-src 'sha256-{digest}'; base-uri 'none'; form-action 'none'"
+STYLE: Final = "report.css"
+"""The asset that every page has."""
+
+
+def document(title: str, parts: Iterable[str], styles: Sequence[str] = (), scripts: Sequence[str] = ()) -> str:
+    """Write the page around its parts, empty ones left out; styles, scripts: further assets, by name."""
+    sheets = [_asset(name) for name in (*styles, STYLE)]
+    programs = [_asset(name) for name in scripts]
+    allowed = f"style-src {_digests(sheets)}" + (f"; script-src {_digests(programs)}" if programs else "")
+    policy = f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
+    looks = "\n".join(f"<style>{sheet}</style>" for sheet in sheets)
     body = "\n".join(part for part in parts if part)
+    ending = "".join(f"<script>{program}</script>\n" for program in programs)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n'
         f"<title>{escape(title)}</title>\n"
-        f"<style>\n{style}\n</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+        f"{looks}\n</head>\n<body>\n<main>\n{body}\n</main>\n{ending}</body>\n</html>\n"
     )
+
+
+def _asset(name: str) -> str:
+    text = resources.files("adacd_hil.analysis").joinpath("assets", name).read_text(encoding="utf-8")
+    return f"\n{text.strip()}\n"
+
+
+def _digests(texts: Iterable[str]) -> str:
+    """Write what a content security policy allows these texts by."""
+    digests = (b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts)
+    return " ".join(f"'sha256-{digest}'" for digest in digests)
+
+
+def data_block(name: str, text: str, kind: str = "text/plain") -> str:
+    """Write text that a script reads and nobody sees; the text must not close the element, as base64 can't."""
+    return f'<script type="{kind}" id="{escape(name)}">{text}</script>'
+
+
+def json_block(name: str, value: object) -> str:
+    """Write a value that a script reads, whatever texts are in it."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return data_block(name, text.replace("<", "\\u003c"), "application/json")
 
 
 def number_text(value: float | None, digits: int, unit: str = "") -> str:
@@ -47,9 +78,10 @@ def number_text(value: float | None, digits: int, unit: str = "") -> str:
 def heading(over: str, title: str, problems: Iterable[str], is_good: bool) -> str:
     """Write the head of a page: a line over the title, the title, and what is wrong, a line each."""
     lines = "".join(f'<p class="problem">{escape(problem)}</p>\n' for problem in problems)
-    tone = "good" if is_good else "bad"
+    tone, word = ("good", "good") if is_good else ("bad", "not good")
     words = _UNIT.sub("&nbsp;", escape(title))
-    return f'<header class="{tone}">\n<p class="over">{escape(over)}</p>\n<h1>{words}</h1>\n{lines}</header>'
+    first = f'<p class="over"><b class="badge">{word}</b> {escape(over)}</p>'
+    return f'<header class="{tone}">\n{first}\n<h1>{words}</h1>\n{lines}</header>'
 
 
 def wrap_section(title: str, *content: str) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.timing import CycleColumns, Cycles
 from adacd_hil.config import Settings
+from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactReport, SchemeState, Vector
 
 Mask = NDArray[np.bool_]
@@ -58,6 +59,15 @@ class PaperStream:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """What was measured over n cycles: q rad, dq rad/s, tau_J Nm, each (n, 2)."""
+
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+
+
+@dataclass(frozen=True)
 class Run:
     """A run as plain arrays over its n cycles; `truth` is None on a real arm."""
 
@@ -81,6 +91,8 @@ class Run:
     contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
     certified: CertifiedStream | None = None  # None of the paper's scheme
     beside: PaperStream | None = None
+    motion: Motion | None = None
+    events: tuple[LoggedEvent, ...] = ()
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

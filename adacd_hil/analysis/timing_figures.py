@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from adacd_hil.analysis.drawing import COLOURS, Drawing, label_below, legend_above, note, style
+from adacd_hil.analysis.drawing import COLOURS, Drawing, label_below, label_decades, legend_above, note, style
 from adacd_hil.analysis.histogram import BINS_PER_DECADE
 from adacd_hil.analysis.timing import (
     COMPUTE,
@@ -113,6 +113,7 @@ def _distribution(axes: Axes, statistics: TimeStatistics, is_reserve: bool) -> N
         axes.stairs([histogram.below], _BELOW, fill=True, color=colour, baseline=0.5)
     axes.set_ylim(0.5, 3.0 * max(int(histogram.counts.max()), histogram.below, 1))
     axes.yaxis.set_minor_locator(NullLocator())
+    label_decades(axes.yaxis)
     found = statistics.percentiles
     for value_us, (_, line) in zip(found.values(), _LINES, strict=False):
         at_us = value_us if value_us >= _FLOOR_US else _BELOW[0] * 1.3

@@ -109,7 +109,7 @@ def tare(
 @json_option
 @explained
 def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
-    """Report logs: HTML, PNG and JSON. The emulator's truth.mcap beside a log is joined to it."""
+    """Report logs: HTML, PDF, PNG, CSV and JSON. The emulator's truth.mcap beside a log is joined to it."""
     from adacd_hil.cli.report import report_logs
 
     reports, code = report_logs(logs, out)

@@ -21,7 +21,7 @@ def report_logs(logs: tuple[Path, ...], out: Path | None) -> tuple[list[Report],
             raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
         names.add(folder)
         truth = path.parent / TRUTH_NAME
-        report = write_report(path, truth if truth.exists() else None, folder)
+        report = write_report(path, truth if truth.exists() else None, folder, is_printed=True)
         is_complete = is_complete and report.is_complete
         reports.append(report)
     return reports, ExitCode.OK if is_complete else ExitCode.PARTIAL

@@ -21,7 +21,9 @@ from hand_made_run import (
 )
 
 from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report import Report, page
+from adacd_hil.analysis.report import Report
+from adacd_hil.analysis.report_page import report_page
+from adacd_hil.analysis.report_reading import Source
 from adacd_hil.analysis.sections import split_sections
 from adacd_hil.analysis.touches import Channel, two_pole_delay_s
 from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction
@@ -253,7 +255,7 @@ def test_the_law_is_that_of_the_fastest_channel():
 def report_of(run):
     """Make a report without figures and files."""
     folder = Path("nowhere")
-    return Report(evaluate(run), run.metadata, "run.mcap", "", True, folder / "a.html", folder / "a.json", ())
+    return Report(evaluate(run), run.metadata, Source("run.mcap"), folder / "a.html", folder / "a.json", ())
 
 
 def reported_run():
@@ -271,15 +273,16 @@ def test_the_text_puts_three_columns_side_by_side():
 
 def test_the_page_has_a_card_for_the_contact():
     run = reported_run()
-    html = page(report_of(run), run, [], [])
-    assert "14.2 ± 0.5 N, true 0.0" in html
+    html = report_page(evaluate(run), run, Source("run.mcap"), [], [])
+    assert "<dt>force</dt><dd>14.2 ± 0.5 N</dd>" in html
+    assert "<dt>truth</dt><dd>link 1, 0.0 N</dd>" in html
     assert "only the moment is known" in html
 
 
 def test_the_page_marks_a_margin_below_one():
     run = make_certified_run()
     run.certified.tau_ext[3000, 4] = 0.2
-    assert '<td class="bad">0.5 / 0.5</td>' in page(report_of(run), run, [], [])
+    assert '<td class="bad">0.5 / 0.5</td>' in report_page(evaluate(run), run, Source("run.mcap"), [], [])
 
 
 def test_a_margin_without_bound_is_null_in_the_table():

@@ -1,0 +1,135 @@
+"""The traces of a run, at its full rate: what is drawn in which panel, and how finely it is written down.
+
+Times in s since motion start, on the rows of the run.
+"""
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.analysis.run import CertifiedStream, Run
+from adacd_hil.analysis.touches import bank_channels
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
+
+FINEST: Final = {
+    "rad": 2e-5,
+    "rad/s": 5e-4,
+    "Nm": 1e-3,
+    "×": 0.02,
+}
+"""Steps that nobody reads finer, by unit: the encoders' own, a fortieth of a threshold, a hundredth of its margin."""
+_PARAMETER_STEP: Final = 1e-5
+_NEAR: Final = 3.0
+"""The range near zero, in thresholds."""
+_BANK_COLOURS: Final = ("identified", "cad", "joint1", "beside", "joint2")
+
+
+class Trace(NamedTuple):
+    """One curve (n,). colour: a variable of the page. is_dashed: a bound. is_mirrored: drawn at ± the values."""
+
+    label: str
+    values: Vector
+    finest: float
+    colour: str
+    is_dashed: bool = False
+    is_mirrored: bool = False
+
+
+class Panel(NamedTuple):
+    """Curves on one ordinate. levels: values with a line of their own; near: half the range near zero, if any."""
+
+    name: str
+    title: str
+    unit: str
+    traces: tuple[Trace, ...]
+    levels: tuple[float, ...] = ()
+    near: float | None = None
+
+
+def panels_of(run: Run) -> tuple[Panel, ...]:
+    """List the panels that the run has something for."""
+    return (*_motion(run), *_residuals(run), *_channels(run), *_parameters(run))
+
+
+def _motion(run: Run) -> Iterator[Panel]:
+    if run.motion is None:
+        return
+    for name, title, unit in (
+        ("q", "Measured position q", "rad"),
+        ("dq", "Measured velocity dq", "rad/s"),
+        ("tau_J", "Measured joint torque tau_J", "Nm"),
+    ):
+        values = getattr(run.motion, name)
+        traces = (Trace(f"joint {j + 1}", values[:, j], FINEST[unit], f"joint{j + 1}") for j in range(JOINTS))
+        yield Panel(name, title, unit, tuple(traces))
+
+
+def _residuals(run: Run) -> Iterator[Panel]:
+    """Give each joint's residual of every model against the thresholds."""
+    finest = FINEST["Nm"]
+    ours = "identified" if run.certified is None else "certified"
+    for joint in range(JOINTS):
+        residual = run.tau_ext_hat[:, joint]
+        traces = []
+        if run.has_cad:
+            traces.append(Trace("CAD model", run.tau_ext_hat_cad[:, joint], finest, "cad"))
+        if run.beside is not None:
+            traces.append(Trace("paper's", run.beside.tau_ext_hat[:, joint], finest, "beside"))
+            bound = _in_view(run.beside.threshold[:, joint], residual)
+            traces.append(Trace("its threshold", bound, finest, "beside", True, True))
+        bound = _in_view(run.threshold[:, joint], residual)
+        traces.append(Trace(ours, residual, finest, "identified"))
+        traces.append(Trace("threshold", bound, finest, "ink", True, True))
+        finite = bound[np.isfinite(bound)]
+        near = _NEAR * float(np.median(finite)) if finite.size else None
+        title = f"Estimated external torque tau_ext_hat, joint {joint + 1}"
+        yield Panel(f"residual{joint + 1}", title, "Nm", tuple(traces), near=near)
+
+
+def _in_view(threshold: Vector, residual: Vector) -> Vector:
+    """Leave out of a threshold what is above every residual, as while a model is uncertain, or infinite."""
+    largest = float(np.max(np.abs(residual[np.isfinite(residual)]), initial=0.0))
+    finite = threshold[np.isfinite(threshold)]
+    ceiling = max(largest, _NEAR * float(finite.min())) if finite.size else 0.0
+    return np.where(threshold <= ceiling, threshold, np.nan)
+
+
+def _channels(run: Run) -> Iterator[Panel]:
+    """Give the channels of the certified scheme's bank, and the largest part of its threshold that any reaches."""
+    stream = run.certified
+    if stream is None:
+        return
+    labels = [
+        f"{cutoff:g} rad/s{'' if smoothing is None else ' smoothed'}"
+        for cutoff, smoothing in bank_channels(run.settings)
+    ]
+    for joint in range(JOINTS):
+        traces = tuple(
+            Trace(label, stream.tau_ext[:, channel, joint], FINEST["Nm"], _BANK_COLOURS[channel % len(_BANK_COLOURS)])
+            for channel, label in enumerate(labels)
+        )
+        yield Panel(f"channels{joint + 1}", f"Residual channels, joint {joint + 1}", "Nm", traces[::-1])
+    shares = _shares(stream)
+    traces = tuple(Trace(f"joint {j + 1}", shares[:, j], FINEST["×"], f"joint{j + 1}") for j in range(JOINTS))
+    title = "Largest residual over its threshold, any channel (an alarm at 1)"
+    yield Panel("share", title, "×", traces, levels=(1.0,), near=1.5)
+
+
+def _shares(stream: CertifiedStream) -> Vector:
+    shares = np.zeros((len(stream.tau_ext), JOINTS))
+    for channel in range(stream.tau_ext.shape[1]):
+        np.maximum(shares, np.abs(stream.tau_ext[:, channel]) / stream.threshold[:, channel], out=shares)
+    return shares
+
+
+def _parameters(run: Run) -> Iterator[Panel]:
+    """Give the estimates theta_hat, a panel per unit."""
+    names = run.parameter_names
+    for unit in dict.fromkeys(PARAMETER_UNITS[name] for name in names):
+        chosen = [name for name in names if PARAMETER_UNITS[name] == unit]
+        traces = tuple(
+            Trace(name, run.theta_hat[:, names.index(name)], _PARAMETER_STEP, colour)
+            for name, colour in zip(chosen, _BANK_COLOURS, strict=False)
+        )
+        yield Panel(f"theta-{chosen[0]}", f"Identified parameters theta_hat: {', '.join(chosen)}", unit, traces)

@@ -1,0 +1,167 @@
+"""Timeline and contact cards: what is marked, where it stands, and how the arm is drawn."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_made_run import A, M, make_run, react, touch, touched_run
+
+from adacd_hil.analysis.arm_drawing import Push, draw_arm
+from adacd_hil.analysis.contacts_page import CARDS, contact_cards
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.run import Motion
+from adacd_hil.analysis.timeline import notices_of, stays_of, timeline
+from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.records import Event, FaultReason, Location, SchemeState
+
+
+def test_stays_follow_one_another_without_a_gap():
+    stays = stays_of(make_run((A, 100), (M, 200), (A, 50)))
+    assert [(stay.state.name, stay.start_s, stay.end_s) for stay in stays] == [
+        ("ADAPT", 0.0, 0.1),
+        ("MONITOR", 0.1, pytest.approx(0.3)),
+        ("ADAPT", pytest.approx(0.3), pytest.approx(0.349)),
+    ]
+
+
+def titles_of(html):
+    return re.findall(r"<title>(.*?)</title>", html)
+
+
+def test_the_timeline_names_states_contacts_and_false_alarms():
+    run = touched_run()
+    titles = titles_of(timeline(run, evaluate(run)))
+    assert titles[0] == "ENABLE, −0.05 to 0.00 s"
+    assert "contact 1 at 1.95 s, on link 1, found on link 1, after 5 ms" in titles
+    assert "contact 3 at 6.95 s, on link 1, missed" in titles
+    assert titles[-1] == "false alarm, at 8.95 s"
+
+
+def test_a_mark_stands_for_the_stretch_around_it():
+    run = touched_run()
+    html = timeline(run, evaluate(run))
+    stretch = re.search(r'data-from="([^"]*)" data-to="([^"]*)"><title>contact 1', html)
+    assert [float(text) for text in stretch.groups()] == pytest.approx([1.80, 2.55])
+
+
+def test_marks_lie_where_their_time_is():
+    run = make_run((A, 1000), (M, 1001))
+    boxes = re.findall(r'<rect x="([^"]*)" y="8.0" width="([^"]*)" height="24.0" fill', timeline(run, evaluate(run)))
+    assert [tuple(map(float, box)) for box in boxes] == [(78.0, 459.0), (537.0, 459.0)]
+
+
+def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
+    run = make_run((A, 100), (SchemeState.FAULT, 50))
+    run.fault[100:] = FaultReason.DRIVE
+    info, warning = Event("info", "bus", "fine"), Event("warning", "bus", "slow")
+    run = replace(run, events=(LoggedEvent(int(run.t_ns[50]), info), LoggedEvent(int(run.t_ns[120]), warning)))
+    notices = notices_of(run, evaluate(run))
+    assert [(notice.at_s, notice.is_bad, notice.text) for notice in notices] == [
+        (0.1, True, "FAULT"),
+        (pytest.approx(0.12), False, "bus: slow"),
+    ]
+
+
+def test_many_warnings_do_not_crowd_out_a_fault():
+    run = make_run((A, 500), (SchemeState.FAULT, 1))
+    run = replace(run, events=tuple(LoggedEvent(int(t), Event("warning", "bus", "slow")) for t in run.t_ns[:400]))
+    notices = notices_of(run, evaluate(run))
+    assert (len(notices), notices[-1].text) == (300, "FAULT")
+
+
+def test_a_run_without_cycles_has_no_timeline():
+    run = make_run((A, 1))
+    empty = replace(run, state=run.state[:0], cycle=run.cycle[:0], t_ns=run.t_ns[:0])
+    assert timeline(empty, evaluate(run)) == ""
+
+
+LENGTHS = (0.4, 0.3)
+
+
+def points_of(svg, kind):
+    """Give the ends of the line of a kind, mm, y up."""
+    found = re.search(rf'<path d="M(\S+) (\S+)L(\S+) (\S+)" class="{kind}"', svg)
+    x1, y1, x2, y2 = (float(text) for text in found.groups())
+    return (x1, -y1), (x2, -y2)
+
+
+def test_the_arm_is_drawn_at_its_joint_angles():
+    svg = draw_arm(np.array([0.0, 0.5 * np.pi]), LENGTHS, Push(1, 0, 0.0, None, None), "arm")
+    assert (points_of(svg, "link touched"), points_of(svg, "link")) == (((0, 0), (400, 0)), ((400, 0), (400, 300)))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_force_pushes_toward_its_side_at_its_lever_arm(side):
+    svg = draw_arm(np.zeros(2), LENGTHS, Push(2, side, 1.0, 0.2, 0.01), "arm")
+    head = re.search(r'<polygon points="([^,]*),([^ ]*)', svg)
+    (_, tail_y), (_, neck_y) = points_of(svg, "force")
+    assert (float(head[1]), float(head[2])) == (600.0, 0.0)
+    assert side * (neck_y - tail_y) > 100.0
+
+
+def test_the_spread_of_the_lever_arm_is_a_bar_on_the_link():
+    svg = draw_arm(np.zeros(2), LENGTHS, Push(2, 1, 1.0, 0.2, 0.01), "arm")
+    assert points_of(svg, "spread") == ((590, 0), (610, 0))
+
+
+def test_a_stronger_force_is_a_longer_arrow():
+    def length(share):
+        (_, tail), (_, neck) = points_of(draw_arm(np.zeros(2), LENGTHS, Push(1, 1, share, 0.1, 0.01), "arm"), "force")
+        return neck - tail
+
+    assert length(1.0) > 1.5 * length(0.2)
+
+
+def test_a_force_without_a_place_is_dashed():
+    assert 'class="force guessed"' in draw_arm(np.zeros(2), LENGTHS, Push(2, 1, 1.0, None, None), "arm")
+
+
+def test_an_arm_describes_itself_without_becoming_markup():
+    svg = draw_arm(np.zeros(2), LENGTHS, None, 'a "<b>')
+    assert 'aria-label="a &quot;&lt;b&gt;"' in svg
+
+
+def carded(run):
+    return contact_cards(evaluate(run), run)
+
+
+def moved(run):
+    still = np.zeros((len(run.cycle), 2))
+    return replace(run, motion=Motion(still + 0.25, still, still))
+
+
+def test_each_contact_has_a_card_with_the_arm_at_its_moment():
+    run = moved(touched_run())
+    run.motion.q[2005] = (1.0, -1.5)
+    html = carded(run)
+    assert "Arm at contact 1, joints at 1.00 and -1.50 rad, link 1 touched" in html
+    assert (html.count("<h3>"), html.count("<svg")) == (3, 3)
+
+
+def test_a_missed_contact_has_a_card_that_says_so():
+    html = carded(touched_run())
+    assert (html.count('class="wrong"'), html.count("<dd>missed</dd>")) == (1, 1)
+
+
+def test_a_contact_on_the_wrong_link_is_marked():
+    run = make_run()
+    touch(run, 2000, 250, (5.0, 1.0), link=2)
+    assert 'class="wrong"' in carded(react(run, 2005, link=1))
+
+
+def test_a_known_force_is_drawn_where_the_report_has_it():
+    run = moved(make_run())
+    touch(run, 2000, 250, (5.0, 1.0), link=2)
+    told = {"location": Location.KNOWN, "force_N": -9.0, "force_sigma": 0.5, "lever_m": 0.2, "lever_sigma": 0.01}
+    html = carded(react(run, 2005, link=2, **told))
+    assert "<dd>−9.0 ± 0.5 N</dd>" in html
+    assert 'class="spread"' in html
+
+
+def test_cards_stop_where_the_table_goes_on():
+    run = make_run()
+    for index in range(CARDS + 2):
+        touch(run, 1100 + 20 * index, 10, (5.0, 0.0), index=index)
+    html = carded(run)
+    assert (html.count("<h3>"), f"The first {CARDS} of {CARDS + 2}." in html) == (CARDS, True)

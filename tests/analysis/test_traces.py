@@ -1,0 +1,181 @@
+"""The traces of a page: what is written down comes back, and what each panel shows."""
+
+import base64
+import json
+import re
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_made_run import make_certified_run, make_run, react, touch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.run import Motion
+from adacd_hil.analysis.trace_encoding import noise_of, pack, step_of
+from adacd_hil.analysis.traces import panels_of
+from adacd_hil.analysis.traces_page import traces_section
+
+VALUES = st.floats(-1e3, 1e3) | st.just(np.nan) | st.just(np.inf)
+
+
+def unpack(packed, count):
+    """Read a series as the page's script does."""
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(packed.text)), np.uint8).reshape(packed.planes, count)
+    zigzag = sum(plane.astype(np.uint64) << np.uint64(8 * place) for place, plane in enumerate(planes))
+    codes = (zigzag >> np.uint64(1)).astype(np.int64) ^ -(zigzag & np.uint64(1)).astype(np.int64)
+    for _ in range(packed.order):
+        codes = np.cumsum(codes).astype(np.int32).astype(np.int64)  # 32 bits, they wrap
+    return np.where(codes == 0, np.nan, packed.low + (codes - 1) * packed.step)
+
+
+@settings(max_examples=40)
+@given(arrays(np.float64, st.integers(1, 60), elements=VALUES), st.floats(1e-5, 1.0))
+def test_a_series_comes_back_within_half_a_step(values, step):
+    packed = pack(values, step)
+    expected = np.where(np.isfinite(values), values, np.nan)
+    np.testing.assert_allclose(unpack(packed, values.size), expected, rtol=0, atol=0.501 * packed.step)
+
+
+@settings(max_examples=40)
+@given(arrays(np.float64, st.integers(1, 60), elements=st.floats(-1e3, 1e3)), st.floats(1e-5, 1.0))
+def test_a_series_is_written_in_the_steps_that_were_asked_for(values, step):
+    assert pack(values, step).step == step
+
+
+def test_a_range_of_more_than_2_to_the_30_steps_is_written_more_coarsely():
+    assert pack(np.array([0.0, 2.0**31]), 1.0).step == 2.0
+
+
+def test_a_series_whose_differences_wrap_comes_back():
+    values = np.array([0.0, 2.0**30, 0.0, 2.0**30, 0.0])
+    assert unpack(pack(values, 1.0), 5).tolist() == values.tolist()
+
+
+def test_a_straight_line_costs_next_to_nothing():
+    assert len(pack(np.arange(100_000.0), 1e-3).text) < 1000
+
+
+def test_noise_costs_less_than_five_bits_per_sample():
+    values = np.random.default_rng(7).normal(0.0, 0.02, 50_000)
+    assert len(pack(values, step_of(values, 1e-4)).text) * 8 < 5.0 * 50_000 * 4 / 3
+
+
+def test_the_noise_of_a_moving_signal_is_found():
+    noise = np.random.default_rng(7).normal(0.0, 0.02, 20_000)
+    assert noise_of(noise + np.sin(np.arange(20_000) / 300.0)) == pytest.approx(0.02, rel=0.03)
+
+
+def test_a_step_is_half_the_noise():
+    values = np.random.default_rng(7).normal(0.0, 0.02, 20_000)
+    assert step_of(values, 1e-4) == pytest.approx(0.01, rel=0.03)
+
+
+def test_a_quiet_signal_is_written_no_finer_than_asked_for():
+    assert step_of(np.zeros(100), 1e-3) == 1e-3
+
+
+def test_gaps_do_not_count_as_noise():
+    values = np.zeros(1000)
+    values[::3] = np.nan
+    assert noise_of(values) == 0.0
+
+
+def moved(run):
+    """Give a run measured motion."""
+    rows = np.arange(len(run.cycle), dtype=np.float64)
+    q = np.column_stack((np.sin(rows / 400.0), np.cos(rows / 300.0)))
+    return replace(run, motion=Motion(q, 2.0 * q, 3.0 * q))
+
+
+def names_of(run):
+    return [panel.name for panel in panels_of(run)]
+
+
+PAPERS = ["residual1", "residual2", "theta-a1", "theta-F_v1", "theta-F_c1"]
+
+
+def test_a_run_of_the_papers_scheme_has_motion_residuals_and_parameters():
+    assert names_of(moved(make_run())) == ["q", "dq", "tau_J", *PAPERS]
+
+
+def test_a_run_without_measured_motion_has_none_to_show():
+    assert names_of(make_run()) == PAPERS
+
+
+def test_a_run_of_the_certified_scheme_has_its_channels():
+    assert names_of(make_certified_run()) == [*PAPERS[:2], "channels1", "channels2", "share", *PAPERS[2:]]
+
+
+def test_every_channel_of_the_bank_is_a_trace_of_its_joint():
+    run = make_certified_run()
+    run.certified.tau_ext[:] = np.arange(10.0).reshape(5, 2)
+    panel = next(panel for panel in panels_of(run) if panel.name == "channels2")
+    assert [trace.values[0] for trace in panel.traces] == [9.0, 7.0, 5.0, 3.0, 1.0]
+
+
+def test_the_share_of_the_threshold_is_that_of_the_channel_nearest_to_an_alarm():
+    run = make_certified_run()
+    run.certified.tau_ext[50, 3, 1] = -0.08
+    run.certified.tau_ext[50, 4, 1] = 0.09
+    run.certified.threshold[50, 4, 1] = 0.3
+    panel = next(panel for panel in panels_of(run) if panel.name == "share")
+    assert panel.traces[1].values[50] == pytest.approx(0.8)
+
+
+def threshold_of(run):
+    panel = next(panel for panel in panels_of(run) if panel.name == "residual1")
+    return panel, next(trace for trace in panel.traces if trace.label == "threshold").values
+
+
+def test_a_threshold_that_is_off_or_far_above_is_not_drawn():
+    run = make_run()
+    run.tau_ext_hat[2000, 0] = 5.0
+    run.threshold[3000] = 5.1
+    _, values = threshold_of(run)
+    assert [np.isnan(values[row]) for row in (0, 2999, 3000, 3001)] == [True, False, True, False]
+
+
+def test_the_range_near_zero_is_three_thresholds():
+    panel, _ = threshold_of(make_run())
+    assert panel.near == pytest.approx(0.45)
+
+
+def plan_of(html):
+    return json.loads(re.search(r'id="trace-plan">(.*?)</script>', html)[1])
+
+
+@pytest.fixture(scope="module")
+def shown():
+    """Give a run with a contact and a fault, and its section of traces."""
+    run = moved(make_run())
+    touch(run, 2000, 250, (5.0, 0.0))
+    run = react(run, 2005)
+    run.state[9300:] = 8
+    return run, traces_section(run, evaluate(run))
+
+
+def test_every_series_of_the_plan_is_in_the_page_at_its_full_rate(shown):
+    run, html = shown
+    plan = plan_of(html)
+    series = [plan["time"], *(curve for panel in plan["panels"] for curve in panel["curves"])]
+    blocks = dict(re.findall(r'<script type="text/plain" id="([^"]*)">([^<]*)</script>', html))
+    sizes = {len(zlib.decompress(base64.b64decode(blocks.pop(one["id"])))) / one["planes"] for one in series}
+    assert (sizes, blocks) == ({len(run.cycle)}, {})
+
+
+def test_the_plan_shades_what_happened(shown):
+    plan = plan_of(shown[1])
+    assert [band for band in plan["bands"] if band[2] in ("react", "fault")] == [
+        [1.955, 2.055, "react"],
+        [9.25, 9.299, "fault"],
+    ]
+    assert (plan["contacts"], plan["faults"]) == ([[1.95, 2.2, 1]], [9.25])
+
+
+def test_a_run_of_one_cycle_has_no_traces():
+    run = make_run((3, 1))
+    assert traces_section(run, evaluate(run)) == ""
