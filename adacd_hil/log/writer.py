@@ -4,7 +4,8 @@ It shares nothing with the control process but the ring and a socket for words: 
 scheduling, nor its session, so that Ctrl-C reaches only the control process. It ends the log when it is told to or when
 the control process dies, after it has taken what that left in the ring.
 
-Packets are gathered and written many at a time, at the latest when a chunk has to end: see packet_writer.py.
+Packets are gathered and written many at a time, at the latest when a chunk has to end: see packet_writer.py. While
+somebody watches the live view they are written whenever the ring has been looked into.
 
 In lockstep the files depend on the packets only, bit for bit; so chunks end by log time there, and nothing is lost but
 to a full disk. Otherwise they end by the clock, so that silence doesn't keep data from the disk; and a disk that is too
@@ -18,6 +19,7 @@ import os
 import socket
 import struct
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,6 +33,9 @@ from adacd_hil.log.parts import part_path
 from adacd_hil.log.ring import RingReader, split
 from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
+
+if TYPE_CHECKING:
+    from adacd_hil.log.live import LiveView
 
 FLUSH_PERIOD_NS = 250_000_000
 POLL_PERIOD_US = 25_000
@@ -59,10 +64,12 @@ class WriterProcess:
         self._part = 0
         self._parts = 1
         self._file = self._begin_file()
-        self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count)
+        self._clock = clock or MonotonicClock()
+        self.live = self._open_live() if setup.live else None
+        watch = self.live.show if self.live else None
+        self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count, watch)
         self._gathered: list[bytes] = []
         self._gathered_bytes = 0
-        self._clock = clock or MonotonicClock()
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
         self._failed_ns: int | None = None  # when the disk was seen to fail, or was last tried
         self._part_ns: tuple[int, int] | None = None  # t_ns of the first and the last packet of the part
@@ -70,6 +77,13 @@ class WriterProcess:
         self._frames = self._messages = self._dropped = 0  # of the parts before
         if not setup.is_blocking:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
+
+    def _open_live(self) -> "LiveView":
+        from adacd_hil.log.live import LiveView  # with an SDK that nothing else needs
+
+        assert self._setup.live is not None
+        start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())
+        return LiveView(self._setup.live, self._channels, self._file.ids, start_ns)
 
     def run(self) -> None:
         """Write until the end, then answer with the last word."""
@@ -93,6 +107,8 @@ class WriterProcess:
         lost = self._lost + self._sink.take_lost()
         last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
         _send(self._connection, json.dumps({**summary, **last}).encode())
+        if self.live is not None:
+            self.live.close()
 
     def _hear(self) -> bytes | None:
         """Receive a word, NOTHING when the control process is dead; None when there is none for a while."""
@@ -107,7 +123,7 @@ class WriterProcess:
         """Take all that waits in the ring; in real time, flush by the clock."""
         while True:
             self._take_some()
-            if self._gathered_bytes >= BATCH_BYTES:
+            if self._gathered_bytes >= BATCH_BYTES or (self.live is not None and self.live.is_watched):
                 self._write()
             if not self._setup.is_blocking:
                 self._look_at_clock()
@@ -256,7 +272,7 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
     """Write a log: say when ready, take packets until the end, say how it went."""
     _schedule_plainly()
     connection = socket.socket(fileno=socket_descriptor)
-    error = ""
+    error = url = ""
     try:
         setup = Setup.from_json(sys.stdin.buffer.read())
         ring = RingReader(ring_descriptor)
@@ -264,9 +280,10 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
         process = WriterProcess(connection, ring, sink, setup)
         sink.settle()
         error = sink.error
+        url = process.live.url if process.live else ""
     except (LogError, OSError, ValueError) as reason:
         error = " ".join(str(reason).split())
-    _send(connection, json.dumps({"error": error}).encode())
+    _send(connection, json.dumps({"error": error, "live_url": url}).encode())
     if not error:
         process.run()
 
