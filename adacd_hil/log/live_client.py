@@ -16,6 +16,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.cdr import payload_dtype
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.live_rates import DESCRIPTION_TOPIC
@@ -56,15 +57,17 @@ class LiveClient:
         self._names: dict[int, str] = {}  # by the numbers of the subscriptions
         self._dtypes: dict[str, np.dtype[Any]] = {}
         self._waiting: deque[LiveMessage] = deque()
-        while not any(message.topic == DESCRIPTION_TOPIC for message in self._waiting):
-            self._hear(OPEN_TIMEOUT_S)
+        self._wait()
 
-    def _hear(self, timeout_s: float) -> None:
-        """Take in what comes first. Raises LogError when nothing does."""
-        message = self._receive(timeout_s)
-        if message is None:
-            raise LogError("it does not serve a log of adacd-hil")
-        self._waiting.append(message)
+    def _wait(self) -> None:
+        """Take in what comes until the subscriptions are in force."""
+        clock = MonotonicClock()
+        end_ns = clock.now_ns() + round(OPEN_TIMEOUT_S * 1e9)
+        while not self._waiting or self._waiting[-1].topic != DESCRIPTION_TOPIC:
+            message = self._receive(max(0.0, (end_ns - clock.now_ns()) * 1e-9))
+            if message is None or clock.now_ns() >= end_ns:
+                raise LogError("it does not serve a log of adacd-hil")
+            self._waiting.append(message)
 
     def receive(self, timeout_s: float) -> LiveMessage | None:
         """Return the next message; None when there is none in time, or the server has ended."""
@@ -120,5 +123,5 @@ def live_client(url: str, topics: Collection[str] | None = None) -> Iterator[Liv
         )
         with connection as opened:
             yield LiveClient(opened, topics)
-    except (OSError, WebSocketException, ValueError) as error:
+    except (OSError, WebSocketException, ValueError, LogError) as error:
         raise LogError(f"live view {url}: {' '.join(str(error).split()) or type(error).__name__}") from None

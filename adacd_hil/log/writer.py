@@ -43,6 +43,8 @@ POLL_PERIOD_US = 25_000
 to look costs the writer as much as to write two cycles."""
 RETRY_PERIOD_NS = 5_000_000_000
 """How long a disk that failed is left alone."""
+LINGER_NS = 200_000_000
+"""How long the live view outlives the log: what its server still has to send would be lost with it."""
 BATCH_BYTES = 256 * 1024
 """Packets that are gathered at most, about 400 cycles: more would be no cheaper, each."""
 
@@ -108,6 +110,8 @@ class WriterProcess:
         last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
         _send(self._connection, json.dumps({**summary, **last}).encode())
         if self.live is not None:
+            if self.live.is_watched:
+                self._clock.sleep_until_ns(self._clock.now_ns() + LINGER_NS)
             self.live.close()
 
     def _hear(self) -> bytes | None:
