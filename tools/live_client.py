@@ -3,8 +3,9 @@
     python tools/live_client.py ws://127.0.0.1:8765 --seconds 10 --json
 
 Expected is the rate that the server keeps, over the time by the log that passed between the topic's first and last
-message; "as they come" for topics that are shown whole. The age of a message is the wall clock when it arrives minus
-its log time, so it means something only in real time and on the host of the run, or one whose clock agrees with it.
+message; topics that are shown whole, and those that come more seldom, have none to compare with. The age of a message
+is the wall clock when it arrives minus its log time, so it means something only in real time and on the host of the
+run, or one whose clock agrees with it.
 """
 
 import argparse
@@ -19,6 +20,9 @@ import numpy as np
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.live_client import LiveMessage, live_client
 from adacd_hil.log.live_rates import EVERY_RECORD, rate_of
+
+WALL_NS = 1_000_000_000_000_000_000
+"""Log times below this, the year 2001, are those of lockstep: they have no age."""
 
 
 @dataclass
@@ -45,8 +49,10 @@ class Topic:
             lasted_s = (times_ns[-1] - times_ns[0]) * 1e-9
             described |= {"slots": len(slots), "expected": expected, "stated_rate_Hz": rate_Hz}
             described["rate_Hz"] = round((len(slots) - 1) / lasted_s, 2) if lasted_s > 0.0 else 0.0
-        p50, p99 = np.percentile(self.ages_ms, (50, 99)).tolist() if self.ages_ms else (0.0, 0.0)
-        return described | {"age_p50_ms": round(p50, 2), "age_p99_ms": round(p99, 2)}
+        if len(times_ns) and times_ns[0] > WALL_NS:
+            p50, p99 = np.percentile(self.ages_ms, (50, 99)).tolist()
+            described |= {"age_p50_ms": round(p50, 2), "age_p99_ms": round(p99, 2)}
+        return described
 
 
 def watch(url: str, seconds: float) -> dict[str, dict[str, Any]]:
@@ -64,9 +70,9 @@ def as_text(topics: dict[str, dict[str, Any]]) -> str:
     """Write the table."""
     lines = [f"{'topic':<28} {'received':>8} {'slots':>11} {'Hz':>7} {'of':>4} {'age p50':>8} {'p99 ms':>8}"]
     for name, topic in topics.items():
-        slots = f"{topic['slots']}/{topic['expected']}" if "expected" in topic else "as they come"
+        slots = f"{topic['slots']}/{topic['expected']}" if "expected" in topic else ""
         rate, stated = topic.get("rate_Hz", ""), topic.get("stated_rate_Hz", "")
-        ages = f"{topic['age_p50_ms']:>8.1f} {topic['age_p99_ms']:>8.1f}" if topic["received"] else ""
+        ages = f"{topic['age_p50_ms']:>8.1f} {topic['age_p99_ms']:>8.1f}" if "age_p50_ms" in topic else ""
         lines.append(f"{name:<28} {topic['received']:>8} {slots:>11} {rate:>7} {stated:>4} {ages}")
     return "\n".join(lines)
 

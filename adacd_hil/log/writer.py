@@ -5,7 +5,7 @@ scheduling, nor its session, so that Ctrl-C reaches only the control process. It
 the control process dies, after it has taken what that left in the ring.
 
 Packets are gathered and written many at a time, at the latest when a chunk has to end: see packet_writer.py. While
-somebody watches the live view they are written whenever the ring has been looked into.
+somebody watches the live view that is more often.
 
 In lockstep the files depend on the packets only, bit for bit; so chunks end by log time there, and nothing is lost but
 to a full disk. Otherwise they end by the clock, so that silence doesn't keep data from the disk; and a disk that is too
@@ -43,6 +43,9 @@ POLL_PERIOD_US = 25_000
 to look costs the writer as much as to write two cycles."""
 RETRY_PERIOD_NS = 5_000_000_000
 """How long a disk that failed is left alone."""
+SHOW_PERIOD_NS = 45_000_000
+"""How often packets are written while somebody watches in real time: at every second look into the ring. At every one
+the writer would take 10 % of a processor instead of 6 %."""
 LINGER_NS = 200_000_000
 """How long the live view outlives the log: what its server still has to send would be lost with it."""
 BATCH_BYTES = 256 * 1024
@@ -73,6 +76,7 @@ class WriterProcess:
         self._gathered: list[bytes] = []
         self._gathered_bytes = 0
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
+        self._shown_ns = self._flushed_ns
         self._failed_ns: int | None = None  # when the disk was seen to fail, or was last tried
         self._part_ns: tuple[int, int] | None = None  # t_ns of the first and the last packet of the part
         self._lost = 0  # packets that were taken but are in no file
@@ -110,7 +114,7 @@ class WriterProcess:
         last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
         _send(self._connection, json.dumps({**summary, **last}).encode())
         if self.live is not None:
-            if self.live.is_watched:
+            if self._is_watched:
                 self._clock.sleep_until_ns(self._clock.now_ns() + LINGER_NS)
             self.live.close()
 
@@ -127,7 +131,7 @@ class WriterProcess:
         """Take all that waits in the ring; in real time, flush by the clock."""
         while True:
             self._take_some()
-            if self._gathered_bytes >= BATCH_BYTES or (self.live is not None and self.live.is_watched):
+            if self._gathered_bytes >= BATCH_BYTES or (self._setup.is_blocking and self._is_watched):
                 self._write()
             if not self._setup.is_blocking:
                 self._look_at_clock()
@@ -140,12 +144,19 @@ class WriterProcess:
             self._gathered_bytes += len(data)
 
     def _look_at_clock(self) -> None:
-        """Flush if it is time, and see to a disk that has failed."""
+        """Flush or show if it is time, and see to a disk that has failed."""
         now_ns = self._clock.now_ns()
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
             self._write()
             self._flush(now_ns)
             self._look_at_disk(now_ns)
+        elif self._is_watched and now_ns - self._shown_ns >= SHOW_PERIOD_NS:
+            self._shown_ns = now_ns
+            self._write()
+
+    @property
+    def _is_watched(self) -> bool:
+        return self.live is not None and self.live.is_watched
 
     def _look_at_disk(self, now_ns: int) -> None:
         """Begin another part where the disk has failed some time ago."""
