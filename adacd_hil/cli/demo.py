@@ -13,7 +13,7 @@ from adacd_hil.cli.report import TRUTH_NAME
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import RequestSettings, Settings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench import Bench
 from firmware_sim.scenario import Scenario, load_scenario, named_profile
@@ -48,7 +48,11 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
 
 
 def run_embedded(
-    cast: Cast, clock_name: str, out: Path, progress: Callable[[str], None] = lambda _: None
+    cast: Cast,
+    clock_name: str,
+    out: Path,
+    progress: Callable[[str], None] = lambda _: None,
+    live: LiveAddress | None = None,
 ) -> tuple[SessionSummary, Path]:
     """Run host and arm in this process, logs in `out`; return how it ended and where the truth is.
 
@@ -75,6 +79,7 @@ def run_embedded(
             "embedded",
             metadata={"scenario": scenario.name, "seed": str(scenario.seed)},
             progress=progress,
+            live=live,
         )
         with on_interrupt(session.interrupt):
             summary = session.run()
@@ -82,7 +87,13 @@ def run_embedded(
 
 
 def play(
-    config: str, scenario_name: str, profile: str | None, seed: int | None, clock_name: str, out: Path
+    config: str,
+    scenario_name: str,
+    profile: str | None,
+    seed: int | None,
+    clock_name: str,
+    out: Path,
+    live: LiveAddress | None = None,
 ) -> tuple[Report, ExitCode]:
     """Play a scenario and report it. Raises ConfigError, CodecError, LogError, CommandError."""
     cast = resolve(config, scenario_name, profile, seed)
@@ -90,7 +101,7 @@ def play(
     progress = Progress()
     what = "experiment" if scenario_name == SCENARIO else f"scenario {scenario.name}"
     progress(f"{what} of configuration {settings.name}, profile {settings.arm.profile}, in {out}")
-    summary, truth_path = run_embedded(cast, clock_name, out, progress)
+    summary, truth_path = run_embedded(cast, clock_name, out, progress, live)
     if summary.result is not None:
         played_s = summary.result.cycles * settings.bus.period_s
         pace = played_s / summary.elapsed_s

@@ -10,13 +10,23 @@ from adacd_hil import __version__
 from adacd_hil.cli.compare_command import compare
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
 from adacd_hil.cli.identify_command import identify
+from adacd_hil.cli.live_options import live_options, require_extra
 from adacd_hil.cli.log_command import log
-from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
+from adacd_hil.cli.options import (
+    clock_option,
+    config_option,
+    explained,
+    json_option,
+    on_bus,
+    on_bus_or_url,
+    profile_option,
+)
 from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
+    from adacd_hil.control.session import LiveAddress
 
 
 @click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
@@ -40,8 +50,16 @@ def cli() -> None:
 @profile_option
 @json_option
 @explained
+@live_options
 def demo(
-    config: str, scenario: str, out: Path, seed: int | None, clock: str, profile: str | None, as_json: bool
+    config: str,
+    scenario: str,
+    out: Path,
+    seed: int | None,
+    clock: str,
+    profile: str | None,
+    as_json: bool,
+    live: "LiveAddress | None",
 ) -> ExitCode:
     """Play the paper's experiment, or another scenario, with an emulated arm in this process, and report it.
 
@@ -50,7 +68,7 @@ def demo(
     """
     from adacd_hil.cli.demo import play
 
-    report, code = play(config, scenario, profile, seed, clock, out)
+    report, code = play(config, scenario, profile, seed, clock, out, live)
     print(json.dumps(report.as_json(), indent=2) if as_json else report.as_text())
     return code
 
@@ -61,7 +79,10 @@ def demo(
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/run"), show_default=True)
 @clock_option(default="realtime")
 @json_option
-def run(connection: "Connection", tare: Path | None, out: Path, clock: str, as_json: bool) -> ExitCode:
+@live_options
+def run(
+    connection: "Connection", tare: Path | None, out: Path, clock: str, as_json: bool, live: "LiveAddress | None"
+) -> ExitCode:
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
     On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, and
@@ -69,7 +90,7 @@ def run(connection: "Connection", tare: Path | None, out: Path, clock: str, as_j
     """
     from adacd_hil.cli.run import run_on_bus
 
-    result, code = run_on_bus(connection, clock, out, tare)
+    result, code = run_on_bus(connection, clock, out, tare, live)
     print(json.dumps(result, indent=2) if as_json else "\n".join(f"{key}: {value}" for key, value in result.items()))
     return code
 
@@ -274,22 +295,28 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 
 
 @cli.command(epilog=EPILOG)
-@on_bus
+@on_bus_or_url("Watch the live view of a run instead, such as ws://127.0.0.1:8765.")
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
 @click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
 @click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
 @json_option
 def monitor(
-    connection: "Connection", node_id: int | None, once: bool, seconds: float | None, as_json: bool
+    place: "Connection | str", node_id: int | None, once: bool, seconds: float | None, as_json: bool
 ) -> ExitCode:
     """Watch a bus: nodes, messages with rate, age, checks and values, load. Sends nothing.
 
-    Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
+    With --url: watch a run that was started with --live: state, residuals against their thresholds, parameters,
+    contacts, events. Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
     """
     from adacd_hil.cli.monitor import PLAIN_S, watch
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
-    return watch(connection, node_id, listened_s, listened_s is None, as_json)
+    if not isinstance(place, str):
+        return watch(place, node_id, listened_s, listened_s is None, as_json)
+    require_extra("--url", "websockets")
+    from adacd_hil.cli.live_monitor import watch_live
+
+    return watch_live(place, listened_s, listened_s is None, as_json)
 
 
 cli.add_command(identify)

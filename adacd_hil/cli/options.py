@@ -71,29 +71,48 @@ _BUS_OPTIONS = (  # last first: click lists them the other way round
     profile_option,
     config_option,
     click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."),
-    click.option("-c", "--channel", required=True, help="Channel of that interface, such as can0."),
-    click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan."),
 )
+
+
+def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
+    return (
+        click.option("-c", "--channel", required=is_required, help="Channel of that interface, such as can0."),
+        click.option("-i", "--interface", required=is_required, help="python-can interface, such as socketcan."),
+    )
 
 
 def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
     """Give a command the options of a bus; it takes them as a `Connection` before its own."""
+    return _connected(command, is_required=True)
 
+
+def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callable[..., None]]:
+    """Give a command the options of a bus, or --url in their place; it takes a `Connection` or the URL first."""
+    url_option = click.option("--url", help=help_text)
+    return lambda command: url_option(_connected(command, is_required=False))
+
+
+def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[..., None]:
     @functools.wraps(command)
     def connect(
-        interface: str,
-        channel: str,
+        interface: str | None,
+        channel: str | None,
         bitrate: int | None,
         config: str,
         profile: str | None,
         dbc: Path | None,
+        url: str | None = None,
         **own: Any,
     ) -> ExitCode:
         from adacd_hil.cli.connection import Connection
 
+        if url is not None:
+            return command(url, **own)
+        if interface is None or channel is None:
+            raise CommandError("give --interface and --channel, or --url", ExitCode.USAGE)
         return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
 
     decorated: Callable[..., None] = explained(connect)
-    for option in _BUS_OPTIONS:
+    for option in (*_BUS_OPTIONS, *_where(is_required)):
         decorated = option(decorated)
     return decorated

@@ -10,7 +10,7 @@ from adacd_hil.cli.progress import Progress
 from adacd_hil.clock import wall_ns
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
-from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
 from adacd_hil.wire.budget import check_budget
 from adacd_hil.wire.bus import Bus
@@ -40,7 +40,11 @@ def drop_old_frames(bus: Bus, interface: str) -> None:
 
 
 def run_on_bus(
-    connection: Connection, clock_name: str, out: Path, tare_path: Path | None = None
+    connection: Connection,
+    clock_name: str,
+    out: Path,
+    tare_path: Path | None = None,
+    live: LiveAddress | None = None,
 ) -> tuple[dict[str, Any], ExitCode]:
     """Run the scheme on a bus, with the offsets of a tare when one is given.
 
@@ -64,7 +68,7 @@ def run_on_bus(
     if sys.stdin is not None and sys.stdin.isatty():
         operator = ConsoleOperator(ScriptedOperator(settings.operator))
     progress = Progress()
-    session = Session(settings, codec, bus, clock, operator, out, interface, progress=progress, tare=tare)
+    session = Session(settings, codec, bus, clock, operator, out, interface, progress=progress, tare=tare, live=live)
     for line in () if tare is None else tare.warnings:
         progress(f"warning: {line}")
     try:

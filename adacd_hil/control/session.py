@@ -17,8 +17,11 @@ from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
+from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.recorder import LogSummary, Recorder
+from adacd_hil.log.robot_description import ROBOT_NAME, robot_description
+from adacd_hil.log.setup import LiveSetup
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.wire.bus import Bus, BusError
@@ -44,6 +47,13 @@ class SessionSummary:
     has_started: bool
     recoveries: int
     elapsed_s: float
+
+
+class LiveAddress(NamedTuple):
+    """Where the live view is served; port 0: any that is free."""
+
+    host: str
+    port: int
 
 
 class Attempt(NamedTuple):
@@ -81,6 +91,7 @@ class Session:
     metadata: dict[str, str] = field(default_factory=dict)
     progress: Callable[[str], None] = lambda _: None
     tare: UsedTare | None = None
+    live: LiveAddress | None = None
     _cycle: Cycle | None = None
     _is_interrupted: bool = False
     _has_started: bool = False
@@ -114,6 +125,8 @@ class Session:
             self.progress(f"not granted: {line}")
         spin = prepare_spin(pacer, self.settings, self.clock, grant)
         recorder = self._open_log(grant, spin)
+        if recorder.live_url:
+            self.progress(f"live view: {recorder.live_url}, layout for it: {self.out / LAYOUT_NAME}")
         for refusal in grant.missing:
             recorder.event(self.clock.now_ns(), Event("warning", "realtime", f"not granted: {refusal}"))
         recovery = Recovery(tap, self.clock, self.operator, recorder, self.progress, lambda: self._is_interrupted)
@@ -205,6 +218,9 @@ class Session:
         attachments["config.toml"] = to_toml(self.settings).encode()
         if self.tare is not None:
             attachments[TARE_NAME] = self.tare.text
+        robot = robot_description(self.settings)
+        (self.out / ROBOT_NAME).write_text(robot)
+        (self.out / LAYOUT_NAME).write_bytes(viewer_layout(robot.encode()))
         with grant.unpinned():
             return Recorder(
                 self.out / LOG_NAME,
@@ -217,7 +233,15 @@ class Session:
                 epoch_ns=0 if is_lockstep else wall_ns() - MonotonicClock().now_ns(),
                 blocking=is_lockstep,
                 settings=self.settings.log,
+                robot=robot.encode(),
+                live=self._live_setup(robot),
             )
+
+    def _live_setup(self, robot: str) -> LiveSetup | None:
+        if self.live is None:
+            return None
+        arm, is_upright = self.settings.arm, self.settings.estimator.gravity
+        return LiveSetup(self.live.host, self.live.port, robot, arm.link_length_m, is_upright)
 
     def _metadata(self, grant: RealtimeGrant) -> dict[str, str]:
         settings = self.settings

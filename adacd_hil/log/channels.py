@@ -18,9 +18,11 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; records.TRUTH_LAYOUT |
 """
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 from adacd_hil.log.cdr import Member, MessageType, body_struct, number_type, ros_message_name
 from adacd_hil.log.errors import LogError
@@ -176,6 +178,12 @@ _CONTACT = (
     Member("lever_sigma", "float64", unit="m", meaning="standard deviation, inf: not known"),
     Member("blind_rad", "float64", unit="rad", meaning="nearer to link 2's axis a force reads as one on link 1"),
 )
+_CONTACT_KINDS: dict[str, Callable[[int], IntEnum]] = {
+    "level": ContactLevel,
+    "kind": ContactKind,
+    "reaction": Reaction,
+    "location": Location,
+}
 _CONTROL = (
     _CYCLE_NUMBER,
     Member("gate_flags", "uint8", meaning="limits that acted, one bit each"),
@@ -290,6 +298,19 @@ def pack_contact(report: ContactReport) -> bytes:
     values = (value if isinstance(value, tuple) else (value,) for value in report)
     by_name = dict(zip(report._fields, values, strict=True))
     return _CONTACT_BODY.pack(*(value for member in _CONTACT for value in by_name[member.name]))
+
+
+def unpack_contact(body: bytes) -> ContactReport:
+    """Unpack the body of /contact. Raises struct.error when it is cut, ValueError for a value that has no name."""
+    values = iter(_CONTACT_BODY.unpack_from(body))
+    fields: dict[str, Any] = {}
+    for member in _CONTACT:
+        if member.size > 1:
+            fields[member.name] = tuple(itertools.islice(values, member.size))
+        else:
+            kind = _CONTACT_KINDS.get(member.name)
+            fields[member.name] = next(values) if kind is None else kind(next(values))
+    return ContactReport(**fields)
 
 
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:

@@ -11,7 +11,7 @@ The order: cycle after cycle, each frame followed by its decoded message, then t
 
 import functools
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,6 +63,8 @@ _JOINT_STATE_RECORD = record_dtype(JOINT_STATE_DTYPE)
 
 Numbers = NDArray[np.int64]
 Rows = NDArray[np.uint8]
+Watch = Callable[[Rows, NDArray[np.uint16], Numbers, Numbers], None]
+"""Takes records that follow each other, the file's numbers of their channels, their log times, and where each ends."""
 
 
 class _Group(NamedTuple):
@@ -78,11 +80,20 @@ class _Group(NamedTuple):
 class PacketWriter:
     """Turns packets into messages of a file."""
 
-    def __init__(self, file: McapFile, messages: tuple[MessageLike, ...], epoch_ns: int, parameter_count: int) -> None:
+    def __init__(
+        self,
+        file: McapFile,
+        messages: tuple[MessageLike, ...],
+        epoch_ns: int,
+        parameter_count: int,
+        watch: Watch | None = None,
+    ) -> None:
+        """Write to `file`; `watch` is given every batch of records, too."""
         self.frames = 0
         self.dropped = 0  # packets that didn't reach the writer
         self._lost = 0  # packets that did, and whose loss is to be said
         self._file = file
+        self._watch = watch
         self._epoch_ns = epoch_ns
         self._latest_ns = np.zeros(1 + max(file.ids.values()), np.int64)
         self._is_known = np.zeros(2**16, np.bool_)
@@ -284,6 +295,8 @@ class PacketWriter:
             stamps[:, 0], stamps[:, 1] = np.divmod(group.t_ns, 1_000_000_000)
             windows(records, size)[ends[group.slots] - size] = rows.view(f"V{size}")[:, 0]
         self._file.add(records, channels, log_ns, ends, packet_ends)
+        if self._watch is not None:
+            self._watch(records, channels, log_ns, ends)
 
     def _move_up(self, log_ns: Numbers, channels: NDArray[np.uint16]) -> None:
         """Move log times up where they would run backwards in their topic, which readers don't expect."""

@@ -24,7 +24,8 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.ring import Ring, room_of
-from adacd_hil.log.setup import Setup, tell_messages
+from adacd_hil.log.robot_description import ROBOT_NAME
+from adacd_hil.log.setup import LiveSetup, Setup, tell_messages
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.wire.bus import Frame
 
@@ -69,11 +70,14 @@ class Recorder:
         blocking: bool = False,
         is_truth: bool = False,
         settings: LogSettings | None = None,
+        robot: bytes = b"",
+        live: LiveSetup | None = None,
     ) -> None:
         """Create the file, replacing the log that is there with all its parts, and start the writer.
 
         messages: of the DBC, default those of the one that comes with the package. epoch_ns: added to t_ns for the
-        log's times; 0 in lockstep. is_truth: the emulator's own log, /truth and /events only. Raises LogError.
+        log's times; 0 in lockstep. is_truth: the emulator's own log, /truth and /events only. robot: the arm's URDF,
+        for viewers. live: serve what is logged. Raises LogError.
         """
         settings = settings or LogSettings()
         own = {
@@ -82,9 +86,12 @@ class Recorder:
             "parameter_count": str(parameter_count),
             "mode": "lockstep" if blocking else "realtime",
         }
-        layout = {} if is_truth else {LAYOUT_NAME: viewer_layout()}
+        layout = {} if is_truth else {LAYOUT_NAME: viewer_layout(robot)}
+        drawn = {ROBOT_NAME: robot} if robot else {}
         self.path = path
         self.dropped = 0
+        self.live_url = ""
+        """Where the live view is, if there is one."""
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
         self._unannounced = 0  # bytes in the ring that the writer was not woken for
@@ -101,8 +108,9 @@ class Recorder:
             part_bytes=settings.part_MiB * _MIB,
             part_ns=round(settings.part_min * _MINUTE_NS),
             may_rotate=stat.S_ISREG(os.fstat(file).st_mode),
-            attachments={**(attachments or {}), **layout},
+            attachments={**(attachments or {}), **drawn, **layout},
             metadata={**(metadata or {}), **own},
+            live=live,
         )
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
@@ -143,6 +151,8 @@ class Recorder:
                 if stat.S_ISREG(self.path.stat().st_mode):
                     self.path.unlink()
             raise LogError(f"log {self.path} can't be written: {error}")
+        assert word is not None
+        self.live_url = word["live_url"]
 
     @property
     def pid(self) -> int:

@@ -40,11 +40,25 @@ class ToldMessage:
 
 
 @dataclass(frozen=True)
+class LiveSetup:
+    """Where the live view is served (port 0: any that is free), and the arm that it draws.
+
+    robot_description: a URDF. is_upright: gravity acts on the joints.
+    """
+
+    host: str
+    port: int
+    robot_description: str
+    link_length_m: tuple[float, float]
+    is_upright: bool = False
+
+
+@dataclass(frozen=True)
 class Setup:
     """`messages`: of the DBC; `is_truth` makes the emulator's own log, which has none.
 
     `path`: absolute, of the first part. A part ends after `part_bytes` before compression or `part_ns` of log time,
-    never where these are 0. `may_rotate`: the log is a file, which others can follow.
+    never where these are 0. `may_rotate`: the log is a file, which others can follow. `live`: served, unless None.
     """
 
     path: Path
@@ -60,6 +74,7 @@ class Setup:
     metadata: dict[str, str]
     further_count: int = 0
     channel_count: int = 0
+    live: LiveSetup | None = None
 
     def to_json(self) -> bytes:
         """Write it."""
@@ -78,6 +93,8 @@ class Setup:
             for message in table["messages"]
         )
         table["attachments"] = {name: base64.b64decode(data) for name, data in table["attachments"].items()}
+        if live := table["live"]:
+            table["live"] = LiveSetup(**{**live, "link_length_m": tuple(live["link_length_m"])})
         return Setup(**table)
 
 

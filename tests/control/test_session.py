@@ -1,5 +1,6 @@
 """Whole runs against the emulator in one process, with something going wrong; torque is judged on the wire."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,11 @@ from session_rig import (
 )
 
 from adacd_hil.control.gate import GateFlag
-from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.control.session import LiveAddress
+from adacd_hil.log.layout import LAYOUT_NAME
+from adacd_hil.log.robot_description import ROBOT_NAME
+from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
+from adacd_hil.scheme.urdf import read_urdf
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.e2e import E2eStatus
 
@@ -184,3 +189,16 @@ def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
     assert summary.result is not None
     assert summary.result.fault in (FaultReason.DRIVE, FaultReason.DATA_AGE)
     assert any(entry.event.name == "Drive1" and "EMCY 0x8100" in entry.event.message for entry in log.events)
+
+
+def test_viewers_find_the_arm_and_a_layout_in_the_log_and_beside_it_and_the_address(tmp_path: Path) -> None:
+    rig = Rig(tmp_path, finish_s=0.3)
+    said: list[str] = []
+    rig.session.live, rig.session.progress = LiveAddress("127.0.0.1", 0), said.append
+    summary, log = rig.run()
+    assert summary.log.is_complete
+    for name in (ROBOT_NAME, LAYOUT_NAME):
+        assert log.attachments[name] == (tmp_path / name).read_bytes()
+    (line,) = [line for line in said if line.startswith("live view")]
+    assert re.fullmatch(rf"live view: ws://127\.0\.0\.1:\d+, layout for it: {tmp_path / LAYOUT_NAME}", line)
+    assert read_urdf(log.attachments[ROBOT_NAME]).joint_names == JOINT_NAMES

@@ -1,0 +1,95 @@
+"""A live view in this process, fed with the packets of a run; what it sends is compared with what the file holds."""
+
+import io
+
+import numpy as np
+from mcap.reader import make_reader
+from recorded_run import CODEC, Run
+from reference_writer import MemorySink
+
+from adacd_hil.log.channels import run_channels
+from adacd_hil.log.live import LiveView
+from adacd_hil.log.live_client import LiveClient, LiveMessage
+from adacd_hil.log.mcap_file import McapFile
+from adacd_hil.log.packet import ROOM, pack_cycle, pack_event
+from adacd_hil.log.packet_writer import PacketWriter
+from adacd_hil.log.setup import LiveSetup
+from adacd_hil.records import Event
+
+EPOCH_NS = 1_700_000_000_000_000_000
+URDF = '<robot name="a"/>'
+LINK_LENGTH_M = (0.35, 0.30)
+SETUP = LiveSetup("127.0.0.1", 0, URDF, LINK_LENGTH_M)
+LAST = Event("info", "test", "last")
+
+
+class Feed:
+    """A file and its live view."""
+
+    def __init__(self, setup: LiveSetup | None = SETUP, parameter_count: int = 7) -> None:
+        messages = tuple(CODEC.messages.values())
+        channels = run_channels(parameter_count, messages)
+        self.sink = MemorySink()
+        self._file = McapFile(self.sink, channels, {}, {})
+        self.live = None if setup is None else LiveView(setup, channels, self._file.ids, EPOCH_NS)
+        show = self.live.show if self.live else None
+        self._writer = PacketWriter(self._file, messages, EPOCH_NS, parameter_count, show)
+        self._packets: list[bytes] = []
+
+    def cycles(self, run: Run, packets_at_once: int) -> None:
+        """Write all of a run, then LAST."""
+        for cycle in run.cycles:
+            self._packets.append(pack_cycle(cycle.t_ns, 0, cycle.messages(), cycle.frames))
+            if cycle.event is not None:
+                self._packets.append(pack_event(cycle.t_ns, 0, cycle.event))
+            if len(self._packets) >= packets_at_once:
+                self.write()
+        self.event(run.cycles[-1].t_ns, LAST)
+        self.write()
+
+    def event(self, t_ns: int, event: Event) -> None:
+        self._packets.append(pack_event(t_ns, 0, event))
+
+    def write(self) -> None:
+        edges = np.cumsum([0, *map(len, self._packets)])
+        data = np.frombuffer(b"".join(self._packets) + bytes(ROOM), np.uint8)
+        assert self._writer.write(data, edges[:-1], np.diff(edges)) == 0
+        self._packets = []
+
+    def file(self) -> bytes:
+        self._file.finish({})
+        return self.sink.getvalue()
+
+    def close(self) -> None:
+        if self.live is not None:
+            self.live.close()
+
+
+def receive_until_last(client: LiveClient) -> list[LiveMessage]:
+    """Receive everything up to LAST, which no rate holds back."""
+    messages: list[LiveMessage] = []
+    while not (messages and messages[-1].topic == "/events" and b"last\0" in messages[-1].payload):
+        message = client.receive(10.0)
+        assert message is not None, "the last event did not come"
+        messages.append(message)
+    return messages
+
+
+def by_topic(messages: list[LiveMessage]) -> dict[str, list[tuple[int, bytes]]]:
+    topics: dict[str, list[tuple[int, bytes]]] = {}
+    for topic, log_ns, payload in messages:
+        topics.setdefault(topic, []).append((log_ns, payload))
+    return topics
+
+
+def first_cycles_of_slots(file: bytes, rates_Hz: dict[str, int]) -> dict[str, list[tuple[int, bytes]]]:
+    """What the file has of each topic, read by mcap's own reader: of each slot of 1 / rate the first cycle."""
+    topics: dict[str, list[tuple[int, bytes]]] = {}
+    firsts: dict[tuple[str, int], int] = {}
+    for _, channel, message in make_reader(io.BytesIO(file)).iter_messages(log_time_order=False):
+        if rate_Hz := rates_Hz[channel.topic]:
+            slot = message.publish_time * rate_Hz // 1_000_000_000
+            if firsts.setdefault((channel.topic, slot), message.publish_time) != message.publish_time:
+                continue
+        topics.setdefault(channel.topic, []).append((message.log_time, message.data))
+    return topics

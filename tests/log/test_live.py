@@ -1,0 +1,244 @@
+"""The live view: what a viewer receives, and that the log doesn't care whether somebody watches."""
+
+import json
+import math
+import os
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_rig import (
+    EPOCH_NS,
+    LAST,
+    LINK_LENGTH_M,
+    SETUP,
+    URDF,
+    Feed,
+    by_topic,
+    first_cycles_of_slots,
+    receive_until_last,
+)
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+from recorded_run import CODEC, feed, make_run, start
+from websockets.sync.client import connect
+
+from adacd_hil.log.channels import run_channels
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.live_client import SUBPROTOCOL, live_client
+from adacd_hil.log.live_rates import Decimator, rate_of
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.setup import LiveSetup
+from adacd_hil.records import Event
+
+STATED_HZ = {
+    "/scheme": 50,
+    "/joint_states": 50,
+    "/control": 50,
+    "/cycle": 20,
+    "/to_can_bus": 10,
+    "/from_can_bus": 10,
+    "/contact": 0,
+    "/events": 0,
+    **{f"/decoded/{name}": 10 for name in CODEC.messages},
+}
+"""As docs/live.md has it."""
+FLOOD = 4000
+
+
+@pytest.fixture(scope="module")
+def run():
+    return make_run(1000, seed=5)
+
+
+@pytest.fixture(scope="module")
+def watched(run):
+    """All that a viewer receives of a run, what it was told of the topics, and the file that was written meanwhile."""
+    fed = Feed()
+    with live_client(fed.live.url) as client:
+        fed.cycles(run, 37)
+        messages = receive_until_last(client)
+        topics = client.topics
+    fed.close()
+    return messages, topics, fed.file()
+
+
+@pytest.mark.parametrize(
+    ("rate_Hz", "batches", "shown"),
+    [
+        (50, [[0, 1, 19], [20, 21, 40]], [[1, 0, 0], [1, 0, 1]]),
+        (50, [[5, 19], [19, 20]], [[1, 0], [0, 1]]),
+        (50, [[5, 5], [5, 6]], [[1, 1], [1, 0]]),  # frames of one cycle stay together, across batches too
+        (50, [[5, 95, 99, 100]], [[1, 1, 0, 1]]),  # a pause moves no slot
+        (10, [[0, 99, 100]], [[1, 0, 1]]),
+        (0, [[5, 5], [6]], [[1, 1], [1]]),
+    ],
+)
+def test_of_each_slot_the_first_cycle_is_shown(rate_Hz, batches, shown):
+    decimator = Decimator(rate_Hz)
+    found = [decimator.choose(np.array(batch) * 1_000_000).tolist() for batch in batches]
+    assert found == [[bool(value) for value in batch] for batch in shown]
+
+
+def test_a_viewer_receives_every_topic_at_its_rate_as_the_file_has_it(watched):
+    messages, _, file = watched
+    expected = first_cycles_of_slots(file, STATED_HZ)
+    received = by_topic(messages)
+    assert {topic for topic in received if topic not in expected} == {"/tf", "/scene", "/robot_description"}
+    assert {topic: received.get(topic) for topic in expected} == expected
+
+
+def test_the_stated_rates_are_those_of_the_program():
+    topics = [channel.topic for channel in run_channels(7, tuple(CODEC.messages.values()))]
+    assert {topic: rate_of(topic) for topic in topics if topic in STATED_HZ} == STATED_HZ
+    assert {topic for topic in topics if topic not in STATED_HZ} == {
+        "/to_can_bus_fd",
+        "/from_can_bus_fd",
+        "/frame_checks",
+    }
+
+
+def test_the_schemas_decode_what_is_received(watched):
+    messages, topics, _ = watched
+    decoded = {topic: decode(topics[topic], payload) for topic, _, payload in messages}
+    assert decoded["/robot_description"].data == URDF
+    assert (decoded["/events"].name, decoded["/events"].message) == (LAST.name, LAST.message)
+    assert set(decoded) == set(topics) - {"/to_can_bus_fd", "/from_can_bus_fd", "/frame_checks"} - silent(
+        topics, messages
+    )
+
+
+def silent(topics, messages):
+    """Topics of messages that are not in the run."""
+    return {topic for topic in topics if topic.startswith("/decoded/")} - {message.topic for message in messages}
+
+
+def decode(topic, payload):
+    schema = Schema(id=1, name=topic.type_name, encoding="ros2msg", data=topic.text.encode())
+    return DecoderFactory().decoder_for("cdr", schema)(payload)
+
+
+def test_the_transforms_put_the_links_where_the_joints_are(watched):
+    messages, topics, _ = watched
+    received = by_topic(messages)
+    assert [log_ns for log_ns, _ in received["/tf"]] == [log_ns for log_ns, _ in received["/joint_states"]]
+    q = decode(topics["/joint_states"], received["/joint_states"][-1][1]).position
+    log_ns, payload = received["/tf"][-1]
+    transforms = decode(topics["/tf"], payload).transforms
+    names = [(transform.header.frame_id, transform.child_frame_id) for transform in transforms]
+    assert names == [("world", "base"), ("base", "link1"), ("link1", "link2"), ("link2", "tip")]
+    stamps = {transform.header.stamp.sec * 1_000_000_000 + transform.header.stamp.nanosec for transform in transforms}
+    assert stamps == {log_ns}
+    angles = [2.0 * math.atan2(t.transform.rotation.z, t.transform.rotation.w) for t in transforms]
+    assert angles == pytest.approx([0.0, *q, 0.0])
+    assert [t.transform.translation.x for t in transforms] == [0.0, 0.0, *LINK_LENGTH_M]
+
+
+def test_a_record_that_makes_no_sense_is_not_drawn_and_nothing_stops(run):
+    fed = Feed()
+    with live_client(fed.live.url, ["/scene", "/events", "/scheme"]) as client:
+        odd = make_run(1, seed=5)
+        odd.cycles[0].output = odd.cycles[0].output._replace(state=200)
+        fed.cycles(odd, 1)
+        received = by_topic(receive_until_last(client))
+    fed.close()
+    assert len(received["/scheme"]) == 1
+    assert "/scene" not in received
+
+
+def test_a_slow_viewer_costs_messages_and_never_the_log():
+    fed, alone = Feed(), Feed(None)
+    narrow = socket.create_connection(("127.0.0.1", int(fed.live.url.rsplit(":", 1)[1])))
+    narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+    options = {"subprotocols": [SUBPROTOCOL], "compression": None, "max_queue": 1, "sock": narrow}
+    with connect(fed.live.url, **options) as slow:
+        advertised = next(word for word in map(json.loads, slow) if word["op"] == "advertise")
+        for topic in ("/events", "/robot_description"):
+            subscribe(slow, [channel for channel in advertised["channels"] if channel["topic"] == topic])
+        slow.recv(timeout=10.0)
+        for file in (fed, alone):
+            flood(file)
+        received = 1
+        while b"last\0" not in slow.recv(timeout=10.0):
+            received += 1
+    fed.close()
+    assert 1024 <= received < FLOOD
+    assert fed.file() == alone.file()
+
+
+def flood(fed):
+    """Write more than the system and the server keep for a client that doesn't read."""
+    for number in range(FLOOD):
+        fed.event(number, Event("info", "flood", 4000 * "x"))
+        if number % 500 == 0:
+            fed.write()
+    fed.event(FLOOD, LAST)
+    fed.write()
+
+
+def subscribe(connection, channels):
+    subscriptions = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+    connection.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+
+
+def test_the_file_of_the_writer_is_the_same_watched_or_not(tmp_path):
+    run = make_run(300, seed=6)
+    run.cycles[-1].event = LAST
+    loaded = []
+    for name, live in (("watched", SETUP), ("alone", None)):
+        recorder = start(tmp_path / f"{name}.mcap", run, live=live)
+        loaded.append("foxglove" in Path(f"/proc/{recorder.pid}/maps").read_text())
+        if live is None:
+            feed(recorder, run.cycles)
+        else:
+            with live_client(recorder.live_url) as client:
+                feed(recorder, run.cycles)
+                recorder.flush()
+                received = by_topic(receive_until_last(client))
+        assert recorder.close().is_complete
+    assert loaded == [True, False]
+    assert (tmp_path / "watched.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+    assert len(received["/scheme"]) == 15
+    assert len(received["/events"]) == sum(cycle.event is not None for cycle in run.cycles)
+
+
+def test_a_port_that_is_taken_is_named_and_leaves_no_log(tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        live = LiveSetup("127.0.0.1", port, URDF, LINK_LENGTH_M)
+        with pytest.raises(LogError, match=rf"can't listen on 127\.0\.0\.1:{port}: .*in use"):
+            Recorder(tmp_path / "run.mcap", messages=CODEC.messages.values(), live=live)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_comes_before_the_first_record_has_the_time_of_the_start():
+    fed = Feed()
+    with live_client(fed.live.url) as client:
+        message = client.receive(10.0)
+    fed.close()
+    assert (message.topic, message.log_ns) == ("/robot_description", EPOCH_NS)
+
+
+def test_nothing_is_sent_or_kept_while_nobody_watches(run):
+    fed = Feed()
+    with live_client(fed.live.url, ["/events"]) as client:
+        assert fed.live.is_watched
+        client.receive(10.0)
+    while fed.live.is_watched:  # until the server has seen it go
+        os.sched_yield()
+    fed.cycles(make_run(50), 50)
+    with live_client(fed.live.url) as client:
+        first = client.receive(10.0)
+    fed.close()
+    assert (first.topic, first.log_ns) == ("/robot_description", EPOCH_NS)
+
+
+def test_no_server_is_one_line():
+    with socket.socket() as other:  # nobody listens
+        other.bind(("127.0.0.1", 0))
+        url = f"ws://127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(LogError, match=f"live view {url}: .*refused"), live_client(url):
+            pass

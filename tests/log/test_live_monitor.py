@@ -1,0 +1,182 @@
+"""`monitor --url`: what a terminal shows of a live view, and how the commands say that they can't."""
+
+import json
+import os
+import sys
+import threading
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from live_rig import Feed, receive_until_last
+from recorded_run import make_run
+
+from adacd_hil.cli.live_monitor import TOPICS, LiveMonitor, as_text
+from adacd_hil.cli.main import cli
+from adacd_hil.log.live_client import live_client
+from adacd_hil.records import (
+    PARAMETER_NAMES,
+    ContactKind,
+    ContactLevel,
+    ContactReport,
+    Event,
+    FaultReason,
+    Location,
+    SchemeState,
+    scheme_layout,
+)
+
+PUSH = ContactReport(
+    5,
+    2,
+    (1, 1),
+    (1.0, 2.0),
+    (0.1, 0.2),
+    True,
+    kind=ContactKind.PUSH,
+    location=Location.KNOWN,
+    force_N=7.25,
+    lever_m=0.125,
+)
+
+
+def two_cycles():
+    """Make a run whose second cycle is shown, 60 ms after the first."""
+    run = make_run(2, start_ns=5_000_000_000)
+    first, second = run.cycles
+    second.t_ns = first.t_ns + 60_000_000
+    slices = scheme_layout(7).slices
+    block = np.zeros(scheme_layout(7).size)
+    block[slices["q"]] = (0.5, -1.0)
+    block[slices["tau_J"]] = (1.25, -2.5)
+    block[slices["tau_ext_hat"]] = (0.03, -0.3)
+    block[slices["threshold"]] = (0.1, np.inf)
+    block[slices["theta_hat"]] = np.arange(1.0, 8.0)
+    second.output = second.output._replace(
+        cycle=41, state=SchemeState.MONITOR, fault=FaultReason.NONE, block=block, previous_state=SchemeState.CERTIFY
+    )
+    second.record = second.record._replace(lateness_ns=12_000, slack_ns=437_000, overruns=7, frames_missing=3)
+    second.contact = PUSH
+    second.event = Event("warning", "realtime", "late")
+    return run
+
+
+@pytest.fixture(scope="module")
+def described():
+    fed = Feed()
+    with live_client(fed.live.url, TOPICS) as client:
+        fed.cycles(two_cycles(), 1)
+        monitor = LiveMonitor(client)
+        for message in receive_until_last(client):
+            monitor.accept(message)
+    fed.close()
+    return monitor.describe()
+
+
+def test_the_latest_state_is_described(described):
+    assert (described["state"], described["fault"], described["cycle"]) == ("MONITOR", "NONE", 41)
+    assert described["joints"][0] == {
+        "joint": "joint1",
+        "q_rad": 0.5,
+        "tau_J_Nm": 1.25,
+        "tau_ext_hat_Nm": 0.03,
+        "threshold_Nm": 0.1,
+        "share": pytest.approx(0.3),
+    }
+    assert (described["joints"][1]["threshold_Nm"], described["joints"][1]["share"]) == (None, None)
+    assert described["parameters"] == dict(zip(PARAMETER_NAMES, np.arange(1.0, 8.0).tolist(), strict=True))
+
+
+def test_times_count_from_the_first_message(described):
+    assert described["t_s"] == 0.06
+    assert [event["t_s"] for event in described["events"]] == [0.06, 0.06]
+    assert described["events"][0] == {"t_s": 0.06, "level": "warning", "name": "realtime", "message": "late"}
+    assert described["contacts"] == [
+        {
+            "t_s": 0.06,
+            "link": 2,
+            "level": ContactLevel.COLLISION.name,
+            "kind": "PUSH",
+            "location": "KNOWN",
+            "force_N": 7.25,
+            "lever_m": 0.125,
+            "is_final": True,
+        }
+    ]
+
+
+def test_a_terminal_shows_bars_that_are_full_at_the_threshold(described):
+    lines = as_text(described).splitlines()
+    timing = "late 12 µs, slack 437 µs, 7 periods skipped, 3 frames missing"
+    assert lines[0] == f"MONITOR, cycle 41, 0.1 s watched; {timing}"
+    (joint1,), (joint2,) = ([line for line in lines if line.startswith(name)] for name in ("joint1", "joint2"))
+    assert joint1.startswith("joint1 [" + 12 * "#" + 28 * "." + "]  30 % of the threshold")
+    assert joint2.startswith("joint2 [" + 40 * "." + "] detection off")
+    assert joint2.endswith("external -0.300 Nm, torque -2.500 Nm, position -57.3°")
+    assert "a1 1  a2 2  a3 3  F_v1 4  F_v2 5  F_c1 6  F_c2 7" in lines
+    assert any(line.split() == ["0.060", "COLLISION", "2", "PUSH", "7.2", "0.12", "KNOWN"] for line in lines)
+    assert any(line.split() == ["0.060", "warning", "realtime", "late"] for line in lines)
+
+
+def test_a_residual_beyond_the_threshold_fills_the_bar_and_a_fault_is_named(described):
+    joint = described["joints"][0] | {"share": 2.5}
+    text = as_text(described | {"joints": [joint, joint], "fault": "DRIVE"})
+    assert "[" + 40 * "#" + "] 250 % of the threshold" in text
+    assert text.startswith("MONITOR by DRIVE")
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_the_monitor_ends_with_the_run(words):
+    fed = Feed()
+
+    def end() -> None:
+        while len(fed.live._subscriptions) < len(TOPICS) + 1:
+            os.sched_yield()
+        fed.close()
+
+    thread = threading.Thread(target=end)
+    thread.start()
+    result = CliRunner().invoke(cli, ["monitor", "--url", fed.live.url, "--seconds", "600", *words])
+    thread.join()
+    assert result.exit_code == 0
+    if words:
+        assert json.loads(result.stdout)["messages"] == 0
+    else:
+        assert result.stdout == "0 messages, none of /scheme\n"
+
+
+@pytest.mark.wallclock
+def test_the_monitor_listens_for_as_long_as_it_is_asked_to():
+    fed = Feed()
+    result = CliRunner().invoke(cli, ["monitor", "--url", fed.live.url, "--seconds", "0.1", "--json"])
+    fed.close()
+    assert (result.exit_code, json.loads(result.stdout)["url"]) == (0, fed.live.url)
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "asked_for"),
+    [
+        ("foxglove", ("demo", "--live"), "--live"),
+        ("foxglove", ("run", "-i", "virtual", "-c", "x", "--live"), "--live"),
+        ("websockets", ("monitor", "--url", "ws://127.0.0.1:1"), "--url"),
+    ],
+)
+def test_without_the_extra_there_is_one_line_and_status_2(monkeypatch, tmp_path, module, words, asked_for):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    result = CliRunner().invoke(cli, words)
+    assert result.exit_code == 2
+    assert result.stderr == f"adacd-hil: {asked_for} needs the extra `live`: pip install 'adacd-hil[live]'\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_monitor_needs_a_bus_or_a_url():
+    result = CliRunner().invoke(cli, ["monitor", "-i", "socketcan"])
+    assert (result.exit_code, result.stderr) == (2, "adacd-hil: give --interface and --channel, or --url\n")
+
+
+def test_where_nothing_is_served_there_is_one_line_and_status_1():
+    result = CliRunner().invoke(cli, ["monitor", "--url", "ws://127.0.0.1:1", "--once"])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("adacd-hil: live view ws://127.0.0.1:1: ")
+    assert result.stderr.count("\n") == 1

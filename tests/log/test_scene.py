@@ -1,0 +1,147 @@
+"""What the live view draws, decoded by code that isn't ours."""
+
+import math
+
+import numpy as np
+import pytest
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
+
+from adacd_hil.log.channels import pack_contact, unpack_contact
+from adacd_hil.log.scene import (
+    ARROW_LIFETIME_NS,
+    GREEN,
+    GREY,
+    LARGEST_SPHERE_M,
+    RED,
+    SMALLEST_SPHERE_M,
+    YELLOW,
+    Shape,
+    draw_contact,
+    draw_joints,
+    share_of_threshold,
+    transforms_of,
+)
+from adacd_hil.log.scene_types import SCENE, TRANSFORMS, MessageType, pack_scene, pack_transforms
+from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
+
+SHAPE = Shape((0.35, 0.30))
+TIME_NS = 1_700_000_000_123_456_789
+PUSH = ContactReport(
+    cycle=7,
+    link=2,
+    direction=(1, -1),
+    tau_ext_peak=(2.5, -1.5),
+    impulse=(0.25, 0.125),
+    is_final=True,
+    level=ContactLevel.COLLISION,
+    kind=ContactKind.PUSH,
+    reaction=Reaction.FLOAT,
+    location=Location.KNOWN,
+    is_two_sided=True,
+    tau_ext_peak_sigma=(0.1, 0.2),
+    impulse_sigma=(0.3, 0.4),
+    force_N=18.5,
+    force_sigma=0.5,
+    lever_m=0.2,
+    lever_sigma=0.01,
+    blind_rad=0.6,
+)
+
+
+def decode(kind: MessageType, payload: bytes):
+    schema = Schema(id=1, name=kind.name, encoding="ros2msg", data=kind.text.encode())
+    return DecoderFactory().decoder_for("cdr", schema)(payload)
+
+
+def drawn(*entities):
+    return decode(SCENE, pack_scene(TIME_NS, entities)).entities
+
+
+def rgba(primitive):
+    return (primitive.color.r, primitive.color.g, primitive.color.b, primitive.color.a)
+
+
+def test_a_contact_report_comes_back_as_it_was_packed():
+    assert unpack_contact(pack_contact(PUSH)) == PUSH
+
+
+def test_each_joint_shows_how_near_its_residual_is():
+    residuals, thresholds = np.array([0.03, -0.15]), np.array([0.1, 0.1])
+    joint1, joint2, state = drawn(*draw_joints(SchemeState.MONITOR, residuals, thresholds))
+    assert [(e.id, e.frame_id, e.frame_locked) for e in (joint1, joint2, state)] == [
+        ("joint1", "link1", True),
+        ("joint2", "link2", True),
+        ("state", "base", True),
+    ]
+    assert (rgba(joint1.spheres[0]), rgba(joint2.spheres[0])) == (GREEN, RED)
+    assert joint1.spheres[0].size.x == pytest.approx(SMALLEST_SPHERE_M + 0.3 * (LARGEST_SPHERE_M - SMALLEST_SPHERE_M))
+    assert joint2.spheres[0].size.z == LARGEST_SPHERE_M  # and no larger
+    assert [entity.texts[0].text for entity in (joint1, joint2, state)] == [
+        "+0.030 Nm, 30 %",
+        "-0.150 Nm, 150 %",
+        "MONITOR",
+    ]
+    assert joint1.texts[0].billboard
+    assert (joint1.timestamp.sec, joint1.timestamp.nanosec) == divmod(TIME_NS, 1_000_000_000)
+    assert (joint1.lifetime.sec, joint1.lifetime.nanosec) == (0, 0)
+
+
+def test_a_joint_is_yellow_from_half_of_the_threshold_and_grey_while_detection_is_off():
+    residuals = np.array([0.05, 0.2])
+    near, off, _ = drawn(*draw_joints(SchemeState.ADAPT, residuals, np.array([0.1, math.inf])))
+    assert rgba(near.spheres[0]) == YELLOW
+    assert (rgba(off.spheres[0]), off.spheres[0].size.y) == (GREY, SMALLEST_SPHERE_M)
+    assert off.texts[0].text == "+0.200 Nm"
+
+
+@pytest.mark.parametrize("threshold", [math.inf, math.nan, 0.0])
+def test_without_a_threshold_there_is_no_share(threshold):
+    assert math.isnan(share_of_threshold(0.1, threshold))
+
+
+def test_a_force_whose_place_is_known_is_an_arrow_that_ends_there():
+    (contact,) = drawn(draw_contact(SHAPE, PUSH))
+    (arrow,) = contact.arrows
+    assert (contact.id, contact.frame_id) == ("contact", "link2")
+    assert contact.lifetime.sec * 1_000_000_000 + contact.lifetime.nanosec == ARROW_LIFETIME_NS
+    assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx((0.2, -0.185))
+    assert arrow.shaft_length + arrow.head_length == pytest.approx(0.185)
+    half = 0.5 * math.atan2(1.0, 0.0)
+    assert (arrow.pose.orientation.z, arrow.pose.orientation.w) == pytest.approx((math.sin(half), math.cos(half)))
+    assert rgba(arrow) == RED
+    assert contact.texts[0].text == "COLLISION link 2: 18.5 N at 0.20 m"
+
+
+def test_a_force_from_the_other_side_points_the_other_way():
+    (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(force_N=-18.5, level=ContactLevel.CONTACT)))
+    (arrow,) = contact.arrows
+    assert arrow.pose.position.y == pytest.approx(0.185)
+    assert arrow.pose.orientation.z == pytest.approx(-math.sqrt(0.5))
+    assert rgba(arrow) == YELLOW
+
+
+def test_on_link_1_the_smallest_force_is_drawn_at_its_end():
+    report = PUSH._replace(link=1, location=Location.LINK_1, force_N=4.0, lever_m=0.0)
+    (contact,) = drawn(draw_contact(SHAPE, report))
+    assert (contact.frame_id, contact.arrows[0].pose.position.x) == ("link1", 0.35)
+    assert contact.texts[0].text == "COLLISION link 1: ≥ 4.0 N"
+
+
+def test_of_the_papers_scheme_which_seeks_no_place_the_torque_gives_the_force():
+    report = PUSH._replace(location=Location.NOT_SOUGHT, force_N=0.0)
+    (contact,) = drawn(draw_contact(SHAPE, report))
+    assert contact.texts[0].text == "COLLISION link 2: ≥ 5.0 N"
+    assert contact.arrows[0].pose.position.y == pytest.approx(0.05)  # pushes toward -y
+
+
+@pytest.mark.parametrize(("force_N", "length_m"), [(0.0, 0.05), (1000.0, 0.6)])
+def test_arrows_stay_in_sight(force_N, length_m):
+    (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(force_N=force_N)))
+    assert contact.arrows[0].shaft_length + contact.arrows[0].head_length == pytest.approx(length_m)
+
+
+def test_an_upright_arm_has_its_y_axis_up():
+    payload = pack_transforms(TIME_NS, transforms_of(Shape((0.35, 0.3), is_upright=True), np.zeros(2)))
+    rotation = decode(TRANSFORMS, payload).transforms[0].transform.rotation
+    assert (rotation.x, rotation.y, rotation.z, rotation.w) == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))

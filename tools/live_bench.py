@@ -1,0 +1,138 @@
+"""The cycle with and without somebody who watches, by turns in one run: the ratio of the percentiles.
+
+    python tools/live_bench.py --blocks 10 --block-s 3
+
+The emulated arm in real time on the embedded bus, with the live view on; a client in a process of its own on the same
+machine subscribes to everything in every other block. What it costs to be watched is then in the log's own /cycle. On
+few processors emulator, host, writer, server and client share them: a client elsewhere costs less.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from live_client import watch
+from side_by_side import patient_config
+
+from adacd_hil.cli.demo import Cast, resolve, run_embedded
+from adacd_hil.config import RequestSettings
+from adacd_hil.control.session import LiveAddress
+from adacd_hil.log.reader import Series, read_log
+
+FIELDS = ("lateness_ns", "compute_ns")
+PERCENTILES = (50.0, 99.0, 99.9)
+SETTLE_NS = 200_000_000
+"""Left out at the beginning of a block, while the client comes or goes."""
+START_S = 3.0
+"""From the first cycle to the first block."""
+
+END_S = 10.0
+"""From the last block to the end of the run, at least: what a busy machine may take longer."""
+
+
+class BenchError(Exception):
+    """A run that did not get to its end."""
+
+
+def view(url: str, blocks: int, block_s: float) -> dict[str, Any]:
+    """Watch every other block, the second first; say when each began and ended, and what came."""
+    found: dict[str, Any] = {"idle": [], "watched": [], "received": []}
+    for block in range(blocks):
+        begin_ns = time.time_ns()
+        if block % 2:
+            found["received"].append(watch(url, block_s))
+        else:
+            time.sleep(block_s)
+        found["watched" if block % 2 else "idle"].append((begin_ns, time.time_ns()))
+    return found
+
+
+def run(blocks: int, block_s: float, folder: Path) -> dict[str, Any]:
+    """Run and compare. Raises BenchError."""
+    cast = _cast(START_S + 1.1 * blocks * block_s + END_S, folder)
+    viewers: list[subprocess.Popen[bytes]] = []
+    words = [sys.executable, __file__, "--blocks", str(blocks), "--block-s", str(block_s), "--view"]
+
+    def on_progress(line: str) -> None:
+        if line.startswith("live view: "):  # its imports are over before the first block
+            url = line.removeprefix("live view: ").split(",")[0]
+            viewers.append(subprocess.Popen([*words, url], stdout=subprocess.PIPE))
+
+    summary, _ = run_embedded(cast, "realtime", folder, on_progress, LiveAddress("127.0.0.1", 0))
+    viewed, _ = viewers[0].communicate(timeout=60.0) if viewers else (b"", b"")
+    if summary.error or summary.result is None or viewers[0].returncode:
+        raise BenchError(summary.error or "the viewer failed")
+    log = read_log(summary.log.path, ("/cycle",))
+    blocks_of = json.loads(viewed)
+    return {
+        "scheduler": summary.grant.scheduler,
+        "dropped": summary.log.dropped,
+        **_compare(log.cycle, log.epoch_ns, blocks_of),
+        "received": _rates(blocks_of["received"]),
+    }
+
+
+def _cast(seconds: float, folder: Path) -> Cast:
+    config = patient_config(folder, base="certified")
+    settings, scenario = resolve(str(config), "idle", None, None)
+    script = (RequestSettings(at_s=seconds, request="finish"),)
+    return Cast(replace(settings, operator=replace(settings.operator, script=script)), scenario)
+
+
+def _compare(cycle: Series, epoch_ns: int, blocks: dict[str, Any]) -> dict[str, Any]:
+    """Return percentiles in µs of both kinds of blocks, and their ratios."""
+    wall_ns = cycle.t_ns + epoch_ns
+    compared: dict[str, Any] = {}
+    for field in FIELDS:
+        values = {}
+        for kind in ("idle", "watched"):
+            is_in = np.zeros(len(wall_ns), np.bool_)
+            for begin_ns, end_ns in blocks[kind]:
+                is_in |= (wall_ns >= begin_ns + SETTLE_NS) & (wall_ns < end_ns)
+            values[kind] = cycle[field][is_in] * 1e-3
+            compared.setdefault("cycles", {})[kind] = int(is_in.sum())
+        idle, watched = (np.percentile(values[kind], PERCENTILES) for kind in ("idle", "watched"))
+        compared[field.replace("_ns", "_us")] = {
+            f"p{percentile:g}": {"idle": round(a, 1), "watched": round(b, 1), "ratio": round(b / a, 3)}
+            for percentile, a, b in zip(PERCENTILES, idle.tolist(), watched.tolist(), strict=True)
+        }
+    return compared
+
+
+def _rates(received: list[dict[str, Any]]) -> dict[str, str]:
+    """Return received / expected slots of the topics that have a rate, all blocks together."""
+    rates = {}
+    for name in received[0]:
+        blocks = [block[name] for block in received if "expected" in block[name]]
+        if blocks:
+            rates[name] = f"{sum(block['slots'] for block in blocks)}/{sum(block['expected'] for block in blocks)}"
+    return rates
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--blocks", type=int, default=10)
+    parser.add_argument("--block-s", type=float, default=3.0)
+    parser.add_argument("--view", metavar="URL", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.view:
+        time.sleep(START_S)
+        print(json.dumps(view(options.view, options.blocks, options.block_s)))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            print(json.dumps(run(options.blocks, options.block_s, Path(folder)), indent=2))
+        except BenchError as error:
+            sys.exit(f"live_bench: {error}")
+
+
+if __name__ == "__main__":
+    main()
