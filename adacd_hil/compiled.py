@@ -10,8 +10,9 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, overload
 
 import numba
 
@@ -70,6 +71,20 @@ def _cache_folder() -> Path:
 numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
 
 
-def compiled(function: Function) -> Function:
-    """Compile `function` at its first call; division by zero gives inf or nan, as in numpy."""
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+@overload
+def compiled(function: Function) -> Function: ...
+@overload
+def compiled(*, nogil: bool) -> Callable[[Function], Function]: ...
+def compiled(function: Function | None = None, *, nogil: bool = False) -> Function | Callable[[Function], Function]:
+    """Compile `function` at its first call; division by zero gives inf or nan, as in numpy.
+
+    nogil: other threads run meanwhile, when it is called from Python.
+    """
+    if function is None:
+        return partial(compiled, nogil=nogil)
+    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy", nogil=nogil)(function))
+
+
+def released(function: Function) -> Function:
+    """Compile `function` as `compiled` does; while it runs, other threads of Python go on. For what takes long."""
+    return compiled(nogil=True)(function)

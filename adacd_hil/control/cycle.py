@@ -36,8 +36,7 @@ from adacd_hil.records import (
     SchemeOutput,
     SchemeState,
 )
-from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
-from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.scheme.selection import pipeline_of
 from adacd_hil.scheme.supervisor import POWERED
 from adacd_hil.wire.tap import Tap
 
@@ -89,7 +88,7 @@ class Cycle:
         self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
         self._deadline = DeadlineWatch(settings)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
-        self._pipeline = CertifiedPipeline(settings) if settings.scheme == "certified" else Pipeline(settings)
+        self._pipeline = pipeline_of(settings)
         self._controller = Controller(settings)
         self._floating = Floating(settings)
         self._gate = Gate(settings.arm, self._period_s)

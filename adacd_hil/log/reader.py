@@ -3,19 +3,19 @@
 Cut and damaged files are read as far as they are intact; `is_complete` and `problem` say so.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
+from adacd_hil.log.bus_frames import FRAME_DTYPE, LONG_FRAME_DTYPE, joined_frames
 from adacd_hil.log.cdr import MessageType
 from adacd_hil.log.channels import DECODED, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.joined import JoinedWalk
 from adacd_hil.log.mcap_file import FIELDS_KEY
 from adacd_hil.log.mcap_walk import MESSAGE_HEAD, RECORD_HEAD_BYTES, Payload, Topic
 from adacd_hil.log.ros_types import (
@@ -39,40 +39,28 @@ from adacd_hil.records import (
     Vector,
 )
 
+if TYPE_CHECKING:
+    from adacd_hil.log.joined import JoinedWalk
+
+__all__ = [
+    "FRAME_DTYPE",
+    "LONG_FRAME_DTYPE",
+    "LoggedContact",
+    "LoggedEvent",
+    "RunLog",
+    "Series",
+    "read_log",
+    "topic_bytes",
+]
+
 EPOCH_KEY = "epoch_ns"
 _KNOWN = {
     CAN_FRAME.name: Payload(CAN_FRAME_DTYPE),
     FD_FRAME.name: Payload(FD_FRAME_DTYPE, has_tail=True),
     JOINT_STATE.name: Payload(JOINT_STATE_DTYPE),
 }
-_FRAME_TOPICS = {
-    "/to_can_bus": (True, "dlc"),
-    "/from_can_bus": (False, "dlc"),
-    "/to_can_bus_fd": (True, "len"),
-    "/from_can_bus_fd": (False, "len"),
-}
-"""Topics of frames: whether they were sent, and the field that counts their data bytes."""
+_PIECE_CYCLES = 20_000
 _NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
-
-
-def _frame_dtype(data_bytes: int) -> "np.dtype[Any]":
-    return np.dtype(
-        [
-            ("t_ns", np.int64),  # when it passed
-            ("cycle_t_ns", np.int64),  # t_ns of the cycle that it was logged with
-            ("can_id", np.uint32),
-            ("is_tx", np.bool_),
-            ("is_error", np.bool_),
-            ("length", np.uint8),  # so many bytes of the data count, the rest is zero
-            ("data", np.uint8, (data_bytes,)),
-        ]
-    )
-
-
-FRAME_DTYPE = _frame_dtype(8)
-"""A frame of a log without FD frames."""
-LONG_FRAME_DTYPE = _frame_dtype(64)
-"""A frame of a log with FD frames, classic ones too: `data` (64,). All else is as in the other."""
 
 
 class LoggedEvent(NamedTuple):
@@ -189,20 +177,26 @@ def read_log(path: Path, topics: Collection[str] | None = None) -> RunLog:
 
     Raises LogError when the file doesn't exist or isn't MCAP.
     """
-    walk = JoinedWalk(path, _payload_layout, topics)
-    metadata = walk.metadata
-    epoch_ns = _number(metadata, EPOCH_KEY, 0)
-    series = _all_series(walk.topics, metadata, epoch_ns)
+    walk, epoch_ns = open_log(path, topics)
+    pieces = list(walk.pieces(_PIECE_CYCLES, epoch_ns, has_frame_records=True))
+    rows = {}
+    for name in walk.topics:
+        found = [piece.records[name] for piece in pieces if name in piece.records]
+        if found:
+            rows[name] = np.concatenate(found)
+    own = own_topics(walk.metadata)
+    every = series_of(rows, walk.topics, own, epoch_ns)
+    series = {name: values for name, values in every.items() if name.startswith(DECODED) or name in own}
     return RunLog(
         path=path,
         problem=walk.problem,
-        metadata=metadata,
+        metadata=walk.metadata,
         summary=walk.summary,
         attachments=walk.attachments,
         topics=series,
         decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
-        frames=_frames(walk.topics, series, epoch_ns),
-        events=_events(walk.topics.get("/events"), epoch_ns),
+        frames=joined_frames([piece.frames for piece in pieces]),
+        events=[event for piece in pieces for event in events_of(piece.payloads, walk.topics, epoch_ns)],
         contacts=_contacts(series["/contact"]),
         parts=walk.parts,
     )
@@ -213,10 +207,24 @@ def topic_bytes(path: Path, topic: str) -> bytes:
 
     Raises LogError when the file can't be read or lacks the topic.
     """
-    found = JoinedWalk(path, _payload_layout, (topic,)).topics.get(topic)
-    if found is None:
+    walk, _ = open_log(path, (topic,))
+    found = []
+    for piece in walk.pieces(_PIECE_CYCLES, 0, has_frame_records=True):
+        found += piece.payloads.get(topic, [])
+        if topic in piece.records:
+            rows = {topic: piece.records[topic]}
+            found.append(series_of(rows, {topic: walk.topics[topic]}, {}, 0)[topic].payloads())
+    if topic not in walk.topics:
         raise LogError(f"log {path} has no topic {topic}")
-    return b"".join(found.payloads) if found.dtype is None else Series(found.records(), 0).payloads()
+    return b"".join(found)
+
+
+def open_log(path: Path, topics: Collection[str] | None) -> tuple["JoinedWalk", int]:
+    """Begin to read a log; return the walk over it and what was added to t_ns for its times. Raises LogError."""
+    from adacd_hil.log.joined import JoinedWalk  # which loads numba
+
+    walk = JoinedWalk(path, _payload_layout, topics)
+    return walk, _number(walk.metadata, EPOCH_KEY, 0)
 
 
 def _payload_layout(channel: Channel, schema: Schema) -> Payload | None:
@@ -244,51 +252,40 @@ def _number(metadata: Mapping[str, str], key: str, default: int) -> int:
         raise LogError(f"the log's metadata {key} = {metadata[key]!r} is not a number") from None
 
 
-def _all_series(topics: Mapping[str, Topic], metadata: Mapping[str, str], epoch_ns: int) -> dict[str, Series]:
-    """Make a series of each topic of fixed size: our own ones, present or not, and the decoded ones."""
+def own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
+    """Describe our own topics in a log with such metadata. Raises LogError."""
     parameter_count = _number(metadata, "parameter_count", len(PARAMETER_NAMES))
+    channels = (*run_channels(parameter_count), *truth_channels())
+    return {
+        channel.topic: Topic.of(channel.topic, channel.type.name, _own_layout(channel.type)) for channel in channels
+    }
+
+
+def series_of(
+    rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
+) -> dict[str, Series]:
+    """Make a series of each topic of fixed size: of our own ones, present or not, and of the others that there are.
+
+    rows: the records of topics (n, size).
+    """
     series = {}
-    for channel in (*run_channels(parameter_count), *truth_channels()):
-        topic = topics.get(channel.topic)
-        if topic is None or topic.type_name != channel.type.name:
-            topic = Topic(channel.type.name, _own_layout(channel.type))
-        if topic.dtype is not None:
-            series[channel.topic] = Series(topic.records(), epoch_ns)
-    for name, topic in topics.items():
-        if name.startswith(DECODED) and topic.dtype is not None:
-            series[name] = Series(topic.records(), epoch_ns)
+    for name, topic in {**topics, **own}.items():
+        found = topics.get(name, topic)
+        if found.type_name != topic.type_name or found.dtype is None:
+            found = topic
+        if found.dtype is not None:
+            is_there = found is topics.get(name) and name in rows
+            records = rows[name].view(found.dtype)[:, 0] if is_there else np.empty(0, found.dtype)
+            series[name] = Series(records, epoch_ns)
     return series
 
 
-def _frames(topics: Mapping[str, Topic], series: Mapping[str, Series], epoch_ns: int) -> NDArray[Any]:
-    parts, places = [], []
-    has_long = any(len(series[name]) for name, (_, length) in _FRAME_TOPICS.items() if length == "len")
-    dtype = LONG_FRAME_DTYPE if has_long else FRAME_DTYPE
-    for name, (is_tx, length) in _FRAME_TOPICS.items():
-        source = series[name]
-        if not len(source):
-            continue
-        part = np.zeros(len(source), dtype)
-        part["t_ns"] = source.t_ns
-        part["cycle_t_ns"] = source.records["publish_time"].astype(np.int64) - epoch_ns
-        part["is_tx"] = is_tx
-        part["length"] = source.records[length]
-        part["can_id"] = source.records["can_id"]
-        part["is_error"] = source.records["is_error"]
-        data = source.records["data"]
-        part["data"][:, : data.shape[1]] = data
-        parts.append(part)
-        places.append(topics[name].place())
-    if not parts:
-        return np.zeros(0, FRAME_DTYPE)
-    return np.concatenate(parts)[np.argsort(np.concatenate(places), kind="stable")]
-
-
-def _events(topic: Topic | None, epoch_ns: int) -> list[LoggedEvent]:
-    if topic is None or topic.type_name != LOG.name:
-        return []
-    events = []
-    for payload in topic.payloads:
+def events_of(payloads: Mapping[str, Iterable[bytes]], topics: Mapping[str, Topic], epoch_ns: int) -> list[LoggedEvent]:
+    """Unpack what /events has."""
+    events: list[LoggedEvent] = []
+    if "/events" not in topics or topics["/events"].type_name != LOG.name:
+        return events
+    for payload in payloads.get("/events", ()):
         sec, nanosec = np.frombuffer(payload, "<u4", 2, 4).tolist()
         events.append(LoggedEvent(sec * 1_000_000_000 + nanosec - epoch_ns, unpack_log(payload)))
     return events

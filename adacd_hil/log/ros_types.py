@@ -11,6 +11,7 @@ import numpy as np
 
 from adacd_hil.log.cdr import ENCAPSULATION, SEPARATOR, TIME_TEXT, MessageType
 from adacd_hil.records import JOINT_NAMES, JOINTS, Event
+from adacd_hil.wire.bus import MAX_STANDARD_ID
 
 _HEADER_TEXT = f"""{SEPARATOR}
 MSG: std_msgs/Header
@@ -92,17 +93,29 @@ _LEVELS = {"info": 2, "warning": 3, "error": 4}
 _LEVEL_NAMES = {number: name for name, number in _LEVELS.items()} | {0: "info", 1: "info", 5: "error"}
 
 
-def pack_can_frame(stamp: bytes, can_id: int, data: bytes, dlc: int, is_error: bool) -> bytes:
-    """Pack a frame; `stamp` is a packed builtin_interfaces/Time, `data` up to 8 bytes of which `dlc` count."""
-    return ENCAPSULATION + stamp + _FRAME_ID + _CAN_FRAME_BODY.pack(can_id, False, can_id > 0x7FF, is_error, dlc, data)
+def pack_can_frame(
+    stamp: bytes,
+    can_id: int,
+    data: bytes,
+    dlc: int,
+    is_error: bool,
+    is_remote: bool = False,
+    is_extended: bool | None = None,
+) -> bytes:
+    """Pack a frame; `stamp` is a packed builtin_interfaces/Time, `data` up to 8 bytes of which `dlc` count.
+
+    Without `is_extended` identifiers beyond 0x7FF are 29-bit ones.
+    """
+    is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended
+    body = _CAN_FRAME_BODY.pack(can_id, is_remote, is_extended, is_error, dlc, data)
+    return ENCAPSULATION + stamp + _FRAME_ID + body
 
 
-def pack_fd_frame(stamp: bytes, can_id: int, data: bytes, is_error: bool) -> bytes:
+def pack_fd_frame(stamp: bytes, can_id: int, data: bytes, is_error: bool, is_extended: bool | None = None) -> bytes:
     """Pack an FD frame; `stamp` is a packed builtin_interfaces/Time, `data` up to 64 bytes."""
     length = len(data)
-    return (
-        ENCAPSULATION + stamp + _FRAME_ID + _FD_FRAME_BODY.pack(can_id, can_id > 0x7FF, is_error, length, length) + data
-    )
+    is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended
+    return ENCAPSULATION + stamp + _FRAME_ID + _FD_FRAME_BODY.pack(can_id, is_extended, is_error, length, length) + data
 
 
 def _joint_state_parts() -> tuple[bytes, bytes]:

@@ -12,15 +12,20 @@ from adacd_hil.records import (
     PARAMETER_UNITS,
     ArmState,
     Event,
+    Reaction,
     Request,
     SchemeOutput,
     SchemeState,
     certified_layout,
-    scheme_layout,
 )
-from adacd_hil.scheme import certificate, certified_kernel, kernel
+from adacd_hil.scheme import certificate, certified_kernel
+from adacd_hil.scheme.batch import RunsBatches
+from adacd_hil.scheme.beside import Beside
+from adacd_hil.scheme.calm import Calm
+from adacd_hil.scheme.intervals import Intervals
+from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_certified
 from adacd_hil.scheme.margin import MarginWatch
-from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.regressor import inverse_dynamics
 from adacd_hil.scheme.supervisor import Supervisor
 from adacd_hil.scheme.touch import Touch
@@ -37,10 +42,9 @@ _MODES = {
     SchemeState.PAYLOAD: _WATCH,
 }
 _LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
-_ADAPTED = int(Observation.ADAPTED)
 
 
-class CertifiedPipeline:
+class CertifiedPipeline(RunsBatches):
     """Adaptation with a certificate, and collision detection, for one run."""
 
     def __init__(self, settings: Settings) -> None:
@@ -56,14 +60,13 @@ class CertifiedPipeline:
         self._tau_J = self._values[places["tau_J"]]
         self._period_s = self._values[places["period_s"]]
         self._promotions = self._values[places["promotions"]]
-        self._is_measuring = settings.realtime.sample_period == "measured"
-        self._t_ns: int | None = None
+        self._intervals = Intervals(settings)
         self._theta_hat = places["theta_hat"]
         self._tau_ext_hat = self._memory[0]["y"][certified_kernel.WIDE]  # what a reaction goes by: fast, and smooth
         self._tau_ext_wide_hat = self._values[places["tau_ext_wide_hat"]]
         self._sigma = self._memory[0]["wide_sigma"]
         self._threshold = self._memory[0]["wide_threshold"]
-        self._paper = _Beside(settings, self._values)
+        self._paper = Beside(settings)
         self._supervisor = Supervisor(settings)
         self._touch = Touch(settings)
         self._theta_ff = np.zeros(base)
@@ -87,7 +90,7 @@ class CertifiedPipeline:
         certified_kernel.begin_refinement(memory)
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
         self._touch.compile()
-        self._paper.compile()
+        self._paper.compile(self._block)
 
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for, a line each."""
@@ -95,16 +98,25 @@ class CertifiedPipeline:
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
-        supervisor, touch = self._supervisor, self._touch
-        previous = supervisor.state
         self._q[:] = arm.q
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
-        period_s = self._period_s[0] = self._measure(arm.t_ns)
+        self._period_s[0] = self._intervals.since_last(arm.t_ns)
         is_complete, periods = int(arm.is_complete), int(arm.periods)
-        mode = _MODES.get(previous, 0)
-        observation = certified_kernel.step(self._constants, self._memory, self._block, is_complete, periods, mode)
-        self._paper.step(arm, period_s)
+        observation = certified_kernel.step(
+            self._constants, self._memory, self._block, is_complete, periods, self._mode
+        )
+        self._paper.step(self._block, is_complete, periods)
+        return self._conclude(arm, request, observation)
+
+    @property
+    def _mode(self) -> int:
+        """What the numbers do in the state reached so far."""
+        return _MODES.get(self._supervisor.state, 0)
+
+    def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
+        supervisor, touch = self._supervisor, self._touch
+        previous = supervisor.state
         state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
         if state is not previous:
             self._enter(state, previous)
@@ -157,13 +169,35 @@ class CertifiedPipeline:
             self._events.append(Event("warning", "margin", warning))
         self._has_warned = bool(warning)
 
-    def _measure(self, t_ns: int) -> float:
-        """Return the time since the cycle before, s; 0 where that is unknown or not to be used."""
-        if not self._is_measuring:
-            return 0.0
-        period_s = 0.0 if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
-        self._t_ns = t_ns
-        return period_s
+    def _calm(self, cycle: int) -> Calm:
+        calm = self._touch.calm(self._supervisor.calm(self._touch.is_reporting), cycle)
+        if self._supervisor.state is not SchemeState.MONITOR:
+            return calm
+        return calm._replace(cycles=min(calm.cycles, self._second - self._monitored - 1))
+
+    def _advance(self, samples: Samples, recorded: Recorded, first: int, last: int, calm: Calm) -> int:
+        paper = self._paper
+        row, paper.mode = run_certified(
+            Numbers(self._constants, self._memory, self._block, self._values),
+            paper.numbers,
+            samples,
+            recorded,
+            first,
+            last,
+            self._mode,
+            paper.mode,
+            calm,
+            self._touch.watch,
+            self._refined,
+        )
+        return row
+
+    def _pass_by(self, cycles: int) -> None:
+        self._touch.pass_by(cycles)
+        self._monitored += cycles if self._supervisor.state is SchemeState.MONITOR else 0
+
+    def _standing(self) -> tuple[Reaction, bool]:
+        return self._touch.reaction, self._has_certificate
 
     def _enter(self, state: SchemeState, previous: SchemeState) -> None:
         """Do what a new state begins with, and what the previous one ends with."""
@@ -202,48 +236,3 @@ class CertifiedPipeline:
         """Take the model in use for the feedforward from now on."""
         self._theta_ff = np.array(self._memory[0]["theta"][: self._theta_ff.size])
         self._refined = float(self._promotions[0])
-
-
-class _Beside:
-    """The paper's scheme on the same stream: adapts until eq. (15) holds, then compares with its thresholds."""
-
-    def __init__(self, settings: Settings, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> None:
-        base = len(settings.estimator.parameter_names)
-        further = len(certified_kernel.parameter_names(settings)) - base
-        places = certified_layout(base, further, settings.channel_count).slices
-        names = ("paper_is_armed", "paper_tau_ext_hat", "paper_threshold", "paper_theta_hat")
-        self._is_armed, self._tau_ext_hat, self._threshold, self._theta_hat = (values[places[name]] for name in names)
-        self._constants = kernel.constants_of(settings)
-        self._memory = kernel.new_memory(base)
-        self._block = kernel.new_block(base)
-        own = self._block.view(np.float64)
-        self._own = {name: own[place] for name, place in scheme_layout(base).slices.items()}
-        self._mode = 0
-
-    def compile(self) -> None:
-        """Run every compiled function once, on copies."""
-        memory, block = self._memory.copy(), self._block.copy()
-        kernel.begin_adaptation(self._constants, memory, block)
-        kernel.step(self._constants, memory, block, 1, 1, kernel.LEARN)
-
-    def begin_adaptation(self) -> None:
-        """Forget the past, as the scheme does whenever it adapts."""
-        kernel.begin_adaptation(self._constants, self._memory, self._block)
-        self._mode = kernel.LEARN
-
-    def step(self, arm: ArmState, period_s: float) -> None:
-        """Take in one cycle, and put what it comes to into the block of the scheme in charge."""
-        own = self._own
-        own["q"][:] = arm.q
-        own["dq"][:] = arm.dq
-        own["tau_J"][:] = arm.tau_J
-        own["period_s"][0] = period_s
-        observation = kernel.step(
-            self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), self._mode
-        )
-        if observation & _ADAPTED:
-            self._mode = kernel.ARMED
-        self._is_armed[0] = float(self._mode == kernel.ARMED)
-        self._tau_ext_hat[:] = own["tau_ext_hat"]
-        self._threshold[:] = own["threshold"]
-        self._theta_hat[:] = own["theta_hat"]

@@ -17,6 +17,8 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ContactReport, Vector
+from adacd_hil.scheme.calm import Calm
+from adacd_hil.scheme.observation import CONTACT_SHIFT
 
 WIDE_SAMPLES = 5
 """Samples of the mean in tau_ext_wide_hat: at 1 kHz it centres 2 ms late, and gets a half-sine's peak right within
@@ -77,6 +79,13 @@ class Isolation:
     def is_open(self) -> bool:
         """Whether a report is out that is not final yet."""
         return self._is_open
+
+    def calm(self, calm: Calm) -> Calm:
+        """Narrow the bounds to those within which no report is due and no direction is new."""
+        if not self._is_open:
+            return calm
+        new = sum(1 << i for i in range(JOINTS) if self._direction[i] == 0)
+        return calm._replace(watched=calm.watched | new << CONTACT_SHIFT, due=self._begin_cycle + self._window_cycles)
 
     def begin(self, cycle: int) -> None:
         """Open the window: a collision is detected in this cycle."""

@@ -22,7 +22,11 @@ from adacd_hil.records import (
     scheme_layout,
 )
 from adacd_hil.scheme import kernel
+from adacd_hil.scheme.batch import RunsBatches
+from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.contact import Isolation
+from adacd_hil.scheme.intervals import Intervals
+from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_paper
 from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.regressor import inverse_dynamics, is_positive_definite
 from adacd_hil.scheme.supervisor import Supervisor
@@ -34,7 +38,7 @@ _MODES = {
 }
 
 
-class Pipeline:
+class Pipeline(RunsBatches):
     """Adaptation and collision detection for one run."""
 
     def __init__(self, settings: Settings) -> None:
@@ -48,8 +52,7 @@ class Pipeline:
         self._dq = self._values[places["dq"]]
         self._tau_J = self._values[places["tau_J"]]
         self._period_s = self._values[places["period_s"]]
-        self._is_measuring = settings.realtime.sample_period == "measured"
-        self._t_ns: int | None = None
+        self._intervals = Intervals(settings)
         self._theta_hat = places["theta_hat"]
         self._tau_ext_hat = places["tau_ext_hat"]
         self._integral = self._memory[0]["integral"]
@@ -78,16 +81,23 @@ class Pipeline:
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
-        supervisor, isolation = self._supervisor, self._isolation
-        previous = supervisor.state
         self._q[:] = arm.q
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
-        self._period_s[0] = self._measure(arm.t_ns)
-        mode = _MODES[previous] | (kernel.REPORTING if isolation.is_open else 0)
+        self._period_s[0] = self._intervals.since_last(arm.t_ns)
         observation = kernel.step(
-            self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), mode
+            self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), self._mode
         )
+        return self._conclude(arm, request, observation)
+
+    @property
+    def _mode(self) -> int:
+        """What the numbers do in the state reached so far."""
+        return _MODES[self._supervisor.state] | (kernel.REPORTING if self._isolation.is_open else 0)
+
+    def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
+        supervisor, isolation = self._supervisor, self._isolation
+        previous = supervisor.state
         state = supervisor.step(arm, request, observation, isolation.is_open)
         joints = observation >> CONTACT_SHIFT
         block = self._values.copy()
@@ -109,13 +119,18 @@ class Pipeline:
             reaction=self._reaction,
         )
 
-    def _measure(self, t_ns: int) -> float:
-        """Return the time since the cycle before, s; 0 where that is unknown or not to be used."""
-        if not self._is_measuring:
-            return 0.0
-        period_s = 0.0 if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
-        self._t_ns = t_ns
-        return period_s
+    def _calm(self, cycle: int) -> Calm:  # noqa: ARG002
+        return self._isolation.calm(self._supervisor.calm(self._isolation.is_open))
+
+    def _advance(self, samples: Samples, recorded: Recorded, first: int, last: int, calm: Calm) -> int:
+        numbers = Numbers(self._constants, self._memory, self._block, self._values)
+        return run_paper(numbers, samples, recorded, first, last, self._mode, calm)
+
+    def _pass_by(self, cycles: int) -> None:
+        pass
+
+    def _standing(self) -> tuple[Reaction, bool]:
+        return self._reaction, self._is_model_valid
 
     def _enter(self, state: SchemeState, previous: SchemeState, cycle: int, joints: int) -> None:
         """Do what a new state begins with, and what the previous one ends with."""

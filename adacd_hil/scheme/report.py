@@ -16,7 +16,9 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, Reaction, Vector
 from adacd_hil.scheme import classification, localisation
+from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.contact import ONSET_FRACTION
+from adacd_hil.scheme.observation import CONTACT_SHIFT
 
 LINK_S = 0.01
 """From detection until the link is decided."""
@@ -47,24 +49,25 @@ class ContactHistory:
     """The last samples of elbow angle, external torques, their uncertainty and their thresholds, in order of time."""
 
     def __init__(self, rows: int) -> None:
-        self._rows = np.zeros((2 * rows, _COLUMNS))  # each row twice, so that any window is one piece
+        self.rows = np.zeros((2 * rows, _COLUMNS))  # each row twice, so that any window is one piece
         self._size = rows
-        self._count = 0
+        self.count = 0
 
     def put(self, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector) -> None:
         """Take in one cycle; vectors (2,)."""
-        _put(self._rows, self._count % self._size, q, tau_ext_wide_hat, sigma, threshold)
-        self._count += 1
+        put_row(self.rows, self.count % self._size, q, tau_ext_wide_hat, sigma, threshold)
+        self.count += 1
 
     def last(self, count: int) -> Vector:
         """Return up to `count` rows, the newest last; a view, good until the next cycle."""
-        count = min(count, self._count, self._size)
-        end = self._size + (self._count - 1) % self._size + 1
-        return self._rows[end - count : end]
+        count = min(count, self.count, self._size)
+        end = self._size + (self.count - 1) % self._size + 1
+        return self.rows[end - count : end]
 
 
 @compiled
-def _put(rows: Vector, place: int, q: Vector, tau: Vector, sigma: Vector, threshold: Vector) -> None:
+def put_row(rows: Vector, place: int, q: Vector, tau: Vector, sigma: Vector, threshold: Vector) -> None:
+    """Take one cycle into the rows of a `ContactHistory`."""
     half = rows.shape[0] // 2
     for row in (place, place + half):
         rows[row, 0] = q[1]
@@ -102,7 +105,7 @@ class ContactReporter:
         self._link_cycles = round(LINK_S / period_s)
         self._window_cycles = round(classification.WINDOW_S / period_s)
         self._before_cycles = round(BEFORE_S / period_s)
-        self._history = ContactHistory(self._before_cycles + 2 * self._window_cycles)
+        self.history = ContactHistory(self._before_cycles + 2 * self._window_cycles)
         self._begin_cycle = 0
         self._detected_cycle = 0
         self._direction = [0] * JOINTS
@@ -125,12 +128,21 @@ class ContactReporter:
 
     def observe(self, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector) -> None:
         """Take in one cycle's values (2,), whatever the state is; thresholds as finite numbers or inf."""
-        self._history.put(q, tau_ext_wide_hat, sigma, threshold)
+        self.history.put(q, tau_ext_wide_hat, sigma, threshold)
+
+    def calm(self, calm: Calm, cycle: int) -> Calm:
+        """Narrow the bounds to those within which, from this cycle on, no report is due and no direction is new."""
+        if not self._is_open:
+            return calm
+        at_link = self._detected_cycle + self._link_cycles
+        due = at_link if cycle <= at_link else self._detected_cycle + self._window_cycles
+        new = sum(1 << i for i in range(JOINTS) if self._direction[i] == 0)
+        return calm._replace(watched=calm.watched | new << CONTACT_SHIFT, due=due)
 
     def begin(self, cycle: int) -> None:
         """Open the window: a contact is detected in this cycle."""
         self._detected_cycle = cycle
-        rows = self._history.last(self._before_cycles)
+        rows = self.history.last(self._before_cycles)
         below = np.all(np.abs(rows[:, TAU]) <= np.maximum(ONSET_FRACTION * rows[:, THRESHOLD], rows[:, SIGMA]), axis=1)
         since = rows.shape[0] - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else rows.shape[0]
         self._begin_cycle = cycle - since
@@ -147,7 +159,7 @@ class ContactReporter:
         """Return the report that is due in this cycle, if one is. joints: bits of those over their threshold."""
         elapsed = cycle - self._detected_cycle
         is_final = elapsed >= self._window_cycles
-        tau_ext_hat = self._history.last(1)[0, TAU]
+        tau_ext_hat = self.history.last(1)[0, TAU]
         for i in range(JOINTS):
             if joints >> i & 1 and self._direction[i] == 0:
                 self._direction[i] = int(np.sign(tau_ext_hat[i]))
@@ -159,7 +171,7 @@ class ContactReporter:
     def _make(
         self, cycle: int, level: ContactLevel, reaction: Reaction, is_two_sided: bool, is_final: bool
     ) -> ContactReport:
-        rows = self._history.last(max(cycle - self._begin_cycle, 1))
+        rows = self.history.last(max(cycle - self._begin_cycle, 1))
         tau, sigma, threshold = rows[:, TAU], rows[-1, SIGMA], rows[-1, THRESHOLD]
         peaks = np.array([_peak(tau[:, i], sigma[i]) for i in range(JOINTS)])
         impulse = self._period_s * np.sum(tau, axis=0)

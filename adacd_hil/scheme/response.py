@@ -11,11 +11,17 @@ import numpy as np
 
 from adacd_hil.config import Settings
 from adacd_hil.records import ContactLevel, Reaction, Vector
+from adacd_hil.scheme.calm import Calm
+from adacd_hil.scheme.observation import Observation
 
 TURNED_CYCLES = 5
 """How many samples in a row the torque must be turned: what a blow leaves in the estimate is shorter."""
 BLIND_S = 0.02
 """After a withdrawal has begun it is not judged yet: the estimate still rings from the blow."""
+
+_ROUNDING_NM = 1e-9
+"""More than two ways of adding up a torque along a way may differ by."""
+_COLLISION = int(Observation.COLLISION)
 
 
 class Response:
@@ -89,8 +95,39 @@ class Response:
             self._choose(tau_ext_hat, is_model_valid)
         if is_latched and self.goes_on and self.level is ContactLevel.CONTACT:
             self._begin(Reaction.STOP, tau_ext_hat)
-        if self._reaction is Reaction.WITHDRAW and self._way.size:
+        if self._is_judging:
             self._judge(tau_ext_hat, is_model_valid)
+
+    def calm(self, calm: Calm, link: int) -> Calm:
+        """Narrow the bounds to those within which nothing calls for another reaction, but what `judged` says."""
+        if self._is_given_up:
+            return calm
+        if link != self._cause[1]:
+            return calm._replace(cycles=0)
+        is_contact = self.level is ContactLevel.CONTACT
+        return calm._replace(watched=calm.watched | _COLLISION) if is_contact else calm
+
+    @property
+    def judged(self) -> tuple[tuple[float, float], float]:
+        """A way, and the external torque along it, Nm, from which on a withdrawal certainly goes on; -inf: any."""
+        if not self._is_judging:
+            return (0.0, 0.0), -np.inf
+        return (float(self._way[0]), float(self._way[1])), _ROUNDING_NM - self._bound_Nm
+
+    def pass_by(self, cycles: int) -> None:
+        """Count calm cycles."""
+        if self._is_judging:
+            self._cycles += cycles
+            self._turned_cycles = 0
+
+    @property
+    def _is_judging(self) -> bool:
+        return self._reaction is Reaction.WITHDRAW and self._way.size > 0
+
+    @property
+    def _bound_Nm(self) -> float:
+        """How far the torque along the way may turn against it."""
+        return float(np.abs(self._way) @ self._collision_Nm)
 
     def _choose(self, tau_ext_hat: Vector, is_model_valid: bool) -> None:
         level, link = self._cause
@@ -114,8 +151,7 @@ class Response:
         if self._cycles <= self._blind_cycles:
             return
         along = float(tau_ext_hat @ self._way)
-        bound = float(np.abs(self._way) @ self._collision_Nm)
-        self._turned_cycles = self._turned_cycles + 1 if along < -bound else 0
+        self._turned_cycles = self._turned_cycles + 1 if along < -self._bound_Nm else 0
         self._is_two_sided = self._is_two_sided or self._turned_cycles >= TURNED_CYCLES
         if self._is_two_sided:
             self._is_given_up = True

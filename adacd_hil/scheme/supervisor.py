@@ -1,4 +1,4 @@
-"""The scheme's state machine: one table, and the conditions that raise its events.
+"""The scheme's state machine: what raises the events of its table, `adacd_hil.scheme.transitions`.
 
 INIT -> COMMISSION -> ENABLE -> ADAPT (-> CERTIFY) -> MONITOR; a contact in any of ENABLE, ADAPT, CERTIFY, MONITOR and
 PAYLOAD -> REACT, and from there back; MONITOR or STOPPED -> PAYLOAD -> ADAPT; any -> FAULT, which is latched. A pair
@@ -13,122 +13,20 @@ A request is kept until it can be served, but only in the states of `_KEPT_IN`; 
 acknowledgement given too early can't release the next stop.
 """
 
-from enum import Enum, IntEnum
 from types import MappingProxyType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from adacd_hil.config import Settings
-from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
+from adacd_hil.records import ArmBatch, ArmState, FaultReason, Request, SchemeState
+from adacd_hil.scheme.calm import NEVER, ArmFinding, Calm, findings_of
 from adacd_hil.scheme.observation import Observation
+from adacd_hil.scheme.transitions import TRANSITIONS, SchemeEvent, next_state
 
 REST_HOLD_S = 0.05
 """How long |dq| stays below the rest velocity until the arm counts as at rest. At the reversal of a withdrawal with
 700 °/s² it stays below 0.05 rad/s for 8 ms: a margin of 6."""
-
-
-class SchemeEvent(IntEnum):
-    """What can move the scheme to another state, in order of precedence."""
-
-    NONE = 0
-    FAULT = 1  # a check of the running arm failed, or a phase took too long
-    COLLISION = 2  # a joint is over its upper threshold
-    CONTACT = 3  # a joint is over its lower threshold
-    LATE = 4  # the host has missed so many deadlines that the arm is to be held
-    COMPLETE = 5  # a cycle with all its data
-    COMMISSIONED = 6  # enough complete cycles at rest in a row
-    ENABLED = 7  # both drives report Operation enabled
-    ADAPTED = 8  # eq. (15) with the evidence for it
-    FITTED = 9  # the estimate is ready to be tested
-    CERTIFIED = 10  # the frozen model has passed its test
-    REFUTED = 11  # the frozen model has failed its test
-    AT_REST = 12  # the arm has come to rest, the report is final, and all of it is to be acknowledged
-    CLEARED = 13  # nothing has pushed for a while, the report is final, and nothing is to be acknowledged
-    ACKNOWLEDGED = 14  # the user has acknowledged, no joint is over its threshold and the host is on time
-    PAYLOAD_ANNOUNCED = 15  # the user wants to change the payload
-    PAYLOAD_CHANGED = 16  # the user has changed the payload and the arm is at rest
-
-
-class Back(Enum):
-    """A place in the table that depends on the past."""
-
-    TO_ORIGIN = "the state from which REACT was entered"
-
-
-TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]] = MappingProxyType(
-    {
-        # Gathers nothing yet. Out: the first complete cycle; too late is a fault.
-        SchemeState.INIT: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COMPLETE: SchemeState.COMMISSION,
-        },
-        # Drives off, arm must lie still. Out: enough complete cycles at rest; too late is a fault.
-        SchemeState.COMMISSION: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COMMISSIONED: SchemeState.ENABLE,
-        },
-        # Drives are asked to enable. Out: both have; too late is a fault; a contact once they have.
-        SchemeState.ENABLE: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
-            SchemeEvent.ENABLED: SchemeState.ADAPT,
-        },
-        # Moves and learns. Out: eq. (15) with evidence; a fit to be tested; a contact; too late is a fault.
-        SchemeState.ADAPT: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
-            SchemeEvent.ADAPTED: SchemeState.MONITOR,
-            SchemeEvent.FITTED: SchemeState.CERTIFY,
-        },
-        # Moves on, the model frozen and tested. Out: the test's result; a contact; too late is a fault.
-        SchemeState.CERTIFY: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
-            SchemeEvent.CERTIFIED: SchemeState.MONITOR,
-            SchemeEvent.REFUTED: SchemeState.ADAPT,
-        },
-        # Moves, detection armed. Out: a contact; a host that is late; the announcement of a payload change.
-        SchemeState.MONITOR: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
-            SchemeEvent.LATE: SchemeState.REACT,
-            SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
-        },
-        # Reacts. Out, once the report is final: at rest, if it is to be acknowledged; else cleared.
-        SchemeState.REACT: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.AT_REST: SchemeState.STOPPED,
-            SchemeEvent.CLEARED: Back.TO_ORIGIN,
-        },
-        # Holds its place. Out: acknowledged while nothing pushes; the announcement of a payload change.
-        SchemeState.STOPPED: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.ACKNOWLEDGED: Back.TO_ORIGIN,
-            SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
-        },
-        # Parks. Out: the payload has been changed and the arm is at rest; a contact.
-        SchemeState.PAYLOAD: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
-            SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
-        },
-        # Latched. Out: a new run.
-        SchemeState.FAULT: {},
-    }
-)
-
-
-def next_state(state: SchemeState, event: SchemeEvent, origin: SchemeState) -> SchemeState:
-    """Look up the table; a pair that is not in it leaves the state as it is.
-
-    origin: the state from which REACT was entered last.
-    """
-    following = TRANSITIONS[state].get(event, state)
-    return origin if following is Back.TO_ORIGIN else following
-
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
@@ -168,6 +66,46 @@ _KEPT_IN = MappingProxyType(
     }
 )
 """Where a request waits to be served. FINISH is the control layer's."""
+
+_RAISED_BY = MappingProxyType(
+    {
+        SchemeEvent.COLLISION: _COLLISION,
+        SchemeEvent.CONTACT: _CONTACT,
+        SchemeEvent.LATE: int(ArmFinding.LATE),
+        SchemeEvent.COMPLETE: int(ArmFinding.COMPLETE),
+        SchemeEvent.ENABLED: int(ArmFinding.ENABLED),
+        SchemeEvent.ADAPTED: _ADAPTED,
+        SchemeEvent.FITTED: _FITTED,
+        SchemeEvent.CERTIFIED: _CERTIFIED,
+        SchemeEvent.REFUTED: _REFUTED,
+    }
+)
+"""Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
+_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _NOT_A_NUMBER | _OVER_LIMIT | _OVER_SPEED
+"""Findings without which `_check` finds nothing in an arm that is enabled."""
+
+
+def _calm_in(state: SchemeState) -> tuple[int, int]:
+    """Return the findings that matter in a state, and what they have to be to leave it as it is."""
+    watched, expected = 0, 0
+    for event in TRANSITIONS[state]:
+        watched |= _RAISED_BY.get(event, 0)
+    if state in _CHECKED or state is SchemeState.COMMISSION:
+        watched |= _NOT_WELL
+    if state in POWERED:
+        expected |= int(ArmFinding.ENABLED)
+    if state is SchemeState.COMMISSION:
+        expected |= int(ArmFinding.COMPLETE) | _REST_UNLOADED
+    return watched | expected, expected
+
+
+_CALM = MappingProxyType({state: _calm_in(state) for state in SchemeState})
+
+
+def _run_at_end(holds: NDArray[np.bool_], before: int) -> int:
+    """Count for how many cycles something has held without a break up to the last; `before`: up to the first."""
+    breaks = np.flatnonzero(~holds)
+    return holds.size - int(breaks[-1]) - 1 if breaks.size else before + holds.size
 
 
 def _verdict(state: SchemeState, observation: int) -> SchemeEvent:
@@ -252,6 +190,45 @@ class Supervisor:
         if event is not SchemeEvent.NONE:
             self._enter(next_state(self._state, event, self._origin), event)
         return self._state
+
+    def findings(self, arms: ArmBatch) -> NDArray[np.int64]:
+        """Return what the arm says of itself in each cycle, bits of `ArmFinding` (n,)."""
+        return findings_of(arms, self._max_age_cycles)
+
+    def calm(self, is_reporting: bool) -> Calm:
+        """Return bounds within which cycles without a request change nothing here but what `pass_by` counts.
+
+        They may be too narrow: a cycle outside is one for `step`. is_reporting: as for `step`, the same all the time.
+        """
+        watched, expected = _CALM[self._state]
+        cycles = NEVER
+        limit = self._limits.get(self._state)
+        periods = NEVER if limit is None else limit[0] - self._spent
+        match self._state:
+            case SchemeState.COMMISSION:
+                cycles = self._commission_cycles - self._commissioned_cycles
+            case SchemeState.MONITOR | SchemeState.STOPPED if self._pending:
+                cycles = 0
+            case SchemeState.PAYLOAD if self._pending:
+                cycles = self._rest_cycles - self._still_cycles
+            case SchemeState.REACT:
+                if not self._is_latched:
+                    watched |= _COLLISION
+                    periods = self._patience_cycles - self._phase_cycles
+                if not is_reporting:
+                    to_rest = self._rest_cycles - self._still_cycles
+                    cycles = to_rest if self._is_latched else self._clear_cycles - self._cleared_cycles
+        return Calm(watched, expected, cycles - 1, periods)
+
+    def pass_by(self, observations: NDArray[np.int64], periods: NDArray[np.int64]) -> None:
+        """Count calm cycles; observations (n,), periods (n,)."""
+        elapsed = int(periods.sum())
+        self._phase_cycles += elapsed
+        self._learning_cycles += elapsed if self._state in _LEARNING else 0
+        self._still_cycles = _run_at_end(observations & _AT_REST != 0, self._still_cycles)
+        self._cleared_cycles = _run_at_end(observations & _ANY_CONTACT == 0, self._cleared_cycles)
+        if self._state is SchemeState.COMMISSION:
+            self._commissioned_cycles += observations.size
 
     def _has_grown(self, arm: ArmState, observation: int) -> bool:
         """Tell whether a contact that would clear itself has become one to be acknowledged."""
@@ -349,10 +326,14 @@ class Supervisor:
     def _overdue(self) -> FaultReason:
         """Return the timeout of a phase that has taken too long, or NONE. A learning arm's clock stops in REACT."""
         limit = self._limits.get(self._state)
-        cycles = self._learning_cycles if self._state in _LEARNING else self._phase_cycles
-        if limit is None or cycles < limit[0]:
+        if limit is None or self._spent < limit[0]:
             return FaultReason.NONE
         return limit[1]
+
+    @property
+    def _spent(self) -> int:
+        """Periods that count towards this phase's timeout."""
+        return self._learning_cycles if self._state in _LEARNING else self._phase_cycles
 
     def _check(self, arm: ArmState, observation: int) -> FaultReason:
         """Return why the arm must not go on, or NONE."""

@@ -5,6 +5,8 @@ Per cycle, after the kernel and the supervisor: `step`. It looks at the state re
 
 from adacd_hil.config import Settings
 from adacd_hil.records import ContactLevel, ContactReport, Reaction, SchemeState, Vector
+from adacd_hil.scheme.calm import Calm
+from adacd_hil.scheme.loop import TouchWatch
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.report import ContactReporter
 from adacd_hil.scheme.response import Response
@@ -41,6 +43,24 @@ class Touch:
     def goes_on(self) -> bool:
         """Whether the arm moves on along its path."""
         return self._response.goes_on
+
+    def calm(self, calm: Calm, cycle: int) -> Calm:
+        """Narrow the bounds to those within which, from this cycle on, only `pass_by` is to be called."""
+        if self._is_reacting and self._link:
+            calm = self._response.calm(calm, self._link)
+        return self._reporter.calm(calm, cycle)
+
+    @property
+    def watch(self) -> TouchWatch:
+        """What a loop over calm cycles does and watches."""
+        history = self._reporter.history
+        return TouchWatch(history.rows, history.count, *self._response.judged)
+
+    def pass_by(self, cycles: int) -> None:
+        """Count calm cycles, whose samples are in the history."""
+        self._reporter.history.count += cycles
+        if self._is_reacting and self._link:
+            self._response.pass_by(cycles)
 
     def step(
         self,

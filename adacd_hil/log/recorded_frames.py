@@ -1,0 +1,49 @@
+"""Frames as recordings have them, in arrays: all that any of the formats knows of a frame.
+
+The fields of `reader.LONG_FRAME_DTYPE` come first and mean the same; what is beyond them is what our own bus never
+has: remote frames, 29-bit identifiers below 0x800, FD frames without bit rate switch, several channels.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.log.reader import LONG_FRAME_DTYPE
+from adacd_hil.wire.bus import MAX_STANDARD_ID
+
+RECORDED_FRAME_DTYPE = np.dtype(
+    [
+        *LONG_FRAME_DTYPE.descr,  # `length` of a remote frame is its DLC, and its data are zero
+        ("channel", np.uint16),  # index of its name
+        ("is_extended", np.bool_),
+        ("is_remote", np.bool_),
+        ("is_fd", np.bool_),
+        ("has_rate_switch", np.bool_),  # BRS
+        ("has_error_state", np.bool_),  # ESI
+    ]
+)
+"""A recorded frame."""
+
+
+class FrameLog(NamedTuple):
+    """The frames of a recording, in its order."""
+
+    channels: tuple[str, ...]  # "" where the recording names none
+    frames: NDArray[Any]  # (n,) of RECORDED_FRAME_DTYPE
+    epoch_ns: int = 0  # what was added to t_ns for the times in the file
+    problem: str = ""  # what is missing, one line; "" for a whole recording
+
+
+def as_logged(frames: NDArray[Any]) -> NDArray[Any]:
+    """Return what a bus end of ours would have received and sent of them, (k,) of LONG_FRAME_DTYPE.
+
+    It never has remote frames, nor 29-bit identifiers that would read as 11-bit ones.
+    """
+    is_as_wide = (frames["can_id"] > MAX_STANDARD_ID) == frames["is_extended"]
+    is_known = ~frames["is_remote"] & (is_as_wide | frames["is_error"])
+    chosen = frames[is_known]
+    logged = np.zeros(len(chosen), LONG_FRAME_DTYPE)
+    for name in LONG_FRAME_DTYPE.names or ():
+        logged[name] = chosen[name]
+    return logged

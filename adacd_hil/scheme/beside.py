@@ -1,0 +1,72 @@
+"""The paper's scheme beside the certified one: it adapts until eq. (15) holds, then compares with its thresholds.
+
+It decides nothing; what it comes to is in the block of the scheme in charge.
+"""
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
+from adacd_hil.scheme import kernel
+from adacd_hil.scheme.kernel import Structured
+from adacd_hil.scheme.observation import Observation
+
+_ADAPTED = int(Observation.ADAPTED)
+
+
+@compiled
+def step(
+    constants: Structured,
+    memory: Structured,
+    block: Structured,
+    mode: int,
+    main: Structured,
+    is_complete: int,
+    periods: int,
+) -> int:
+    """Take in the sample that the main scheme's block has, fill that block's fields, and return the next mode.
+
+    constants, memory, block: of the paper's kernel. main: after the main kernel's step.
+    """
+    own, out = block[0], main[0]
+    own["q"][:] = out["q"]
+    own["dq"][:] = out["dq"]
+    own["tau_J"][:] = out["tau_J"]
+    own["period_s"][:] = out["period_s"]
+    observation = kernel.step(constants, memory, block, is_complete, periods, mode)
+    if observation & _ADAPTED:
+        mode = kernel.ARMED
+    out["paper_is_armed"][0] = 1.0 if mode == kernel.ARMED else 0.0
+    out["paper_tau_ext_hat"][:] = own["tau_ext_hat"]
+    out["paper_threshold"][:] = own["threshold"]
+    out["paper_theta_hat"][:] = own["theta_hat"]
+    return mode
+
+
+class Beside:
+    """The paper's scheme on the same stream."""
+
+    def __init__(self, settings: Settings) -> None:
+        count = len(settings.estimator.parameter_names)
+        self.constants = kernel.constants_of(settings)
+        self.memory = kernel.new_memory(count)
+        self.block = kernel.new_block(count)
+        self.mode = 0
+
+    @property
+    def numbers(self) -> tuple[Structured, Structured, Structured]:
+        """What its kernel works on: constants, memory, block."""
+        return self.constants, self.memory, self.block
+
+    def compile(self, main: Structured) -> None:
+        """Run every compiled function once, on copies. main: the block of the scheme in charge."""
+        memory, block = self.memory.copy(), self.block.copy()
+        kernel.begin_adaptation(self.constants, memory, block)
+        step(self.constants, memory, block, kernel.LEARN, main.copy(), 1, 1)
+
+    def begin_adaptation(self) -> None:
+        """Forget the past, as the scheme does whenever it adapts."""
+        kernel.begin_adaptation(self.constants, self.memory, self.block)
+        self.mode = kernel.LEARN
+
+    def step(self, main: Structured, is_complete: int, periods: int) -> None:
+        """Take in one cycle, and put what it comes to into the block of the scheme in charge."""
+        self.mode = step(self.constants, self.memory, self.block, self.mode, main, is_complete, periods)

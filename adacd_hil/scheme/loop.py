@@ -1,0 +1,139 @@
+"""The compiled loops over recorded cycles: the kernels' own step, cycle by cycle, to the first that needs a look.
+
+The same calls in the same order as a live cycle, without what comes after them: a cycle that is calm ends there, and
+the first that isn't, or the last that was asked for, is the caller's to conclude.
+
+Compiled at their first call, which no live run makes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.compiled import compiled, released
+from adacd_hil.records import ArmBatch, Vector
+from adacd_hil.scheme import beside, certified_kernel, kernel, report
+from adacd_hil.scheme.calm import Calm, is_calm
+from adacd_hil.scheme.kernel import Structured
+
+
+class Samples(NamedTuple):
+    """What the loops read of n cycles, as columns. period_s: 0 where not measured. findings: of the arm."""
+
+    cycle: NDArray[np.int64]
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+    period_s: Vector
+    is_complete: NDArray[np.int64]
+    periods: NDArray[np.int64]
+    findings: NDArray[np.int64]
+
+
+class Numbers(NamedTuple):
+    """What a kernel works on. values: the same memory as block, as (size,) float64."""
+
+    constants: Structured
+    memory: Structured
+    block: Structured
+    values: Vector
+
+
+class Recorded(NamedTuple):
+    """What the loops write: bits of `Observation` (n,), blocks (n, size)."""
+
+    observations: NDArray[np.int64]
+    blocks: Vector
+
+
+class TouchWatch(NamedTuple):
+    """What of a contact goes on in every cycle.
+
+    rows: of `report.ContactHistory`, written: how many have been. way, least_Nm: below which the filtered external torque
+    along the way of a withdrawal has to be judged.
+    """
+
+    rows: Vector
+    written: int
+    way: tuple[float, float]
+    least_Nm: float
+
+
+def samples_of(arms: ArmBatch, period_s: Vector, findings: NDArray[np.int64]) -> Samples:
+    """Lay out the columns as the compiled loops read them."""
+    integers = (np.ascontiguousarray(column, dtype=np.int64) for column in (arms.cycle, arms.is_complete, arms.periods))
+    q, dq, tau_J = (np.ascontiguousarray(column, dtype=np.float64) for column in (arms.q, arms.dq, arms.tau_J))
+    cycle, is_complete, periods = integers
+    return Samples(cycle, q, dq, tau_J, period_s, is_complete, periods, findings)
+
+
+@compiled
+def _put(block: Structured, samples: Samples, k: int) -> None:
+    out = block[0]
+    out["q"][:] = samples.q[k]
+    out["dq"][:] = samples.dq[k]
+    out["tau_J"][:] = samples.tau_J[k]
+    out["period_s"][0] = samples.period_s[k]
+
+
+@released
+def run_paper(
+    numbers: Numbers, samples: Samples, recorded: Recorded, first: int, last: int, mode: int, calm: Calm
+) -> int:
+    """Run `kernel.step` from sample `first` to the first that isn't calm, at most to `last`; return which it is."""
+    constants, memory, block, values = numbers
+    passed = 0
+    for k in range(first, last + 1):
+        _put(block, samples, k)
+        observation = kernel.step(constants, memory, block, samples.is_complete[k], samples.periods[k], mode)
+        recorded.observations[k] = observation
+        recorded.blocks[k] = values
+        passed += samples.periods[k]
+        if not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k]):
+            return k
+    return last
+
+
+@released
+def run_certified(
+    numbers: Numbers,
+    paper: tuple[Structured, Structured, Structured],
+    samples: Samples,
+    recorded: Recorded,
+    first: int,
+    last: int,
+    mode: int,
+    paper_mode: int,
+    calm: Calm,
+    touch: TouchWatch,
+    promotions: float,
+) -> tuple[int, int]:
+    """Run both schemes as `run_paper` does; return the sample and the paper's next mode.
+
+    A model that has taken over, so that there are not that many promotions any more, is not calm.
+    """
+    constants, memory, block, values = numbers
+    m, out = memory[0], block[0]
+    written, passed = touch.written, 0
+    for k in range(first, last + 1):
+        is_complete, periods = samples.is_complete[k], samples.periods[k]
+        _put(block, samples, k)
+        observation = certified_kernel.step(constants, memory, block, is_complete, periods, mode)
+        paper_mode = beside.step(paper[0], paper[1], paper[2], paper_mode, block, is_complete, periods)
+        recorded.observations[k] = observation
+        recorded.blocks[k] = values
+        passed += periods
+        y = m["y"][certified_kernel.WIDE]
+        along_Nm = y[0] * touch.way[0] + y[1] * touch.way[1]
+        if (
+            not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k])
+            or out["promotions"][0] != promotions
+            or not (along_Nm >= touch.least_Nm)
+            or k == last
+        ):
+            return k, paper_mode
+        place = written % (touch.rows.shape[0] // 2)
+        report.put_row(touch.rows, place, out["q"], out["tau_ext_wide_hat"], m["wide_sigma"], m["wide_threshold"])
+        written += 1
+    return last, paper_mode

@@ -1,0 +1,235 @@
+"""The plugin of python-can: its tools read and write our logs, and nothing of a frame is lost."""
+
+import gzip
+import importlib.metadata
+import itertools
+import sys
+import tomllib
+from decimal import Decimal
+from pathlib import Path
+
+import can
+import can.logconvert
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from adacd_hil.log.can_io import McapReader, McapWriter
+from adacd_hil.log.can_messages import TimedMessage, to_messages
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.frame_log import read_frames
+from adacd_hil.log.reader import read_log
+
+NOON_NS = 1_790_000_000_123_456_789
+
+
+def all_kinds(channels=(0, 1)):
+    """Make a message of every kind there is, with times that a float can't hold."""
+    kinds = []
+    for is_rx, channel, (can_id, is_extended) in itertools.product(
+        (True, False), channels, ((0, False), (0x7FF, False), (0x7FF, True), (0x1FFFFFFF, True))
+    ):
+        common = {"is_rx": is_rx, "channel": channel, "arbitration_id": can_id, "is_extended_id": is_extended}
+        kinds += [dict(common, data=bytes(range(1, size + 1))) for size in (0, 3, 8)]
+        kinds += [dict(common, is_remote_frame=True, dlc=dlc) for dlc in (0, 5, 8)]
+        kinds += [
+            dict(common, is_fd=True, bitrate_switch=brs, error_state_indicator=esi, data=bytes(range(size)))
+            for brs, esi, size in itertools.product((True, False), (True, False), (0, 8, 12, 64))
+        ]
+    for channel, can_id in itertools.product(channels, (0x004, 0x204)):
+        kinds.append(
+            {"channel": channel, "is_error_frame": True, "arbitration_id": can_id, "data": bytes(range(8, 16))}
+        )
+        kinds[-1]["is_extended_id"] = False
+    kinds.append({"channel": channels[0], "is_error_frame": True, "arbitration_id": 0x80, "dlc": 0})
+    return [TimedMessage(NOON_NS + 1_000_003 * number, **kind) for number, kind in enumerate(kinds)]
+
+
+def content(message):
+    """List everything that a message is, but for its time."""
+    return (
+        message.arbitration_id,
+        message.is_extended_id,
+        message.is_remote_frame,
+        message.is_error_frame,
+        message.channel,
+        message.dlc,
+        bytes(message.data),
+        message.is_fd,
+        message.is_rx,
+        message.bitrate_switch,
+        message.error_state_indicator,
+    )
+
+
+def write(path, messages):
+    with McapWriter(path) as writer:
+        for message in messages:
+            writer(message)
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return all_kinds()
+
+
+@pytest.fixture(scope="module")
+def path(messages, tmp_path_factory):
+    path = tmp_path_factory.mktemp("can_io") / "bus.mcap"
+    write(path, messages)
+    return path
+
+
+@pytest.fixture
+def tools(monkeypatch, tmp_path):
+    """Let python-can find the plugin as it would after an installation."""
+    points = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]["entry-points"]
+    lines = [f"[{group}]\n{name} = {value}\n" for group, table in points.items() for name, value in table.items()]
+    folder = tmp_path / "installed" / "plugin-1.dist-info"
+    folder.mkdir(parents=True)
+    (folder / "entry_points.txt").write_text("\n".join(lines))
+    (folder / "METADATA").write_text("Name: plugin\nVersion: 1\n")
+    monkeypatch.syspath_prepend(str(folder.parent))
+    for table in (can.io.player.MESSAGE_READERS, can.io.logger.MESSAGE_WRITERS):
+        monkeypatch.delitem(table, ".mcap", raising=False)
+
+    def convert(source, target):
+        monkeypatch.setattr(sys, "argv", ["can_logconvert", str(source), str(target)])
+        can.logconvert.main()
+        return target
+
+    yield convert
+    for table in (can.io.player.MESSAGE_READERS, can.io.logger.MESSAGE_WRITERS):
+        table.pop(".mcap", None)
+    assert importlib.metadata.entry_points(group="can.io.message_reader")
+
+
+def test_nothing_of_a_message_is_lost(messages, path):
+    read = list(McapReader(path))
+    assert [content(message) for message in read] == [content(message) for message in messages]
+    assert [message.t_ns for message in read] == [message.t_ns for message in messages]
+
+
+def test_pythons_float_is_the_one_nearest_to_the_time(path):
+    errors_s = [Decimal(message.timestamp) - Decimal(message.t_ns) / 10**9 for message in McapReader(path)]
+    assert max(map(abs, errors_s)) < Decimal("120e-9")
+
+
+def test_a_time_that_somebody_changed_counts(tmp_path):
+    message = TimedMessage(NOON_NS, arbitration_id=1, data=b"")
+    message.timestamp = 12.5
+    write(tmp_path / "x.mcap", [message, can.Message(timestamp=1790000000.1234567)])
+    assert read_frames(tmp_path / "x.mcap").frames["t_ns"].tolist() == [12_500_000_000, 1_790_000_000_123_456_717]
+
+
+def test_logconvert_to_blf_and_back_keeps_all_but_the_direction_of_error_frames(messages, path, tools, tmp_path):
+    back = tools(tools(path, tmp_path / "bus.blf"), tmp_path / "back.mcap")
+    read = list(McapReader(back))
+    assert [content(message) for message in read] == [content(message) for message in messages]
+    errors_ns = [one.t_ns - other.t_ns for one, other in zip(read, messages, strict=True)]
+    assert max(map(abs, errors_ns)) <= 240
+
+
+def test_logconvert_from_mcap_to_mcap_keeps_nanoseconds(messages, path, tools, tmp_path):
+    read = list(McapReader(tools(path, tmp_path / "copy.mcap")))
+    assert [message.t_ns for message in read] == [message.t_ns for message in messages]
+
+
+def test_others_decode_the_frames(messages, path):
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
+        decoded = [(channel, frame) for _, channel, _, frame in reader.iter_decoded_messages(log_time_order=False)]
+    assert len(decoded) == len(messages)
+    for (channel, frame), message in zip(decoded, messages, strict=True):
+        prefix = "/can1" if message.channel == 1 else ""
+        way = "from" if message.is_rx else "to"
+        assert channel.topic == f"{prefix}/{way}_can_bus{'_fd' if message.is_fd else ''}"
+        assert (frame.id, frame.is_extended, frame.is_error) == (*content(message)[:2], message.is_error_frame)
+        if message.is_fd:
+            assert bytes(frame.data) == message.data
+        else:
+            assert (frame.is_rtr, frame.dlc) == (message.is_remote_frame, message.dlc)
+        assert frame.header.stamp.sec * 10**9 + frame.header.stamp.nanosec == message.t_ns
+
+
+def test_our_reader_has_the_first_channels_frames(messages, path):
+    log = read_log(path)
+    assert log.is_complete
+    assert log.summary["frames"] == str(len(messages))
+    assert log.frames["t_ns"].tolist() == [message.t_ns for message in messages if message.channel == 0]
+
+
+def test_names_of_channels_are_kept(tmp_path):
+    names = ["vcan0", "/dev/ttyUSB0", 3, None]
+    write(tmp_path / "x.mcap", [can.Message(timestamp=1.0, channel=name) for name in names])
+    assert [message.channel for message in McapReader(tmp_path / "x.mcap")] == names
+    assert read_frames(tmp_path / "x.mcap").channels == ("vcan0", "/dev/ttyUSB0", "3", "")
+
+
+def test_frames_of_a_log_that_is_cut_are_read_up_to_the_cut(messages, path, tmp_path):
+    whole = path.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    counts = []
+    for size in np.linspace(8, len(whole) - 1, 40).astype(int).tolist():
+        cut.write_bytes(whole[:size])
+        reader = McapReader(cut)
+        read = list(reader)
+        assert [content(message) for message in read] == [content(message) for message in messages[: len(read)]]
+        assert reader.problem
+        counts.append(len(read))
+    assert counts == sorted(counts)
+    assert len(set(counts)) > 2
+
+
+def test_a_flipped_bit_in_a_chunk_costs_the_chunk_and_is_said(messages, path, tmp_path):
+    with path.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[0]
+    whole = bytearray(path.read_bytes())
+    whole[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    (tmp_path / "x.mcap").write_bytes(whole)
+    log = read_frames(tmp_path / "x.mcap")
+    assert 0 < len(log.frames) < len(messages)
+    assert "x.mcap is damaged at byte" in log.problem
+
+
+def test_a_gzipped_log_is_read(messages, path, tmp_path):
+    zipped = tmp_path / "bus.mcap.gz"
+    zipped.write_bytes(gzip.compress(path.read_bytes()))
+    with gzip.open(zipped) as file:
+        assert len(list(McapReader(file))) == len(messages)
+
+
+def test_what_is_no_mcap_is_refused(tmp_path):
+    (tmp_path / "x.mcap").write_bytes(b"hello world")
+    with pytest.raises(LogError, match="not an MCAP file"):
+        McapReader(tmp_path / "x.mcap")
+
+
+def test_nothing_is_appended(tmp_path):
+    with pytest.raises(ValueError, match="appended"):
+        McapWriter(tmp_path / "x.mcap", append=True)
+    assert not (tmp_path / "x.mcap").exists()
+
+
+def test_a_time_before_1970_is_refused(tmp_path):
+    writer = McapWriter(tmp_path / "x.mcap")
+    with pytest.raises(ValueError, match="t_ns = -1000000000"):
+        writer(can.Message(timestamp=-1.0))
+    writer.stop()
+    writer.stop()
+
+
+def test_mf4_keeps_classic_and_fd_frames_to_the_microsecond(messages, tmp_path):
+    pytest.importorskip("asammdf")
+    data = [message for message in messages if not (message.is_error_frame or message.is_remote_frame)]
+    path = tmp_path / "bus.mf4"
+    with can.MF4Writer(path) as writer:
+        for message in data:
+            writer(message)
+    log = read_frames(path)
+    assert [content(message)[:4] for message in to_messages(log.frames, list(log.channels))] == [
+        content(message)[:4] for message in data
+    ]
+    errors_ns = log.frames["t_ns"] - [message.t_ns for message in data]
+    assert np.ptp(errors_ns) < 1000
