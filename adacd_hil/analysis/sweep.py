@@ -52,7 +52,7 @@ def run_sweep(
     wanted = sum(key not in done for key in plan.row_keys())
     tasks = plan.tasks(done, rows_per_task)
     flying: dict[Any, Task] = {}
-    completed = as_completed()
+    completed = as_completed(loop=client.loop)
     rows: list[Values] = []
     computed = failures = 0
 

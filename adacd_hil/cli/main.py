@@ -10,6 +10,7 @@ from adacd_hil import __version__
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
 from adacd_hil.cli.identify_command import identify
 from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
+from adacd_hil.cli.sweep_command import sweep
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -289,6 +290,7 @@ def monitor(
 
 
 cli.add_command(identify)
+cli.add_command(sweep)
 
 
 def main() -> None:
