@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil import __version__
+from adacd_hil.cli.compare_command import compare
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
 from adacd_hil.cli.identify_command import identify
 from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
+from adacd_hil.cli.play_command import play
+from adacd_hil.cli.replay_command import replay
 from adacd_hil.cli.sweep_command import sweep
 
 if TYPE_CHECKING:
@@ -291,6 +294,9 @@ def monitor(
 
 cli.add_command(identify)
 cli.add_command(sweep)
+cli.add_command(play)
+cli.add_command(replay)
+cli.add_command(compare)
 
 
 def main() -> None:

@@ -10,9 +10,10 @@ from adacd_hil.config import Settings
 from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.realtime import Recurrence, make_pacer
+from adacd_hil.control.realtime import make_pacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
+from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.tap import Tap

@@ -13,16 +13,17 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
-from adacd_hil.control.deadline import DeadlineWatch
 from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.floating import Floating
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import Pacer, Recurrence, Tick
+from adacd_hil.control.realtime import Pacer, Tick
 from adacd_hil.control.reference import Reference
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_watch import ArmWatch
 from adacd_hil.device.network import Master
+from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import (
@@ -77,16 +78,14 @@ class Cycle:
     ) -> None:
         """Prepare. `clock`: what durations within a cycle are measured by."""
         self._period_s = settings.bus.period_s
-        heartbeat_s = settings.bus.heartbeat_ms * 1e-3
-        self._heartbeats = Recurrence(heartbeat_s, self._period_s)
-        self._looks_at_nodes = Recurrence(0.1 * heartbeat_s, self._period_s)
+        self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, self._period_s)
         self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
         self._exchange = Exchange(settings, bus, arm, master, clock)
         self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
-        self._deadline = DeadlineWatch(settings)
+        self._watch = ArmWatch(settings, master.watch)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = pipeline_of(settings)
         self._controller = Controller(settings)
@@ -100,7 +99,6 @@ class Cycle:
         self._state = SchemeState.INIT
         self._enabled_cycle: int | None = None
         self._faulted_cycle: int | None = None
-        self._lost: list[str] = []
         self._interrupts = 0
         self._is_finishing = False
 
@@ -123,7 +121,7 @@ class Cycle:
         self._pacer.resume()
         while not self._is_over(output):
             tick = self._pacer.next()
-            arm = self._watch(self._exchange.read(tick))
+            arm = self._watch.judge(self._exchange.read(tick))
             request = self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
@@ -138,14 +136,6 @@ class Cycle:
         fault = output.fault if output is not None else FaultReason.NONE
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
-
-    def _watch(self, arm: ArmState) -> ArmState:
-        """Take for a fault of the arm a device that has fallen silent or left Operational, or a host that is late."""
-        if self._looks_at_nodes.is_due(arm.cycle):
-            self._lost = self._master.watch(arm.t_ns)
-        if self._lost and arm.fault is FaultReason.NONE:
-            arm = arm._replace(fault=FaultReason.HEARTBEAT)
-        return self._deadline.judge(arm)
 
     def _request(self, tick: Tick) -> Request:
         """Ask the operator; what concerns the end of the run stays here."""
@@ -217,18 +207,19 @@ class Cycle:
     def _transition(self, output: SchemeOutput) -> Event:
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
-            return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {self._deadline.describe()}")
+            lateness = self._watch.deadline.describe()
+            return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {lateness}")
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
         excess = self._arm.describe_excess() if output.fault is FaultReason.LIMIT else []
-        late = [self._deadline.describe()] if output.fault is FaultReason.DEADLINE else []
+        late = [self._watch.deadline.describe()] if output.fault is FaultReason.DEADLINE else []
         missing = self._pipeline.describe_missing() if output.fault is FaultReason.ADAPT_TIMEOUT else []
         causes = [
             *late,
             *missing,
             *excess,
             *self._arm.describe_faults(),
-            *self._lost,
+            *self._watch.lost,
             *self._master.describe_emergencies(),
         ]
         details = "; ".join([output.fault.name, *causes])

@@ -68,21 +68,6 @@ class Pacer(Protocol):
         """Go on after a pause that was meant: its periods are passed over and not counted as overruns."""
 
 
-class Recurrence:
-    """Something that is done every so many cycles, and after skipped ones as soon as there is a cycle again."""
-
-    def __init__(self, interval_s: float, period_s: float) -> None:
-        self._cycles = max(1, round(interval_s / period_s))
-        self._due_cycle = 0
-
-    def is_due(self, cycle: int) -> bool:
-        """Whether it is to be done in this cycle; asked once per cycle."""
-        if cycle < self._due_cycle:
-            return False
-        self._due_cycle = cycle - cycle % self._cycles + self._cycles
-        return True
-
-
 class GridPacer:
     """Begins cycles on a fixed grid; a late one doesn't move the grid, a very late one skips whole periods.
 

@@ -1,6 +1,5 @@
 """One run from the first check to the closed log: boot the devices, compile, enable, cycle, disable."""
 
-import platform
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -11,13 +10,14 @@ from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult
-from adacd_hil.control.operator import Operator
+from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.realtime import Pacer, make_pacer, prepare_spin
 from adacd_hil.control.recovery import Recovery
 from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
+from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.recorder import LogSummary, Recorder
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
@@ -233,8 +233,8 @@ class Session:
             "clock": "lockstep" if self.is_lockstep else "realtime",
             **grant.describe(),
             "period_us": str(settings.bus.period_us),
-            "python": platform.python_version(),
-            "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
+            "operator": "script" if isinstance(self.operator, ScriptedOperator) else "console",
+            **arithmetic(),
             **(self.tare.metadata() if self.tare is not None else {}),
             **self.metadata,
         }

@@ -22,6 +22,7 @@ from adacd_hil.wire.bus import Bus, Frame
 ANSWER_TIMEOUT_S = 0.5
 """Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
+NMT_ID = 0x000
 _SDO_ABORT = 0x80
 _ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index: CiA 301, table 22
 
@@ -107,7 +108,7 @@ class CanopenBus:
 
     def command(self, nmt_command: int, node_id: int = 0) -> None:
         """Send an NMT command to one node, or to all. Raises BusError."""
-        self._bus.send(0x000, bytes((nmt_command, node_id)))
+        self._bus.send(NMT_ID, bytes((nmt_command, node_id)))
 
     def _send(self, can_id: int, data: bytes) -> None:
         self._bus.send(can_id, data)

@@ -6,6 +6,7 @@ Source: CiA 301 (4.2), clause 7.2.8.2.2 (heartbeat protocol); t_ns is the host's
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from adacd_hil.device.placement import Device
 from adacd_hil.records import Event
 from adacd_hil.wire.bus import Frame
 
@@ -94,3 +95,10 @@ class HeartbeatWatch:
             node.complaint = complaint
             self._report(Event("error", node.name, f"heartbeat: {text}"))
         return f"{node.name} (node {node.node_id}): {text}"
+
+
+def follow_devices(devices: Iterable[Device], period_ms: int, report: Callable[[Event], None]) -> HeartbeatWatch:
+    """Make the watch over those devices that send heartbeats."""
+    return HeartbeatWatch(
+        [(device.name, device.node_id) for device in devices if device.has(0x1017)], period_ms, report
+    )

@@ -12,7 +12,7 @@ from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError
 from adacd_hil.device.drive_setup import command_deadline_ms, set_up_drive
 from adacd_hil.device.emergency import describe_emergency
-from adacd_hil.device.heartbeat import OPERATIONAL, PATIENCE_PERIODS, HeartbeatWatch
+from adacd_hil.device.heartbeat import OPERATIONAL, PATIENCE_PERIODS, follow_devices
 from adacd_hil.device.pdo_mapping import set_up_pdos
 from adacd_hil.device.placement import place_devices
 from adacd_hil.device.profile import EMCY_INHIBIT_100US
@@ -22,7 +22,8 @@ from adacd_hil.records import Event
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 
-_START, _ENTER_PRE_OPERATIONAL, _RESET_COMMUNICATION = 0x01, 0x80, 0x82
+START, RESET_COMMUNICATION = 0x01, 0x82
+_ENTER_PRE_OPERATIONAL = 0x80
 _SYNC_ID = 0x080
 _IDENTIFIER_MASK = 0x7FF
 _PROFILE_NUMBER_MASK = 0xFFFF  # of 0x1000
@@ -59,12 +60,12 @@ class Master:
         self._heartbeat_id = codec.message("HostHeartbeat").can_id
         self.slaves: list[Slave] = []
         self.nodes: dict[str, Any] = {}
-        for device in place_devices(settings):
+        devices = place_devices(settings)
+        for device in devices:
             node = self._canopen.add_node(device.node_id, device.objects, self._emergency_listener(device.name))
             self.nodes[device.name] = node
             self.slaves.append(Slave(device, node))
-        watched = [(slave.name, slave.node_id) for slave in self.slaves if slave.has(0x1017)]
-        self._heartbeats = HeartbeatWatch(watched, settings.bus.heartbeat_ms, self._events.append)
+        self._heartbeats = follow_devices(devices, settings.bus.heartbeat_ms, self._events.append)
         self._canopen.bystander = self._heartbeats.accept
 
     def _emergency_listener(self, name: str) -> Callable[[Any], None]:
@@ -108,7 +109,7 @@ class Master:
         waiting = {slave.node_id: slave.name for slave in self.slaves}
         self._heartbeats.stop()
         self._emergencies.clear()
-        self._command(_RESET_COMMUNICATION)
+        self._command(RESET_COMMUNICATION)
 
         def is_last_boot(frame: Frame) -> bool:
             if frame.can_id & 0x780 == 0x700 and frame.data == b"\x00":
@@ -211,11 +212,11 @@ class Master:
         """Let all nodes exchange cyclic frames, the sensors first by default. Raises BusError."""
         self._heartbeats.start()
         if self._settings.devices.start == "all":
-            self._command(_START)
+            self._command(START)
             return
         # False sorts first: a drive that starts finds its sensor sending.
         for slave in sorted(self.slaves, key=lambda slave: slave.device.settings.kind == "drive"):
-            self._canopen.command(_START, slave.node_id)
+            self._canopen.command(START, slave.node_id)
 
     def stop(self) -> None:
         """Put all nodes back to pre-operational; drives drop out if they are still enabled. Raises BusError."""

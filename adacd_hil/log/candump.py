@@ -58,3 +58,28 @@ def parse(line: str) -> tuple[str, tuple[Any, ...]]:
     )
     assert len(row) == len(RECORDED_FRAME_DTYPE.names or ())
     return match["channel"], row
+
+
+def channel_name(name: str) -> str:
+    """Spell a channel for a line; a number is that of an interface, as in python-can."""
+    spelled = re.sub(r"\s+", "_", name)
+    return f"can{spelled}" if spelled.isdecimal() or not spelled else spelled
+
+
+def line(row: Any, channel: str, epoch_ns: int = 0) -> str:
+    """Write a row of RECORDED_FRAME_DTYPE, its time cut to the µs that canplayer reads."""
+    seconds, rest_ns = divmod(int(row["t_ns"]) + epoch_ns, 1_000_000_000)
+    can_id, length = int(row["can_id"]), int(row["length"])
+    if row["is_error"]:
+        identifier = f"{ERROR_FLAG | can_id:08X}"
+    else:
+        identifier = f"{can_id:08X}" if row["is_extended"] else f"{can_id:03X}"
+    if row["is_remote"]:
+        content = f"R{length or ''}"
+    else:
+        content = row["data"][:length].tobytes().hex().upper()
+        if row["is_fd"] and not row["is_error"]:
+            flags = _RATE_SWITCH * bool(row["has_rate_switch"]) | _ERROR_STATE * bool(row["has_error_state"])
+            content = f"#{flags:X}{content}"
+    way = "T" if row["is_tx"] else "R"
+    return f"({seconds}.{rest_ns // 1000:06d}) {channel} {identifier}#{content} {way}\n"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.reader import LONG_FRAME_DTYPE
-from adacd_hil.wire.bus import MAX_STANDARD_ID
+from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, MAX_STANDARD_ID
 
 RECORDED_FRAME_DTYPE = np.dtype(
     [
@@ -35,14 +35,21 @@ class FrameLog(NamedTuple):
     problem: str = ""  # what is missing, one line; "" for a whole recording
 
 
-def as_logged(frames: NDArray[Any]) -> NDArray[Any]:
-    """Return what a bus end of ours would have received and sent of them, (k,) of LONG_FRAME_DTYPE.
-
-    It never has remote frames, nor 29-bit identifiers that would read as 11-bit ones.
-    """
+def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
+    """Say which frames a bus end of ours can receive (n,): none remote, none of 29 bits that reads as 11-bit."""
     is_as_wide = (frames["can_id"] > MAX_STANDARD_ID) == frames["is_extended"]
-    is_known = ~frames["is_remote"] & (is_as_wide | frames["is_error"])
-    chosen = frames[is_known]
+    return np.asarray(~frames["is_remote"] & (is_as_wide | frames["is_error"]))
+
+
+def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
+    """Say which frames a bus end of ours can send as they are (n,): of FD frames those of more than 8 bytes."""
+    is_short_fd = frames["is_fd"] & (frames["length"] <= MAX_CLASSIC_BYTES)
+    return np.asarray(is_plain(frames) & ~frames["is_error"] & ~is_short_fd)
+
+
+def as_logged(frames: NDArray[Any]) -> NDArray[Any]:
+    """Return what a bus end of ours would have received and sent of them, (k,) of LONG_FRAME_DTYPE."""
+    chosen = frames[is_plain(frames)]
     logged = np.zeros(len(chosen), LONG_FRAME_DTYPE)
     for name in LONG_FRAME_DTYPE.names or ():
         logged[name] = chosen[name]

@@ -5,6 +5,7 @@ It decides nothing; what it comes to is in the block of the scheme in charge.
 
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS
 from adacd_hil.scheme import kernel
 from adacd_hil.scheme.kernel import Structured
 from adacd_hil.scheme.observation import Observation
@@ -27,17 +28,18 @@ def step(
     constants, memory, block: of the paper's kernel. main: after the main kernel's step.
     """
     own, out = block[0], main[0]
-    own["q"][:] = out["q"]
-    own["dq"][:] = out["dq"]
-    own["tau_J"][:] = out["tau_J"]
-    own["period_s"][:] = out["period_s"]
+    for i in range(JOINTS):
+        own["q"][i], own["dq"][i], own["tau_J"][i] = out["q"][i], out["dq"][i], out["tau_J"][i]
+    own["period_s"][0] = out["period_s"][0]
     observation = kernel.step(constants, memory, block, is_complete, periods, mode)
     if observation & _ADAPTED:
         mode = kernel.ARMED
     out["paper_is_armed"][0] = 1.0 if mode == kernel.ARMED else 0.0
-    out["paper_tau_ext_hat"][:] = own["tau_ext_hat"]
-    out["paper_threshold"][:] = own["threshold"]
-    out["paper_theta_hat"][:] = own["theta_hat"]
+    for i in range(JOINTS):
+        out["paper_tau_ext_hat"][i] = own["tau_ext_hat"][i]
+        out["paper_threshold"][i] = own["threshold"][i]
+    for j in range(own["theta_hat"].size):
+        out["paper_theta_hat"][j] = own["theta_hat"][j]
     return mode
 
 

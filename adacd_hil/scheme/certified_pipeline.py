@@ -170,8 +170,9 @@ class CertifiedPipeline(RunsBatches):
         self._has_warned = bool(warning)
 
     def _calm(self, cycle: int) -> Calm:
-        calm = self._touch.calm(self._supervisor.calm(self._touch.is_reporting), cycle)
-        if self._supervisor.state is not SchemeState.MONITOR:
+        supervisor, touch = self._supervisor, self._touch
+        calm = touch.calm(supervisor.calm(touch.is_reporting, touch.goes_on), cycle)
+        if supervisor.state is not SchemeState.MONITOR:
             return calm
         return calm._replace(cycles=min(calm.cycles, self._second - self._monitored - 1))
 

@@ -50,8 +50,8 @@ class Recorded(NamedTuple):
 class TouchWatch(NamedTuple):
     """What of a contact goes on in every cycle.
 
-    rows: of `report.ContactHistory`, written: how many have been. way, least_Nm: below which the filtered external torque
-    along the way of a withdrawal has to be judged.
+    rows: of `report.ContactHistory`; written: how many have been. least_Nm: of the filtered external torque along the
+    way of a withdrawal, below which that has to be judged.
     """
 
     rows: Vector
@@ -71,9 +71,10 @@ def samples_of(arms: ArmBatch, period_s: Vector, findings: NDArray[np.int64]) ->
 @compiled
 def _put(block: Structured, samples: Samples, k: int) -> None:
     out = block[0]
-    out["q"][:] = samples.q[k]
-    out["dq"][:] = samples.dq[k]
-    out["tau_J"][:] = samples.tau_J[k]
+    for i in range(samples.q.shape[1]):
+        out["q"][i] = samples.q[k, i]
+        out["dq"][i] = samples.dq[k, i]
+        out["tau_J"][i] = samples.tau_J[k, i]
     out["period_s"][0] = samples.period_s[k]
 
 
@@ -88,7 +89,8 @@ def run_paper(
         _put(block, samples, k)
         observation = kernel.step(constants, memory, block, samples.is_complete[k], samples.periods[k], mode)
         recorded.observations[k] = observation
-        recorded.blocks[k] = values
+        for j in range(values.size):
+            recorded.blocks[k, j] = values[j]
         passed += samples.periods[k]
         if not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k]):
             return k
@@ -122,7 +124,8 @@ def run_certified(
         observation = certified_kernel.step(constants, memory, block, is_complete, periods, mode)
         paper_mode = beside.step(paper[0], paper[1], paper[2], paper_mode, block, is_complete, periods)
         recorded.observations[k] = observation
-        recorded.blocks[k] = values
+        for j in range(values.size):
+            recorded.blocks[k, j] = values[j]
         passed += periods
         y = m["y"][certified_kernel.WIDE]
         along_Nm = y[0] * touch.way[0] + y[1] * touch.way[1]

@@ -195,29 +195,40 @@ class Supervisor:
         """Return what the arm says of itself in each cycle, bits of `ArmFinding` (n,)."""
         return findings_of(arms, self._max_age_cycles)
 
-    def calm(self, is_reporting: bool) -> Calm:
+    def calm(self, is_reporting: bool, goes_on: bool = False) -> Calm:
         """Return bounds within which cycles without a request change nothing here but what `pass_by` counts.
 
-        They may be too narrow: a cycle outside is one for `step`. is_reporting: as for `step`, the same all the time.
+        They may be too narrow: a cycle outside is one for `step`. is_reporting, goes_on: as for `step`, and staying so.
         """
         watched, expected = _CALM[self._state]
-        cycles = NEVER
         limit = self._limits.get(self._state)
         periods = NEVER if limit is None else limit[0] - self._spent
+        cycles = NEVER
+        waits_for_rest = False
         match self._state:
             case SchemeState.COMMISSION:
                 cycles = self._commission_cycles - self._commissioned_cycles
-            case SchemeState.MONITOR | SchemeState.STOPPED if self._pending:
+            case SchemeState.MONITOR | SchemeState.STOPPED if Request.PAYLOAD in self._pending:
                 cycles = 0
-            case SchemeState.PAYLOAD if self._pending:
-                cycles = self._rest_cycles - self._still_cycles
+            case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
+                watched |= _CONTACT
+                expected |= _CONTACT
+            case SchemeState.PAYLOAD:
+                waits_for_rest = bool(self._pending)
+            case SchemeState.REACT if self._is_latched:
+                waits_for_rest = not is_reporting
             case SchemeState.REACT:
-                if not self._is_latched:
-                    watched |= _COLLISION
-                    periods = self._patience_cycles - self._phase_cycles
-                if not is_reporting:
-                    to_rest = self._rest_cycles - self._still_cycles
-                    cycles = to_rest if self._is_latched else self._clear_cycles - self._cleared_cycles
+                watched |= _COLLISION
+                periods = self._patience_cycles - self._phase_cycles
+                to_clear = self._clear_cycles - self._cleared_cycles
+                if to_clear > 1 or goes_on:
+                    cycles = NEVER if is_reporting else to_clear
+                else:
+                    waits_for_rest = not is_reporting
+        if waits_for_rest and self._still_cycles:
+            cycles = self._rest_cycles - self._still_cycles
+        elif waits_for_rest:
+            watched |= _AT_REST
         return Calm(watched, expected, cycles - 1, periods)
 
     def pass_by(self, observations: NDArray[np.int64], periods: NDArray[np.int64]) -> None:

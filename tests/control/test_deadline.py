@@ -9,7 +9,7 @@ import pytest
 from session_rig import Rig
 
 from adacd_hil.config import RealtimeSettings, load_settings
-from adacd_hil.control.deadline import DeadlineWatch
+from adacd_hil.device.deadline import DeadlineWatch
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import ArmState, FaultReason, SchemeState
 

@@ -7,7 +7,7 @@ import pytest
 
 from adacd_hil.clock import MonotonicClock, VirtualClock
 from adacd_hil.config import LockstepSettings, load_settings
-from adacd_hil.control.realtime import GridPacer, Pacer, Recurrence, Tick, calibrate, make_pacer, prepare_spin
+from adacd_hil.control.realtime import GridPacer, Pacer, Tick, calibrate, make_pacer, prepare_spin
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.tap import Tap
@@ -170,19 +170,3 @@ def test_a_modelled_host_that_is_slower_than_a_period_skips_periods() -> None:
     pacer.next()
     pacer.spend(500_000)
     assert (pacer.next(), pacer.overruns) == (Tick(2, 2_200_000, 2, 200_000), 1)
-
-
-def test_a_recurrence_is_due_every_so_many_cycles() -> None:
-    heartbeats = Recurrence(0.1, 0.001)
-    assert [cycle for cycle in range(350) if heartbeats.is_due(cycle)] == [0, 100, 200, 300]
-
-
-def test_a_recurrence_whose_cycle_is_skipped_is_due_in_the_next_one() -> None:
-    heartbeats = Recurrence(0.1, 0.001)
-    cycles = [0, 98, 99, 103, 104, 199, 402, 403, 499, 500]
-    assert [cycle for cycle in cycles if heartbeats.is_due(cycle)] == [0, 103, 402, 500]
-
-
-def test_an_interval_shorter_than_a_period_is_due_in_every_cycle() -> None:
-    often = Recurrence(0.0001, 0.001)
-    assert [cycle for cycle in range(3) if often.is_due(cycle)] == [0, 1, 2]

@@ -1,0 +1,222 @@
+"""What a replay decided against what the log says was decided: every field of /scheme, every contact report, events.
+
+Two values are the same if they have the same bits. Between machines whose arithmetic differs (`same_arithmetic`) a real
+value may be off by `TOLERANCE` of the largest one that its field has had so far, and by as much of one unit; then, too,
+all that is counted, named or switched has to be the same, and what is infinite or not a number.
+"""
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.config import Settings
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.provenance import arithmetic
+from adacd_hil.log.reader import Series
+from adacd_hil.records import JOINTS, ContactReport, Layout, Vector
+from adacd_hil.scheme.batch import SchemeBatch
+from adacd_hil.scheme.selection import layout_of
+
+TOLERANCE: Final = 1e-9
+"""Least squares over a minute amplify a rounding error of 1e-16 by the condition number, up to 1e6."""
+SHOWN: Final = 20
+"""Mismatches that are kept; all are counted."""
+_HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "is_model_valid")
+
+
+class Mismatch(NamedTuple):
+    """A value that isn't the logged one. `place`: joint, parameter or channel of the field, "" for a plain one."""
+
+    topic: str
+    field: str
+    place: str
+    cycle: int
+    t_ns: int
+    logged: str
+    replayed: str
+
+    @property
+    def name(self) -> str:
+        """Topic, field and place."""
+        return f"{self.topic}.{self.field}" + (f"[{self.place}]" if self.place else "")
+
+    @property
+    def line(self) -> str:
+        """All of it in one line."""
+        return f"cycle {self.cycle}, {self.t_ns * 1e-9:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
+
+
+def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
+    """Say what a log's numbers were computed with that is another here; empty where they have to be equal bit for bit.
+
+    What a log doesn't say counts as the same. Of the machine its architecture counts.
+    """
+    different = []
+    for key, here in arithmetic().items():
+        there = metadata.get(key, "")
+        if there and there.split()[-1:] != here.split()[-1:]:
+            different.append(f"{key} {there}, {here} here")
+    return different
+
+
+class SchemeComparison:
+    """Compares stretch after stretch. `count`: all mismatches; `fields`: how many in which field."""
+
+    def __init__(self, settings: Settings, tolerance: float = 0.0, shown: int = SHOWN) -> None:
+        self.mismatches: list[Mismatch] = []
+        self.count = 0
+        self.fields: Counter[str] = Counter()
+        self.cycles = 0
+        self.missing_fields: list[str] = []
+        """Fields that the log's format lacks."""
+        self._shown = shown
+        self._tolerance = tolerance
+        self._layout: Layout = layout_of(settings)
+        self._names = _place_names(settings, self._layout)
+        self._scales: dict[str, Vector] = {}
+
+    def compare(self, scheme: Series, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Compare the decisions of n cycles with the records of /scheme (n,)."""
+        records = scheme.records
+        self.cycles += len(records)
+        self._compare_whole("stamp_ns", scheme.t_ns, ticks.t_ns, ticks)
+        for name in _HEAD:
+            self._compare_whole(name, records[name], getattr(batch, name), ticks)
+        known = set(scheme.fields)
+        self.missing_fields = [name for name in self._layout.slices if name not in known]
+        for name, place in self._layout.slices.items():
+            if name in known:
+                logged = np.ascontiguousarray(records[name], np.float64).reshape(len(records), -1)
+                self._compare_reals(name, logged, np.ascontiguousarray(batch.block[:, place]), ticks)
+
+    def _compare_whole(self, name: str, logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks) -> None:
+        is_other = np.asarray(logged != replayed)
+        if is_other.any():
+            self._note(name, is_other[:, np.newaxis], logged[:, np.newaxis], replayed[:, np.newaxis], ticks)
+
+    def _compare_reals(self, name: str, logged: Vector, replayed: Vector, ticks: Ticks) -> None:
+        """Compare a field of the block (n, k)."""
+        if logged.shape != replayed.shape:
+            raise LogError(f"/scheme.{name} has {logged.shape[1]} values in the log, {replayed.shape[1]} here")
+        is_other = np.asarray(logged.view(np.uint64) != replayed.view(np.uint64))
+        if self._tolerance:
+            is_other &= ~self._is_near(name, logged, replayed)
+        if is_other.any():
+            self._note(name, is_other, logged, replayed, ticks)
+
+    def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
+        finite = np.where(np.isfinite(logged), np.abs(logged), 0.0)
+        scale = np.maximum(self._scales.get(name, np.ones(logged.shape[1])), finite.max(axis=0, initial=0.0))
+        self._scales[name] = scale
+        with np.errstate(invalid="ignore"):
+            is_near = np.abs(logged - replayed) <= self._tolerance * scale
+        return np.asarray(is_near | (logged == replayed) | (np.isnan(logged) & np.isnan(replayed)))
+
+    def _note(
+        self, name: str, is_other: NDArray[np.bool_], logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks
+    ) -> None:
+        """Count what differs (n, k), and keep the first of it."""
+        rows, columns = np.nonzero(is_other)
+        self.count += len(rows)
+        self.fields[f"/scheme.{name}"] += len(rows)
+        for row, column in zip(rows[: self._shown].tolist(), columns[: self._shown].tolist(), strict=True):
+            place = self._names[name][column] if name in self._names else ""
+            values = (_text(side[row, column].item()) for side in (logged, replayed))
+            self._keep(Mismatch("/scheme", name, place, int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
+
+    def add(self, mismatch: Mismatch) -> None:
+        """Count a mismatch that was found elsewhere."""
+        self.count += 1
+        self.fields[f"{mismatch.topic}.{mismatch.field}"] += 1
+        self._keep(mismatch)
+
+    def _keep(self, mismatch: Mismatch) -> None:
+        """Keep the earliest ones, in order of time."""
+        self.mismatches.append(mismatch)
+        if len(self.mismatches) > 2 * self._shown:
+            self.first()
+
+    def first(self) -> tuple[Mismatch, ...]:
+        """Return the earliest mismatches."""
+        self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
+        return tuple(self.mismatches)
+
+    def compare_contacts(
+        self, logged: Mapping[int, Mapping[str, Any]], replayed: Mapping[int, ContactReport], cycles: Mapping[int, int]
+    ) -> None:
+        """Compare contact reports by the time at which they were made, ns; cycles: of these times."""
+        for t_ns in sorted({*logged, *replayed}):
+            where = (cycles.get(t_ns, -1), t_ns)
+            theirs, ours = logged.get(t_ns), replayed.get(t_ns)
+            if theirs is None or ours is None:
+                said = [("no report" if side is None else "a report") for side in (theirs, ours)]
+                self.add(Mismatch("/contact", "report", "", *where, *said))
+                continue
+            for field, place, there, here in _contact_values(theirs, ours):
+                if not self._is_same(there, here):
+                    self.add(Mismatch("/contact", field, place, *where, _text(there), _text(here)))
+
+    def _is_same(self, logged: float, replayed: float) -> bool:
+        if struct.pack("<d", logged) == struct.pack("<d", replayed):
+            return True
+        is_real = isinstance(logged, float) and math.isfinite(logged) and math.isfinite(replayed)
+        return is_real and abs(logged - replayed) <= self._tolerance * max(1.0, abs(logged))
+
+    def compare_events(self, logged: Sequence[tuple[int, str]], replayed: Sequence[str], cycle: int) -> None:
+        """Compare the texts of the margin's events (t_ns, text) of the stretch that begins with a cycle, in order."""
+        for index in range(max(len(logged), len(replayed))):
+            t_ns, theirs = logged[index] if index < len(logged) else (0, "no event")
+            ours = replayed[index] if index < len(replayed) else "no event"
+            if theirs != ours:
+                self.add(Mismatch("/events", "margin", "", cycle, t_ns, repr(theirs), repr(ours)))
+
+
+def _text(value: float) -> str:
+    """Write a value so that it reads back to the same bits."""
+    return repr(value)
+
+
+def contact_records(series: Series) -> dict[int, dict[str, Any]]:
+    """Return the logged reports by the time at which they were made, ns."""
+    names = [name for name in ContactReport._fields if name in series.fields]
+    rows = zip(series.t_ns.tolist(), series.records, strict=True)
+    return {t_ns: {name: record[name].tolist() for name in names} for t_ns, record in rows}
+
+
+def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Iterator[tuple[str, str, float, float]]:
+    for field, theirs in logged.items():
+        ours = getattr(replayed, field)
+        if isinstance(theirs, list):
+            for joint, (there, here) in enumerate(zip(theirs, ours, strict=True)):
+                yield field, f"joint {joint + 1}", there, type(there)(here)
+        else:
+            yield field, "", theirs, type(theirs)(ours)
+
+
+def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...]]:
+    """Name the values of every field of the block."""
+    joints = tuple(f"joint {joint + 1}" for joint in range(JOINTS))
+    parameters, further = settings.estimator.parameter_names, settings.further_names
+    named = {
+        "theta_hat": parameters,
+        "paper_theta_hat": parameters,
+        "theta_further": further,
+        "theta_std": (*parameters, *further),
+    }
+    return {field.name: _names_of(field.name, field.size, named, joints) for field in layout.fields}
+
+
+def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]], joints: Iterable[str]) -> tuple[str, ...]:
+    if name in named:
+        return tuple(named[name])
+    if size == 1:
+        return ("",)
+    if size == JOINTS:
+        return tuple(joints)
+    return tuple(f"channel {index // JOINTS + 1}, joint {index % JOINTS + 1}" for index in range(size))

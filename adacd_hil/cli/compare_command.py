@@ -1,0 +1,107 @@
+"""`adacd-hil compare`: two logs beside each other."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.exit_codes import ExitCode
+from adacd_hil.cli.options import explained, json_option
+
+if TYPE_CHECKING:
+    from adacd_hil.analysis.log_comparison import LogComparison
+    from adacd_hil.analysis.run_digest import Detection
+
+_EPILOG = (
+    "Exit status: 0 both decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
+    "same as far as both logs are whole."
+)
+
+
+@click.command(epilog=_EPILOG)
+@click.argument("first", type=click.Path(path_type=Path))
+@click.argument("second", type=click.Path(path_type=Path))
+@json_option
+@explained
+def compare(first: Path, second: Path, as_json: bool) -> ExitCode:
+    """Compare two runs: settings, every field of /scheme, states, contacts, parameters, timing.
+
+    Times count from motion start, the first cycle in ADAPT. A folder stands for the run log in it.
+    """
+    from adacd_hil.analysis.log_comparison import compare_logs
+    from adacd_hil.control.session import LOG_NAME
+
+    paths = (given / LOG_NAME if given.is_dir() else given for given in (first, second))
+    found = compare_logs(*paths)
+    print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
+    if not found.is_same:
+        return ExitCode.FAILURE
+    return ExitCode.PARTIAL if found.notes else ExitCode.OK
+
+
+def _as_text(found: "LogComparison") -> str:
+    from adacd_hil.cli.table import format_table
+
+    names = [str(found.first.path), str(found.second.path)]
+    lines = [f"1: {names[0]}", f"2: {names[1]}", "", *found.notes]
+    if found.is_same:
+        lines.append(f"the same in all {found.cycles} cycles")
+    else:
+        lines.append(f"{found.cycles} cycles compared, {found.only[0]} and {found.only[1]} only in one")
+    if found.settings:
+        lines += ["", format_table(("setting", "1", "2"), [(key, *pair) for key, pair in found.settings.items()])]
+    if found.metadata:
+        lines += ["", format_table(("metadata", "1", "2"), [(key, *pair) for key, pair in found.metadata.items()])]
+    if found.fields:
+        rows = [
+            (each.field, f"{each.first_s:.3f} s", str(each.first_cycle), str(each.cycles), f"{each.largest:.3g}")
+            for each in found.fields
+        ]
+        lines += ["", format_table(("field", "differs from", "cycle", "cycles", "by at most"), rows, (1, 2, 3, 4))]
+    if found.contacts:
+        rows3 = [(_contact(pair.first), _contact(pair.second)) for pair in found.contacts]
+        lines += ["", format_table(("contact in 1", "in 2"), rows3)]
+    lines += ["", format_table(("state", "1", "2"), _states(found))]
+    lines += ["", format_table(("parameter", "1", "2"), _parameters(found))]
+    lines += ["", format_table(("timing, µs", "1", "2"), _timing(found))]
+    return "\n".join(lines)
+
+
+def _contact(contact: "Detection | None") -> str:
+    if contact is None:
+        return "–"
+    force = f", {contact.force_N:.1f} N" if contact.force_N else ""
+    return f"{contact.time_s:.3f} s, link {contact.link}{force}"
+
+
+def _states(found: "LogComparison") -> list[tuple[str, str, str]]:
+    first, second = found.first.states, found.second.states
+    rows = []
+    for index in range(max(len(first), len(second))):
+        a = first[index] if index < len(first) else None
+        b = second[index] if index < len(second) else None
+        name = a[1] if a and b and a[1] == b[1] else f"{a[1] if a else '–'} / {b[1] if b else '–'}"
+        rows.append((name, f"{a[0]:.3f} s" if a else "–", f"{b[0]:.3f} s" if b else "–"))
+    return rows
+
+
+def _parameters(found: "LogComparison") -> list[tuple[str, str, str]]:
+    first, second = found.first.parameters, found.second.parameters
+    names = [*first, *(name for name in second if name not in first)]
+    return [(name, _numbers(first.get(name, [])), _numbers(second.get(name, []))) for name in names]
+
+
+def _numbers(values: list[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values) or "–"
+
+
+def _timing(found: "LogComparison") -> list[tuple[str, str, str]]:
+    rows = []
+    for name, values in found.first.timing_us.items():
+        cells = [
+            " / ".join(f"{value:.0f}" for value in side.timing_us.get(name, {}).values()) or "–"
+            for side in (found.first, found.second)
+        ]
+        rows.append((f"{name} {'/'.join(values)}", cells[0], cells[1]))
+    return rows

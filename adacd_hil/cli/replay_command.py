@@ -1,0 +1,208 @@
+"""`adacd-hil replay`: a log once more through arm and scheme, compared with itself or set beside other settings."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.options import explained, json_option, profile_option
+
+if TYPE_CHECKING:
+    from adacd_hil.analysis.replay import Replay
+    from adacd_hil.analysis.replay_source import Source
+    from adacd_hil.config import Settings
+
+_EPILOG = (
+    "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
+    "usage or configuration; 3 what could be compared is identical, but not all of the log could; 130 interrupted."
+)
+_MOST_COLUMNS = 6
+"""Variants beside the log's own that are set side by side; more are rows."""
+
+
+@click.command(epilog=_EPILOG)
+@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Change a setting, such as filter.a_rad_s=50."
+)
+@click.option("--vary", multiple=True, metavar="KEY=A,B,C", help="Replay once for each value; of several, every pair.")
+@click.option("--config", metavar="NAME|FILE", help="Settings as a whole; needed for recordings without a log.")
+@profile_option
+@click.option("--dbc", type=click.Path(path_type=Path, dir_okay=False), help="Contract of a recording without a log.")
+@click.option(
+    "--against", type=click.Path(path_type=Path), help="Log of the run that a recording is of, to compare with."
+)
+@click.option("--tolerance", type=click.FloatRange(0.0, 1.0), help="Of real values; default: 0 on the same machine.")
+@click.option("--shown", type=click.IntRange(min=0), default=20, show_default=True, help="Mismatches to print.")
+@json_option
+@explained
+def replay(
+    logs: tuple[Path, ...],
+    changes: tuple[str, ...],
+    vary: tuple[str, ...],
+    config: str | None,
+    profile: str | None,
+    dbc: Path | None,
+    against: Path | None,
+    tolerance: float | None,
+    shown: int,
+    as_json: bool,
+) -> ExitCode:
+    """Replay logs: the raw frames once more through codec, arm and scheme.
+
+    Without other settings, every field of /scheme and every contact report is compared with the log, bit for bit; a
+    folder stands for the run log in it. With --set, --vary or --config, the result stands beside the original: what
+    would have been detected, when, false alarms, parameters. The truth.mcap beside a log is joined to it.
+
+    Frames that others recorded (candump .log, BLF, ASC, MF4, TRC) are replayed --against the log of their run, or with
+    --config alone, where the configuration's script plays the user.
+    """
+    from adacd_hil.cli.progress import Progress
+
+    progress = Progress()
+    try:
+        results = [
+            _replay_one(path, changes, vary, (config, profile, dbc), against, tolerance, progress) for path in logs
+        ]
+    finally:
+        progress.close()
+    if as_json:
+        print(json.dumps([_as_json(*result, shown) for result in results], indent=2, allow_nan=False))
+    else:
+        print("\n\n".join(_as_text(*result, shown) for result in results))
+    codes = [_code(replays) for _, replays, _ in results]
+    return max(codes, key=[ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE].index)
+
+
+_Result = tuple[Path, "list[Replay]", list[str]]
+"""A log, the replays of it, the log's own first, and the names of the others."""
+
+
+def _replay_one(
+    given: Path,
+    changes: tuple[str, ...],
+    vary: tuple[str, ...],
+    configured: tuple[str | None, str | None, Path | None],
+    against: Path | None,
+    tolerance: float | None,
+    progress: Any,
+) -> _Result:
+    from adacd_hil.analysis.replay import contacts_beside, replay_source
+    from adacd_hil.analysis.what_if import apply_settings, keep_facts, parse_changes, parse_variations
+    from adacd_hil.config import load_settings
+    from adacd_hil.control.operator import ScriptedOperator
+
+    source, is_alone = _open(given, configured, against)
+    own = source.settings
+    base = own
+    config, profile, _ = configured
+    if config is not None and not is_alone:
+        base = keep_facts(own, load_settings(config, profile or own.arm.profile))
+    base = apply_settings(base, parse_changes(changes))
+    variants = {_name(choice): apply_settings(base, choice) for choice in parse_variations(vary)} if vary else {}
+    if not variants and base != own:
+        variants = {", ".join(filter(None, [config or "", *changes])): base}
+    progress(f"replaying {given}" + (f" with {len(variants)} other settings" if variants else ""))
+    truth = contacts_beside(_log_of(against or given))
+    settings: list[Settings] = [own, *variants.values()]
+    return given, replay_source(source, settings, truth, progress, tolerance, ScriptedOperator), list(variants)
+
+
+def _log_of(given: Path) -> Path:
+    from adacd_hil.control.session import LOG_NAME
+
+    return given / LOG_NAME if given.is_dir() else given
+
+
+def _open(
+    given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
+) -> "tuple[Source, bool]":
+    """Open a log or a recording; also say whether it is a recording alone."""
+    from adacd_hil.analysis.can_recording import RecordingAgainstLog, RecordingAlone
+    from adacd_hil.analysis.replay_source import LogSource
+    from adacd_hil.config import load_settings
+    from adacd_hil.device.contract import load_contract
+    from adacd_hil.wire.codec import load_codec
+
+    path = _log_of(given)
+    if against is not None:
+        return RecordingAgainstLog(path, _log_of(against)), False
+    if path.suffix.lower() == ".mcap":
+        return LogSource(path), False
+    config, profile, dbc = configured
+    if config is None:
+        raise CommandError(
+            f"{path} says nothing of the settings: --against the log of its run, or --config", ExitCode.USAGE
+        )
+    settings = load_settings(config, profile)
+    return RecordingAlone(path, settings, load_codec(dbc) if dbc else load_contract(settings)), True
+
+
+def _name(choice: dict[str, str]) -> str:
+    return ", ".join(f"{key}={value}" for key, value in choice.items())
+
+
+def _code(replays: "list[Replay]") -> ExitCode:
+    own = replays[0]
+    if own.mismatch_count:
+        return ExitCode.FAILURE
+    return ExitCode.OK if own.is_whole else ExitCode.PARTIAL
+
+
+def _verdict(own: "Replay") -> str:
+    if own.mismatch_count:
+        return f"{own.mismatch_count} values differ from the log's"
+    if own.compared == 0:
+        return "nothing to compare with"
+    exact = "bit for bit" if own.tolerance == 0.0 else f"within {own.tolerance:g} of each field's scale"
+    return f"identical, {exact}"
+
+
+def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int) -> str:
+    from adacd_hil.analysis.what_if import NOTE, side_by_side
+    from adacd_hil.cli.table import format_table
+
+    own = replays[0]
+    attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""
+    lines = [f"{path}: {_verdict(own)}: {own.compared} of {own.cycles} cycles{attempts} compared"]
+    lines += [f"  {mismatch.line}" for mismatch in own.mismatches[:shown]]
+    if own.mismatch_count > shown:
+        lines.append(f"  … {own.mismatch_count} in all: " + _counts(own))
+    lines += [f"  {note}" for note in own.notes]
+    if not names and own.compared:
+        return "\n".join(lines)
+    head = ["", "original", *names]
+    rows = [tuple(row) for row in side_by_side(replays)]
+    if len(names) > _MOST_COLUMNS:
+        turned = list(zip(*rows, strict=True))
+        head, rows = ["", *turned[0]], [(name, *row) for name, row in zip(head[1:], turned[1:], strict=True)]
+    return "\n".join([*lines, "", format_table(head, rows), "", NOTE])
+
+
+def _counts(own: "Replay") -> str:
+    return ", ".join(f"{count} of {field}" for field, count in own.mismatched_fields.items())
+
+
+def _as_json(path: Path, replays: "list[Replay]", names: list[str], shown: int) -> dict[str, Any]:
+    from adacd_hil.analysis.what_if import as_json, changed_keys
+
+    own = replays[0]
+    return {
+        "log": str(path),
+        "identical": own.is_identical,
+        "cycles": own.cycles,
+        "compared": own.compared,
+        "attempts": own.attempts,
+        "tolerance": own.tolerance,
+        "mismatch_count": own.mismatch_count,
+        "mismatched_fields": own.mismatched_fields,
+        "mismatches": [mismatch._asdict() for mismatch in own.mismatches[:shown]],
+        "notes": list(own.notes),
+        "original": as_json(own),
+        "variants": [
+            {"name": name, "settings": changed_keys(own.settings, found.settings), **as_json(found)}
+            for name, found in zip(names, replays[1:], strict=True)
+        ],
+    }

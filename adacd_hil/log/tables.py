@@ -1,0 +1,156 @@
+"""Topics and decoded frames as tables, in Parquet or CSV, one file each; a stretch of the log in memory at a time.
+
+A table begins with `t_ns` (of the run's clock) and `cycle_t_ns` (of the cycle that it was logged with, by which tables
+are joined); a field of several numbers becomes as many columns, `tau_J_1`, `tau_J_2`. Booleans stay booleans, states
+and reasons are the numbers that the schemas name.
+"""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.log.decoding import Decoder
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.wire.codec import Codec
+
+TABLE_FORMATS: Final = ("parquet", "csv")
+_PARQUET_HINT = "Parquet is written with pyarrow; pip install 'adacd-hil[tables]', or choose csv"
+
+Columns = Mapping[str, Any]
+"""Columns of a table by name, of equal length: arrays or lists."""
+
+
+def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
+    """Make the columns of a topic."""
+    columns: dict[str, Any] = {
+        "t_ns": series.t_ns,
+        "cycle_t_ns": series.records["publish_time"].astype(np.int64) - epoch_ns,
+    }
+    for name in series.fields:
+        values = series[name]
+        if values.ndim == 1:
+            columns[name] = values
+        else:
+            columns |= {f"{name}_{place}": values[:, place - 1] for place in range(1, values.shape[1] + 1)}
+    return columns
+
+
+def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
+    """Make the columns of /events."""
+    rows = [(event.t_ns, *event.event) for event in events]
+    return {name: [row[place] for row in rows] for place, name in enumerate(("t_ns", "level", "name", "message"))}
+
+
+def frame_columns(frames: NDArray[Any], codec: Codec) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Decode frames of RECORDED_FRAME_DTYPE by a contract: (message, columns) of each one that occurs."""
+    is_data = ~frames["is_error"] & ~frames["is_remote"]
+    for message in codec.messages.values():
+        found = frames[is_data & (frames["can_id"] == message.can_id) & (frames["length"] == message.length)]
+        if not len(found):
+            continue
+        decoder = Decoder(message)
+        values = np.empty((len(found), decoder.count))
+        decoder.decode(np.ascontiguousarray(found["data"][:, : message.length]), values)
+        columns: dict[str, Any] = {"t_ns": found["t_ns"], "cycle_t_ns": found["cycle_t_ns"]}
+        columns |= {signal.name: values[:, place] for place, signal in enumerate(message.signals)}
+        yield message.name, columns
+
+
+class _Table(Protocol):
+    """A file of one table."""
+
+    def write(self, columns: Columns) -> None:
+        """Add rows."""
+
+    def close(self) -> None:
+        """End the file."""
+
+
+class Tables:
+    """Files of tables in one folder, each made when its first rows come."""
+
+    def __init__(self, folder: Path, kind: str, metadata: Mapping[str, str]) -> None:
+        """Make the folder. `metadata` goes into Parquet files. Raises LogError when nothing can be written."""
+        self.rows: dict[Path, int] = {}
+        """How many rows each file has."""
+        self._folder = folder
+        self._kind = kind
+        self._metadata = dict(metadata)
+        self._tables: dict[str, _Table] = {}
+        if kind == "parquet":
+            _import_pyarrow()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise LogError(f"{folder} can't be made a folder: {error.strerror}") from None
+
+    def write(self, topic: str, columns: Columns) -> None:
+        """Add rows to the table of a topic; none make an empty table. Raises LogError."""
+        path = self._folder / f"{topic.strip('/').replace('/', '_')}.{self._kind}"
+        try:
+            if topic not in self._tables:
+                self._tables[topic] = _Csv(path) if self._kind == "csv" else _Parquet(path, self._metadata)
+                self.rows[path] = 0
+            self._tables[topic].write(columns)
+        except OSError as error:
+            raise LogError(f"{path} can't be written: {error.strerror or error}") from None
+        self.rows[path] += len(columns["t_ns"])
+
+    def close(self) -> None:
+        """End all files. Raises LogError."""
+        try:
+            for table in self._tables.values():
+                table.close()
+        except OSError as error:
+            raise LogError(f"{self._folder} can't be written: {error.strerror or error}") from None
+
+
+class _Csv:
+    def __init__(self, path: Path) -> None:
+        self._file: IO[str] = path.open("w", encoding="utf-8", newline="")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._has_head = False
+
+    def write(self, columns: Columns) -> None:
+        if not self._has_head:
+            self._writer.writerow(columns)
+            self._has_head = True
+        lists = [values.tolist() if isinstance(values, np.ndarray) else values for values in columns.values()]
+        self._writer.writerows(zip(*lists, strict=True))
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _Parquet:
+    def __init__(self, path: Path, metadata: dict[str, str]) -> None:
+        self._path = path
+        self._metadata = metadata
+        self._writer: Any = None
+        self._arrow, self._parquet = _import_pyarrow()
+
+    def write(self, columns: Columns) -> None:
+        table = self._arrow.table(dict(columns))
+        if self._writer is None:
+            schema = table.schema.with_metadata(self._metadata)
+            self._writer = self._parquet.ParquetWriter(self._path, schema, compression="zstd")
+        self._writer.write_table(table)
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
+def _import_pyarrow() -> tuple[Any, Any]:
+    """Return pyarrow and its module for Parquet. Raises LogError with what to install."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise LogError(_PARQUET_HINT) from None
+    return pyarrow, pyarrow.parquet

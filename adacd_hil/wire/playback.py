@@ -1,0 +1,131 @@
+"""Frames sent at the times of a recording: absolute deadlines, and how well they were kept.
+
+A frame is due at begin + (t_ns − first t_ns) / speed. Its lateness doesn't move those that follow; what is due at once
+goes out at once, in the order of the recording.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, NamedTuple
+
+from adacd_hil.clock import Clock
+from adacd_hil.wire.bus import Bus
+
+LEAD_NS: Final = 5_000_000
+"""From the call to the first frame."""
+LOOP_PAUSE_NS: Final = 1_000_000
+"""From the last frame of a recording to the first of its repetition, by the recording's time."""
+LATE_NS: Final = 1_000_000
+"""A frame later than this is counted as late."""
+_BUCKET_NS = 1_000
+_STOP_NS = 50_000_000
+"""How soon a request to stop is noticed in a pause."""
+_MOST_AT_ONCE = 64
+
+
+class PlayedFrame(NamedTuple):
+    """A frame of a recording. t_ns: by any clock."""
+
+    t_ns: int
+    can_id: int
+    data: bytes
+
+
+class Lateness:
+    """How late frames were handed to the bus: counted by whole µs, so that hours take no memory."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.late_frames = 0
+        """Those later than LATE_NS."""
+        self.worst_ns = 0
+        self._counts: Counter[int] = Counter()
+
+    def add(self, lateness_ns: int) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self.late_frames += lateness_ns > LATE_NS
+        self.worst_ns = max(self.worst_ns, lateness_ns)
+        self._counts[lateness_ns // _BUCKET_NS] += 1
+
+    def quantile_us(self, share: float) -> int:
+        """Return the smallest whole number of µs that so large a share of the frames was not later than."""
+        needed = share * self.frames
+        for bucket, count in sorted(self._counts.items()):
+            needed -= count
+            if needed <= 0:
+                return bucket + 1
+        return 0
+
+
+def play(
+    bus: Bus,
+    clock: Clock,
+    frames: Iterable[PlayedFrame],
+    *,
+    speed: float = 1.0,
+    longest_pause_ns: int | None = None,
+    is_stopped: Callable[[], bool] = lambda: False,
+) -> Lateness:
+    """Send frames at their times until they end or `is_stopped`.
+
+    longest_pause_ns: pauses of the recording are cut to this. Frames out of order are sent with those before them.
+    Raises BusError.
+    """
+    lateness = Lateness()
+    for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
+        while (now_ns := clock.now_ns()) < due_ns and not is_stopped():
+            clock.sleep_until_ns(min(due_ns, now_ns + _STOP_NS))
+        if is_stopped():
+            break
+        late_ns = max(0, clock.now_ns() - due_ns)
+        bus.send_all([(frame.can_id, frame.data) for frame in group])
+        for _ in group:
+            lateness.add(late_ns)
+    return lateness
+
+
+def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[PlayedFrame]:
+    """Give a recording several times, one after the other, by one clock; 0 times: for ever."""
+    shift_ns, end_ns, done = 0, None, 0
+    while not times or done < times:
+        is_first = True
+        for frame in frames():
+            if is_first and end_ns is not None:
+                shift_ns = end_ns + LOOP_PAUSE_NS - frame.t_ns
+            is_first = False
+            end_ns = frame.t_ns + shift_ns
+            yield frame._replace(t_ns=end_ns)
+        if is_first:
+            return
+        done += 1
+
+
+def _scheduled(
+    frames: Iterable[PlayedFrame], clock: Clock, speed: float, longest_pause_ns: int | None
+) -> Iterator[tuple[int, PlayedFrame]]:
+    """Give each frame with the time at which it is due, which never runs backwards."""
+    begin_ns, first_ns, cut_ns, latest_ns = 0, None, 0, 0
+    for frame in frames:
+        if first_ns is None:
+            begin_ns = clock.now_ns() + LEAD_NS
+            first_ns = latest_ns = frame.t_ns
+        pause_ns = frame.t_ns - latest_ns
+        if longest_pause_ns is not None and pause_ns > longest_pause_ns:
+            cut_ns += pause_ns - longest_pause_ns
+        latest_ns = max(latest_ns, frame.t_ns)
+        yield begin_ns + round((latest_ns - first_ns - cut_ns) / speed), frame
+
+
+def _grouped(scheduled: Iterable[tuple[int, PlayedFrame]]) -> Iterator[tuple[int, list[PlayedFrame]]]:
+    """Put frames that are due at the same time together, a handful at most."""
+    group: list[PlayedFrame] = []
+    group_ns = 0
+    for due_ns, frame in scheduled:
+        if group and (due_ns != group_ns or len(group) == _MOST_AT_ONCE):
+            yield group_ns, group
+            group = []
+        group_ns = due_ns
+        group.append(frame)
+    if group:
+        yield group_ns, group

@@ -1,0 +1,89 @@
+"""`adacd-hil play`: what goes out, what doesn't, and what is said."""
+
+import json
+
+import can
+import pytest
+from click.testing import CliRunner
+from recorded_frames_log import write_frames
+
+from adacd_hil.cli import play as play_module
+from adacd_hil.cli.play_command import play
+
+CHANNEL = "test_play"
+
+
+@pytest.fixture
+def listener():
+    with can.Bus(interface="virtual", channel=CHANNEL, receive_own_messages=False) as bus:
+        yield bus
+
+
+def heard(bus):
+    messages = []
+    while (message := bus.recv(0)) is not None:
+        messages.append(message)
+    return messages
+
+
+@pytest.fixture
+def log(tmp_path):
+    return write_frames(tmp_path / "bus.mcap")
+
+
+def run(log, *arguments):
+    command = [str(log), "-i", "virtual", "-c", CHANNEL, *arguments]
+    return CliRunner().invoke(play, command)
+
+
+def test_every_frame_goes_out_in_its_order(log, listener):
+    done = run(log, "--json")
+    described = json.loads(done.stdout)
+    messages = heard(listener)
+    assert done.exit_code == 0, done.stderr
+    assert [m.arbitration_id for m in messages] == [0x000, 0x080, 0x181, 0x18DAF110, 0x201, 0x7A5]
+    assert [bytes(m.data) for m in messages][:3] == [b"\x01\x00", b"\x07", bytes(8)]
+    assert messages[3].is_extended_id
+    assert (described["frames"], described["unsendable"], described["withheld"]) == (6, 4, 0)
+    assert described["lateness_us"]["p50"] <= described["lateness_us"]["p99"] <= described["lateness_us"]["max"] + 1
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("--only", "host"), [0x000, 0x080, 0x201]),
+        (("--only", "devices"), [0x181, 0x18DAF110, 0x7A5]),
+        (("--id", "181", "--id", "080"), [0x080, 0x181]),
+        (("--start", "0.002", "--end", "0.004"), [0x181, 0x18DAF110]),
+        (("--id", "181", "--loop", "3", "--speed", "2"), [0x181] * 3),
+    ],
+)
+def test_frames_are_chosen(log, listener, options, expected):
+    assert run(log, *options).exit_code == 0
+    assert [m.arbitration_id for m in heard(listener)] == expected
+
+
+def test_a_real_bus_gets_what_devices_send_and_no_more(log, listener, monkeypatch):
+    monkeypatch.setattr(play_module, "is_hardware", lambda *_: True)
+    done = run(log)
+    assert [m.arbitration_id for m in heard(listener)] == [0x181]
+    assert "5 frames withheld: they could move an arm on this bus; --commands sends them, too" in done.stdout
+    assert "4 frames can't be sent" in done.stdout
+
+
+def test_commands_go_to_a_real_bus_when_asked_for(log, listener, monkeypatch):
+    monkeypatch.setattr(play_module, "is_hardware", lambda *_: True)
+    assert "withheld" not in run(log, "--commands").stdout
+    assert len(heard(listener)) == 6
+
+
+def test_what_is_no_recording_is_said_before_the_bus_is_opened(tmp_path):
+    done = CliRunner().invoke(play, [str(tmp_path / "x.mcap"), "-i", "socketcan", "-c", "none"])
+    assert (done.exit_code, "x.mcap can't be read: No such file" in done.stderr) == (1, True)
+
+
+def test_a_damaged_recording_is_played_up_to_its_damage_and_partial(log, listener):
+    log.write_bytes(log.read_bytes()[:-20])
+    done = run(log)
+    assert (done.exit_code, len(heard(listener))) == (3, 6)
+    assert "warning: bus.mcap is cut" in done.stdout

@@ -1,0 +1,96 @@
+"""The arm from a run's log against what the same run's loop saw of it, bit for bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cycle_rig import CODEC, CycleRig
+from fault_rig import run_realtime, settings_of
+from recorded_arm_rig import Live, differences, live_states, play, ticks_of
+
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.records import ArmBatch, FaultReason, SchemeState
+
+pytestmark = pytest.mark.slow
+
+TROUBLES = [
+    {"kind": "lose", "node": "sensor1", "frame": "torque", "count": 2, "at_s": 0.02},
+    {"kind": "duplicate", "node": "all", "frame": "torque", "count": 3, "at_s": 0.04},
+    {"kind": "corrupt", "node": "sensor2", "frame": "torque", "bits": 2, "count": 2, "at_s": 0.06},
+    {"kind": "reorder", "node": "sensor1", "frame": "torque", "count": 1, "at_s": 0.08},
+    {"kind": "corrupt", "node": "drive1", "frame": "feedback", "mask": "00001000", "count": 1, "at_s": 0.1},
+    {"kind": "delay", "node": "sensor1", "frame": "torque", "delay_us": 1500.0, "duration_s": 0.01, "at_s": 0.12},
+    {"kind": "emcy_storm", "node": "sensor1", "code": 0x1000, "rate_Hz": 500.0, "duration_s": 0.02, "at_s": 0.14},
+    {"kind": "silence", "node": "all", "duration_s": 0.002, "at_s": 0.16},
+    {"kind": "drive_fault", "node": "drive1", "code": 0x2310, "at_s": 0.2},
+]
+
+
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> Live:
+    """Play a run with many faults, the last of which begins a second attempt."""
+    return play(tmp_path_factory.mktemp("troubled"), TROUBLES, finish_s=0.3, acknowledge_faults=1)
+
+
+@pytest.fixture(scope="module")
+def read(troubled: Live) -> ArmBatch:
+    return troubled.read()
+
+
+def test_lost_repeated_wrong_and_late_frames_come_out_as_the_loop_took_them(troubled: Live, read: ArmBatch) -> None:
+    assert differences(troubled.states, read) == []
+
+
+def test_the_run_that_is_compared_has_old_values_and_a_fault(read: ArmBatch) -> None:
+    assert set(np.unique(read.age_tau_J)) == {0, 1, 2}
+    assert set(np.unique(read.age_q)) >= {0, 1, 2}
+    assert set(np.unique(read.fault)) == {FaultReason.NONE, FaultReason.DRIVE}
+    assert np.count_nonzero(~read.is_complete) > 10
+
+
+def test_a_new_attempt_forgets_the_one_before(troubled: Live) -> None:
+    arm = troubled.recorded_arm()
+    ticks = ticks_of(troubled.log)
+    arm.read(ticks, troubled.log.frames)
+    came_from = troubled.log.scheme["previous_state"]
+    again = 1 + np.flatnonzero((came_from[1:] == SchemeState.INIT) & (came_from[:-1] == SchemeState.FAULT))
+    assert arm.beginnings == [0, *again]
+
+
+def test_a_run_read_in_pieces_is_the_same_run(troubled: Live) -> None:
+    arm = troubled.recorded_arm()
+    ticks, frames = ticks_of(troubled.log), troubled.log.frames
+    states = iter(troubled.states)
+    for first, last in ((0, 0), (0, 1), (1, 230), (230, 231), (231, 1200), (1200, len(ticks.cycle))):
+        piece = Ticks(*(column[first:last] for column in ticks))
+        low_ns = ticks.t_ns[first - 1] if first else -1
+        high_ns = ticks.t_ns[last - 1] if last else -1
+        is_inside = (frames["cycle_t_ns"] > low_ns) & (frames["cycle_t_ns"] <= high_ns)
+        assert differences([next(states) for _ in range(last - first)], arm.read(piece, frames[is_inside])) == []
+
+
+def test_frames_that_come_after_their_cycle_in_real_time_are_of_the_cycle_before(tmp_path: Path) -> None:
+    rows = [
+        {"kind": "delay", "node": "sensor1", "frame": "torque", "delay_us": 800.0, "duration_s": 0.02, "at_s": 0.05},
+        {"kind": "lose", "node": "sensor1", "frame": "heartbeat", "at_s": 0.06},
+    ]
+    with live_states() as states:
+        outcome = run_realtime(tmp_path, rows, finish_s=0.6)
+    batch = Live(settings_of(0.6), CODEC, states, outcome.log).read()
+    assert differences(states, batch) == []
+    assert FaultReason.HEARTBEAT in batch.fault
+    assert batch.age_tau_J.max() == 1
+
+
+def test_a_host_that_skipped_periods_is_late_in_its_recording_too(tmp_path: Path) -> None:
+    rig = CycleRig(tmp_path, finish_s=0.1)
+    for cycle, periods in ((230, 2), (240, 3), (250, 9)):
+        rig.in_cycle[cycle] = lambda periods=periods: rig.clock.sleep_until_ns(
+            rig.clock.now_ns() + periods * rig.settings.bus.period_ns
+        )
+    with live_states() as states:
+        rig.run()
+    batch = Live(rig.settings, CODEC, states, rig.read()).read()
+    assert differences(states, batch) == []
+    assert batch.periods.max() == 9
+    assert FaultReason.DEADLINE in batch.fault

@@ -1,0 +1,288 @@
+"""Recorded cycles run at once: the same bits as cycle by cycle, wherever the runs are split."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from excited_arm import PERIOD_S, SETTINGS, record
+from planar_arm import PAYLOAD_1KG, THETA
+
+from adacd_hil.control.excitation import Excitation
+from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState, certified_layout, scheme_layout
+from adacd_hil.scheme.batch import arm_at
+from adacd_hil.scheme.margin import MarginWatch
+from adacd_hil.scheme.selection import layout_of, pipeline_of
+
+REST = 60
+"""Cycles at rest, the first of them without drives."""
+PAUSES_S = ((4.6, 5.5), (6.2, 7.5), (8.0, 9.2))
+PUSHES = ((4.55, 4.7, (3.0, 0.8)), (6.15, 6.25, (0.0, -0.6)), (7.9, 8.03, (1.5, 0.0)))
+REQUESTS = (
+    (4.6, Request.ACKNOWLEDGE),  # too early
+    (5.2, Request.ACKNOWLEDGE),
+    (7.0, Request.ACKNOWLEDGE),
+    (7.2, Request.PAYLOAD),
+    (7.333, Request.PAYLOAD_CHANGED),
+)
+PAYLOAD_S = 7.27
+SECONDS = 11.7
+
+
+def settings_of(scheme):
+    """Return settings with which either scheme soon monitors, and promotes models while it does."""
+    return replace(
+        SETTINGS,
+        scheme=scheme,
+        termination=replace(SETTINGS.termination, hold_s=0.3, beta_Nm=0.4, excitation_Nm2s=1e-6),
+        detector=replace(SETTINGS.detector, threshold_Nm=(0.3, 0.3)),
+        certified=replace(SETTINGS.certified, refine_s=0.2),
+    )
+
+
+def motion_with_pauses(seconds):
+    """Return q_d, dq_d (n, 2) of the excitation, slowed down to rest in the pauses."""
+    count = round(seconds / PERIOD_S)
+    at_s = np.arange(count) * PERIOD_S
+    rate = np.ones(count)
+    for begin_s, end_s in PAUSES_S:
+        rate = np.minimum(rate, np.clip(np.maximum(begin_s - at_s, at_s - end_s) / 0.1 + 1.0, 0.0, 1.0))
+    excitation, warped_s = Excitation(SETTINGS), np.cumsum(rate) * PERIOD_S
+    q_d, dq_d, ddq_d = (np.zeros((count, 2)) for _ in range(3))
+    for k in range(count):
+        excitation.evaluate(warped_s[k], q_d[k], dq_d[k], ddq_d[k])
+    return q_d, rate[:, None] * dq_d
+
+
+@pytest.fixture(scope="module")
+def life():
+    """An arm that learns, is pushed, stopped, acknowledged, touched, loaded, and pushed while it learns again."""
+    motion = motion_with_pauses(SECONDS)
+    count = len(motion[0])
+    tau_ext = np.zeros((count, 2))
+    for begin_s, end_s, torque in PUSHES:
+        tau_ext[round(begin_s / PERIOD_S) : round(end_s / PERIOD_S)] = torque
+    moved = record(THETA["P"], SECONDS, tau_ext, PAYLOAD_1KG, PAYLOAD_S, motion, seed=4)
+    q, dq, tau_J = (np.concatenate((np.tile(column[0], (REST, 1)), column)) for column in moved)
+    total = REST + count
+    random = np.random.default_rng(2)
+    periods = np.ones(total, dtype=np.int64)
+    periods[random.integers(REST, total, 6)] = 2
+    is_complete = np.ones(total, dtype=bool)
+    is_complete[random.integers(REST, total, 12)] = False
+    is_complete[:2] = False
+    cycle = np.arange(total, dtype=np.int64)
+    arms = ArmBatch(
+        cycle=cycle,
+        t_ns=1_790_000_000_000_000_000 + np.cumsum(periods) * 1_000_000 + random.integers(0, 50_000, total),
+        periods=periods,
+        q=q,
+        dq=dq,
+        tau_J=tau_J,
+        age_q=random.integers(0, 3, (total, 2)),
+        age_tau_J=random.integers(0, 3, (total, 2)),
+        is_enabled=cycle > REST // 2,
+        is_complete=is_complete,
+        fault=np.zeros(total, dtype=np.uint8),
+        is_late=np.zeros(total, dtype=bool),
+    )
+    requests = np.zeros(total, dtype=np.uint8)
+    for at_s, request in REQUESTS:
+        requests[REST + round(at_s / PERIOD_S)] = request
+    return arms, requests
+
+
+def pipeline_for(scheme):
+    pipeline = pipeline_of(settings_of(scheme))
+    if scheme == "certified":
+        pipeline._margin = MarginWatch(2, memory_blocks=1.0, warn_share=5.0)
+    return pipeline
+
+
+def part(arms, begin, end):
+    return ArmBatch(*(column[begin:end] for column in arms))
+
+
+def state_of(thing):
+    """Return everything that a pipeline remembers, in a form that compares bit by bit."""
+    if isinstance(thing, np.ndarray | np.void):
+        return thing.tobytes()
+    if type(thing).__module__.startswith("adacd_hil.scheme") and hasattr(thing, "__dict__"):
+        return {name: state_of(value) for name, value in vars(thing).items()}
+    return repr(thing)
+
+
+def stepped(pipeline, arms, requests):
+    return [pipeline.step(arm_at(arms, k), Request(requests[k])) for k in range(len(requests))]
+
+
+def rows_of(outputs):
+    """Return what a batch has of each cycle, one tuple per cycle."""
+    return [
+        (o.cycle, o.state, o.previous_state, o.fault, o.reaction, o.contact_joints, o.is_model_valid, o.contact,
+         o.block.tobytes())
+        for o in outputs
+    ]  # fmt: skip
+
+
+def rows_of_batches(batches):
+    rows = []
+    for batch in batches:
+        contacts = dict(zip(batch.contact_places.tolist(), batch.contacts, strict=True))
+        columns = batch[:7]
+        for k in range(batch.cycle.size):
+            values = tuple(column[k].item() for column in columns)
+            rows.append((*values, contacts.get(k), batch.block[k].tobytes()))
+    return rows
+
+
+SCHEMES = ("paper", "certified")
+
+
+@pytest.fixture(scope="module", params=SCHEMES)
+def lived(request, life):
+    """The scheme's name, its pipeline after the life, and its outputs, step by step."""
+    pipeline = pipeline_for(request.param)
+    outputs = stepped(pipeline, *life)
+    return request.param, pipeline, outputs
+
+
+def test_the_life_has_all_of_it(lived):
+    scheme, pipeline, outputs = lived
+    missing = {state.name for state in set(SchemeState) - {output.state for output in outputs}}
+    assert missing == ({"FAULT", "CERTIFY"} if scheme == "paper" else {"FAULT"})
+    assert len([output for output in outputs if output.contact is not None]) >= 6
+    if scheme == "certified":
+        assert {output.reaction.name for output in outputs} == {"NONE", "STOP", "WITHDRAW"}
+        assert outputs[6000].block[layout_of(settings_of(scheme)).slices["promotions"]] >= 5
+        assert [event.name for event in pipeline._events] == ["margin"]
+
+
+def test_run_gives_the_bits_of_step(life, lived):
+    scheme, pipeline, outputs = lived
+    again = pipeline_for(scheme)
+    batch = again.run(*life)
+    assert rows_of_batches([batch]) == rows_of(outputs)
+    assert state_of(again) == state_of(pipeline)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_it_may_be_split_anywhere_and_mixed_with_single_steps(life, lived, seed):
+    scheme, pipeline, outputs = lived
+    arms, requests = life
+    random = np.random.default_rng(seed)
+    again, rows = pipeline_for(scheme), []
+    begin = 0
+    while begin < len(requests):
+        end = min(begin + int(random.choice((0, 1, 2, 7, 60, 400, 2000))), len(requests))
+        few = part(arms, begin, end), requests[begin:end]
+        if end - begin < 100 and random.integers(2):
+            rows += rows_of(stepped(again, *few))
+        else:
+            rows += rows_of_batches([again.run(*few)])
+        begin = end
+    assert rows == rows_of(outputs)
+    assert state_of(again) == state_of(pipeline)
+
+
+def changed(column, value):
+    """Return a disturbance that sets a column of an ArmBatch."""
+
+    def change(arms, begin, end):
+        getattr(arms, column)[begin:end] = value
+
+    return change
+
+
+def pushed(torque):
+    def change(arms, begin, end):
+        arms.tau_J[begin:end] += torque
+
+    return change
+
+
+def at_rest(arms, begin, end):
+    arms.q[begin:end] = arms.q[begin]
+    arms.dq[begin:end] = 0.0
+
+
+DISTURBANCES = {
+    **{f"fault {reason.name}": (changed("fault", reason), 1) for reason in FaultReason},
+    "q not a number": (changed("q", np.nan), 1),
+    "torque infinite in a cycle that is not complete": (
+        lambda *at: (changed("tau_J", np.inf)(*at), changed("is_complete", False)(*at)),
+        1,
+    ),
+    "beyond the position limit": (changed("q", 1.6), 1),
+    "beyond the velocity limit": (changed("dq", 30.0), 3),
+    "old position": (changed("age_q", 4), 1),
+    "old torque": (changed("age_tau_J", 4), 1),
+    "as old as may be": (changed("age_q", 3), 20),
+    "a drive drops out": (changed("is_enabled", False), 2),
+    "late once": (changed("is_late", True), 1),
+    "late for long": (changed("is_late", True), 90),
+    "incomplete": (changed("is_complete", False), 30),
+    "many periods": (changed("periods", 7), 5),
+    "a timeout of periods": (changed("periods", 100_000), 1),
+    "pushed along": (pushed((-2.0, -0.5)), 60),
+    "pushed against": (pushed((6.0, 1.0)), 150),
+    "touched": (pushed((-0.5, 0.0)), 120),
+    "at rest": (at_rest, 140),
+    "stamps stand still": (changed("t_ns", 0), 2),
+    **{request.name: (request, 1) for request in Request},
+}
+PLACES_S = {
+    "INIT": -0.06,
+    "COMMISSION": -0.055,
+    "ENABLE": -0.045,
+    "ADAPT": 0.7,
+    "CERTIFY": 1.7,
+    "MONITOR": 3.0,
+    "REACT": 4.575,
+    "STOPPED": 4.9,
+    "PAYLOAD": 7.22,
+}
+TAIL = 240
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("place", PLACES_S)
+def test_whatever_disturbs_a_state_is_seen_as_step_sees_it(life, scheme, place):
+    """Four rows of the table at a time, drawn so that each comes in each state."""
+    arms, requests = life
+    begin = REST + round(PLACES_S[place] / PERIOD_S)
+    random = np.random.default_rng(sorted(PLACES_S).index(place))
+    names = random.permutation(list(DISTURBANCES)).tolist()
+    for few in (names[k : k + 4] for k in range(0, len(names), 4)):
+        tail = ArmBatch(*(column[begin : begin + TAIL].copy() for column in arms))
+        asked = requests[begin : begin + TAIL].copy()
+        for name in few:
+            change, cycles = DISTURBANCES[name]
+            at = int(random.integers(0, 100))
+            if isinstance(change, Request):
+                asked[at] = change
+            else:
+                change(tail, at, at + cycles)
+        one, two = pipeline_for(scheme), pipeline_for(scheme)
+        for pipeline in (one, two):
+            pipeline.run(part(arms, 0, begin), requests[:begin])
+        assert rows_of_batches([one.run(tail, asked)]) == rows_of(stepped(two, tail, asked)), few
+        assert state_of(one) == state_of(two), few
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_what_monitors_is_looked_at_once_a_second_and_when_a_model_takes_over(life, scheme):
+    arms, requests = life
+    pipeline = pipeline_for(scheme)
+    pipeline.run(part(arms, 0, 2400), requests[:2400])
+    looks = []
+    conclude = pipeline._conclude
+    pipeline._conclude = lambda arm, *rest: looks.append(arm.cycle) or conclude(arm, *rest)
+    batch = pipeline.run(part(arms, 2400, 4400), requests[2400:4400])
+    assert set(batch.state) == {SchemeState.MONITOR}
+    promotions = batch.block[:, layout_of(settings_of(scheme)).slices["promotions"]] if scheme == "certified" else [0]
+    assert len(looks) <= (3 + np.ptp(promotions) if scheme == "certified" else 1)
+
+
+def test_the_layout_is_that_of_the_scheme():
+    assert layout_of(settings_of("paper")) == scheme_layout(7)
+    assert layout_of(settings_of("certified")) == certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count)
