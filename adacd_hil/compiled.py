@@ -46,7 +46,7 @@ def compiled_sources(root: Path) -> dict[str, bytes]:
     return {name: texts[name] for name in sorted(found)}
 
 
-def _source_digest() -> str:
+def source_digest() -> str:
     """Digest the sources that compiled code may depend on."""
     digest = hashlib.sha256()
     for name, text in compiled_sources(Path(__file__).resolve().parent.parent).items():
@@ -58,13 +58,13 @@ def _cache_folder() -> Path:
     """Name the folder of this source state, under NUMBA_CACHE_DIR, the user's cache or the temporary folder."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
-        return Path(given) / _source_digest()
+        return Path(given) / source_digest()
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "adacd-hil"
     try:
         base.mkdir(parents=True, exist_ok=True)
     except OSError:
         base = Path(tempfile.gettempdir()) / f"adacd-hil-{os.getuid()}"
-    return base / _source_digest()
+    return base / source_digest()
 
 
 numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]

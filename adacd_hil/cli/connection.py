@@ -2,6 +2,7 @@
 
 import dataclasses
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -119,7 +120,10 @@ def raise_interrupt() -> NoReturn:
 
 @contextmanager
 def on_interrupt(interrupt: Callable[[], None]) -> Iterator[None]:
-    """Let SIGINT and SIGTERM call a function instead of ending the process."""
+    """Let SIGINT and SIGTERM call a function instead of ending the process; outside the main thread, nothing can."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number in previous:
         signal.signal(number, lambda *_: interrupt())

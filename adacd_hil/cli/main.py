@@ -23,6 +23,7 @@ from adacd_hil.cli.options import (
 )
 from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
+from adacd_hil.cli.sweep_command import sweep
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -324,6 +325,7 @@ cli.add_command(play)
 cli.add_command(replay)
 cli.add_command(compare)
 cli.add_command(log)
+cli.add_command(sweep)
 
 
 def main() -> None:

@@ -1,0 +1,131 @@
+"""`adacd-hil sweep`: logs or scenarios, settings and seeds, every combination, on all processors or a Dask cluster."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.options import explained, json_option, profile_option
+
+if TYPE_CHECKING:
+    from adacd_hil.analysis.sweep_plan import Plan
+
+_LOG_NAME = "run.mcap"
+
+
+@click.command(
+    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` says why; 1 the cluster is "
+    "lost, or the folder can't be written; 2 wrong usage or configuration; 130 interrupted: the same command goes on."
+)
+@click.argument("logs", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Play this scenario instead; repeatable.")
+@click.option("--seeds", default="1", show_default=True, metavar="N|A:B", help="Seeds of the scenarios, A to B.")
+@click.option("--vary", multiple=True, metavar="KEY=A,B,...", help="A setting's values; every combination is a row.")
+@click.option("--config", default="", metavar="NAME|FILE", help="Configuration; default: each log's own, or certified.")
+@profile_option
+@click.option("--workers", type=click.IntRange(1, 1024), help="Processes on this machine; default: its processors.")
+@click.option("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler to use instead: tcp://host:8786.")
+@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the results.")
+@json_option
+@explained
+def sweep(
+    logs: tuple[Path, ...],
+    scenarios: tuple[str, ...],
+    seeds: str,
+    vary: tuple[str, ...],
+    config: str,
+    profile: str | None,
+    workers: int | None,
+    scheduler: str,
+    out: Path,
+    as_json: bool,
+) -> ExitCode:
+    """Replay LOGS, or play scenarios, with every combination of settings; one table, OUT/sweep.parquet.
+
+    A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
+    """
+    from adacd_hil.analysis.sweep import connect, run_sweep
+    from adacd_hil.analysis.sweep_rows import replay_task
+    from adacd_hil.analysis.sweep_store import SweepStore
+    from adacd_hil.cli.progress import Progress
+
+    if bool(logs) == bool(scenarios):
+        raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
+    plan = _plan(logs, scenarios, seeds, vary, config, profile or "")
+    if logs:
+        work = replay_task
+    else:
+        from adacd_hil.cli.sweep_simulation import simulate_task
+
+        work = simulate_task
+    store = SweepStore(out)
+    progress = Progress()
+    progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
+    try:
+        with connect(scheduler, workers or os.cpu_count() or 1) as client:
+            outcome = run_sweep(plan, work, store, client, progress)
+        about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
+        table = store.join(plan.row_keys(), about)
+    finally:
+        progress.close()
+    result = {
+        "table": str(table),
+        "rows": plan.size,
+        "computed": outcome.computed,
+        "found_done": outcome.found,
+        "failed": outcome.failed,
+        "elapsed_s": round(outcome.elapsed_s, 3),
+        "rows_per_s": round(outcome.computed / outcome.elapsed_s, 2) if outcome.elapsed_s else None,
+    }
+    print(json.dumps(result, indent=2) if as_json else "\n".join(f"{key}: {value}" for key, value in result.items()))
+    return ExitCode.PARTIAL if outcome.failed else ExitCode.OK
+
+
+def _plan(
+    logs: Sequence[Path], scenarios: Sequence[str], seeds: str, vary: Sequence[str], config: str, profile: str
+) -> "Plan":
+    from adacd_hil import __version__
+    from adacd_hil.analysis.sweep_plan import plan_logs, plan_scenarios
+    from adacd_hil.analysis.what_if import apply_settings, parse_variations
+    from adacd_hil.compiled import source_digest
+    from adacd_hil.config import load_settings
+
+    variants = parse_variations(vary)
+    base = load_settings(config or "certified", profile or None)
+    for changes in variants:  # what no run could take is refused before the first one
+        apply_settings(base, changes)
+    version = f"{__version__} {source_digest()}"
+    if logs:
+        return plan_logs(_files(logs), variants, config, profile, version)
+    from firmware_sim.scenario import load_scenario
+
+    for scenario in scenarios:
+        load_scenario(scenario, base.arm.profile, None)
+    return plan_scenarios(scenarios, _seeds(seeds), variants, config, profile, version)
+
+
+def _files(logs: Sequence[Path]) -> list[Path]:
+    """Find the logs; a folder stands for those below it."""
+    found: list[Path] = []
+    for given in logs:
+        below = sorted(given.rglob(_LOG_NAME)) if given.is_dir() else [given]
+        if not below or not below[0].exists():
+            raise CommandError(f"no {_LOG_NAME} in {given}" if given.is_dir() else f"log {given} does not exist")
+        found += below
+    return found
+
+
+def _seeds(text: str) -> range:
+    """Read `N` or `A:B`."""
+    first, colon, last = text.partition(":")
+    try:
+        low, high = int(first), int(last if colon else first)
+    except ValueError:
+        low, high = 1, 0
+    if not 0 <= low <= high:
+        raise CommandError(f"--seeds {text!r} is neither a number nor A:B with 0 <= A <= B", ExitCode.USAGE)
+    return range(low, high + 1)

@@ -1,0 +1,154 @@
+"""A sweep computes every row once, tries again what failed by accident, and goes on where it was stopped."""
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from adacd_hil.analysis.sweep import run_sweep
+from adacd_hil.analysis.sweep_plan import Plan, plan_logs, plan_scenarios
+from adacd_hil.analysis.sweep_store import SweepStore
+from adacd_hil.cli.main import cli
+from adacd_hil.log.errors import LogError
+
+distributed = pytest.importorskip("distributed")
+parquet = pytest.importorskip("pyarrow.parquet")
+
+THRESHOLDS = [{"detector.threshold_Nm": "0.1"}, {"detector.threshold_Nm": "0.4"}]
+
+
+def plan_of(seeds=range(1, 6), variants=THRESHOLDS, version="1") -> Plan:
+    return plan_scenarios(["paper"], seeds, variants, "paper", "", version)
+
+
+def row_of(task, row, **more):
+    return {"key": row.key, "seed": task.subject.seed, **dict(row.changes), "status": "ok", "error": None, **more}
+
+
+class Work:
+    """Rows without an arm. Notes what it was asked for, in a file since it is sent about; raises as often as told."""
+
+    def __init__(self, folder: Path, failures: dict[int, int] | None = None) -> None:
+        self.notes = folder / f"notes{len(list(folder.glob('notes*')))}"
+        self.notes.touch()
+        self.failures = failures or {}
+
+    def __call__(self, task):
+        with self.notes.open("a") as notes:
+            notes.write(f"{task.subject.seed} {len(task.rows)}\n")
+        if self.tries(task.subject.seed) <= self.failures.get(task.subject.seed, 0):
+            raise OSError("the disk was away")
+        return [row_of(task, row) for row in task.rows]
+
+    def tries(self, seed: int) -> int:
+        """Count the tasks of a seed."""
+        return sum(line.split()[0] == str(seed) for line in self.notes.read_text().splitlines())
+
+
+@pytest.fixture(scope="module")
+def client():
+    """Workers that are threads of this process: what they do can be looked at."""
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, silence_logs=50
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+def sweep(folder: Path, client, work, plan=None, rows_per_task=2):
+    plan = plan or plan_of()
+    lines: list[str] = []
+    store = SweepStore(folder)
+    outcome = run_sweep(plan, work, store, client, lines.append, rows_per_task)
+    rows = parquet.read_table(store.join(plan.row_keys(), {"version": plan.version})).to_pylist()
+    return outcome, rows, lines
+
+
+def test_every_row_is_computed_once_and_stands_in_the_order_of_the_plan(tmp_path: Path, client) -> None:
+    work = Work(tmp_path)
+    outcome, rows, lines = sweep(tmp_path, client, work)
+    assert (outcome.computed, outcome.found, outcome.failed) == (10, 0, 0)
+    assert [work.tries(seed) for seed in range(1, 6)] == [1] * 5
+    assert [row["seed"] for row in rows] == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+    assert [row["detector.threshold_Nm"] for row in rows] == ["0.1", "0.4"] * 5
+    assert lines[-1].startswith("10 of 10 rows")
+
+
+def test_a_sweep_that_is_begun_again_computes_what_is_missing(tmp_path: Path, client) -> None:
+    sweep(tmp_path, client, Work(tmp_path), plan_of(range(1, 4)))
+    work = Work(tmp_path)
+    outcome, rows, _ = sweep(tmp_path, client, work)
+    assert (outcome.computed, outcome.found, len(rows)) == (4, 6, 10)
+    assert [work.tries(seed) for seed in range(1, 6)] == [0, 0, 0, 1, 1]
+
+
+def test_a_task_that_fails_by_accident_is_tried_again(tmp_path: Path, client) -> None:
+    work = Work(tmp_path, {2: 2})
+    outcome, rows, _ = sweep(tmp_path, client, work)
+    assert (outcome.failed, work.tries(2)) == (0, 3)
+    assert {row["status"] for row in rows} == {"ok"}
+
+
+def test_a_task_that_always_fails_leaves_rows_that_say_why_and_are_computed_the_next_time(
+    tmp_path: Path, client
+) -> None:
+    outcome, rows, lines = sweep(tmp_path, client, Work(tmp_path, {3: 9}))
+    assert (outcome.computed, outcome.failed) == (10, 2)
+    assert {row["error"] for row in rows if row["seed"] == 3} == {"OSError: the disk was away"}
+    assert lines[-1].endswith("2 failed")
+    outcome, rows, _ = sweep(tmp_path, client, Work(tmp_path))
+    assert (outcome.computed, outcome.found, outcome.failed) == (2, 8, 0)
+    assert {row["status"] for row in rows} == {"ok"}
+
+
+def test_a_key_changes_with_all_that_a_result_depends_on(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    log.write_bytes(b"one")
+    first = list(plan_logs([log], THRESHOLDS, "", "", "1").row_keys())
+    assert len(set(first)) == 2
+    assert list(plan_logs([log], THRESHOLDS, "", "", "1").row_keys()) == first
+    for other in (
+        plan_logs([log], [{"detector.threshold_Nm": "0.3"}, {"filter.a_rad_s": "0.1"}], "", "", "1"),
+        plan_logs([log], THRESHOLDS, "paper", "", "1"),
+        plan_logs([log], THRESHOLDS, "", "S", "1"),
+        plan_logs([log], THRESHOLDS, "", "", "2"),
+    ):
+        assert not set(first) & set(other.row_keys())
+    log.write_bytes(b"another")
+    assert not set(first) & set(plan_logs([log], THRESHOLDS, "", "", "1").row_keys())
+
+
+def test_tasks_are_of_one_subject_and_of_so_many_rows_at_most() -> None:
+    plan = plan_of(range(1, 3), [{"filter.a_rad_s": str(value)} for value in range(10, 17)])
+    tasks = list(plan.tasks(frozenset(), 3))
+    assert [(task.subject.seed, len(task.rows)) for task in tasks] == [(1, 3), (1, 3), (1, 1), (2, 3), (2, 3), (2, 1)]
+
+
+def test_a_part_that_is_damaged_is_named(tmp_path: Path, client) -> None:
+    sweep(tmp_path, client, Work(tmp_path))
+    part = next((tmp_path / "parts").glob("*.parquet"))
+    part.write_bytes(part.read_bytes()[:-9])
+    with pytest.raises(LogError, match=f"{part}.*remove it") as refusal:
+        SweepStore(tmp_path).done()
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ((), "a sweep is of LOGS or of --scenario"),
+        (("--scenario", "papr"), "did you mean 'paper'?"),
+        (("--scenario", "paper", "--seeds", "9:1"), "--seeds '9:1'"),
+        (("--scenario", "paper", "--vary", "detector.treshold_Nm=1"), "did you mean `detector.threshold_Nm`?"),
+        (("--scenario", "paper", "--vary", "detector.threshold_Nm=-1"), "below"),
+        (("none.mcap",), "log none.mcap does not exist"),
+    ],
+)
+def test_a_wrong_plan_is_one_line_before_anything_runs(tmp_path: Path, arguments: tuple[str, ...], line: str) -> None:
+    played = CliRunner().invoke(cli, ["sweep", *arguments, "--out", str(tmp_path / "out")])
+    assert played.exit_code in (1, 2)
+    assert line in played.stderr
+    assert len(played.stderr.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
