@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.log_export import export
 from adacd_hil.cli.options import explained, json_option
 
 _log_argument = click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
@@ -152,3 +153,6 @@ def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) ->
     result = {"out": str(done.out), "logs": list(done.names), "messages": done.messages, "shared": list(done.shared)}
     print(json.dumps(result, indent=2) if as_json else f"{done.out}: {done.messages} messages")
     return ExitCode.OK
+
+
+log.add_command(export)
