@@ -201,6 +201,11 @@ def pushed(torque):
     return change
 
 
+def one_joint_then_the_other(arms, begin, end):
+    arms.tau_J[begin:end, 0] -= 1.0
+    arms.tau_J[begin + 20 : begin + 40, 1] -= 1.5
+
+
 def at_rest(arms, begin, end):
     arms.q[begin:end] = arms.q[begin]
     arms.dq[begin:end] = 0.0
@@ -226,6 +231,7 @@ DISTURBANCES = {
     "a timeout of periods": (changed("periods", 100_000), 1),
     "pushed along": (pushed((-2.0, -0.5)), 60),
     "pushed against": (pushed((6.0, 1.0)), 150),
+    "pushed on one joint, then on the other for a moment": (one_joint_then_the_other, 80),
     "touched": (pushed((-0.5, 0.0)), 120),
     "at rest": (at_rest, 140),
     "stamps stand still": (changed("t_ns", 0), 2),
@@ -253,7 +259,8 @@ def test_whatever_disturbs_a_state_is_seen_as_step_sees_it(life, scheme, place):
     begin = REST + round(PLACES_S[place] / PERIOD_S)
     random = np.random.default_rng(sorted(PLACES_S).index(place))
     names = random.permutation(list(DISTURBANCES)).tolist()
-    for few in ([], *(names[k : k + 4] for k in range(0, len(names), 4))):
+    alone = [], ["pushed against"], ["pushed on one joint, then on the other for a moment"]
+    for few in (*alone, *(names[k : k + 4] for k in range(0, len(names), 4))):
         tail = ArmBatch(*(column[begin : begin + TAIL].copy() for column in arms))
         asked = requests[begin : begin + TAIL].copy()
         for name in few:
