@@ -97,24 +97,37 @@ def follow(arms, observations, requests, draw):
     return visited, looks
 
 
-@pytest.mark.parametrize("touched", [Observation.CONTACT, Observation.CONTACT | Observation.AT_REST])
-@pytest.mark.parametrize("cycles", [20, 200, 400])
-def test_a_contact_clears_and_loses_patience_in_its_cycle(touched, cycles):
-    """A contact, then rest; an acknowledgement waits for its end, and is too late for one that has cleared."""
-    count = 1000
+def healthy(count):
+    """Return an arm to which nothing happens, what is found of it until it monitors, and no requests."""
     observations = np.full(count, int(REST))
     observations[20] = int(Observation.ADAPTED)
-    observations[30 : 30 + cycles] = int(touched)
     zeros, ages, no = np.zeros((count, 2)), np.zeros((count, 2), dtype=np.int64), np.zeros(count, dtype=bool)
     cycle = np.arange(count)
     arms = ArmBatch(
         cycle, cycle, np.ones_like(cycle), zeros, zeros, zeros, ages, ages, ~no, ~no, no.astype(np.uint8), no
     )
-    requests = np.zeros(count, dtype=np.uint8)
+    return arms, observations, np.zeros(count, dtype=np.uint8)
+
+
+@pytest.mark.parametrize("touched", [Observation.CONTACT, Observation.CONTACT | Observation.AT_REST])
+@pytest.mark.parametrize("cycles", [20, 200, 400])
+def test_a_contact_clears_and_loses_patience_in_its_cycle(touched, cycles):
+    """A contact, then rest; an acknowledgement waits for its end, and is too late for one that has cleared."""
+    arms, observations, requests = healthy(1000)
+    observations[30 : 30 + cycles] = int(touched)
     requests[380] = Request.ACKNOWLEDGE
     states, looks = follow(arms, observations, requests, lambda: (False, False))
     assert SchemeState.REACT in states
     assert (SchemeState.STOPPED in states) == (cycles == 400)
+    assert looks < 30
+
+
+def test_a_changed_payload_waits_for_rest():
+    arms, observations, requests = healthy(300)
+    observations[40:100] = int(Observation.NONE)
+    requests[[30, 60]] = Request.PAYLOAD, Request.PAYLOAD_CHANGED
+    states, looks = follow(arms, observations, requests, lambda: (False, False))
+    assert SchemeState.PAYLOAD in states
     assert looks < 30
 
 
