@@ -10,6 +10,7 @@ it doesn't count. Absolute figures are this machine's; what grows with the lengt
 """
 
 import argparse
+import json
 import os
 import struct
 import subprocess

