@@ -125,6 +125,7 @@ def test_frames_out_of_order_and_names_are_counted(tmp_path):
         "1 error frames lose that they were FD",
     )
     assert read_frames(tmp_path / "x.blf").frames["t_ns"].tolist() == [times_ns[0], times_ns[0], times_ns[2]]
+    assert read_frames(tmp_path / "x.asc").frames["t_ns"].tolist() == [0, 0, 1_000_000]
 
 
 def test_a_run_in_lockstep_keeps_its_times_in_blf(tmp_path):
