@@ -16,7 +16,7 @@ from adacd_hil.analysis.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.attempts import Stretch
 from adacd_hil.analysis.replay_outcome import Adaptation, ContactOutcome, OutcomeGatherer, Transition
 from adacd_hil.analysis.replay_source import LogSource, Source
-from adacd_hil.analysis.scheme_comparison import TOLERANCE, Mismatch, SchemeComparison, different_arithmetic
+from adacd_hil.analysis.scheme_comparison import SHOWN, TOLERANCE, Mismatch, SchemeComparison, different_arithmetic
 from adacd_hil.analysis.truth_contacts import TrueContact, read_contacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm
@@ -156,9 +156,10 @@ class _Player:
 
     def play(self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]]) -> None:
         """Take in a stretch."""
+        ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
-        ticks = stretch.ticks
+            self.gatherer.begin(stretch.attempt, int(ticks.cycle[0]))
         batch = self._run(stretch, arms)
         texts = [event.message for event in self._pipeline.take_events()]
         self.gatherer.take(ticks, batch)
@@ -176,7 +177,6 @@ class _Player:
     def _begin(self) -> None:
         self._pipeline = pipeline_of(self.settings)
         self._state = SchemeState.INIT
-        self.gatherer.begin()
         self.attempts += 1
         if self._asking is not None:
             self._asking.begin()
@@ -220,14 +220,18 @@ def replay_source(
     progress: Progress = lambda _: None,
     tolerance: float | None = None,
     script_of: ScriptOf | None = None,
+    shown: int = SHOWN,
 ) -> list[Replay]:
-    """Replay what a source gives, once for each of the settings. Raises LogError, ConfigError, CodecError."""
+    """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
+
+    Raises LogError, ConfigError, CodecError.
+    """
     if tolerance is None:
         tolerance = TOLERANCE if different_arithmetic(source.metadata) else 0.0
     is_scripted = source.metadata.get("operator", SCRIPTED if not source.metadata else "") == SCRIPTED
     players = []
     for settings in variants:
-        comparison = SchemeComparison(settings, tolerance) if settings == source.settings else None
+        comparison = SchemeComparison(settings, tolerance, shown) if settings == source.settings else None
         asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
         players.append(_Player(settings, truth, comparison, asking))
     decoders = _Decoders(source.codec, variants)
