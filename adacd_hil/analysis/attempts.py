@@ -26,8 +26,9 @@ Places = NDArray[np.int64]
 class Stretch(NamedTuple):
     """Cycles of one attempt that follow each other without a gap in the log.
 
-    `attempt`: its number in the run, from 0; `is_begin`: the attempt begins with it. `is_exact`: nothing of the attempt is missing so far, so that a replay has
-    to come to the same. requests (n,) of Request, None where nobody knows them; scheme: the records of /scheme (n,).
+    `attempt`: its number in the run, from 0; `is_begin`: it begins with this. `is_exact`: nothing of it is missing so
+    far, so that a replay has to come to the same. requests (n,) of Request, None where nobody knows them; scheme: the
+    records of /scheme (n,).
     """
 
     attempt: int

@@ -21,8 +21,8 @@ from adacd_hil.analysis.truth_contacts import TrueContact, read_contacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm
 from adacd_hil.log.reader import LoggedContact
-from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeState
-from adacd_hil.scheme.batch import SchemeBatch
+from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
+from adacd_hil.scheme.batch import SchemeBatch, arm_at
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.pipeline import Pipeline
 from adacd_hil.scheme.selection import pipeline_of
@@ -185,16 +185,15 @@ class _Player:
         """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
         if stretch.requests is not None:
             return self._pipeline.run(arms, stretch.requests)
-        batches = []
+        outputs = []
         for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
             request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
-            one = ArmBatch(**{name: column[row : row + 1] for name, column in arms._asdict().items()})
-            batch = self._pipeline.run(one, np.array([request], np.uint8))
-            self._state = SchemeState(batch.state[0])
+            output = self._pipeline.step(arm_at(arms, row), request)
+            self._state = output.state
             if self._asking is not None:
                 self._asking.note(cycle, self._state)
-            batches.append(batch)
-        return _stack(batches)
+            outputs.append(output)
+        return _columns(outputs)
 
     def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
         """Compare the reports of a part; exact: from when to when, ns, it can be compared."""
@@ -204,13 +203,20 @@ class _Player:
         self._reports, self._cycles = {}, {}
 
 
-def _stack(batches: Sequence[SchemeBatch]) -> SchemeBatch:
-    """Put batches of one cycle each behind each other."""
-    plain = [name for name in SchemeBatch._fields if name not in ("contacts", "contact_places")]
-    columns = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in plain}
-    contacts = [(row, report) for row, batch in enumerate(batches) for report in batch.contacts]
-    places = np.array([row for row, _ in contacts], np.int64)
-    return SchemeBatch(**columns, contacts=[report for _, report in contacts], contact_places=places)
+def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
+    """Put the decisions of single cycles into columns."""
+    states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
+    wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
+    columns: dict[str, Any] = {
+        name: np.array([getattr(output, name) for output in outputs], kind) for name, kind in wholes
+    }
+    contacts = {row: output.contact for row, output in enumerate(outputs) if output.contact is not None}
+    return SchemeBatch(
+        **columns,
+        block=np.array([output.block for output in outputs]),
+        contacts=list(contacts.values()),
+        contact_places=np.array(list(contacts), np.int64),
+    )
 
 
 def replay_source(

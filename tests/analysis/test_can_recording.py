@@ -40,7 +40,7 @@ def test_without_the_log_the_script_plays_the_user(log: Path, whole: Replay, tmp
     assert found.notes == ()
 
 
-def test_a_recording_that_begins_later_is_found_in_the_run_and_what_it_lacks_is_said(
+def test_a_recording_that_begins_later_is_found_in_its_run_and_what_it_lacks_is_said(
     log: Path, whole: Replay, tmp_path: Path
 ) -> None:
     path = tmp_path / "bus.log"
