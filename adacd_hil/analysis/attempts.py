@@ -26,10 +26,12 @@ Places = NDArray[np.int64]
 class Stretch(NamedTuple):
     """Cycles of one attempt that follow each other without a gap in the log.
 
-    `is_begin`: the attempt begins with it. `is_exact`: nothing of the attempt is missing so far, so that a replay has
-    to come to the same. requests (n,) of Request, None where nobody knows them; scheme: the records of /scheme (n,).
+    `attempt`: its number in the run, from 0; `is_begin`: it begins with this. `is_exact`: nothing of it is missing so
+    far, so that a replay has to come to the same. requests (n,) of Request, None where nobody knows them; scheme: the
+    records of /scheme (n,).
     """
 
+    attempt: int
     is_begin: bool
     is_exact: bool
     ticks: Ticks
@@ -58,6 +60,7 @@ class AttemptSplitter:
         self._epoch_ns = epoch_ns
         self._frames: NDArray[Any] | None = None  # of an attempt whose first cycle is yet to come
         self._has_begun = False
+        self._attempt = -1
         self._is_exact = False
         self._last = (-1, 0, int(SchemeState.INIT))  # cycle, overruns and state before
         self._tail = np.zeros(0, np.uint8)  # counters of the SYNCs after that cycle
@@ -125,13 +128,16 @@ class AttemptSplitter:
         for start, end, first, last in zip(bounds[:-1], bounds[1:], places, [*places[1:], len(frames)], strict=True):
             if is_begin[start]:
                 self._has_begun = self._is_exact = True
+                self._attempt += 1
             if is_gap[start]:
                 self._is_exact = False
                 self.gaps.append(Gap(int(number[start]), int(t_ns[start]), int(steps[start] - 1 - skipped[start])))
             if not self._has_begun:
                 self.headless_cycles += end - start
+                self._attempt = 0
                 continue
             yield Stretch(
+                attempt=self._attempt,
                 is_begin=bool(is_begin[start]),
                 is_exact=self._is_exact,
                 ticks=Ticks(number[start:end], t_ns[start:end], periods[start:end]),

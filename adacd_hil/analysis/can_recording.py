@@ -11,6 +11,7 @@ which the drives are told to be off are taken for the host's disabling, in which
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -238,14 +239,16 @@ class RecordingAlone:
         self._is_headless = 0 not in begins
         begins.setdefault(0, 0)
         starts = sorted(begins)
-        for start, end in zip(starts, [*starts[1:], len(number)], strict=True):
+        for attempt, (start, end) in enumerate(pairwise([*starts, len(number)])):
             mine = frames[begins[start] : begins.get(end, len(frames))]
             kept = end - _disabling(mine, t_ns[start:end], self.codec)
             if kept > start:
                 ticks = Ticks(
                     number[start:kept], t_ns[start:kept], np.diff(number[start:kept], prepend=number[start] - 1)
                 )
-                yield Stretch(is_begin=True, is_exact=False, ticks=ticks, frames=mine, requests=None, scheme=None)
+                yield Stretch(
+                    attempt=attempt, is_begin=True, is_exact=False, ticks=ticks, frames=mine, requests=None, scheme=None
+                )
 
     def notes(self) -> list[str]:
         """Say what is missing."""

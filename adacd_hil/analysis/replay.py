@@ -16,13 +16,13 @@ from adacd_hil.analysis.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.attempts import Stretch
 from adacd_hil.analysis.replay_outcome import Adaptation, ContactOutcome, OutcomeGatherer, Transition
 from adacd_hil.analysis.replay_source import LogSource, Source
-from adacd_hil.analysis.scheme_comparison import TOLERANCE, Mismatch, SchemeComparison, different_arithmetic
+from adacd_hil.analysis.scheme_comparison import SHOWN, TOLERANCE, Mismatch, SchemeComparison, different_arithmetic
 from adacd_hil.analysis.truth_contacts import TrueContact, read_contacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm
 from adacd_hil.log.reader import LoggedContact
-from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeState
-from adacd_hil.scheme.batch import SchemeBatch
+from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
+from adacd_hil.scheme.batch import SchemeBatch, arm_at
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.pipeline import Pipeline
 from adacd_hil.scheme.selection import pipeline_of
@@ -156,9 +156,10 @@ class _Player:
 
     def play(self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]]) -> None:
         """Take in a stretch."""
+        ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
-        ticks = stretch.ticks
+            self.gatherer.begin(stretch.attempt, int(ticks.cycle[0]))
         batch = self._run(stretch, arms)
         texts = [event.message for event in self._pipeline.take_events()]
         self.gatherer.take(ticks, batch)
@@ -176,7 +177,6 @@ class _Player:
     def _begin(self) -> None:
         self._pipeline = pipeline_of(self.settings)
         self._state = SchemeState.INIT
-        self.gatherer.begin()
         self.attempts += 1
         if self._asking is not None:
             self._asking.begin()
@@ -185,16 +185,15 @@ class _Player:
         """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
         if stretch.requests is not None:
             return self._pipeline.run(arms, stretch.requests)
-        batches = []
+        outputs = []
         for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
             request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
-            one = ArmBatch(**{name: column[row : row + 1] for name, column in arms._asdict().items()})
-            batch = self._pipeline.run(one, np.array([request], np.uint8))
-            self._state = SchemeState(batch.state[0])
+            output = self._pipeline.step(arm_at(arms, row), request)
+            self._state = output.state
             if self._asking is not None:
                 self._asking.note(cycle, self._state)
-            batches.append(batch)
-        return _stack(batches)
+            outputs.append(output)
+        return _columns(outputs)
 
     def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
         """Compare the reports of a part; exact: from when to when, ns, it can be compared."""
@@ -204,13 +203,20 @@ class _Player:
         self._reports, self._cycles = {}, {}
 
 
-def _stack(batches: Sequence[SchemeBatch]) -> SchemeBatch:
-    """Put batches of one cycle each behind each other."""
-    plain = [name for name in SchemeBatch._fields if name not in ("contacts", "contact_places")]
-    columns = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in plain}
-    contacts = [(row, report) for row, batch in enumerate(batches) for report in batch.contacts]
-    places = np.array([row for row, _ in contacts], np.int64)
-    return SchemeBatch(**columns, contacts=[report for _, report in contacts], contact_places=places)
+def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
+    """Put the decisions of single cycles into columns."""
+    states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
+    wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
+    columns: dict[str, Any] = {
+        name: np.array([getattr(output, name) for output in outputs], kind) for name, kind in wholes
+    }
+    contacts = {row: output.contact for row, output in enumerate(outputs) if output.contact is not None}
+    return SchemeBatch(
+        **columns,
+        block=np.array([output.block for output in outputs]),
+        contacts=list(contacts.values()),
+        contact_places=np.array(list(contacts), np.int64),
+    )
 
 
 def replay_source(
@@ -220,14 +226,18 @@ def replay_source(
     progress: Progress = lambda _: None,
     tolerance: float | None = None,
     script_of: ScriptOf | None = None,
+    shown: int = SHOWN,
 ) -> list[Replay]:
-    """Replay what a source gives, once for each of the settings. Raises LogError, ConfigError, CodecError."""
+    """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
+
+    Raises LogError, ConfigError, CodecError.
+    """
     if tolerance is None:
         tolerance = TOLERANCE if different_arithmetic(source.metadata) else 0.0
     is_scripted = source.metadata.get("operator", SCRIPTED if not source.metadata else "") == SCRIPTED
     players = []
     for settings in variants:
-        comparison = SchemeComparison(settings, tolerance) if settings == source.settings else None
+        comparison = SchemeComparison(settings, tolerance, shown) if settings == source.settings else None
         asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
         players.append(_Player(settings, truth, comparison, asking))
     decoders = _Decoders(source.codec, variants)

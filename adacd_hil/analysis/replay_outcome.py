@@ -75,7 +75,8 @@ class OutcomeGatherer:
         self.theta_hat: tuple[float, ...] = ()
         self.state = SchemeState.INIT
         self._settings = settings
-        self._contacts = contacts
+        self._contacts = None if contacts is None else list(contacts)
+        self._attempt = 0
         self._theta = layout_of(settings).slices["theta_hat"]
         self._threshold = layout_of(settings).slices["threshold"]
         self._began: tuple[int, int] | None = None  # cycle and time of the adaptation in progress
@@ -113,8 +114,10 @@ class OutcomeGatherer:
         self.state = SchemeState(batch.state[-1])
 
     def _mark_onsets(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        contacts = self._contacts or ()
-        while self._next < len(contacts) and contacts[self._next].onset <= ticks.cycle[-1]:
+        contacts = self._contacts or []
+        while self._next < len(contacts) and contacts[self._next].attempt < self._attempt:
+            self._next += 1  # nobody cycled
+        while self._next < len(contacts) and self._is_by(contacts[self._next], int(ticks.cycle[-1])):
             row = int(np.searchsorted(ticks.cycle, contacts[self._next].onset))
             configured = np.array(self._settings.detector.threshold_Nm)
             threshold = batch.block[row, self._threshold]
@@ -124,6 +127,9 @@ class OutcomeGatherer:
                 np.where(np.isfinite(threshold), threshold, configured),
             )
             self._next += 1
+
+    def _is_by(self, contact: TrueContact, cycle: int) -> bool:
+        return contact.attempt == self._attempt and contact.onset <= cycle
 
     def _enter(self, transition: Transition, theta_hat: Vector) -> None:
         self.transitions.append(transition)
@@ -143,9 +149,14 @@ class OutcomeGatherer:
             self.adaptations.append(Adaptation(self._began[1], None, self.theta_hat))
             self._began = None
 
-    def begin(self) -> None:
-        """Begin another attempt."""
+    def begin(self, attempt: int, cycle: int) -> None:
+        """Begin an attempt, by its number in the run and its first cycle."""
         self._give_up()
+        self._attempt = attempt
+        if self._contacts is not None:
+            self._contacts = [
+                contact.counted_from(cycle) if contact.attempt == attempt else contact for contact in self._contacts
+            ]
         self._was_over = False
 
     def end(self) -> None:

@@ -20,6 +20,7 @@ from adacd_hil.wire.codec import Codec, parse_codec
 
 FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
 TOPICS: Final = (*FRAME_TOPICS, "/scheme", "/cycle", "/contact", "/events")
+CYCLES_PER_PIECE: Final = 20_000
 _MARGIN: Final = "margin"
 """Name of the events that the scheme itself says."""
 
@@ -49,9 +50,9 @@ class Part(NamedTuple):
 class LogSource:
     """A log of ours."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
         """Open the log. Raises LogError, ConfigError, CodecError."""
-        self._stream = LogStream(path, TOPICS)
+        self._stream = LogStream(path, TOPICS, cycles_per_piece)
         self._path = path
         self.metadata: Mapping[str, str] = self._stream.metadata
         self.settings = settings_of(path, self._stream.attachments)

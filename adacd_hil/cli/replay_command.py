@@ -64,7 +64,8 @@ def replay(
     progress = Progress()
     try:
         results = [
-            _replay_one(path, changes, vary, (config, profile, dbc), against, tolerance, progress) for path in logs
+            _replay_one(path, changes, vary, (config, profile, dbc), against, tolerance, shown, progress)
+            for path in logs
         ]
     finally:
         progress.close()
@@ -87,6 +88,7 @@ def _replay_one(
     configured: tuple[str | None, str | None, Path | None],
     against: Path | None,
     tolerance: float | None,
+    shown: int,
     progress: Any,
 ) -> _Result:
     from adacd_hil.analysis.replay import contacts_beside, replay_source
@@ -107,7 +109,7 @@ def _replay_one(
     progress(f"replaying {given}" + (f" with {len(variants)} other settings" if variants else ""))
     truth = contacts_beside(_log_of(against or given))
     settings: list[Settings] = [own, *variants.values()]
-    return given, replay_source(source, settings, truth, progress, tolerance, ScriptedOperator), list(variants)
+    return given, replay_source(source, settings, truth, progress, tolerance, ScriptedOperator, shown), list(variants)
 
 
 def _log_of(given: Path) -> Path:

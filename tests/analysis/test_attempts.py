@@ -1,0 +1,98 @@
+"""What belongs together in a log: attempts, gaps, skipped periods."""
+
+import numpy as np
+
+from adacd_hil.analysis.attempts import AttemptSplitter
+from adacd_hil.log.channels import run_channels
+from adacd_hil.log.mcap_walk import record_dtype
+from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, Series
+from adacd_hil.log.stream import Piece
+from adacd_hil.records import SchemeState
+
+DTYPES = {channel.topic: record_dtype(channel.type.dtype) for channel in run_channels(7) if channel.type.fields}
+M, F, N = SchemeState.MONITOR, SchemeState.FAULT, SchemeState.INIT
+SYNC, NMT, RESET = 0x080, 0x000, 0x82
+
+
+def piece(rows, frames=(), dtype=FRAME_DTYPE) -> Piece:
+    """Rows: cycle, overruns, state before, state. Frames: time in ms, identifier, first byte."""
+    scheme, cycle = (np.zeros(len(rows), DTYPES[topic]) for topic in ("/scheme", "/cycle"))
+    for k, (number, overruns, previous, state) in enumerate(rows):
+        for records in (scheme, cycle):
+            records["publish_time"][k] = number * 1_000_000
+            records["cycle"][k] = number
+        cycle["overruns"][k] = overruns
+        scheme["previous_state"][k], scheme["state"][k] = previous, state
+    passed = np.zeros(len(frames), dtype)
+    for k, (t_ms, can_id, byte) in enumerate(frames):
+        passed["cycle_t_ns"][k] = round(t_ms * 1_000_000)
+        passed["can_id"][k], passed["length"][k], passed["is_tx"][k] = can_id, 2, True
+        passed["data"][k, 0] = byte
+    return Piece({"/scheme": Series(scheme, 0), "/cycle": Series(cycle, 0)}, passed, {})
+
+
+def test_skipped_periods_are_no_gap() -> None:
+    splitter = AttemptSplitter(0)
+    (stretch,) = splitter.split(piece([(0, 0, N, N), (1, 0, N, M), (4, 2, M, M), (5, 2, M, M)]))
+    assert stretch.ticks.periods.tolist() == [1, 1, 3, 1]
+    assert stretch.is_begin
+    assert stretch.is_exact
+    assert splitter.gaps == []
+
+
+def test_cycles_that_are_missing_are_a_gap_and_the_time_goes_on() -> None:
+    splitter = AttemptSplitter(0)
+    before, after = splitter.split(piece([(0, 0, N, N), (1, 0, N, M), (9, 2, M, M), (10, 2, M, M)]))
+    assert (before.is_exact, after.is_exact, after.is_begin) == (True, False, False)
+    assert after.ticks.periods.tolist() == [8, 1]
+    assert [gap[0] for gap in splitter.gaps] == [9]
+    assert splitter.gaps[0].missing == 5
+
+
+def test_a_reset_begins_an_attempt_also_at_the_border_of_pieces_and_before_longer_frames() -> None:
+    splitter = AttemptSplitter(0)
+    first = piece([(0, 0, N, N), (1, 0, M, F)], [(0, SYNC, 1), (1, SYNC, 2), (2, SYNC, 3), (9, NMT, RESET)])
+    second = piece([(20, 0, N, N)], [(20, SYNC, 21)], LONG_FRAME_DTYPE)
+    (before,) = splitter.split(first)
+    (after,) = splitter.split(second)
+    assert (before.attempt, after.attempt) == (0, 1)
+    assert after.is_begin
+    assert after.is_exact
+    assert before.frames["can_id"].tolist() == [SYNC] * 3
+    assert after.frames["can_id"].tolist() == [NMT, SYNC]
+    assert after.frames["data"][:, 0].tolist() == [RESET, 21]
+
+
+def test_periods_skipped_while_the_drives_were_disabled_dont_count_for_the_next_attempt() -> None:
+    frames = [(0, SYNC, 1), (1, SYNC, 2), (2, SYNC, 3), (5, SYNC, 6), (9, NMT, RESET), (21, SYNC, 22)]
+    rows = [(0, 0, N, N), (1, 0, M, F), (21, 3, N, N)]
+    _, after = AttemptSplitter(0).split(piece(rows, frames))
+    assert after.ticks.periods.tolist() == [2]  # of the three, two were skipped before the SYNC with counter 6
+
+
+def test_a_begin_whose_first_cycles_are_missing_is_not_compared() -> None:
+    splitter = AttemptSplitter(0)
+    (stretch,) = splitter.split(piece([(700, 0, M, M)], [(0, NMT, RESET)]))
+    assert stretch.is_begin
+    assert not stretch.is_exact
+    assert splitter.gaps[0].missing == 700
+
+
+def test_what_begins_in_the_middle_is_left_out() -> None:
+    splitter = AttemptSplitter(0)
+    assert list(splitter.split(piece([(700, 0, M, M), (701, 0, M, M)]))) == []
+    assert splitter.headless_cycles == 2
+
+
+def test_after_a_fault_a_scheme_that_begins_anew_is_an_attempt_even_if_the_frames_are_lost() -> None:
+    before, after = AttemptSplitter(0).split(piece([(0, 0, N, N), (1, 0, M, F), (2, 0, N, N)]))
+    assert (before.attempt, after.attempt, after.is_begin) == (0, 1, True)
+
+
+def test_records_without_their_counterpart_are_counted() -> None:
+    whole = piece([(0, 0, N, N), (1, 0, N, M)])
+    series = {**whole.series, "/cycle": Series(whole.series["/cycle"].records[:1], 0)}
+    splitter = AttemptSplitter(0)
+    (stretch,) = splitter.split(whole._replace(series=series))
+    assert stretch.ticks.cycle.tolist() == [0]
+    assert splitter.unpaired == 1

@@ -1,0 +1,72 @@
+"""Two logs beside each other: what differs is named with the first cycle, contacts are matched by time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from log.recorded_run import make_run, record
+
+from adacd_hil.analysis.log_comparison import MATCH_S, compare_logs, match_contacts
+from adacd_hil.analysis.run_digest import Detection
+from adacd_hil.analysis.what_if import apply_settings
+from adacd_hil.config import load_settings, to_toml
+
+SETTINGS = load_settings("paper")
+
+
+def write(folder: Path, count: int = 40, change=None, settings=SETTINGS) -> Path:
+    run = make_run(count)
+    run.attachments["config.toml"] = to_toml(settings).encode()
+    if change is not None:
+        change(run)
+    folder.mkdir()
+    record(folder / "run.mcap", run)
+    return folder / "run.mcap"
+
+
+def contact(time_s: float) -> Detection:
+    return Detection(time_s, 1, 2, 0, (0.0, 0.0), 0.0)
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A log, and one that is shorter, with other settings and some other values."""
+
+    def change(run) -> None:
+        for number in (7, 9, 12):
+            run.cycles[number].output.block[1] += 0.25 * number  # q of joint 2
+        run.cycles[5].output.block[4] = np.nan
+
+    folder = tmp_path_factory.mktemp("compared")
+    other = apply_settings(SETTINGS, {"filter.a_rad_s": "20"})
+    return write(folder / "a"), write(folder / "b", 25, change, other)
+
+
+def test_a_log_is_the_same_as_itself(paths: tuple[Path, Path]) -> None:
+    found = compare_logs(paths[0], paths[0])
+    assert found.is_same
+    assert (found.cycles, found.fields, found.settings, found.notes) == (40, (), {}, ())
+
+
+def test_what_differs_is_named_with_its_first_cycle_and_by_how_much(paths: tuple[Path, Path]) -> None:
+    found = compare_logs(*paths)
+    missing, q = found.fields
+    assert (missing.field, missing.first_cycle, missing.cycles, missing.largest) == ("tau_J", 5, 1, np.inf)
+    assert (q.field, q.first_cycle, q.cycles) == ("q", 7, 3)
+    assert q.largest == pytest.approx(3.0)
+    assert q.first_s == pytest.approx((7 - 3) * 1e-3)  # the first cycle in ADAPT is 3
+    assert not found.is_same
+    assert found.settings == {"filter.a_rad_s": ("10.0", "20.0")}
+    assert (found.cycles, found.only) == (25, (15, 0))
+
+
+def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> None:
+    first = [contact(1.0), contact(5.0), contact(9.0)]
+    second = [contact(1.0 + 0.9 * MATCH_S), contact(1.1), contact(5.0 + 1.1 * MATCH_S)]
+    assert match_contacts(first, second) == [
+        (first[0], second[1]),
+        (None, second[0]),
+        (first[1], None),
+        (None, second[2]),
+        (first[2], None),
+    ]

@@ -1,0 +1,163 @@
+"""A log is replayed: the same bits come out, and what isn't the same, or isn't there, is named."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
+
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.replay import Replay, contacts_beside, replay, replay_many, replay_source
+from adacd_hil.analysis.report import RUN_TOPICS, run_from_log
+from adacd_hil.analysis.what_if import apply_settings
+from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import read_log
+from adacd_hil.records import FaultReason, SchemeState
+
+pytestmark = pytest.mark.slow
+
+
+def changed(log: Path, change, cycles_per_piece: int = 20_000):
+    source = ChangedLog(log, change, cycles_per_piece)
+    return replay_source(source, [source.settings], script_of=ScriptedOperator, shown=50)[0]
+
+
+def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log: Path, whole: Replay) -> None:
+    found = whole
+    assert found.mismatches == ()
+    assert found.is_identical
+    assert found.is_whole
+    assert found.attempts == 2
+    assert found.compared == found.cycles == len(read_log(log, ("/scheme",)).scheme)
+    assert [each.fault for each in found.states if each.state is SchemeState.FAULT] == [FaultReason.DRIVE]
+    assert len(found.contacts) == len(read_log(log, ("/contact",)).contacts) > 0
+
+
+def test_where_the_log_is_cut_into_pieces_doesnt_matter(log: Path, whole: Replay) -> None:
+    found = changed(log, lambda piece: piece, cycles_per_piece=333)
+    assert (found.mismatches, found.attempts, found.notes) == ((), 2, ())
+    assert found.states == whole.states
+
+
+def test_every_flipped_bit_is_found_and_named(log: Path) -> None:
+    """A bit of every field of /scheme, of one value of each, each in a cycle of its own."""
+    fields = read_log(log, ("/scheme",)).scheme.records.dtype
+    names = [name for name in fields.names if name not in ("record_length", "log_time", "publish_time", "sec")]
+    places = {name: (300 + 7 * k, max(int(np.prod(fields[name].shape)), 1) - 1) for k, name in enumerate(names)}
+
+    def change(piece):
+        records = writable(piece.series["/scheme"])
+        for name, (row, element) in places.items():
+            flip(records, row, name, element)
+        return with_records(piece, "/scheme", records)
+
+    found = changed(log, change)
+    named = {"nanosec": "stamp_ns"}
+    assert {(each.topic, each.field, each.cycle) for each in found.mismatches} == {
+        ("/scheme", named.get(name, name), row) for name, (row, _) in places.items()
+    }
+    assert found.mismatch_count == len(names)
+    by_field = {each.field: each for each in found.mismatches}
+    assert by_field["q"].place == "joint 2"
+    assert by_field["theta_hat"].place == "F_c2"
+    assert by_field["q"].logged != by_field["q"].replayed
+    assert by_field["request"].logged == "1"
+    assert "/scheme.state" in by_field["state"].line()
+
+
+def test_a_flipped_bit_of_any_field_of_a_contact_report_is_found_and_named(log: Path) -> None:
+    names: list[str] = []
+
+    def change(piece):
+        records = writable(piece.series["/contact"])
+        skipped = ("record_length", "log_time", "publish_time", "sec", "nanosec")
+        names.extend(name for name in records.dtype.names if name not in skipped)
+        for name in names:
+            flip(records, 0, name)
+        return with_records(piece, "/contact", records)
+
+    found = changed(log, change)
+    assert {(each.topic, each.field) for each in found.mismatches} == {("/contact", name) for name in names}
+
+
+def test_a_report_that_is_not_in_the_log_is_named(log: Path) -> None:
+    found = changed(log, lambda piece: with_records(piece, "/contact", piece.series["/contact"].records[1:]))
+    (mismatch,) = found.mismatches
+    assert (mismatch.name, mismatch.logged, mismatch.replayed) == ("/contact.report", "no report", "a report")
+
+
+def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(log: Path, whole: Replay) -> None:
+    found = changed(log, without_cycles(700, 725), cycles_per_piece=1000)
+    number = read_log(log, ("/cycle",)).cycle["cycle"].astype(int)
+    assert found.mismatches == ()
+    assert found.compared == 700 + (number > number[np.argmax(np.diff(number))]).sum()
+    assert found.cycles == whole.cycles - 25
+    assert any("25 cycles with their frames are missing before cycle 725" in note for note in found.notes)
+    assert not found.is_whole
+
+
+def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log: Path) -> None:
+    found = changed(log, without_cycles(0, 500), cycles_per_piece=1000)
+    assert found.attempts == 1 or found.compared < found.cycles
+    assert found.mismatches == ()
+    assert found.compared > 1000
+    assert not found.is_whole
+
+
+def test_a_cut_log_is_compared_as_far_as_it_goes(log: Path, whole: Replay, tmp_path: Path) -> None:
+    content = log.read_bytes()
+    cut = tmp_path / "run.mcap"
+    cut.write_bytes(content[: len(content) * 2 // 3])
+    found = replay(cut)
+    assert found.mismatches == ()
+    assert 1000 < found.compared < whole.compared
+    assert any("not whole" in note for note in found.notes)
+
+
+def test_what_a_replay_says_of_contacts_is_what_the_report_says(log: Path, whole: Replay) -> None:
+    truth = read_log(log.with_name("truth.mcap"), ("/truth",))
+    cycle = truth.truth.records["cycle"]
+    cycle[np.argmax(np.diff(cycle.astype(int)) < 0) + 1 :] += 1200  # of the second attempt, as the host counts
+    metrics = evaluate(run_from_log(read_log(log, RUN_TOPICS), truth))
+    found = whole
+    assert found.true_contacts is not None
+    assert [each.delay_ms for each in found.true_contacts] == pytest.approx([c.delay_ms for c in metrics.contacts])
+    assert [each.link for each in found.true_contacts] == [contact.link for contact in metrics.contacts]
+    assert found.false_alarms == metrics.false_alarms
+    assert found.missed == metrics.missed
+    assert found.adaptation_s == pytest.approx(list(metrics.adaptation_s.values()))
+
+
+def test_other_settings_decide_otherwise_about_the_same_motion(log: Path) -> None:
+    own = settings_of_run()
+    own = apply_settings(own, {"realtime.sample_period": "nominal"})
+    high, deaf, fast = (
+        apply_settings(own, changes)
+        for changes in (
+            {"detector.threshold_Nm": "0.6"},
+            {"detector.threshold_Nm": "50"},
+            {"filter.a_rad_s": "50", "filter.b_rad_s": "50"},
+        )
+    )
+    tared = replace(own, arm=replace(own.arm, torque_offset_Nm=(0.5, 0.0)))
+    mine, later, never, sooner, other = replay_many(log, [own, high, deaf, fast, tared])
+    assert mine.is_identical
+    assert other.parameters != mine.parameters  # the frames were decoded once more for it
+    assert later.compared == 0
+    delays = [each.true_contacts[0].delay_ms for each in (sooner, mine, later)]
+    assert delays == sorted(delays)
+    assert len(set(delays)) == 3
+    assert never.true_contacts[0].detected_ns is None
+    assert never.missed == 1
+    assert contacts_beside(log) is not None
+
+
+def test_a_log_without_its_settings_is_refused(tmp_path: Path) -> None:
+    from log.recorded_run import make_run
+    from log.recorded_run import record as write
+
+    write(tmp_path / "run.mcap", make_run(3))
+    with pytest.raises(LogError, match=r"no config\.toml attached"):
+        replay(tmp_path / "run.mcap")

@@ -1,0 +1,107 @@
+"""`adacd-hil replay` and `compare`: what they print, and the status that they end with."""
+
+import json
+from pathlib import Path
+
+import pytest
+from analysis.flipped_log import flip_in_file
+from analysis.replay_rig import write_candump
+from click.testing import CliRunner, Result
+
+from adacd_hil.cli.main import cli
+from adacd_hil.log.reader import read_log
+
+pytestmark = pytest.mark.slow
+OK, FAILURE, USAGE, PARTIAL = 0, 1, 2, 3
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def test_an_identical_log_ends_with_status_0_and_says_so(log: Path) -> None:
+    done = run("replay", log.parent)
+    assert done.exit_code == OK
+    assert "identical, bit for bit" in done.stdout
+    assert "in 2 attempts" in done.stdout
+
+
+def test_a_flipped_bit_in_the_file_ends_with_status_1_and_the_field_is_named(log: Path, tmp_path: Path) -> None:
+    scheme = read_log(log, ("/scheme",)).scheme
+    record = scheme.records[1700:1701]
+    offset = record.dtype.fields["theta_hat"][1] - record.dtype.fields["sec"][1]
+    begin = record.tobytes()[record.dtype.fields["sec"][1] :][: offset + 8]
+    assert len(begin) > 40
+    flip_in_file(log, tmp_path / "run.mcap", begin, offset)
+    done = run("replay", tmp_path / "run.mcap", "--json")
+    (result,) = json.loads(done.stdout)
+    assert done.exit_code == FAILURE
+    assert result["mismatch_count"] == 1
+    (mismatch,) = result["mismatches"]
+    assert (mismatch["topic"], mismatch["field"], mismatch["place"]) == ("/scheme", "theta_hat", "a1")
+    assert mismatch["cycle"] == int(record["cycle"][0])
+    assert mismatch["logged"] != mismatch["replayed"]
+    assert "theta_hat[a1]" in run("replay", tmp_path / "run.mcap").stdout
+
+
+def test_a_cut_log_ends_with_status_3(log: Path, tmp_path: Path) -> None:
+    content = log.read_bytes()
+    (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])
+    done = run("replay", tmp_path)
+    assert done.exit_code == PARTIAL
+    assert "identical, bit for bit" in done.stdout
+    assert "the log is not whole" in done.stdout
+
+
+def test_other_settings_stand_beside_the_original(log: Path) -> None:
+    done = run("replay", log, "--vary", "detector.threshold_Nm=0.3,50", "--json")
+    (result,) = json.loads(done.stdout)
+    assert done.exit_code == OK
+    assert result["identical"]
+    assert [variant["name"] for variant in result["variants"]] == [
+        "detector.threshold_Nm=0.3",
+        "detector.threshold_Nm=50",
+    ]
+    assert [variant["missed"] for variant in result["variants"]] == [0, 1]
+    text = run("replay", log, "--set", "detector.threshold_Nm=50").stdout
+    assert "missed" in text
+    assert "The arm in the log moved as it did" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--set", "detector.treshold=1"), "did you mean `detector.threshold_Nm`?"),
+        (("--set", "detector"), "must be key=value"),
+        (("--config", "papper"), "did you mean 'paper'?"),
+    ],
+)
+def test_settings_that_cant_be_used_end_with_status_2(log: Path, arguments: tuple[str, ...], line: str) -> None:
+    done = run("replay", log, *arguments)
+    assert done.exit_code == USAGE
+    assert line in done.stderr
+
+
+def test_a_recording_alone_needs_a_configuration(log: Path, tmp_path: Path) -> None:
+    write_candump(log, tmp_path / "bus.log")
+    done = run("replay", tmp_path / "bus.log")
+    assert done.exit_code == USAGE
+    assert "--against the log of its run, or --config" in done.stderr
+
+
+def test_a_log_that_isnt_there_ends_with_status_1(tmp_path: Path) -> None:
+    done = run("replay", tmp_path / "none.mcap")
+    assert done.exit_code == FAILURE
+    assert "none.mcap" in done.stderr
+
+
+def test_two_logs_that_are_the_same_compare_with_status_0_and_others_with_1(log: Path, tmp_path: Path) -> None:
+    assert run("compare", log, log.parent).exit_code == OK
+    content = log.read_bytes()
+    (tmp_path / "run.mcap").write_bytes(content[: len(content) * 3 // 4])
+    done = run("compare", log, tmp_path, "--json")
+    found = json.loads(done.stdout)
+    assert done.exit_code == FAILURE
+    assert not found["is_same"]
+    assert found["only"][0] > 0
+    assert found["fields"] == []

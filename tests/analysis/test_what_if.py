@@ -1,0 +1,102 @@
+"""Settings are changed by dotted keys and TOML values, and facts of the log are kept."""
+
+from dataclasses import replace
+
+import pytest
+
+from adacd_hil.analysis.what_if import (
+    apply_settings,
+    changed_keys,
+    keep_facts,
+    parse_changes,
+    parse_variations,
+    split_list,
+)
+from adacd_hil.config import ConfigError, load_settings
+
+PAPER = load_settings("paper")
+
+
+def test_a_number_stands_for_a_list_of_it() -> None:
+    assert apply_settings(PAPER, {"detector.threshold_Nm": "0.1"}).detector.threshold_Nm == (0.1, 0.1)
+
+
+def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken() -> None:
+    changes = {
+        "detector.threshold_Nm": "[0.1, 0.2]",
+        "filter.a_rad_s": "50",
+        "estimator.law": '"gradient"',
+        "scheme": "certified",
+        "certified.cutoffs_rad_s": "[5, 20, 80]",
+        "operator.script": '[{at_s = 1.5, request = "finish"}]',
+    }
+    changed = apply_settings(PAPER, changes)
+    assert changed.detector.threshold_Nm == (0.1, 0.2)
+    assert changed.filter.a_rad_s == 50.0
+    assert changed.estimator.law == "gradient"
+    assert changed.scheme == "certified"
+    assert changed.certified.cutoffs_rad_s == (5.0, 20.0, 80.0)
+    assert [(entry.at_s, entry.request) for entry in changed.operator.script] == [(1.5, "finish")]
+    assert changed.trajectory == PAPER.trajectory
+
+
+def test_a_setting_that_is_unset_can_be_set() -> None:
+    assert apply_settings(PAPER, {"devices.quick_stop_option": "6"}).devices.quick_stop_option == 6
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "line"),
+    [
+        ("detector.treshold_Nm", "0.1", "unknown key `detector.treshold_Nm`; did you mean `detector.threshold_Nm`?"),
+        ("threshold_Nm", "0.1", "did you mean `detector.threshold_Nm`?"),
+        ("detectr.threshold_Nm", "0.1", "did you mean `detector.threshold_Nm`?"),
+        ("detector", "0.1", "`detector` is a section; its keys are detector.threshold_Nm"),
+        ("filter.a_rad_s", "-1", "`filter.a_rad_s` = -1.0 rad/s is below 0.1 rad/s"),
+        ("filter.a_rad_s", "fast", "`filter.a_rad_s` = 'fast' must be of type float"),
+        ("filter.a_rad_s", "[1", "`filter.a_rad_s` = [1 is not a TOML value"),
+        ("detector.threshold_Nm", "[0.1]", "`detector.threshold_Nm` has 1 values, 2 expected"),
+    ],
+)
+def test_a_change_that_cant_be_made_is_named(key: str, value: str, line: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        apply_settings(PAPER, {key: value})
+    assert line in str(error.value)
+
+
+def test_several_lists_of_values_give_every_combination() -> None:
+    given = ["filter.a_rad_s=10,20", "detector.threshold_Nm=[0.1, 0.2],0.3"]
+    assert parse_variations(given) == [
+        {"filter.a_rad_s": a, "detector.threshold_Nm": h} for a in ("10", "20") for h in ("[0.1, 0.2]", "0.3")
+    ]
+
+
+def test_commas_in_brackets_and_quotes_part_nothing() -> None:
+    assert split_list("""[1, 2], {a = 1, b = 2}, "x, y", 'z,', 5""") == [
+        "[1, 2]", "{a = 1, b = 2}", '"x, y"', "'z,'", "5",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("given", ["filter.a_rad_s", "=5"])
+def test_a_change_without_key_or_value_is_refused(given: str) -> None:
+    with pytest.raises(ConfigError, match="must be key=value"):
+        parse_changes([given])
+
+
+def test_another_configuration_keeps_what_made_the_numbers_of_the_log() -> None:
+    tared = replace(PAPER.arm, torque_offset_Nm=(0.3, -0.2), sign=(-1, 1))
+    own = replace(PAPER, arm=tared, bus=replace(PAPER.bus, heartbeat_ms=200))
+    own = apply_settings(own, {"realtime.sample_period": "nominal"})
+    kept = keep_facts(own, load_settings("certified"))
+    assert kept.scheme == "certified"
+    assert kept.arm.torque_offset_Nm == (0.3, -0.2)
+    assert kept.arm.sign == (-1, 1)
+    assert kept.bus == own.bus
+    assert kept.realtime.sample_period == "nominal"
+
+
+def test_changed_settings_are_listed_by_key_with_both_values() -> None:
+    other = apply_settings(PAPER, {"filter.a_rad_s": "50", "devices.quick_stop_option": "6"})
+    assert changed_keys(PAPER, other) == {
+        "filter.a_rad_s": ("10.0", "50.0"),
+        "devices.quick_stop_option": ("unset", "6"),
+    }
