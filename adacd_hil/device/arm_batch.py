@@ -35,9 +35,10 @@ _KINDS = 3 * DEVICES + 1
 _STANDARD_IDS = 0x800
 _MOST_WATCHED = 8
 _MOST_BITS = 32
+_MOST_CYCLES = 8192
+"""Cycles of one call."""
 _STATUS_BITS = 0x07
 _ALWAYS_NS = 1 << 62
-_NO_FAULT = int(FaultReason.NONE)
 
 _MESSAGE = np.dtype(
     [
@@ -138,6 +139,7 @@ class OrdinaryCycles:
         self._messages = np.zeros(2 * DEVICES, _MESSAGE)
         self._constants = np.zeros(1, _CONSTANTS)
         self._memory = np.zeros(1, _MEMORY)
+        self._values = np.zeros((_MOST_CYCLES, DEVICES, 2))
         self._kinds = np.zeros(_STANDARD_IDS, np.uint8)
         self._watched: list[_Watched] = []
         self._heartbeat_ids = [HEARTBEAT_ID + device.node_id for device in arm.devices]
@@ -244,10 +246,21 @@ class OrdinaryCycles:
         """
         if not self._begin(state):
             return _NOTHING
-        memory = self._memory
+        memory, constants, values = self._memory, self._constants[0], self._values
+        most = slice(place, place + _MOST_CYCLES)
+        ticks = batch.cycle[most], batch.t_ns[most], batch.periods[most]
         count, last = _read(
-            frames, batch, place, at, self._constants, self._messages, self._kinds, memory, state.is_enabled
+            frames, at, ticks, self._constants, self._messages, self._kinds, memory, state.is_enabled, self._values
         )
+        read = slice(place, place + count)
+        batch.q[read] = constants["sign"] * values[:count, :JOINTS, 0]
+        batch.dq[read] = constants["sign"] * values[:count, :JOINTS, 1]
+        batch.tau_J[read] = constants["sign"] * values[:count, JOINTS:, 0] - constants["torque_offset_Nm"]
+        batch.age_q[read] = batch.age_tau_J[read] = 0
+        batch.is_enabled[read] = state.is_enabled
+        batch.is_complete[read] = True
+        batch.fault[read] = FaultReason.NONE
+        batch.is_late[read] = False
         places, cycles = memory[0]["frame"].tolist(), memory[0]["frame_cycle"].tolist()
         return Stretch(count, last, [(at, cycle) for at, cycle in zip(places, cycles, strict=True) if at >= 0])
 
@@ -298,42 +311,32 @@ def _byte_count(found: MessageCodec, signal: SignalCodec) -> int:
 @released
 def _read(
     frames: FrameColumns,
-    batch: ArmBatch,
-    place: int,
     at: int,
+    ticks: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     constants: Structured,
     messages: Structured,
     kinds: NDArray[np.uint8],
     memory: Structured,
     is_enabled: bool,
+    values: NDArray[np.float64],
 ) -> tuple[int, int]:
-    """Read ordinary cycles; return how many, and where the frames of the last one begin."""
+    """Read ordinary cycles; return how many, and where the frames of the last one begin.
+
+    ticks: cycle, t_ns, periods (n,). values (n, devices, 2) gets position and velocity, and torque.
+    """
+    cycles, times_ns, periods = ticks
     found = np.empty(_KINDS, np.int64)
-    values = np.zeros((DEVICES, 2))
-    count, last = 0, at
-    while place < len(batch.cycle):
-        cycle, t_ns = batch.cycle[place], batch.t_ns[place]
-        if batch.periods[place] != 1 or cycle != memory[0]["cycle"] + 1:
-            break
-        end = _check(frames, t_ns, at, constants, messages, kinds, memory, found, values)
+    last = at
+    for place in range(len(cycles)):
+        cycle, t_ns = cycles[place], times_ns[place]
+        if periods[place] != 1 or cycle != memory[0]["cycle"] + 1:
+            return place, last
+        end = _check(frames, t_ns, at, constants, messages, kinds, memory, found, values[place])
         if end < 0 or _is_old(frames, cycle, t_ns, constants, messages, memory, found, is_enabled):
-            break
-        _keep(frames, cycle, t_ns, messages, memory, found, values)
-        for joint in range(JOINTS):
-            sign = constants[0]["sign"][joint]
-            batch.q[place, joint] = sign * values[joint, 0]
-            batch.dq[place, joint] = sign * values[joint, 1]
-            batch.tau_J[place, joint] = sign * values[JOINTS + joint, 0] - constants[0]["torque_offset_Nm"][joint]
-            batch.age_q[place, joint] = 0
-            batch.age_tau_J[place, joint] = 0
-        batch.is_enabled[place] = is_enabled
-        batch.is_complete[place] = True
-        batch.fault[place] = _NO_FAULT
-        batch.is_late[place] = False
+            return place, last
+        _keep(frames, cycle, t_ns, messages, memory, found, values[place])
         last, at = at, end
-        place += 1
-        count += 1
-    return count, last
+    return len(cycles), last
 
 
 @compiled

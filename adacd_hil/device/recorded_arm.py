@@ -42,7 +42,8 @@ class Ticks(NamedTuple):
     """The beginnings of n cycles, as columns (n,) of int64.
 
     `t_ns`: when SYNC went out or came, as all messages of the cycle carry it; so do its frames, as cycle_t_ns.
-    `periods`: since the cycle before, 1 unless some were skipped.
+    `periods`: since the cycle before, 1 unless some were skipped: one more than the step of /cycle's overruns. Where an
+    attempt begins again it is taken for 1, since the pause before it was meant.
     """
 
     cycle: NDArray[np.int64]
@@ -64,6 +65,7 @@ class RecordedArm:
         self._settings, self._codec = settings, codec
         self._is_following = settings.bus.follows
         self._devices = place_devices(settings)
+        self._has_begun_again = False
         self._begin()
 
     def _begin(self) -> None:
@@ -134,7 +136,7 @@ class RecordedArm:
 
     def _exchange(self, batch: ArmBatch, place: int, passed: _Passed) -> None:
         """Do what Exchange.read did with the frames of a cycle, and judge the state as the cycle did."""
-        cycle, t_ns, periods = (int(column[place]) for column in (batch.cycle, batch.t_ns, batch.periods))
+        t_ns = int(batch.t_ns[place])
         sync_at = self._find_sync(passed, t_ns)
         self._pass(passed[:sync_at])
         if not self._is_running:  # a log whose beginning was cut off
@@ -142,7 +144,9 @@ class RecordedArm:
         arm = self._arm
         if arm.cycle < 0:
             self.beginnings.append(place)
-        arm.synchronise(cycle, t_ns, periods)
+            if self._has_begun_again:
+                batch.periods[place] = 1
+        arm.synchronise(int(batch.cycle[place]), t_ns, int(batch.periods[place]))
         for is_sent, frame in passed[sync_at:]:
             if not is_sent:
                 self._accept(frame, is_late=frame.t_ns < t_ns)
@@ -174,6 +178,7 @@ class RecordedArm:
         if nmt_command == RESET_COMMUNICATION:
             if self._is_running:
                 self._begin()
+                self._has_begun_again = True
             self._is_booting = True
         elif nmt_command == START and not self._is_running:
             self._start()
