@@ -163,6 +163,15 @@ def test_a_damaged_attachment_is_left_out(tmp_path):
     assert (len(messages), recovery.losses.attachments) == (COUNT, 1)
 
 
+def test_an_attachment_whose_crc_was_zeroed_with_it_is_left_out(tmp_path):
+    """A CRC of 0 says that there is none."""
+    place = WHOLE.index(b"x = 1")
+    data = WHOLE[: place + 3] + bytes(7) + WHOLE[place + 10 :]
+    recovery, _, attachments, _ = recovered(tmp_path, data)
+    assert attachments == {"arm.dbc": ATTACHMENTS["arm.dbc"]}
+    assert recovery.losses.attachments == 1
+
+
 def test_what_no_crc_vouches_for_is_saved_only_while_the_whole_fits_its_own(tmp_path):
     """Chunks without CRC, and messages outside of chunks."""
     parts = take_apart(WHOLE)
