@@ -118,11 +118,11 @@ def test_without_first_chunk_and_summary_no_message_is_saved(tmp_path):
     assert recovery.is_lossy
 
 
-@pytest.mark.parametrize("place", [1, 8])
-def test_records_are_found_again_behind_a_length_that_is_wrong(place, whole, tmp_path):
-    """The length of the first message index, or its opcode; the chunk before and all behind are intact."""
+@pytest.mark.parametrize(("place", "bit"), [(1, 4), (1, 3), (8, 4)])
+def test_records_are_found_again_behind_a_length_that_is_wrong(place, bit, whole, tmp_path):
+    """Too small, too large, beyond the file, of the first message index; the chunk before and all behind are intact."""
     part = kinds(take_apart(WHOLE), Opcode.MESSAGE_INDEX)[0]
-    recovery, messages, _, _ = recovered(tmp_path, flipped(WHOLE, part.offset + place, 4))
+    recovery, messages, _, _ = recovered(tmp_path, flipped(WHOLE, part.offset + place, bit))
     assert messages == whole[0]
     assert not recovery.is_lossy
     assert recovery.losses.bytes == 9 + len(part.body)
