@@ -169,6 +169,7 @@ BROKEN = {
         {"unindexed-messages", "statistics", "counts"},
     ),
     "chunk-index": (operated(put(Opcode.CHUNK_INDEX, 24, "<Q", 5)), {"chunk-index"}),
+    "chunk-index, offsets": (operated(put(Opcode.CHUNK_INDEX, 38, "<Q", 5)), {"chunk-index"}),
     "chunk-index, one gone": (operated(without(Opcode.CHUNK_INDEX, 1)), {"chunk-index", "summary-offset"}),
     "chunk-index, twice": (operated(twice_indexed), {"chunk-index", "summary-offset"}),
     "no-chunk-index": (operated(without(Opcode.CHUNK_INDEX)), {"no-chunk-index", "summary-offset"}),
