@@ -25,8 +25,10 @@ VICTIMS = ("writer", "control", "both")
 LOSS_BOUND_S = 0.3
 MOST_S = 4.0
 """Latest moment to kill, after the first cycles are on the disk."""
-START_S = 120.0
-"""Longest until then: everything is compiled before."""
+START_S = 600.0
+"""Longest until then: everything is compiled before, the first time for minutes on a busy machine."""
+ATTEMPTS = 3
+"""A run that ends by itself before its moment, as one does that finds no time to compute, is played again."""
 ROOT = Path(__file__).resolve().parent.parent
 _DEMO = "from adacd_hil.cli.main import main; main()"
 
@@ -43,8 +45,21 @@ class KillResult:
     violations: list[str]
 
 
+class RunEndedError(Exception):
+    """A run that ended before it was killed."""
+
+
 def kill_trial(seed: int, folder: Path) -> KillResult:
     """Start a run, kill it, recover its log, judge the result."""
+    for attempt in range(ATTEMPTS):
+        try:
+            return _attempt(seed, folder / str(attempt))
+        except RunEndedError as error:
+            print(f"seed {seed}: {error}", file=sys.stderr)
+    return KillResult(seed, "none", 0, 0.0, 1, [f"{ATTEMPTS} runs ended before they were killed"])
+
+
+def _attempt(seed: int, folder: Path) -> KillResult:
     victim = VICTIMS[seed % len(VICTIMS)]
     wait_s = float(np.random.default_rng(seed).uniform(0.0, MOST_S))
     command = [sys.executable, "-c", _DEMO, "demo", "--clock", "realtime", "--out", str(folder)]
@@ -54,6 +69,8 @@ def kill_trial(seed: int, folder: Path) -> KillResult:
         try:
             writer = _wait_for_cycles(process, path)
             time.sleep(wait_s)
+            if process.poll() is not None:
+                raise RunEndedError(f"the run ended by itself, exit status {process.returncode}")
             killed_ns = time.time_ns()
             for pid in {"writer": [writer], "control": [process.pid], "both": [process.pid, writer]}[victim]:
                 os.kill(pid, signal.SIGKILL)
@@ -66,11 +83,13 @@ def kill_trial(seed: int, folder: Path) -> KillResult:
 def _wait_for_cycles(process: "subprocess.Popen[bytes]", path: Path) -> int:
     """Wait until cycles are on the disk; return the pid of the log's writer."""
     end_s = time.monotonic() + START_S
-    while time.monotonic() < end_s and process.poll() is None:
+    while time.monotonic() < end_s:
+        if process.poll() is not None:
+            raise RunEndedError(f"the run ended by itself, exit status {process.returncode}")
         time.sleep(0.1)
         if path.exists() and len(read_log(path, ("/cycle",)).cycle):
             return _writer_of(process.pid, path)
-    raise RuntimeError(f"{path}: no cycle within {START_S:g} s")
+    raise RunEndedError(f"no cycle within {START_S:g} s")
 
 
 def _writer_of(control: int, path: Path) -> int:
@@ -80,7 +99,7 @@ def _writer_of(control: int, path: Path) -> int:
         links = (link.resolve() for link in Path(f"/proc/{child}/fd").iterdir())
         if path.resolve() in links:
             return child
-    raise RuntimeError(f"{path}: nobody has it open")
+    raise RunEndedError("nobody has the log open")
 
 
 def _wait_for_end(pid: int) -> None:

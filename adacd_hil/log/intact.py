@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import IO
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
@@ -10,10 +11,11 @@ from mcap.records import Attachment, Metadata
 from adacd_hil.log.chunk_contents import Contents, message_contents, read_contents
 from adacd_hil.log.definitions import Definitions
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.file_end import crc_of, read_end
 from adacd_hil.log.mcap_file import PART_KEY, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.mcap_walk import MAGIC
 from adacd_hil.log.parts import find_parts, part_path
-from adacd_hil.log.record_scan import ChunkError, Gap, Trailer, attachment_crc_fits, open_chunk, parse, scan
+from adacd_hil.log.record_scan import ChunkError, Gap, RawRecord, attachment_crc_fits, open_chunk, parse, scan
 from adacd_hil.log.summary import DROPPED_KEY, number
 
 
@@ -49,33 +51,32 @@ class IntactLog:
                 yield item
 
     def _read(self, path: Path) -> Iterator[Attachment | Contents]:
-        has_trailer = False
         try:
             with path.open("rb") as file:
-                if file.read(len(MAGIC)) != MAGIC:
-                    raise LogError(f"{path} is not an MCAP file")
+                _check_ends(path, file)
                 for item in scan(file):
-                    if isinstance(item, Trailer):
-                        has_trailer = True
-                        continue
                     if isinstance(item, Gap):
                         raise _damaged(path, item.offset)
-                    if item.opcode == Opcode.CHUNK:
-                        yield self._open(path, item.offset, item.body)
-                    elif item.opcode == Opcode.MESSAGE:
-                        yield message_contents(item)
-                    elif item.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                        self.definitions.take((item,))
-                    elif item.opcode == Opcode.ATTACHMENT:
-                        if not attachment_crc_fits(item.body):
-                            raise _damaged(path, item.offset)
-                        yield parse(item.opcode, item.body)
-                    elif item.opcode == Opcode.METADATA:
-                        self._take_metadata(parse(item.opcode, item.body))
+                    if isinstance(item, RawRecord):
+                        yield from self._take(path, item)
         except OSError as error:
             raise LogError(f"log {path} can't be read: {error.strerror}") from None
-        if not has_trailer:
-            raise _damaged(path, path.stat().st_size)
+
+    def _take(self, path: Path, record: RawRecord) -> Iterator[Attachment | Contents]:
+        """Give what is in a record of the data section; the summary only repeats it."""
+        opcode, body = record.opcode, record.body
+        if opcode == Opcode.CHUNK:
+            yield self._open(path, record.offset, body)
+        elif opcode == Opcode.MESSAGE:
+            yield message_contents(record)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self.definitions.take((record,))
+        elif opcode == Opcode.ATTACHMENT:
+            if not attachment_crc_fits(body):
+                raise _damaged(path, record.offset)
+            yield parse(opcode, body)
+        elif opcode == Opcode.METADATA:
+            self._take_metadata(parse(opcode, body))
 
     def _open(self, path: Path, offset: int, body: bytes) -> Contents:
         try:
@@ -97,5 +98,16 @@ class IntactLog:
         self.metadata.setdefault(item.name, table)
 
 
+def _check_ends(path: Path, file: IO[bytes]) -> None:
+    """Raise LogError when a file has no beginning or no end, or when the data section fails its CRC."""
+    if file.read(len(MAGIC)) != MAGIC:
+        raise LogError(f"{path} is not an MCAP file")
+    end = read_end(file)
+    if end is None:
+        raise LogError(f"{path} is cut, it has no end: recover it first")
+    if end.data_crc and end.data_crc != crc_of(file, 0, end.data_end):
+        raise LogError(f"{path} is damaged, it fails its CRC: recover it first")
+
+
 def _damaged(path: Path, offset: int) -> LogError:
-    return LogError(f"{path} is damaged or cut at byte {offset}: recover it first")
+    return LogError(f"{path} is damaged at byte {offset}: recover it first")

@@ -150,7 +150,7 @@ class Salvage:
             elif opcode in _DEFINITIONS and self.is_vouched:
                 self.definitions.take((record,))
             elif opcode == Opcode.ATTACHMENT:
-                if not attachment_crc_fits(record.body):
+                if not attachment_crc_fits(record.body, self.is_vouched):
                     self._lose(record.offset, len(record.body), "attachment fails its CRC")
                     return
                 self._saved_attachments += 1

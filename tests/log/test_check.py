@@ -26,6 +26,7 @@ from mcap.writer import CompressionType, Writer
 from adacd_hil.log.check import check_log, find_logs
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.findings import RULES
+from adacd_hil.log.ros_text import text_problem
 
 WHOLE = make_log()
 SCHEMA = Schema(id=1, name=TYPE.name, encoding="ros2msg", data=TYPE.text.encode())
@@ -168,6 +169,7 @@ BROKEN = {
         {"unindexed-messages", "statistics", "counts"},
     ),
     "chunk-index": (operated(put(Opcode.CHUNK_INDEX, 24, "<Q", 5)), {"chunk-index"}),
+    "chunk-index, offsets": (operated(put(Opcode.CHUNK_INDEX, 38, "<Q", 5)), {"chunk-index"}),
     "chunk-index, one gone": (operated(without(Opcode.CHUNK_INDEX, 1)), {"chunk-index", "summary-offset"}),
     "chunk-index, twice": (operated(twice_indexed), {"chunk-index", "summary-offset"}),
     "no-chunk-index": (operated(without(Opcode.CHUNK_INDEX)), {"no-chunk-index", "summary-offset"}),
@@ -322,3 +324,21 @@ def test_statistics_are_read_as_mcap_writes_them():
     statistics = first(take_apart(WHOLE), Opcode.STATISTICS).read(Statistics)
     assert (statistics.message_count, statistics.channel_message_counts) == (20, {1: 10, 2: 10})
     assert struct.unpack_from("<Q", first(take_apart(WHOLE), Opcode.STATISTICS).body)[0] == 20
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (b"\xff", "is not UTF-8"),
+        (b"float64 x\nno\n", "the type: no field: 'no'"),
+        (b"pkg/Other x\n", "the type: unknown type pkg/Other"),
+        (b"Time stamp\n", "the type: unknown type Time"),
+        (b"uint8 A=\n", "the type: no constant: 'uint8 A='"),
+        (b"uint8 x\n" + b"=" * 80 + b"\nuint8 y\n", "a type has no name: 'uint8 y'"),
+        (b"pkg/Y y\n" + b"=" * 80 + b"\nMSG: pkg/Y\nbad\n", "pkg/Y: no field: 'bad'"),
+        (b"pkg/msg/Y[<=3] y  # c\nstring<=5 s\nuint8 A=1\n\n# c\n" + b"=" * 80 + b"\nMSG: pkg/Y\nbool[] b true\n", ""),
+        (b"Y y\n" + b"=" * 80 + b"\nMSG: pkg/Y\nfloat32 x 1.5\n", ""),
+    ],
+)
+def test_the_text_of_a_schema_is_read_as_ros_would(text, problem):
+    assert text_problem(text) == problem

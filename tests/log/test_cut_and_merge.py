@@ -105,24 +105,39 @@ def spoil_chunk(data):
     return data[: chunk.offset + 60] + b"\xff" + data[chunk.offset + 61 :]
 
 
+def without_crc(data):
+    """A log whose data section has no CRC, as others write them."""
+    parts = take_apart(data)
+    for part in kinds(parts, Opcode.DATA_END):
+        part.put(0, "<I", 0)
+    return put_together(parts, has_right_crcs=False)
+
+
 @pytest.mark.parametrize(
-    "spoil",
+    ("spoil", "reason"),
     [
-        spoil_chunk,
-        lambda data: data[:-1],
-        lambda data: data[: len(data) // 2],
-        lambda data: data.replace(b"x = 1", b"x = 2"),
+        (lambda data: data[:-1], "is cut, it has no end"),
+        (lambda data: data[: len(data) // 2], "is cut, it has no end"),
+        (lambda data: data.replace("Prüfung".encode(), "Trüfung".encode()), "is damaged, it fails its CRC"),
+        (lambda data: spoil_chunk(without_crc(data)), r"is damaged at byte \d+"),
+        (lambda data: without_crc(data).replace(b"x = 1", b"x = 2"), r"is damaged at byte \d+"),
+        (lambda data: without_crc(data)[:100] + bytes(20) + without_crc(data)[120:], r"is damaged at byte \d+"),
     ],
 )
-def test_a_damaged_log_is_recovered_first(spoil, log_path, tmp_path):
+def test_a_damaged_log_is_recovered_first(spoil, reason, log_path, tmp_path):
     log_path.write_bytes(spoil(log_path.read_bytes()))
     for work in (
         lambda out: cut(log_path, out, Stretch(-INFINITE, INFINITE)),
         lambda out: merge([log_path], out),
     ):
-        with pytest.raises(LogError, match=r"is damaged or cut at byte \d+: recover it first$"):
+        with pytest.raises(LogError, match=f"^{log_path} {reason}: recover it first$"):
             work(tmp_path / "out.mcap")
         assert list(tmp_path.iterdir()) == [log_path]
+
+
+def test_a_strangers_log_without_crcs_is_taken_as_it_is(log_path, tmp_path):
+    log_path.write_bytes(without_crc(log_path.read_bytes()))
+    assert merge([log_path], tmp_path / "out.mcap").messages == 2 * CYCLES
 
 
 def test_a_log_is_not_overwritten_by_what_is_made_of_it(log_path):

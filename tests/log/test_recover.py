@@ -118,11 +118,11 @@ def test_without_first_chunk_and_summary_no_message_is_saved(tmp_path):
     assert recovery.is_lossy
 
 
-@pytest.mark.parametrize("place", [1, 8])
-def test_records_are_found_again_behind_a_length_that_is_wrong(place, whole, tmp_path):
-    """The length of the first message index, or its opcode; the chunk before and all behind are intact."""
+@pytest.mark.parametrize(("place", "bit"), [(1, 4), (1, 3), (8, 4)])
+def test_records_are_found_again_behind_a_length_that_is_wrong(place, bit, whole, tmp_path):
+    """Too small, too large, beyond the file, of the first message index; the chunk before and all behind are intact."""
     part = kinds(take_apart(WHOLE), Opcode.MESSAGE_INDEX)[0]
-    recovery, messages, _, _ = recovered(tmp_path, flipped(WHOLE, part.offset + place, 4))
+    recovery, messages, _, _ = recovered(tmp_path, flipped(WHOLE, part.offset + place, bit))
     assert messages == whole[0]
     assert not recovery.is_lossy
     assert recovery.losses.bytes == 9 + len(part.body)
@@ -161,6 +161,15 @@ def test_a_damaged_attachment_is_left_out(tmp_path):
     recovery, messages, attachments, _ = recovered(tmp_path, flipped(WHOLE, WHOLE.index(b"x = 1")))
     assert attachments == {"arm.dbc": ATTACHMENTS["arm.dbc"]}
     assert (len(messages), recovery.losses.attachments) == (COUNT, 1)
+
+
+def test_an_attachment_whose_crc_was_zeroed_with_it_is_left_out(tmp_path):
+    """A CRC of 0 says that there is none."""
+    place = WHOLE.index(b"x = 1")
+    data = WHOLE[: place + 3] + bytes(7) + WHOLE[place + 10 :]
+    recovery, _, attachments, _ = recovered(tmp_path, data)
+    assert attachments == {"arm.dbc": ATTACHMENTS["arm.dbc"]}
+    assert recovery.losses.attachments == 1
 
 
 def test_what_no_crc_vouches_for_is_saved_only_while_the_whole_fits_its_own(tmp_path):
