@@ -42,6 +42,8 @@ CLOSER = """new Promise((resolve) => {
   contact.click();
   requestAnimationFrame(() => requestAnimationFrame(() => resolve(performance.now() - began)));
 })"""
+REHEARSAL = "for (const when of ['beforeprint', 'afterprint']) dispatchEvent(new Event(when))"
+"""What a page does to be printed and after it, without the printing."""
 TOP_OF_TRACES = """(() => {
   const box = document.querySelector(".bar").getBoundingClientRect();
   return [box.left + scrollX, box.top + scrollY];
@@ -150,6 +152,7 @@ def browse(page: Path, out: Path | None = None) -> Seen:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             _take_pictures(tab, out)
+        tab.evaluate(REHEARSAL)
         closer_ms = tab.evaluate(CLOSER) if has_traces else None
         if out is not None and has_traces:
             left, top = tab.evaluate(TOP_OF_TRACES)

@@ -44,7 +44,7 @@ def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, descri
     ]
     joints = "".join(f'<circle cx="{x:.0f}" cy="{-y:.0f}" r="{0.035 * reach:.0f}"/>' for x, y in ((0.0, 0.0), elbow))
     xs, ys = zip((0.0, 0.0), elbow, tip, *points, strict=True)
-    width, height = 1.75 * reach, 1.25 * reach
+    width, height = 1.5 * reach, 1.1 * reach
     left = 0.5 * (min(xs) + max(xs)) - 0.5 * width
     top = -0.5 * (min(ys) + max(ys)) - 0.5 * height
     base = 0.08 * reach

@@ -653,12 +653,14 @@ def _contacts_text(run: Run, contacts: tuple[Contact, ...], false_s: tuple[float
     if run.truth is None:
         return f"{_number(len(contacts), 'detection')}, whose truth is not recorded"
     armed = [contact for contact in contacts if contact.is_armed]
+    delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
+    within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
     if not armed:
         found = "no contact while detection was armed"
     elif missed:
-        found = f"{len(armed) - missed} of {_number(len(armed), 'contact')} detected, {missed} missed"
+        found = f"{len(armed) - missed} of {_number(len(armed), 'contact')} detected{within}, {missed} missed"
     else:
-        found = "the one contact detected" if len(armed) == 1 else f"all {len(armed)} contacts detected"
+        found = f"{'the one contact' if len(armed) == 1 else f'all {len(armed)} contacts'} detected{within}"
     false = "none false" if not false_s else _number(len(false_s), "false alarm")
     if not armed and not false_s:
         false = "no false alarm"

@@ -16,7 +16,6 @@ from adacd_hil.analysis.run import Run
 from adacd_hil.records import SchemeState
 
 STATE_COLOURS: Final = {
-    SchemeState.ENABLE: "grid",
     SchemeState.ADAPT: "adaptation",
     SchemeState.CERTIFY: "certify",
     SchemeState.REACT: "react",
@@ -81,6 +80,13 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
     return sorted(notices[:_MOST_NOTICES])
 
 
+def state_key(run: Run) -> str:
+    """Name the colours of the states that the run has been in."""
+    there = {stay.state for stay in stays_of(run)}
+    entries = [f'<i class="key {colour}"></i>{state.name}' for state, colour in STATE_COLOURS.items() if state in there]
+    return f'<span class="keys">{" ".join(entries)}</span>'
+
+
 def timeline(run: Run, metrics: Metrics) -> str:
     """Write the figure; nothing of a run without cycles."""
     if run.state.size == 0:
@@ -98,7 +104,7 @@ def timeline(run: Run, metrics: Metrics) -> str:
     caption = (
         "<b>Timeline.</b> States, contacts by number (a bar as long as the touch, hollow if it was not detected), and "
         'below them warnings, faults and false alarms.<span class="scripted"> Choose any of them to see the traces '
-        "there.</span>"
+        f"there.</span> {state_key(run)}"
     )
     return f'<figure id="timeline">\n<div class="scroll">{svg}</div>\n<figcaption>{caption}</figcaption>\n</figure>\n'
 

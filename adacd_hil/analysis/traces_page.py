@@ -6,7 +6,7 @@ from typing import Any, Final
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.page import data_block, json_block, wrap_section
 from adacd_hil.analysis.run import Run
-from adacd_hil.analysis.timeline import STATE_COLOURS, notices_of, stays_of
+from adacd_hil.analysis.timeline import STATE_COLOURS, notices_of, state_key, stays_of
 from adacd_hil.analysis.trace_encoding import Packed, pack, step_of
 from adacd_hil.analysis.traces import Panel, panels_of
 
@@ -59,7 +59,9 @@ def traces_section(run: Run, metrics: Metrics) -> str:
         "faults": [round(notice.at_s, 4) for notice in notices_of(run, metrics) if notice.is_bad],
     }
     figures = "\n".join(map(_figure, panels))
-    return wrap_section("Traces", _BAR, figures, _note(panels, drawn), "".join(blocks), json_block("trace-plan", plan))
+    return wrap_section(
+        "Traces", _BAR, _key(run), figures, _note(panels, drawn), "".join(blocks), json_block("trace-plan", plan)
+    )
 
 
 def _numbers(name: str, packed: Packed) -> dict[str, Any]:
@@ -79,6 +81,10 @@ _BAR: Final = """<noscript>
 <output id="shown"></output>
 <span class="note">wheel: closer, wider · drag: choose a stretch · shift + drag: move · double click: whole run</span>
 </div>"""
+
+
+def _key(run: Run) -> str:
+    return f'<p class="note scripted">{state_key(run)} <i class="key touch"></i>touch</p>'
 
 
 def _figure(panel: Panel) -> str:

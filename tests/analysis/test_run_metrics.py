@@ -581,24 +581,25 @@ def faulted():
     [
         (
             detected_run(),
-            "All 2 contacts detected, none false; the model was identified in 1.00 s and again in 0.80 s after 1 kg.",
+            "All 2 contacts detected within 5 ms, none false; the model was identified in 1.00 s and again in 0.80 s "
+            "after 1 kg.",
         ),
         (
             touched_run(),
-            "2 of 3 contacts detected, 1 missed, 1 false alarm; the model was identified in 1.00 s and again in "
-            "0.80 s after 1 kg.",
+            "2 of 3 contacts detected within 5 ms, 1 missed, 1 false alarm; the model was identified in 1.00 s and "
+            "again in 0.80 s after 1 kg.",
         ),
         (
             contact_in_adaptation(),
-            "All 2 contacts detected, 1 more while it was not armed, none false; the model was identified in 1.00 s "
-            "and again in 0.80 s after 1 kg.",
+            "All 2 contacts detected within 5 ms, 1 more while it was not armed, none false; the model was identified "
+            "in 1.00 s and again in 0.80 s after 1 kg.",
         ),
         (
             payload_taken_off(),
             "No contact while detection was armed, no false alarm; the model was identified in 1.00 s and again in "
             "0.80 s after taking off 1.5 kg.",
         ),
-        (one_detected(), "The one contact detected, none false; the model was identified in 1.00 s."),
+        (one_detected(), "The one contact detected within 5 ms, none false; the model was identified in 1.00 s."),
         (
             real_arm(),
             "1 detection, whose truth is not recorded; the model was identified in 1.00 s and again in 0.80 s after "

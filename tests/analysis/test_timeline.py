@@ -11,7 +11,7 @@ from adacd_hil.analysis.arm_drawing import Push, draw_arm
 from adacd_hil.analysis.contacts_page import CARDS, contact_cards
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.run import Motion
-from adacd_hil.analysis.timeline import notices_of, stays_of, timeline
+from adacd_hil.analysis.timeline import notices_of, state_key, stays_of, timeline
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, Location, SchemeState
 
@@ -49,6 +49,11 @@ def test_marks_lie_where_their_time_is():
     run = make_run((A, 1000), (M, 1001))
     boxes = re.findall(r'<rect x="([^"]*)" y="8.0" width="([^"]*)" height="24.0" fill', timeline(run, evaluate(run)))
     assert [tuple(map(float, box)) for box in boxes] == [(78.0, 459.0), (537.0, 459.0)]
+
+
+def test_the_key_names_the_states_that_the_run_has_been_in():
+    key = state_key(make_run((A, 100), (M, 200), (SchemeState.STOPPED, 5)))
+    assert re.findall(r'class="key (\w+)"></i>(\w+)', key) == [("adaptation", "ADAPT"), ("stopped", "STOPPED")]
 
 
 def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
