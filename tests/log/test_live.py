@@ -4,6 +4,8 @@ import json
 import math
 import os
 import socket
+import struct
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +26,18 @@ from mcap_ros2.decoder import DecoderFactory
 from recorded_run import CODEC, feed, make_run, start
 from websockets.sync.client import connect
 
+from adacd_hil.clock import VirtualClock
+from adacd_hil.log import words
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.live_client import SUBPROTOCOL, live_client
+from adacd_hil.log.live_client import SUBPROTOCOL, LiveClient, live_client
 from adacd_hil.log.live_rates import Decimator, rate_of
+from adacd_hil.log.packet import pack_cycle, pack_event
 from adacd_hil.log.recorder import Recorder
-from adacd_hil.log.setup import LiveSetup
+from adacd_hil.log.ring import Ring, RingReader
+from adacd_hil.log.setup import LiveSetup, Setup
+from adacd_hil.log.sink import Sink
+from adacd_hil.log.writer import LINGER_NS, SHOW_PERIOD_NS, WriterProcess
 from adacd_hil.records import Event
 
 STATED_HZ = {
@@ -87,6 +95,7 @@ def test_a_viewer_receives_every_topic_at_its_rate_as_the_file_has_it(watched):
     received = by_topic(messages)
     assert {topic for topic in received if topic not in expected} == {"/tf", "/scene", "/robot_description"}
     assert {topic: received.get(topic) for topic in expected} == expected
+    assert len(received["/robot_description"]) == 1
 
 
 def test_the_stated_rates_are_those_of_the_program():
@@ -133,6 +142,17 @@ def test_the_transforms_put_the_links_where_the_joints_are(watched):
     angles = [2.0 * math.atan2(t.transform.rotation.z, t.transform.rotation.w) for t in transforms]
     assert angles == pytest.approx([0.0, *q, 0.0])
     assert [t.transform.translation.x for t in transforms] == [0.0, 0.0, *LINK_LENGTH_M]
+
+
+def test_the_scene_shows_the_joints_at_its_rate_and_every_contact(watched, run):
+    messages, topics, _ = watched
+    received = by_topic(messages)
+    scenes = [[entity.id for entity in decode(topics["/scene"], data).entities] for _, data in received["/scene"]]
+    contacts = sum(cycle.contact is not None for cycle in run.cycles)
+    slots = {log_ns // 100_000_000 for log_ns, _ in received["/scheme"]}
+    assert scenes.count(["contact"]) == contacts > 0
+    assert scenes.count(["joint1", "joint2", "state"]) == len(slots) > 5
+    assert len(scenes) == contacts + len(slots)
 
 
 def test_a_record_that_makes_no_sense_is_not_drawn_and_nothing_stops(run):
@@ -214,12 +234,16 @@ def test_a_port_that_is_taken_is_named_and_leaves_no_log(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_comes_before_the_first_record_has_the_time_of_the_start():
+def test_who_comes_late_gets_the_description_with_the_time_of_the_last_record():
+    late = make_run(1, start_ns=7_000_000_000)
     fed = Feed()
-    with live_client(fed.live.url) as client:
-        message = client.receive(10.0)
+    with live_client(fed.live.url, []) as client:
+        assert client.receive(10.0)[:2] == ("/robot_description", EPOCH_NS)
+        fed.cycles(late, 1)
+        with live_client(fed.live.url, []) as second:
+            message = second.receive(10.0)
     fed.close()
-    assert (message.topic, message.log_ns) == ("/robot_description", EPOCH_NS)
+    assert message[:2] == ("/robot_description", EPOCH_NS + 7_000_000_000 + 60)  # its last frame
 
 
 def test_nothing_is_sent_or_kept_while_nobody_watches(run):
@@ -242,3 +266,66 @@ def test_no_server_is_one_line():
         url = f"ws://127.0.0.1:{other.getsockname()[1]}"
         with pytest.raises(LogError, match=f"live view {url}: .*refused"), live_client(url):
             pass
+
+
+class OtherEnd:
+    """A server whose words are given; what is said to it is kept."""
+
+    def __init__(self, *channels):
+        advertised = [{"id": n, "topic": topic, "schemaName": "a/B", "schema": ""} for n, topic in channels]
+        self.heard = []
+        self._words = [json.dumps({"op": "serverInfo"}), json.dumps({"op": "advertise", "channels": advertised})]
+
+    def recv(self, timeout):
+        assert timeout > 0.0
+        return self._words.pop(0)
+
+    def send(self, word):
+        subscriptions = [tuple(subscription.values()) for subscription in json.loads(word)["subscriptions"]]
+        self.heard.append(subscriptions)
+        self._words += [struct.pack("<BIQ", 1, number, 5) + b"payload" for number, _ in subscriptions]
+
+
+def test_a_client_asks_for_what_it_wants_and_last_for_the_answer_that_it_is_in_force():
+    end = OtherEnd((4, "/robot_description"), (7, "/scheme"), (9, "/cycle"))
+    client = LiveClient(end, ["/cycle"])
+    assert end.heard == [[(9, 9)], [(4, 4)]]
+    assert client.receive(0.1) == ("/cycle", 5, b"payload")
+
+
+def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_outlives_the_log(tmp_path):
+    run = make_run(1)
+    run.cycles[0].event = LAST
+    clock, ring = VirtualClock(), Ring(2**20)
+    clock.sleep_until_ns(3_000_000_000)
+    reader = RingReader(ring.descriptor)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    sink = Sink(os.open(tmp_path / "run.mcap", os.O_WRONLY | os.O_CREAT), waits=False)
+    setup = Setup(
+        path=tmp_path / "run.mcap",
+        is_truth=False,
+        is_blocking=False,
+        messages=(),
+        parameter_count=7,
+        epoch_ns=EPOCH_NS,
+        part_bytes=0,
+        part_ns=0,
+        may_rotate=False,
+        attachments={},
+        metadata={},
+        live=SETUP,
+    )
+    process = WriterProcess(theirs, reader, sink, setup, clock)
+    thread = threading.Thread(target=process.run)
+    thread.start()
+    with live_client(process.live.url) as client:
+        assert client.receive(10.0)[:2] == ("/robot_description", EPOCH_NS + 3_000_000_000)
+        ring.put(pack_cycle(run.cycles[0].t_ns, 0, run.cycles[0].messages(), []))
+        ring.put(pack_event(run.cycles[0].t_ns, 0, LAST))
+        clock.sleep_until_ns(clock.now_ns() + SHOW_PERIOD_NS)
+        assert "/scheme" in by_topic(receive_until_last(client))
+        ours.send(words.END)
+        thread.join()
+    assert clock.now_ns() == 3_000_000_000 + SHOW_PERIOD_NS + LINGER_NS
+    for end in (ours, theirs, reader, ring):
+        end.close()

@@ -13,7 +13,9 @@ from recorded_run import make_run
 
 from adacd_hil.cli.live_monitor import TOPICS, LiveMonitor, as_text
 from adacd_hil.cli.main import cli
-from adacd_hil.log.live_client import live_client
+from adacd_hil.log.cdr import payload_dtype
+from adacd_hil.log.channels import run_channels
+from adacd_hil.log.live_client import LiveMessage, live_client
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactKind,
@@ -123,6 +125,28 @@ def test_a_residual_beyond_the_threshold_fills_the_bar_and_a_fault_is_named(desc
     text = as_text(described | {"joints": [joint, joint], "fault": "DRIVE"})
     assert "[" + 40 * "#" + "] 250 % of the threshold" in text
     assert text.startswith("MONITOR by DRIVE")
+
+
+class CertifiedClient:
+    """Has one record of the certified scheme, whose bank has three channels."""
+
+    def __init__(self):
+        (scheme,) = (c for c in run_channels(7, (), 2, 3) if c.topic == "/scheme")
+        self.record = np.zeros(1, payload_dtype(scheme.type.text))[0]
+        self.record["tau_ext_bank"] = (0.1, 0.2, -0.9, 0.4, 0.3, 5.0)
+        self.record["threshold_bank"] = (1.0, 1.0, 1.0, 1.0, 1.0, np.inf)
+
+    def decode(self, message):
+        return self.record
+
+
+def test_of_the_certified_scheme_the_filter_nearest_to_its_threshold_counts():
+    client = CertifiedClient()
+    monitor = LiveMonitor(client)
+    monitor.accept(LiveMessage("/scheme", 0, b""))
+    assert [joint["share"] for joint in monitor.describe()["joints"]] == [0.9, 0.4]
+    client.record["threshold_bank"] = np.inf
+    assert [joint["share"] for joint in monitor.describe()["joints"]] == [None, None]
 
 
 @pytest.mark.parametrize("words", [(), ("--json",)])

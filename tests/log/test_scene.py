@@ -138,7 +138,15 @@ def test_of_the_papers_scheme_which_seeks_no_place_the_torque_gives_the_force():
 @pytest.mark.parametrize(("force_N", "length_m"), [(0.0, 0.05), (1000.0, 0.6)])
 def test_arrows_stay_in_sight(force_N, length_m):
     (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(force_N=force_N)))
-    assert contact.arrows[0].shaft_length + contact.arrows[0].head_length == pytest.approx(length_m)
+    (arrow,) = contact.arrows
+    assert arrow.shaft_length + arrow.head_length == pytest.approx(length_m)
+    assert arrow.shaft_length >= 0.6 * length_m - 1e-12
+
+
+@pytest.mark.parametrize(("lever_m", "drawn_m"), [(-0.05, 0.0), (0.1, 0.1), (0.5, 0.30)])
+def test_a_force_is_drawn_on_the_link(lever_m, drawn_m):
+    (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(lever_m=lever_m)))
+    assert contact.arrows[0].pose.position.x == pytest.approx(drawn_m)
 
 
 def test_an_upright_arm_has_its_y_axis_up():
