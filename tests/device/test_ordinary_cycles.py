@@ -1,5 +1,6 @@
 """Recordings in which one thing is changed by hand: read at once as far as possible, and frame by frame."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from recorded_arm_rig import Live, play, ticks_of
 
 from adacd_hil.device.ordinary_cycles import OrdinaryCycles, Stretch
-from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.records import ArmBatch
 
 pytestmark = pytest.mark.slow
@@ -83,6 +84,13 @@ def _lose_cycle(recording: Recording) -> Recording:
     return Recording(recording.frames[recording.frames["cycle_t_ns"] != t_ns], ticks)
 
 
+def _end_late(recording: Recording) -> Recording:
+    place = recording.find(DRIVE_STATUS)
+    recording.frames["t_ns"][place] -= 2_000_000
+    later = np.flatnonzero(recording.frames["can_id"] == DRIVE_STATUS)
+    return recording._replace(frames=np.delete(recording.frames, later[later > place]))
+
+
 CHANGES: dict[str, Callable[[Recording], Recording]] = {
     "nothing": lambda recording: recording,
     "a torque with a wrong bit": _set("data", TORQUE, 0x10, 3),
@@ -97,9 +105,10 @@ CHANGES: dict[str, Callable[[Recording], Recording]] = {
     "a feedback older than SYNC": _set("t_ns", FEEDBACK, -2_000_000),
     "a position that jumps": _set("data", FEEDBACK, 0x10, 2),
     "a velocity that doesn't fit": _set("data", FEEDBACK, 0x10, 6),
-    "SYNC twice": lambda recording: recording.with_copy(SYNC),
+    "SYNC twice": lambda recording: recording.with_copy(SYNC, to=recording.find(TORQUE) + 1),
     "no SYNC": lambda recording: _delete(recording, SYNC),
     "a drive's status older than SYNC": _set("t_ns", DRIVE_STATUS, -2_000_000),
+    "a drive's last status older than SYNC": _end_late,
     "a drive's status of another state": _set("data", DRIVE_STATUS, 0x04, 0),
     "a drive's status of another mode": _set("data", DRIVE_STATUS, 0x01, 2),
     "a drive's status that is too short": _set("length", DRIVE_STATUS, -1),
@@ -120,7 +129,12 @@ def test_what_is_read_at_once_is_what_is_read_frame_by_frame(
     frames = quiet.log.frames.copy()
     ticks = Ticks(*(column[:600].copy() for column in ticks_of(quiet.log)))
     recording = CHANGES[change](Recording(frames[frames["cycle_t_ns"] <= ticks.t_ns[-1]], ticks))
-    at_once, one_by_one = quiet.recorded_arm(), quiet.recorded_arm()
+    settings = dataclasses.replace(
+        quiet.settings,
+        arm=dataclasses.replace(quiet.settings.arm, sign=(-1, 1), torque_offset_Nm=(0.25, -0.5)),
+        realtime=dataclasses.replace(quiet.settings.realtime, on_misses="hold"),
+    )
+    at_once, one_by_one = (RecordedArm(settings, quiet.codec) for _ in range(2))
     found = at_once.read(recording.ticks, recording.frames)
     monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: Stretch(0, 0, []))
     due = one_by_one.read(recording.ticks, recording.frames)
