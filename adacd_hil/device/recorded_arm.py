@@ -9,8 +9,8 @@ logged with. That is all that the live loop went by:
 - What was received after SYNC belongs to the cycle, or to the one before where its stamp is older than SYNC. Frames
   that came once all cyclic ones were in, or when the time for them was over, were read in the next cycle and stand
   there.
-- Between the host's NMT reset and its NMT start only heartbeats count. What came before the reset was thrown away.
-- An attempt begins with the reset; nothing of what was before survives it.
+- Before the host's NMT start nothing counts: a heartbeat of before it says no more than none.
+- An attempt begins with the host's NMT reset; nothing of what was before survives it.
 
 Error frames change nothing. Of a cycle whose packet the logger dropped nothing is known, its frames included: from
 there on the states may differ until every counter and age has been renewed.
@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_batch import FrameColumns, NotOrdinaryError, OrdinaryCycles, columns_of
+from adacd_hil.device.arm_batch import FrameColumns, columns_of
 from adacd_hil.device.arm_watch import ArmWatch
 from adacd_hil.device.canopen_bus import NMT_ID
 from adacd_hil.device.heartbeat import follow_devices
 from adacd_hil.device.network import RESET_COMMUNICATION, START
+from adacd_hil.device.ordinary_cycles import NotOrdinaryError, OrdinaryCycles
 from adacd_hil.device.placement import place_devices
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
 from adacd_hil.wire.bus import EmbeddedBus, Frame
@@ -76,7 +77,6 @@ class RecordedArm:
         self._watch = ArmWatch(settings, self._heartbeats.watch)
         self._ordinary = self._make_ordinary()
         self._state: ArmState | None = None
-        self._is_booting = False
         self._is_running = False
 
     def read(self, ticks: Ticks, frames: NDArray[Any]) -> ArmBatch:
@@ -175,11 +175,9 @@ class RecordedArm:
 
     def _command(self, nmt_command: int) -> None:
         """Follow what the host told the devices: it does so at the beginning of an attempt and after its end only."""
-        if nmt_command == RESET_COMMUNICATION:
-            if self._is_running:
-                self._begin()
-                self._has_begun_again = True
-            self._is_booting = True
+        if nmt_command == RESET_COMMUNICATION and self._is_running:
+            self._begin()
+            self._has_begun_again = True
         elif nmt_command == START and not self._is_running:
             self._start()
 
@@ -188,9 +186,7 @@ class RecordedArm:
         self._is_running = True
 
     def _accept(self, frame: Frame, is_late: bool = False) -> None:
-        if self._is_running and self._arm.accept(frame, is_late):
-            return
-        if self._is_running or self._is_booting:
+        if self._is_running and not self._arm.accept(frame, is_late):
             self._heartbeats.accept(frame)
 
 

@@ -13,9 +13,9 @@ from test_two_arms import SECOND
 from test_two_arms import Rig as TwoArms
 from test_two_arms import settings_of as two_arms_settings
 
-from adacd_hil.device.arm_batch import OrdinaryCycles, Stretch
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.drive import Drive
+from adacd_hil.device.ordinary_cycles import OrdinaryCycles, Stretch
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.log.reader import read_log
@@ -40,6 +40,20 @@ TROUBLES = [
 def troubled(tmp_path_factory: pytest.TempPathFactory) -> Live:
     """Play a run with many faults, the last of which begins a second attempt."""
     return play(tmp_path_factory.mktemp("troubled"), TROUBLES, finish_s=0.3, acknowledge_faults=1)
+
+
+@pytest.fixture(scope="module")
+def fd(tmp_path_factory: pytest.TempPathFactory) -> Live:
+    """Play a run over CAN FD, where one frame says all."""
+    rows = [*TROUBLES[:4], {"kind": "sensor_error", "node": "sensor2", "at_s": 0.1}]
+    return play(tmp_path_factory.mktemp("fd"), rows, "fd", finish_s=0.3)
+
+
+@pytest.fixture(scope="module")
+def stock(tmp_path_factory: pytest.TempPathFactory) -> Live:
+    """Play a run of devices whose frames nothing protects."""
+    rows = [*TROUBLES[:2], *TROUBLES[4:6], {"kind": "lose", "node": "drive2", "frame": "heartbeat", "at_s": 0.0}]
+    return play(tmp_path_factory.mktemp("stock"), rows, "stock", finish_s=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -99,21 +113,11 @@ def _numbers(device: Drive | TorqueSensor) -> dict[str, object]:
     return {name: value for name, value in memory.items() if isinstance(value, (int, float, bool, list, type(None)))}
 
 
-@pytest.mark.parametrize(
-    ("config", "rows", "fault"),
-    [
-        ("fd", [*TROUBLES[:4], {"kind": "sensor_error", "node": "sensor2", "at_s": 0.1}], FaultReason.SENSOR),
-        (
-            "stock",
-            [*TROUBLES[:2], *TROUBLES[4:6], {"kind": "silence", "node": "drive2", "at_s": 0.2}],
-            FaultReason.NONE,
-        ),
-    ],
-)
+@pytest.mark.parametrize(("config", "fault"), [("fd", FaultReason.SENSOR), ("stock", FaultReason.HEARTBEAT)])
 def test_long_and_unprotected_frames_come_out_as_the_loop_took_them(
-    config: str, rows: list[dict[str, Any]], fault: FaultReason, tmp_path: Path
+    config: str, fault: FaultReason, request: pytest.FixtureRequest
 ) -> None:
-    live = play(tmp_path, rows, config, finish_s=0.3)
+    live: Live = request.getfixturevalue(config)
     arm = live.recorded_arm()
     batch = arm.read(ticks_of(live.log), live.log.frames)
     assert differences(live.states, batch) == []
