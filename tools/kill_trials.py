@@ -1,7 +1,7 @@
 """Runs of the experiment in real time that are killed, for tools/damage_campaign.py: what recover must save of each.
 
-The host and the emulated arm are one process, the writer of the log is another. What was on the way when the processes
-died is told by the wall clock, which the log's times are of.
+The host and the emulated arm are one process, the writer of the log is another. The emulator has a log and a writer of
+its own, which nobody kills: it tells which cycle was the last.
 """
 
 import os
@@ -35,7 +35,7 @@ _DEMO = "from adacd_hil.cli.main import main; main()"
 
 @dataclass(frozen=True)
 class KillResult:
-    """One killed run. `cycles`: saved; `lost_s`: from the last of them to the kill."""
+    """One killed run. `cycles`: saved; `lost_s`: from the last of them to the last that there was."""
 
     seed: int
     victim: str
@@ -71,13 +71,32 @@ def _attempt(seed: int, folder: Path) -> KillResult:
             time.sleep(wait_s)
             if process.poll() is not None:
                 raise RunEndedError(f"the run ended by itself, exit status {process.returncode}")
-            killed_ns = time.time_ns()
-            for pid in {"writer": [writer], "control": [process.pid], "both": [process.pid, writer]}[victim]:
-                os.kill(pid, signal.SIGKILL)
+            killed_ns = time.monotonic_ns()
+            _kill(victim, process.pid, writer)
             _wait_for_end(writer)
         finally:
             process.kill()
-    return _judge(seed, victim, killed_ns, path)
+    return _judge(seed, victim, path, _last_cycle_ns(folder / "truth.mcap", killed_ns))
+
+
+def _kill(victim: str, control: int, writer: int) -> None:
+    if victim != "writer":
+        os.kill(control, signal.SIGKILL)
+    if victim != "control":
+        try:
+            os.kill(writer, signal.SIGKILL)
+        except ProcessLookupError:
+            if victim == "writer":
+                raise RunEndedError("the log had ended") from None
+
+
+def _last_cycle_ns(path: Path, killed_ns: int) -> int:
+    """Return when the last cycle before the kill was, by the emulator's log, whose writer nobody killed."""
+    end_s = time.monotonic() + START_S
+    while (log := read_log(path)).problem and time.monotonic() < end_s:
+        time.sleep(0.1)
+    times_ns = log.truth.t_ns
+    return int(times_ns[times_ns <= killed_ns][-1])
 
 
 def _wait_for_cycles(process: "subprocess.Popen[bytes]", path: Path) -> int:
@@ -111,7 +130,7 @@ def _wait_for_end(pid: int) -> None:
     os.close(descriptor)
 
 
-def _judge(seed: int, victim: str, killed_ns: int, path: Path) -> KillResult:
+def _judge(seed: int, victim: str, path: Path, last_ns: int) -> KillResult:
     before = messages_of(path)  # whatever mcap's reader finds up to the damage
     checked = check_log(path)
     violations = []
@@ -136,7 +155,7 @@ def _judge(seed: int, victim: str, killed_ns: int, path: Path) -> KillResult:
     topics = {name: len(log.topics[name]) for name in ("/scheme", "/control", "/joint_states")}
     if any(abs(count - len(cycle)) > 1 for count in topics.values()):
         violations.append(f"{len(cycle)} cycles, but {topics}")
-    lost_s = (killed_ns - int(log.cycle.records["publish_time"][-1])) * 1e-9
+    lost_s = max(0, last_ns - int(log.cycle.t_ns[-1])) * 1e-9
     if lost_s > LOSS_BOUND_S:
         violations.append(f"lost {lost_s:.3f} s, more than {LOSS_BOUND_S:g} s")
     if victim != "control" and not recovery.is_lossy:
