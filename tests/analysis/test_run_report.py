@@ -481,6 +481,12 @@ def test_a_browser_opens_the_page_without_a_word(report):
     assert (seen.complaints, seen.requests) == ([], [])
 
 
+LISTEN = """Object.defineProperty(window, "uPlot", { get() { return this.made; }, set(value) {
+  const plots = this.plots = [];
+  this.made = class extends value { constructor(...parts) { super(...parts); plots.push(this); } };
+} });"""
+"""Keeps the panels within reach as uPlot makes them."""
+DRAWN_DATA = "plots[0].data"
 MIDDLE_OF_A_PANEL = """(() => {
   document.querySelector("#panel-residual1").scrollIntoView({ behavior: "instant" });
   const box = document.querySelector("#panel-residual1 .u-over").getBoundingClientRect();
@@ -490,17 +496,50 @@ LEGEND = """new Promise((resolve) => requestAnimationFrame(() => requestAnimatio
   [...document.querySelectorAll("#panel-residual1 .u-value")].map((cell) => cell.textContent)))))"""
 
 
-@in_chromium
-def test_the_traces_show_what_was_recorded_in_a_cycle(report):
-    run = touched_run()
+@pytest.fixture(scope="module")
+def panel(report):
+    """Give what the panel of joint 1's residual draws of the whole run, of a contact, and its legend in the middle."""
     with BROWSE.open_tab(BROWSE.chromium()) as tab:
+        tab.ask("Page.enable")
+        tab.ask("Page.addScriptToEvaluateOnNewDocument", source=LISTEN)
         tab.ask("Page.navigate", url=report.html_path.as_uri())
         tab.evaluate(BROWSE.DRAWN)
+        whole = tab.evaluate(DRAWN_DATA)
         tab.evaluate(BROWSE.CLOSER)
         x, y = tab.evaluate(MIDDLE_OF_A_PANEL)
         tab.ask("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        texts = [text.replace("−", "-") for text in tab.evaluate(LEGEND)]
-    at_s, cad, ours = (float(texts[place]) for place in (0, 1, 2))
+        legend = [text.replace("−", "-") for text in tab.evaluate(LEGEND)]
+        return SimpleNamespace(whole=whole, closer=tab.evaluate(DRAWN_DATA), legend=legend)
+
+
+HALF_A_STEP = 0.51e-3
+
+
+@in_chromium
+def test_the_whole_run_is_drawn_by_the_smallest_and_the_largest_value_of_each_pixel(panel):
+    run = touched_run()
+    times_s, cad = np.array(panel.whole[0]), np.array(panel.whole[1])
+    starts = np.searchsorted(run.time_s(), times_s[::2] - 5e-4)
+    low, high = (extreme.reduceat(run.tau_ext_hat_cad[:, 0], starts) for extreme in (np.minimum, np.maximum))
+    assert len(times_s) < len(run.cycle) / 3
+    np.testing.assert_allclose(cad[::2], low, rtol=0, atol=HALF_A_STEP)
+    np.testing.assert_allclose(cad[1::2], high, rtol=0, atol=HALF_A_STEP)
+
+
+@in_chromium
+def test_a_contact_is_drawn_cycle_by_cycle(panel):
+    run = touched_run()
+    times_s, cad = np.array(panel.closer[0]), np.array(panel.closer[1])
+    rows = np.flatnonzero((run.time_s() > times_s[0] - 5e-4) & (run.time_s() < times_s[-1] + 5e-4))
+    assert rows.size == pytest.approx(750, abs=5)
+    np.testing.assert_allclose(times_s, run.time_s()[rows], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(cad, run.tau_ext_hat_cad[rows, 0], rtol=0, atol=HALF_A_STEP)
+
+
+@in_chromium
+def test_the_legend_has_the_values_under_the_cursor(panel):
+    run = touched_run()
+    at_s, cad, ours = (float(panel.legend[place]) for place in (0, 1, 2))
     row = int(np.argmin(np.abs(run.time_s() - at_s)))
     assert at_s == pytest.approx(1.95 - 0.15 + 0.375, abs=0.005)  # in the middle of what a contact's card shows
     assert (cad, ours) == pytest.approx((run.tau_ext_hat_cad[row, 0], run.tau_ext_hat[row, 0]), abs=1.1e-3)

@@ -46,7 +46,7 @@ def test_a_mark_stands_for_the_stretch_around_it():
 
 
 def test_marks_lie_where_their_time_is():
-    run = make_run((A, 1000), (M, 1001))
+    run = make_run((SchemeState.ENABLE, 1000), (A, 1001))
     boxes = re.findall(r'<rect x="([^"]*)" y="8.0" width="([^"]*)" height="24.0" fill', timeline(run, evaluate(run)))
     assert [tuple(map(float, box)) for box in boxes] == [(78.0, 459.0), (537.0, 459.0)]
 
@@ -59,11 +59,13 @@ def test_the_key_names_the_states_that_the_run_has_been_in():
 def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
     run = make_run((A, 100), (SchemeState.FAULT, 50))
     run.fault[100:] = FaultReason.DRIVE
-    info, warning = Event("info", "bus", "fine"), Event("warning", "bus", "slow")
-    run = replace(run, events=(LoggedEvent(int(run.t_ns[50]), info), LoggedEvent(int(run.t_ns[120]), warning)))
+    told = ((50, "info", "fine"), (110, "error", "off"), (120, "warning", "slow"))
+    events = tuple(LoggedEvent(int(run.t_ns[row]), Event(level, "bus", what)) for row, level, what in told)
+    run = replace(run, events=events)
     notices = notices_of(run, evaluate(run))
     assert [(notice.at_s, notice.is_bad, notice.text) for notice in notices] == [
         (0.1, True, "FAULT"),
+        (pytest.approx(0.11), True, "bus: off"),
         (pytest.approx(0.12), False, "bus: slow"),
     ]
 
@@ -92,8 +94,8 @@ def points_of(svg, kind):
 
 
 def test_the_arm_is_drawn_at_its_joint_angles():
-    svg = draw_arm(np.array([0.0, 0.5 * np.pi]), LENGTHS, Push(1, 0, 0.0, None, None), "arm")
-    assert (points_of(svg, "link touched"), points_of(svg, "link")) == (((0, 0), (400, 0)), ((400, 0), (400, 300)))
+    svg = draw_arm(np.array([0.5 * np.pi, 0.5 * np.pi]), LENGTHS, Push(1, 0, 0.0, None, None), "arm")
+    assert (points_of(svg, "link touched"), points_of(svg, "link")) == (((0, 0), (0, 400)), ((0, 400), (-300, 400)))
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -160,8 +162,18 @@ def test_a_known_force_is_drawn_where_the_report_has_it():
     touch(run, 2000, 250, (5.0, 1.0), link=2)
     told = {"location": Location.KNOWN, "force_N": -9.0, "force_sigma": 0.5, "lever_m": 0.2, "lever_sigma": 0.01}
     html = carded(react(run, 2005, link=2, **told))
+    (tail_x, tail_y), (neck_x, neck_y) = points_of(html, "force")
+    along = (np.cos(0.5), np.sin(0.5))  # link 2
+    assert along[0] * (neck_y - tail_y) - along[1] * (neck_x - tail_x) < -50.0
     assert "<dd>−9.0 ± 0.5 N</dd>" in html
     assert 'class="spread"' in html
+
+
+def test_a_contact_that_detection_was_not_armed_for_is_not_wrong():
+    run = make_run()
+    touch(run, 400, 100, (5.0, 0.0))
+    html = carded(run)
+    assert ("not armed in ADAPT" in html, 'class="wrong"' in html) == (True, False)
 
 
 def test_cards_stop_where_the_table_goes_on():

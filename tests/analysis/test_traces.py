@@ -18,6 +18,8 @@ from adacd_hil.analysis.run import Motion
 from adacd_hil.analysis.trace_encoding import noise_of, pack, step_of
 from adacd_hil.analysis.traces import panels_of
 from adacd_hil.analysis.traces_page import traces_section
+from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.records import Event
 
 VALUES = st.floats(-1e3, 1e3) | st.just(np.nan) | st.just(np.inf)
 
@@ -57,6 +59,11 @@ def test_a_series_whose_differences_wrap_comes_back():
 
 def test_a_straight_line_costs_next_to_nothing():
     assert len(pack(np.arange(100_000.0), 1e-3).text) < 1000
+
+
+def test_a_smooth_curve_is_differenced_twice_and_noise_once():
+    noise = np.random.default_rng(7).normal(0.0, 0.02, 1000)
+    assert (pack(np.arange(1000.0) ** 2, 1.0).order, pack(noise, 0.01).order) == (2, 1)
 
 
 def test_noise_costs_less_than_five_bits_per_sample():
@@ -155,6 +162,7 @@ def shown():
     touch(run, 2000, 250, (5.0, 0.0))
     run = react(run, 2005)
     run.state[9300:] = 8
+    run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("warning", "bus", "slow")),))
     return run, traces_section(run, evaluate(run))
 
 
