@@ -56,7 +56,7 @@ class Arm:
         devices = place_devices(settings)
         self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
         self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
-        self._devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
+        self.devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
         self._bus = bus
         self.sync_id = codec.message("Sync").can_id
         self._is_following = settings.bus.follows
@@ -70,7 +70,8 @@ class Arm:
             sign * 1000.0 / rated for sign, rated in zip(settings.arm.sign, settings.arm.rated_torque_Nm, strict=True)
         )
         self._max_age = settings.bus.max_age_cycles
-        self._max_status_age = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
+        self.status_age_limits = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
+        """How old each drive's status may be, in cycles; infinite where nothing is expected."""
         self._handlers = self._build_handlers()
         self._cycle = -1
         self._t_ns = 0
@@ -122,7 +123,7 @@ class Arm:
 
     def _miss(self) -> None:
         """Let every device note that its frame of the cycle that ends now did not come."""
-        for bit, device in enumerate(self._devices):
+        for bit, device in enumerate(self.devices):
             if not self._seen & (1 << bit):
                 device.miss()
 
@@ -143,6 +144,13 @@ class Arm:
         if take(frame.data, self._cycle):
             self._received |= bit
         return True
+
+    def accept_past(self, frame: Frame, cycle: int) -> bool:
+        """Take one frame of a cycle that is over; False when it is not one of the arm's."""
+        handler = self._handlers.get(frame.can_id)
+        if handler is not None:
+            handler[0](frame.data, cycle)
+        return handler is not None
 
     @property
     def is_complete(self) -> bool:
@@ -188,7 +196,7 @@ class Arm:
         sensor1, sensor2 = self.sensors
         if not (sensor1.status in USABLE and sensor2.status in USABLE):
             return FaultReason.SENSOR
-        (drive1, drive2), (limit1, limit2) = self.drives, self._max_status_age
+        (drive1, drive2), (limit1, limit2) = self.drives, self.status_age_limits
         if is_enabled and (self._cycle - drive1.status_cycle > limit1 or self._cycle - drive2.status_cycle > limit2):
             return FaultReason.DATA_AGE
         return FaultReason.NONE
@@ -197,7 +205,7 @@ class Arm:
         """Return the age of every signal that the arm is run by, against its limit."""
         cycle = self._cycle
         ages = []
-        for drive, status_limit in zip(self.drives, self._max_status_age, strict=True):
+        for drive, status_limit in zip(self.drives, self.status_age_limits, strict=True):
             ages.append(SignalAge(drive.name, "position, velocity", cycle - drive.sample_cycle, self._max_age))
             if drive.has_status_frame and not math.isinf(status_limit):
                 ages.append(SignalAge(drive.name, "statusword", cycle - drive.status_cycle, int(status_limit)))
@@ -227,13 +235,13 @@ class Arm:
         """Return what the checks have said of all cyclic frames so far."""
         return FrameChecks(
             self._cycle,
-            tuple(tuple(device.end_to_end.counts) for device in self._devices),
-            tuple(device.implausible_frames for device in self._devices),
+            tuple(tuple(device.end_to_end.counts) for device in self.devices),
+            tuple(device.implausible_frames for device in self.devices),
         )
 
     def describe_checks(self) -> list[str]:
         """Say how many cyclic frames of each device passed and failed their checks, one line each."""
-        return [_describe_checks(device) for device in self._devices]
+        return [_describe_checks(device) for device in self.devices]
 
     def describe_faults(self) -> list[str]:
         """Say what is wrong with each device, one line each; empty when nothing is.

@@ -206,7 +206,7 @@ class Drive:
         self._sender = self.command_message.sender()
         self._period_s = period_s
         self._quick_stop_option = quick_stop_option
-        self._position_jump_rad = position_jump_rad
+        self.position_jump_rad = position_jump_rad
         self._position_at = find_signal(self.feedback_message, "position")
         self._velocity_at = find_signal(self.feedback_message, "velocity")
         self._feedback_status = _status_places(self.feedback_message)
@@ -270,10 +270,23 @@ class Drive:
         last, self._received_position_rad = self._received_position_rad, position
         elapsed_s = (cycle - self._received_cycle) * self._period_s
         self._received_cycle = cycle
-        if last is not None and not abs(position - last - velocity * elapsed_s) <= self._position_jump_rad:
+        if last is not None and not abs(position - last - velocity * elapsed_s) <= self.position_jump_rad:
             self.implausible_frames += 1
             return False
         return True
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the last feedback that came is in use, and the next is to follow it without loss."""
+        if self.is_protected:
+            return self.end_to_end.counter is not None
+        return self._received_position_rad == self.position_rad and self._received_cycle == self.sample_cycle
+
+    def skip(self, count: int) -> None:
+        """Take so many feedback frames for right that were taken elsewhere; the next one is compared with none."""
+        if self.is_protected:
+            self.end_to_end.skip(count)
+        self._received_position_rad = None
 
     def miss(self) -> None:
         """Note a cycle in which no feedback came."""

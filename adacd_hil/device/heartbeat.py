@@ -14,6 +14,7 @@ PATIENCE_PERIODS = 2.5
 """Periods without a heartbeat until a node counts as silent, on the host and in 0x1016 of the devices: one heartbeat
 may be lost and the next one be late by half a period, and yet nobody waits for a third."""
 OPERATIONAL = 5
+HEARTBEAT_ID = 0x700
 _STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
 
 
@@ -32,8 +33,11 @@ class HeartbeatWatch:
 
     def __init__(self, nodes: Iterable[tuple[str, int]], period_ms: int, report: Callable[[Event], None]) -> None:
         """`nodes`: name and node id. `report` gets an event when a node falls out and when it is back."""
-        self._nodes = {0x700 + node_id: _Node(name, node_id) for name, node_id in nodes}
-        self._patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
+        self._nodes = {HEARTBEAT_ID + node_id: _Node(name, node_id) for name, node_id in nodes}
+        self.can_ids = tuple(self._nodes)
+        """Identifiers of the heartbeats that are watched."""
+        self.patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
+        """Longest silence of a node that is none."""
         self._report = report
         self._is_watching = False
         self._since_ns: int | None = None
@@ -72,17 +76,25 @@ class HeartbeatWatch:
                 lines.append(line)
         return lines
 
+    def heard_ns(self) -> dict[int, int] | None:
+        """Say by identifier when each node was last heard, or began to be watched; None unless all are OPERATIONAL."""
+        since_ns = self._since_ns
+        nodes = self._nodes.items()
+        if since_ns is None or any(node.state != OPERATIONAL or node.complaint for _, node in nodes):
+            return None
+        return {can_id: max(node.heard_ns or since_ns, since_ns) for can_id, node in nodes}
+
     def _judge(self, node: _Node, t_ns: int, since_ns: int) -> str:
         heard_ns = since_ns if node.heard_ns is None else max(node.heard_ns, since_ns)
         silent_ns = t_ns - heard_ns
-        if silent_ns > self._patience_ns:
+        if silent_ns > self.patience_ns:
             complaint = "silent"
-            text = f"no heartbeat for {silent_ns // 1_000_000} ms, {self._patience_ns // 1_000_000} ms allowed"
+            text = f"no heartbeat for {silent_ns // 1_000_000} ms, {self.patience_ns // 1_000_000} ms allowed"
         elif (
             node.state is not None
             and node.state != OPERATIONAL
             # A heartbeat from before the start command took effect may still be on its way.
-            and (node.has_run or t_ns - since_ns > self._patience_ns)
+            and (node.has_run or t_ns - since_ns > self.patience_ns)
         ):
             complaint = f"state {node.state}"
             text = f"is {_STATES.get(node.state, f'in NMT state {node.state}')}, OPERATIONAL expected"

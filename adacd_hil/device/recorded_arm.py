@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_batch import FrameColumns, NotOrdinaryError, OrdinaryCycles, columns_of
 from adacd_hil.device.arm_watch import ArmWatch
 from adacd_hil.device.canopen_bus import NMT_ID
 from adacd_hil.device.heartbeat import follow_devices
@@ -41,7 +42,8 @@ class Ticks(NamedTuple):
     """The beginnings of n cycles, as columns (n,) of int64.
 
     `t_ns`: when SYNC went out or came, as all messages of the cycle carry it; so do its frames, as cycle_t_ns.
-    `periods`: since the cycle before, 1 unless some were skipped.
+    `periods`: since the cycle before, 1 unless some were skipped: one more than the step of /cycle's overruns. Where an
+    attempt begins again it is taken for 1, since the pause before it was meant.
     """
 
     cycle: NDArray[np.int64]
@@ -52,15 +54,18 @@ class Ticks(NamedTuple):
 class RecordedArm:
     """Turns what a log has of one run into what its arm reported, attempt after attempt.
 
-    `beginnings`: places in the last batch with which an attempt began.
+    `beginnings`: places in the last batch with which an attempt began. `exact_cycles`: how many cycles so far went
+    through the live classes; the others were read at once.
     """
 
     def __init__(self, settings: Settings, codec: Codec) -> None:
         """Place the devices. Raises ConfigError and CodecError as `Arm`."""
         self.beginnings: list[int] = []
+        self.exact_cycles = 0
         self._settings, self._codec = settings, codec
         self._is_following = settings.bus.follows
         self._devices = place_devices(settings)
+        self._has_begun_again = False
         self._begin()
 
     def _begin(self) -> None:
@@ -69,6 +74,8 @@ class RecordedArm:
         self._arm = Arm(settings, self._codec, EmbeddedBus(VirtualClock()))  # with nobody on it
         self._heartbeats = follow_devices(self._devices, settings.bus.heartbeat_ms, lambda _: None)
         self._watch = ArmWatch(settings, self._heartbeats.watch)
+        self._ordinary = self._make_ordinary()
+        self._state: ArmState | None = None
         self._is_booting = False
         self._is_running = False
 
@@ -78,23 +85,58 @@ class RecordedArm:
         `frames`: FRAME_DTYPE or LONG_FRAME_DTYPE of the log's reader. Consecutive calls take up a run piece by piece;
         what was logged after the last cycle of a piece may come with this call or with the next.
         """
-        count = len(ticks.cycle)
         batch = _empty_batch(ticks)
         self.beginnings = []
-        cycle_t_ns = np.ascontiguousarray(frames["cycle_t_ns"])
-        firsts = np.searchsorted(cycle_t_ns, ticks.t_ns, "left").tolist()
-        ends = np.searchsorted(cycle_t_ns, ticks.t_ns, "right").tolist()
-        at = 0
-        for place in range(count):
-            self._pass(_unpack(frames[at : firsts[place]]))
-            at = ends[place]
-            self._exchange(batch, place, _unpack(frames[firsts[place] : at]))
-        self._pass(_unpack(frames[at:]))
+        columns = columns_of(frames)
+        at = place = 0
+        while place < len(batch.cycle):
+            cycles, at = self._skip(batch, place, columns, at)
+            place += cycles
+            first, end = self._find(columns, at, int(batch.t_ns[place]))
+            self._pass(_unpack(columns, at, first))
+            self._exchange(batch, place, _unpack(columns, first, end))
+            at = end
+            place += 1
+        self._pass(_unpack(columns, at, len(frames)))
         return batch
+
+    @staticmethod
+    def _find(columns: FrameColumns, at: int, t_ns: int) -> tuple[int, int]:
+        """Find the frames of a cycle, from `at` on: where they begin and end."""
+        rest = columns.cycle_t_ns[at:]
+        first, end = np.searchsorted(rest, t_ns, "left"), np.searchsorted(rest, t_ns, "right")
+        return at + int(first), at + int(end)
+
+    def _make_ordinary(self) -> OrdinaryCycles | None:
+        """Make what reads ordinary cycles at once, where that is possible."""
+        try:
+            return OrdinaryCycles(self._settings, self._arm, self._heartbeats)
+        except NotOrdinaryError:
+            return None
+
+    def _skip(self, batch: ArmBatch, place: int, columns: FrameColumns, at: int) -> tuple[int, int]:
+        """Read ordinary cycles at once, as many as there are; return how many of them the live classes can do without.
+
+        Also return where the next frames begin. The last cycle that is ordinary goes through the live classes, so that
+        these stand where they would stand had they taken all.
+        """
+        if self._ordinary is None or self._state is None:
+            return 0, at
+        stretch = self._ordinary.read(batch, place, columns, at, self._state)
+        skipped = stretch.cycles - 1
+        if skipped <= 0:
+            return 0, at
+        for device in self._arm.devices:
+            device.skip(skipped)
+        for news, cycle in stretch.news:
+            ((_, frame),) = _unpack(columns, news, news + 1)
+            if not self._arm.accept_past(frame, cycle):
+                self._heartbeats.accept(frame)
+        return skipped, stretch.last
 
     def _exchange(self, batch: ArmBatch, place: int, passed: _Passed) -> None:
         """Do what Exchange.read did with the frames of a cycle, and judge the state as the cycle did."""
-        cycle, t_ns, periods = (int(column[place]) for column in (batch.cycle, batch.t_ns, batch.periods))
+        t_ns = int(batch.t_ns[place])
         sync_at = self._find_sync(passed, t_ns)
         self._pass(passed[:sync_at])
         if not self._is_running:  # a log whose beginning was cut off
@@ -102,11 +144,15 @@ class RecordedArm:
         arm = self._arm
         if arm.cycle < 0:
             self.beginnings.append(place)
-        arm.synchronise(cycle, t_ns, periods)
+            if self._has_begun_again:
+                batch.periods[place] = 1
+        arm.synchronise(int(batch.cycle[place]), t_ns, int(batch.periods[place]))
         for is_sent, frame in passed[sync_at:]:
             if not is_sent:
                 self._accept(frame, is_late=frame.t_ns < t_ns)
-        _put(batch, place, self._watch.judge(arm.state()))
+        self._state = self._watch.judge(arm.state())
+        self.exact_cycles += 1
+        _put(batch, place, self._state)
 
     def _find_sync(self, passed: _Passed, t_ns: int) -> int:
         """Find SYNC among the frames of a cycle; 0 where it was logged before them."""
@@ -132,6 +178,7 @@ class RecordedArm:
         if nmt_command == RESET_COMMUNICATION:
             if self._is_running:
                 self._begin()
+                self._has_begun_again = True
             self._is_booting = True
         elif nmt_command == START and not self._is_running:
             self._start()
@@ -147,24 +194,25 @@ class RecordedArm:
             self._heartbeats.accept(frame)
 
 
-def _unpack(frames: NDArray[Any]) -> _Passed:
-    """Turn recorded frames into those of a bus."""
-    if not len(frames):
+def _unpack(columns: FrameColumns, first: int, end: int) -> _Passed:
+    """Turn some recorded frames into those of a bus."""
+    if first == end:
         return []
-    size = frames["data"].shape[1]
-    data = frames["data"].tobytes()
-    names = ("is_tx", "can_id", "length", "t_ns", "is_error")
-    columns = zip(*(frames[name].tolist() for name in names), strict=True)
+    t_ns, _, can_id, is_tx, is_error, length, data = (column[first:end] for column in columns)
     return [
-        (is_sent, Frame(can_id, data[place * size : place * size + length], t_ns, is_error))
-        for place, (is_sent, can_id, length, t_ns, is_error) in enumerate(columns)
+        (was_sent, Frame(identifier, payload[:size].tobytes(), stamp_ns, is_wrong))
+        for was_sent, identifier, payload, size, stamp_ns, is_wrong in zip(
+            is_tx.tolist(), can_id.tolist(), data, length.tolist(), t_ns.tolist(), is_error.tolist(), strict=True
+        )
     ]
 
 
 def _empty_batch(ticks: Ticks) -> ArmBatch:
     count = len(ticks.cycle)
     return ArmBatch(
-        *ticks,
+        cycle=np.array(ticks.cycle, np.int64),
+        t_ns=np.array(ticks.t_ns, np.int64),
+        periods=np.array(ticks.periods, np.int64),
         q=np.empty((count, JOINTS)),
         dq=np.empty((count, JOINTS)),
         tau_J=np.empty((count, JOINTS)),

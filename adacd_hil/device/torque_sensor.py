@@ -50,12 +50,12 @@ class TorqueSensor:
         self.status_message = codec.messages.get(f"{name}Status")
         self.end_to_end = self.torque_message.receiver()
         self._period_s = period_s
-        self._torque_rate_Nm_s = torque_rate_Nm_s
-        self._torque_range_Nm = torque_range_Nm
+        self.torque_rate_Nm_s = torque_rate_Nm_s
+        self.torque_range_Nm = torque_range_Nm
         names = [signal.name for signal in self.torque_message.values]
         self._torque_at = find_signal(self.torque_message, "torque")
         self._status_at = names.index("status") if "status" in names else None
-        self._status_in_header = _STATUS_IN_HEADER[self.torque_message.header_bytes]
+        self.status_in_header = _STATUS_IN_HEADER[self.torque_message.header_bytes]
         self._slow_status_at = None if self.status_message is None else find_signal(self.status_message, "status")
         self._status_receiver = None if self.status_message is None else self.status_message.receiver()
         self.is_protected = self.torque_message.header_bytes > 0
@@ -94,7 +94,7 @@ class TorqueSensor:
         # Two frames of one cycle, late and present, may lie a period apart.
         elapsed_s = max(1, cycle - self._received_cycle) * self._period_s
         self._received_cycle = cycle
-        if last is not None and not abs(torque - last) <= self._torque_rate_Nm_s * elapsed_s:
+        if last is not None and not abs(torque - last) <= self.torque_rate_Nm_s * elapsed_s:
             self.implausible_frames += 1
             return False
         return True
@@ -102,11 +102,24 @@ class TorqueSensor:
     def _take_status(self, data: bytes, values: tuple[float, ...], torque: float) -> None:
         if self._status_at is not None:
             self.status = _STATUSES[int(values[self._status_at]) & _STATUS_BITS]
-        elif self._status_in_header is not None:
-            byte, shift = self._status_in_header
+        elif self.status_in_header is not None:
+            byte, shift = self.status_in_header
             self.status = _STATUSES[data[byte] >> shift & _STATUS_BITS]
-        elif self._torque_range_Nm:
-            self.status = _judge_range(torque, self._torque_range_Nm)
+        elif self.torque_range_Nm:
+            self.status = _judge_range(torque, self.torque_range_Nm)
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the last torque that came is in use, and the next is to follow it without loss."""
+        if self.is_protected:
+            return self.end_to_end.counter is not None
+        return self._received_torque_Nm == self.torque_Nm and self._received_cycle == self.sample_cycle
+
+    def skip(self, count: int) -> None:
+        """Take so many torque frames for right that were taken elsewhere; the next one is compared with none."""
+        if self.is_protected:
+            self.end_to_end.skip(count)
+        self._received_torque_Nm = None
 
     def miss(self) -> None:
         """Note a cycle in which no torque came."""

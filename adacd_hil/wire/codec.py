@@ -108,6 +108,11 @@ class MessageCodec:
         """Whether the frames are CAN FD: those of up to 8 bytes are classic on every bus."""
         return self.length > CLASSIC_BYTES
 
+    def first_byte(self, signal: SignalCodec) -> int:
+        """Return where the container of a signal begins in a frame."""
+        containers = self._struct.format[1:]
+        return struct.calcsize("<" + containers[: signal.container])
+
     def sender(self) -> E2eSender:
         """Make the end-to-end sender of this message; without protection it changes nothing."""
         if self.protection is Protection.PROFILE_2:

@@ -29,12 +29,12 @@ def _crc8_table() -> bytes:
     return bytes(table)
 
 
-_TABLE_8 = _crc8_table()
+TABLE_8 = _crc8_table()
 
 
 def crc8(data: bytes | bytearray, data_id: int) -> int:
     """Compute the Profile 2 CRC of a frame whose bytes 1… are `data[1:]`."""
-    table = _TABLE_8
+    table = TABLE_8
     crc = 0xFF
     for byte in data[1:]:
         crc = table[crc ^ byte]
@@ -151,6 +151,11 @@ class E2eReceiver:
         self.counts = [0] * len(E2eStatus)
         """How often each status was found; the index is its number."""
 
+    @property
+    def counter(self) -> int | None:
+        """The last frame's counter while that frame was in sequence; None when it wasn't, none came, or none counts."""
+        return None
+
     def check(self, frame: bytes) -> E2eStatus:
         """Check one frame; only a valid one may change a value."""
         status = self._judge(frame)
@@ -175,6 +180,11 @@ class E2eReceiver:
     def restart(self) -> None:
         """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
 
+    def skip(self, count: int) -> None:
+        """Take so many frames for OK that were checked elsewhere; the next frame with a right CRC sets the sequence."""
+        self.counts[E2eStatus.OK] += count
+        self.restart()
+
     def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
         return E2eStatus.OK
 
@@ -196,6 +206,11 @@ class _SequenceReceiver(E2eReceiver):
         self._last: int | None = None
         self._missing = 0
         self._to_sync = 0
+
+    @property
+    def counter(self) -> int | None:
+        """The last frame's counter while that frame was in sequence; None when it wasn't or none came."""
+        return self._last if self._missing == self._to_sync == 0 else None
 
     def _note_silence(self) -> None:
         self._missing += 1
@@ -238,6 +253,11 @@ class Profile2Receiver(_SequenceReceiver):
         """Forget the sequence: the next frame with a right CRC sets it. The counts stay."""
         super().restart()
         self._max_delta = self._tolerance.max_delta
+
+    @property
+    def counter(self) -> int | None:
+        """The last frame's counter while that frame was in sequence; None when it wasn't or none came."""
+        return super().counter if self._max_delta == self._tolerance.max_delta else None
 
     def _note_silence(self) -> None:
         self._widen()

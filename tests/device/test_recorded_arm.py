@@ -1,14 +1,24 @@
 """The arm from a run's log against what the same run's loop saw of it, bit for bit."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from cycle_rig import CODEC, CycleRig
 from fault_rig import run_realtime, settings_of
+from numpy.typing import NDArray
 from recorded_arm_rig import Live, differences, live_states, play, ticks_of
+from test_two_arms import SECOND
+from test_two_arms import Rig as TwoArms
+from test_two_arms import settings_of as two_arms_settings
 
+from adacd_hil.device.arm_batch import OrdinaryCycles, Stretch
+from adacd_hil.device.contract import load_contract
+from adacd_hil.device.drive import Drive
 from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.device.torque_sensor import TorqueSensor
+from adacd_hil.log.reader import read_log
 from adacd_hil.records import ArmBatch, FaultReason, SchemeState
 
 pytestmark = pytest.mark.slow
@@ -57,16 +67,88 @@ def test_a_new_attempt_forgets_the_one_before(troubled: Live) -> None:
     assert arm.beginnings == [0, *again]
 
 
+def test_the_pause_before_a_new_attempt_counts_for_no_periods(troubled: Live, read: ArmBatch) -> None:
+    ticks = ticks_of(troubled.log)
+    arm = troubled.recorded_arm()
+    arm.read(ticks, troubled.log.frames)
+    _, again = arm.beginnings
+    periods = ticks.periods.copy()
+    periods[again] = 40
+    assert troubled.recorded_arm().read(ticks._replace(periods=periods), troubled.log.frames).periods[again] == 1
+
+
+def test_ordinary_cycles_read_at_once_leave_the_arm_as_frame_by_frame(
+    troubled: Live, read: ArmBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_once, one_by_one = troubled.recorded_arm(), troubled.recorded_arm()
+    ticks, frames = ticks_of(troubled.log), troubled.log.frames
+    at_once.read(ticks, frames)
+    monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: Stretch(0, 0, []))
+    batch = one_by_one.read(ticks, frames)
+    assert differences(troubled.states, batch) == []
+    assert (at_once.exact_cycles < 0.4 * len(ticks.cycle), one_by_one.exact_cycles) == (True, len(ticks.cycle))
+    assert at_once._arm.frame_checks() == one_by_one._arm.frame_checks()
+    assert at_once._heartbeats.__dict__["_nodes"] == one_by_one._heartbeats.__dict__["_nodes"]
+    for mine, theirs in zip(at_once._arm.devices, one_by_one._arm.devices, strict=True):
+        assert _numbers(mine) == _numbers(theirs)
+
+
+def _numbers(device: Drive | TorqueSensor) -> dict[str, object]:
+    """Return all that a device and the check of its frames remember."""
+    memory = {**vars(device), **vars(device.end_to_end)}
+    return {name: value for name, value in memory.items() if isinstance(value, (int, float, bool, list, type(None)))}
+
+
+@pytest.mark.parametrize(
+    ("config", "rows", "fault"),
+    [
+        ("fd", [*TROUBLES[:4], {"kind": "sensor_error", "node": "sensor2", "at_s": 0.1}], FaultReason.SENSOR),
+        (
+            "stock",
+            [*TROUBLES[:2], *TROUBLES[4:6], {"kind": "silence", "node": "drive2", "at_s": 0.2}],
+            FaultReason.NONE,
+        ),
+    ],
+)
+def test_long_and_unprotected_frames_come_out_as_the_loop_took_them(
+    config: str, rows: list[dict[str, Any]], fault: FaultReason, tmp_path: Path
+) -> None:
+    live = play(tmp_path, rows, config, finish_s=0.3)
+    arm = live.recorded_arm()
+    batch = arm.read(ticks_of(live.log), live.log.frames)
+    assert differences(live.states, batch) == []
+    assert fault in batch.fault
+    assert arm.exact_cycles < 0.8 * len(live.states)
+
+
+def test_nearly_all_cycles_of_a_quiet_run_are_read_at_once(troubled: Live) -> None:
+    arm = troubled.recorded_arm()
+    ticks, frames = ticks_of(troubled.log), troubled.log.frames
+    arm.read(ticks, frames)
+    quiet = arm.beginnings[-1] + 250  # from here to its end nothing befalls the second attempt
+    arm = troubled.recorded_arm()
+    for cycles in (slice(0, quiet), slice(quiet, None)):
+        before = arm.exact_cycles
+        arm.read(*_piece(ticks, frames, cycles))
+    assert arm.exact_cycles - before < 0.05 * (len(ticks.cycle) - quiet)
+
+
+def _piece(ticks: Ticks, frames: NDArray[Any], cycles: slice) -> tuple[Ticks, NDArray[Any]]:
+    """Cut out some cycles with their frames and those that were logged since the cycle before."""
+    first, last, _ = cycles.indices(len(ticks.cycle))
+    low_ns = ticks.t_ns[first - 1] if first else -1
+    high_ns = ticks.t_ns[last - 1] if last else -1
+    is_inside = (frames["cycle_t_ns"] > low_ns) & (frames["cycle_t_ns"] <= high_ns)
+    return Ticks(*(column[cycles] for column in ticks)), frames[is_inside]
+
+
 def test_a_run_read_in_pieces_is_the_same_run(troubled: Live) -> None:
     arm = troubled.recorded_arm()
     ticks, frames = ticks_of(troubled.log), troubled.log.frames
     states = iter(troubled.states)
-    for first, last in ((0, 0), (0, 1), (1, 230), (230, 231), (231, 1200), (1200, len(ticks.cycle))):
-        piece = Ticks(*(column[first:last] for column in ticks))
-        low_ns = ticks.t_ns[first - 1] if first else -1
-        high_ns = ticks.t_ns[last - 1] if last else -1
-        is_inside = (frames["cycle_t_ns"] > low_ns) & (frames["cycle_t_ns"] <= high_ns)
-        assert differences([next(states) for _ in range(last - first)], arm.read(piece, frames[is_inside])) == []
+    for first, last in ((0, 0), (0, 1), (1, 230), (230, 231), (231, 700), (700, len(ticks.cycle))):
+        batch = arm.read(*_piece(ticks, frames, slice(first, last)))
+        assert differences([next(states) for _ in range(last - first)], batch) == []
 
 
 def test_frames_that_come_after_their_cycle_in_real_time_are_of_the_cycle_before(tmp_path: Path) -> None:
@@ -94,3 +176,13 @@ def test_a_host_that_skipped_periods_is_late_in_its_recording_too(tmp_path: Path
     assert differences(states, batch) == []
     assert batch.periods.max() == 9
     assert FaultReason.DEADLINE in batch.fault
+
+
+def test_a_host_that_follows_anothers_sync_is_read_by_the_sync_that_came(tmp_path: Path) -> None:
+    rig = TwoArms(tmp_path, finish_s=0.05)
+    with live_states() as states:
+        rig.run()
+    settings = two_arms_settings(SECOND)
+    batch = Live(settings, load_contract(settings), states, read_log(rig.path)).read()
+    assert differences(states, batch) == []
+    assert batch.is_enabled.any()
