@@ -1,18 +1,19 @@
-"""An MCAP file as blocks of message records: read, checked and decompressed by a thread ahead of who asks.
+"""An MCAP file as blocks of message records: read, checked and decompressed by threads ahead of who asks.
 
 All work on bytes (reading, CRCs, decompression, passing over index records) is done without the GIL. A block has the
 records of many chunks; its memory is used again after the next one is asked for.
 """
 
 import io
+import itertools
 import os
 import struct
-import zlib
+import threading
 from collections import deque
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import IO, Any, NamedTuple, TypeAlias
+from typing import IO, NamedTuple, TypeAlias
 
 import numpy as np
 import zstandard
@@ -27,10 +28,16 @@ from adacd_hil.log.compiled_records import WORD, pass_over, words_of
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_walk import MAGIC, RECORD_HEAD_BYTES
 
+try:
+    from zlib_ng.zlib_ng import crc32  # six times as fast, which saves a sixth of the time to read a log
+except ImportError:
+    from zlib import crc32
+
 READ_BYTES = 1 << 20
-BLOCK_BYTES = 1 << 22
-AHEAD = 4
-"""Blocks that may wait."""
+BLOCK_BYTES = 1 << 21
+THREADS = 2
+AHEAD = 6
+"""Blocks that may wait or be in work."""
 _MAX_CHUNK = 1 << 30
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
@@ -54,7 +61,8 @@ class Block(NamedTuple):
 
     data: Bytes
     ends: list[int]  # of each chunk
-    position: int  # in the file, of the last of them
+    position: int  # in the file, of the first of them
+    problem: str  # why chunks are missing, "" if none is
 
 
 class Record(NamedTuple):
@@ -71,70 +79,133 @@ class Problem(NamedTuple):
     text: str
 
 
+class _PackedChunk(NamedTuple):
+    """A chunk as it is in the file; a record outside chunks is one by itself."""
+
+    body: bytes  # of the record of the chunk; the whole record outside chunks
+    is_chunk: bool
+    size: int  # decompressed
+    position: int
+
+
+_Packed: TypeAlias = list[_PackedChunk]
 Item: TypeAlias = Block | Record | Problem
 
 
-def items_ahead(path: Path) -> Iterator[Item]:
-    """Read a file in a thread ahead. Raises LogError when it can't be read or isn't MCAP."""
-    items = read_items(path)
-    with ThreadPoolExecutor(1, "log-reader") as thread:
+def read_items(path: Path) -> Iterator[Item]:
+    """Read a file from front to end in threads ahead. Raises LogError when it can't be read or isn't MCAP."""
+    packed = _read_packed(path)
+    numbers = itertools.count()
+    memory = [np.empty(0, np.uint8)] * (AHEAD + 2)  # one is held by who asks, one may wait for the one before it
+    is_reading = threading.Lock()
+
+    def read_next() -> tuple[int, Item | None]:
+        with is_reading:
+            number = next(numbers)
+            item = next(packed, None)
+        if not isinstance(item, list):
+            return number, item
+        place = number % len(memory)
+        size = sum(chunk.size for chunk in item) + WORD
+        if len(memory[place]) < size:
+            memory[place] = np.zeros(max(size, BLOCK_BYTES), np.uint8)
+        return number, _unpack(item, memory[place])
+
+    with ThreadPoolExecutor(THREADS, "log-reader") as threads:
         try:
-            waiting = deque(thread.submit(next, items, None) for _ in range(AHEAD))
-            while (item := waiting.popleft().result()) is not None:
-                yield item
-                waiting.append(thread.submit(next, items, None))
+            yield from _in_order(deque(threads.submit(read_next) for _ in range(AHEAD)), threads, read_next)
         finally:
-            thread.shutdown(cancel_futures=True)
+            threads.shutdown(cancel_futures=True)
 
 
-def read_items(path: Path, has_chunks: bool = True) -> Iterator[Item]:
-    """Read a file from front to end, without `has_chunks` all but its messages.
+def read_others(path: Path) -> Iterator[Record | Problem]:
+    """Read all of a file but its messages, as fast as it can be passed over. Raises LogError as `read_items` does."""
+    for item in _read_packed(path, has_chunks=False):
+        if not isinstance(item, list):
+            yield item
 
-    Raises LogError when it can't be read or isn't MCAP.
-    """
+
+def _in_order(
+    waiting: "deque[Future[tuple[int, Item | None]]]",
+    threads: ThreadPoolExecutor,
+    read_next: Callable[[], tuple[int, Item | None]],
+) -> Iterator[Item]:
+    """Yield what the threads make by its number; they may take turns in another order than they were asked."""
+    early: dict[int, Item | None] = {}
+    for number in itertools.count():
+        while number not in early:
+            other, item = waiting.popleft().result()
+            early[other] = item
+        item = early.pop(number)
+        if item is None:
+            return
+        yield item
+        waiting.append(threads.submit(read_next))
+
+
+def _unpack(chunks: _Packed, memory: Bytes) -> Block:
+    """Put the records of chunks one after the other."""
+    decompressor = zstandard.ZstdDecompressor()
+    ends, problem, filled = [], "", 0
+    for chunk in chunks:
+        try:
+            _unpack_chunk(chunk, decompressor, memory[filled : filled + chunk.size])
+        except DAMAGE:
+            problem = problem or f"damaged at byte {chunk.position}"
+        else:
+            filled += chunk.size
+            ends.append(filled)
+    return Block(memory, ends, chunks[0].position, problem)
+
+
+def _unpack_chunk(chunk: _PackedChunk, decompressor: zstandard.ZstdDecompressor, records: Bytes) -> None:
+    """Put the records of a chunk where they belong. Raises one of DAMAGE."""
+    if not chunk.is_chunk:
+        records[:] = np.frombuffer(chunk.body, np.uint8)
+        return
+    name, data = _compressed(chunk.body)
+    if name == b"zstd":
+        with decompressor.stream_reader(data) as reader:
+            count = 0
+            while count < chunk.size and (read := reader.readinto(records[count:].data)):
+                count += read
+        if count != chunk.size:
+            raise ValueError("a chunk isn't as long as it says")
+    else:
+        stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(io.BytesIO(chunk.body))), validate_crc=False)
+        records[:] = np.frombuffer(stream.read(size), np.uint8)
+    _, _, _, crc, _ = _CHUNK_HEAD.unpack_from(chunk.body)
+    if crc and crc32(records.data) != crc:
+        raise ValueError("a chunk fails its CRC")
+
+
+def _compressed(body: bytes) -> tuple[bytes, memoryview]:
+    """Return how the records of a chunk are compressed, and to what. Raises one of DAMAGE."""
+    *_, name_size = _CHUNK_HEAD.unpack_from(body)
+    place = _CHUNK_HEAD.size + name_size
+    (size,) = struct.unpack_from("<Q", body, place)
+    data = memoryview(body)[place + 8 : place + 8 + size]
+    if len(data) != size:
+        raise ValueError("a chunk is longer than its record")
+    return body[_CHUNK_HEAD.size : place], data
+
+
+def _packed_chunk(body: bytes, position: int) -> _PackedChunk:
+    """Look at a chunk. Raises one of DAMAGE."""
+    _, _, size, _, _ = _CHUNK_HEAD.unpack_from(body)
+    name, data = _compressed(body)
+    if size > _MAX_CHUNK or (name == b"zstd" and zstandard.frame_content_size(data) not in (-1, size)):
+        raise ValueError("a chunk isn't as long as it says")
+    return _PackedChunk(body, is_chunk=True, size=size, position=position)
+
+
+def _read_packed(path: Path, has_chunks: bool = True) -> Iterator[_Packed | Record | Problem]:
+    """Read a file from front to end, chunks as they are."""
     try:
         with path.open("rb", buffering=0) as file:
             yield from _Reading(file, path, has_chunks).items()
     except OSError as error:
         raise LogError(f"log {path} can't be read: {error.strerror}") from None
-
-
-class _Blocks:
-    """The block in progress, and the memory of those that wait."""
-
-    def __init__(self) -> None:
-        # One is being filled, AHEAD wait and one is being walked over.
-        self._memory = [np.empty(0, np.uint8)] * (AHEAD + 2)
-        self._turn = 0
-        self._filled = 0
-        self._ends: list[int] = []
-        self._position = 0
-
-    def room(self, size: int) -> bool:
-        """Say whether so many bytes more fit; into an empty block they do."""
-        if self._ends:
-            return self._filled + size <= len(self._memory[self._turn]) - WORD
-        if len(self._memory[self._turn]) < size + WORD:
-            self._memory[self._turn] = np.zeros(max(size + WORD, BLOCK_BYTES), np.uint8)
-        return True
-
-    def place(self, size: int) -> Bytes:
-        """Return where the next so many bytes go, for which there is room."""
-        return self._memory[self._turn][self._filled : self._filled + size]
-
-    def add(self, size: int, position: int) -> None:
-        """Take what has been put there as a chunk."""
-        self._filled += size
-        self._ends.append(self._filled)
-        self._position = position
-
-    def end(self) -> Iterator[Block]:
-        """End the block in progress if it has anything."""
-        if self._ends:
-            yield Block(self._memory[self._turn], self._ends, self._position)
-            self._turn = (self._turn + 1) % len(self._memory)
-            self._filled = 0
-            self._ends = []
 
 
 class _Reading:
@@ -150,14 +221,10 @@ class _Reading:
         self._start = self._stop = 0  # of what is in memory and not yet taken
         self._crc = 0  # of all before `_summed`
         self._summed = 0
-        self._blocks = _Blocks()
-        self._decompressor = zstandard.ZstdDecompressor()
+        self._packed: _Packed = []
+        self._packed_size = 0
         self._is_passed = np.zeros(256, np.bool_)
         self._is_passed[list(_PASSED if has_chunks else (*_PASSED, *_IN_BLOCKS, Opcode.CHUNK))] = True
-
-    @property
-    def _position(self) -> int:
-        return self._before + self._start
 
     def _fill(self, count: int) -> bool:
         """Have `count` bytes in memory from `_start` on, and as many more as there is room; False at the file's end."""
@@ -180,96 +247,66 @@ class _Reading:
 
     def _sum_up(self) -> None:
         """Take into the CRC what has been taken from memory."""
-        self._crc = zlib.crc32(self._data[self._summed : self._start].data, self._crc)
+        self._crc = crc32(self._data[self._summed : self._start].data, self._crc)
         self._summed = self._start
 
-    def items(self) -> Iterator[Item]:
+    def items(self) -> Iterator[_Packed | Record | Problem]:
         """Read the records."""
-        is_whole = self._fill(len(MAGIC))
-        magic = self._data[: min(self._stop, len(MAGIC))].tobytes()
-        if not MAGIC.startswith(magic):
+        self._fill(len(MAGIC))
+        if not MAGIC.startswith(self._bytes(len(MAGIC))):
             raise LogError(f"{self._path} is not an MCAP file")
-        self._start = len(magic)
+        is_whole = self._stop >= len(MAGIC)
+        self._start = min(self._stop, len(MAGIC))
         while is_whole:
             self._start = pass_over(self._data, self._words, self._start, self._stop, self._is_passed)
             if not self._fill(RECORD_HEAD_BYTES):
                 break
             opcode, length = _RECORD_HEAD.unpack_from(self._data.data, self._start)
-            if opcode == 0 or length > self._size - self._position - RECORD_HEAD_BYTES:
-                break
-            if not self._fill(RECORD_HEAD_BYTES + length):
+            is_in_file = opcode and length <= self._size - self._before - self._start - RECORD_HEAD_BYTES
+            if not is_in_file or not self._fill(RECORD_HEAD_BYTES + length):
                 break
             yield from self._take(opcode, length)
             self._start += RECORD_HEAD_BYTES + length
             if opcode == Opcode.FOOTER:
-                is_whole = self._fill(len(MAGIC)) and self._bytes(len(MAGIC)) == MAGIC
-                yield from self._blocks.end()
-                if not is_whole:
-                    break
-                return
-        yield from self._blocks.end()
+                if self._fill(len(MAGIC)) and self._bytes(len(MAGIC)) == MAGIC:
+                    return
+                break
+        yield from self._end_block()
         yield Problem(f"cut after {self._size} bytes")
 
     def _bytes(self, count: int) -> bytes:
-        return self._data[self._start : self._start + count].tobytes()
+        """Return the next bytes, fewer at the file's end."""
+        return self._data[self._start : min(self._start + count, self._stop)].tobytes()
 
-    def _take(self, opcode: int, length: int) -> Iterator[Item]:
+    def _take(self, opcode: int, length: int) -> Iterator[_Packed | Record | Problem]:
         """Take the record at `_start`, which is in memory."""
-        position = self._position + RECORD_HEAD_BYTES
-        body = self._data[self._start + RECORD_HEAD_BYTES : self._start + RECORD_HEAD_BYTES + length]
-        try:
-            if opcode == Opcode.CHUNK:
-                yield from self._take_chunk(body, position)
-            elif opcode in _IN_BLOCKS:
-                size = RECORD_HEAD_BYTES + length
-                if not self._blocks.room(size):
-                    yield from self._blocks.end()
-                    self._blocks.room(size)
-                self._blocks.place(size)[:] = self._data[self._start : self._start + size]
-                self._blocks.add(size, position)
-            elif not self._is_passed[opcode]:
-                yield from self._blocks.end()
-                if opcode == Opcode.DATA_END:
-                    self._sum_up()
-                    if int.from_bytes(body[:4].tobytes(), "little") not in (0, self._crc):
-                        yield Problem("the data section fails its CRC")
-                else:
-                    yield Record(opcode, body.tobytes(), position)
-        except DAMAGE:
-            yield Problem(f"damaged at byte {position}")
-
-    def _take_chunk(self, body: Bytes, position: int) -> Iterator[Item]:
-        """Decompress a chunk into the block in progress."""
-        _, _, size, crc, name_size = _CHUNK_HEAD.unpack_from(body.data)
-        place = _CHUNK_HEAD.size + name_size
-        name = body[_CHUNK_HEAD.size : place].tobytes()
-        (data_size,) = struct.unpack_from("<Q", body.data, place)
-        data = body[place + 8 : place + 8 + data_size]
-        if size > _MAX_CHUNK or len(data) != data_size:
-            raise ValueError("sizes of a chunk make no sense")
-        if name == b"zstd" and zstandard.frame_content_size(data.data) not in (-1, size):
-            raise ValueError("a chunk isn't as long as it says")
-        if not self._blocks.room(size):
-            yield from self._blocks.end()
-            self._blocks.room(size)
-        records = self._blocks.place(size)
-        if name == b"zstd":
-            count = 0
-            with self._decompressor.stream_reader(data.data) as reader:
-                while count < size and (read := reader.readinto(records[count:].data)):
-                    count += read
-            if count != size:
-                raise ValueError("a chunk isn't as long as it says")
+        if self._is_passed[opcode]:
+            return
+        position = self._before + self._start + RECORD_HEAD_BYTES
+        record = self._bytes(RECORD_HEAD_BYTES + length)
+        if opcode == Opcode.CHUNK:
+            try:
+                yield from self._add(_packed_chunk(record[RECORD_HEAD_BYTES:], position))
+            except DAMAGE:
+                yield Problem(f"damaged at byte {position}")
+        elif opcode in _IN_BLOCKS:
+            yield from self._add(_PackedChunk(record, is_chunk=False, size=len(record), position=position))
         else:
-            records[:] = np.frombuffer(_others_decompressed(body.tobytes()), np.uint8)
-        if crc and zlib.crc32(records.data) != crc:
-            raise ValueError("a chunk fails its CRC")
-        self._blocks.add(size, position)
+            yield from self._end_block()
+            yield Record(opcode, record[RECORD_HEAD_BYTES:], position)
+        if opcode == Opcode.DATA_END:
+            self._sum_up()
+            if int.from_bytes(record[9:13], "little") not in (0, self._crc):
+                yield Problem("the data section fails its CRC")
 
+    def _add(self, chunk: _PackedChunk) -> Iterator[_Packed]:
+        """Put a chunk into the block in progress."""
+        if self._packed_size + chunk.size > BLOCK_BYTES - WORD:
+            yield from self._end_block()
+        self._packed.append(chunk)
+        self._packed_size += chunk.size
 
-def _others_decompressed(body: bytes) -> bytes:
-    """Decompress a chunk in another way than our writer's."""
-    chunk = Chunk.read(ReadDataStream(io.BytesIO(body)))
-    stream, size = get_chunk_data_stream(chunk, validate_crc=False)
-    decompressed: Any = stream.read(size)
-    return bytes(decompressed)
+    def _end_block(self) -> Iterator[_Packed]:
+        if self._packed:
+            packed, self._packed, self._packed_size = self._packed, [], 0
+            yield packed

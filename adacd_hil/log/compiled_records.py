@@ -58,138 +58,8 @@ FRAME_DATA = 23
 """Where the data of a bus frame begin."""
 
 
-@compiled
-def whole_size(words: Numbers, position: int, end: int) -> int:
-    """Return how many bytes the record at `position` has; 0 when it isn't whole up to `end`."""
-    if end - position < RECORD_HEAD:
-        return 0
-    length = words[position + 1]
-    return RECORD_HEAD + length if 0 <= length <= end - position - RECORD_HEAD else 0
-
-
-@compiled
-def is_as_described(words: Numbers, position: int, size: int, slots: Numbers, slot: int) -> bool:
-    """Say whether a record of `size` bytes is as long as its topic's are."""
-    most, tail = slots[slot, SIZE], slots[slot, TAIL]
-    if tail == most:
-        return bool(size == most)
-    count = words[position + slots[slot, COUNT]] & 0xFFFFFFFF if size >= tail else -1
-    return bool(count == size - tail and size <= most)
-
-
-@compiled
-def enter_cycle(publish_ns: int, state: Numbers) -> bool:
-    """Count a cycle where the publish time rises; False where that would be one too many."""
-    if publish_ns <= state[LATEST_NS]:
-        return True
-    if state[CYCLES] == state[MOST_CYCLES]:
-        return False
-    state[CYCLES] += 1
-    state[LATEST_NS] = publish_ns
-    return True
-
-
-@compiled
-def lack_of_room(slots: Numbers, slot: int, frames: Bytes, frame_bytes: int, state: Numbers) -> int:
-    """Say what keeps a record of a topic from being taken, WANTED if nothing does."""
-    kind = slots[slot, KIND]
-    if kind & IS_VARYING:
-        return VARYING
-    if kind & IS_FRAME:
-        if kind & IS_LONG and frame_bytes == FRAME_DATA + WORD:
-            return LONG
-        if (state[FRAMES] + 1) * frame_bytes > len(frames) - WORD:
-            return FRAMES_FULL
-    if kind & IS_RECORDS and slots[slot, FILLED] == slots[slot, ROOM]:
-        return FULL
-    return WANTED
-
-
-@compiled
-def look_at(
-    data: Bytes,
-    words: Numbers,
-    position: int,
-    size: int,
-    channels: Numbers,
-    slots: Numbers,
-    frames: Bytes,
-    frame_bytes: int,
-    state: Numbers,
-) -> int:
-    """Say what to do with a record: WANTED, NOT_WANTED, or why to stop before it."""
-    if data[position] != MESSAGE:
-        return DEFINITION
-    if size < HEAD:
-        state[WRONG] += 1
-        return NOT_WANTED
-    if not enter_cycle(words[position + 23], state):
-        return CUT
-    channel = words[position + 9] & 0xFFFF
-    slot = channels[channel]
-    state[CULPRIT] = channel if slot < 0 else slot
-    if slot < 0:
-        return NOT_WANTED if slot == UNWANTED else UNDEFINED
-    if not slots[slot, KIND] & IS_VARYING and not is_as_described(words, position, size, slots, slot):
-        state[WRONG] += 1
-        return NOT_WANTED
-    return lack_of_room(slots, slot, frames, frame_bytes, state)
-
-
-@compiled
-def put_frame(
-    data: Bytes,
-    words: Numbers,
-    position: int,
-    size: int,
-    kind: int,
-    frames: Bytes,
-    frame_words: Numbers,
-    frame_bytes: int,
-    frame_places: Numbers,
-    epoch_ns: int,
-    state: Numbers,
-) -> None:
-    """Add the frame that a record has."""
-    place = state[FRAMES] * frame_bytes
-    is_long = 1 if kind & IS_LONG else 0
-    stamp = words[position + HEAD + 4]
-    start = position + frame_places[is_long, 3]
-    frame_words[place] = (stamp & 0xFFFFFFFF) * 1_000_000_000 + ((stamp >> 32) & 0xFFFFFFFF) - epoch_ns
-    frame_words[place + 8] = words[position + 23] - epoch_ns
-    frame_words[place + 16] = words[position + frame_places[is_long, 0]]
-    frames[place + 20] = 1 if kind & IS_SENT else 0
-    frames[place + 21] = data[position + frame_places[is_long, 1]]
-    frames[place + 22] = data[position + frame_places[is_long, 2]]
-    count = position + size - start
-    if count == WORD:
-        frame_words[place + FRAME_DATA] = words[start]
-    else:
-        for index in range(count):
-            frames[place + FRAME_DATA + index] = data[start + index]
-    for index in range(place + FRAME_DATA + count, place + frame_bytes):
-        frames[index] = 0
-    state[FRAMES] += 1
-
-
-@compiled
-def put_record(
-    words: Numbers, position: int, size: int, slots: Numbers, slot: int, arena: Bytes, arena_words: Numbers
-) -> None:
-    """Add a record to those of its topic."""
-    most = slots[slot, SIZE]
-    place = slots[slot, START] + slots[slot, FILLED] * most
-    last = size - WORD
-    for offset in range(0, last, WORD):
-        arena_words[place + offset] = words[position + offset]
-    arena_words[place + last] = words[position + last]
-    for index in range(place + size, place + most):
-        arena[index] = 0
-    slots[slot, FILLED] += 1
-
-
 @compiled(nogil=True)
-def take(
+def take(  # noqa: PLR0912, PLR0915 - functions that are handed arrays count references, which costs more than the walk
     data: Bytes,
     words: Numbers,
     end: int,
@@ -213,36 +83,101 @@ def take(
     position = state[POSITION]
     reason = DONE
     while position < end:
-        size = whole_size(words, position, end)
-        if size == 0:
+        left = end - position
+        length = words[position + 1] if left >= RECORD_HEAD else -1
+        if length < 0 or length > left - RECORD_HEAD:
             reason = BROKEN
             break
-        reason = look_at(data, words, position, size, channels, slots, frames, frame_bytes, state)
-        if reason == WANTED:
-            slot = state[CULPRIT]
-            kind = slots[slot, KIND]
-            if kind & IS_FRAME:
-                put_frame(
-                    data,
-                    words,
-                    position,
-                    size,
-                    kind,
-                    frames,
-                    frame_words,
-                    frame_bytes,
-                    frame_places,
-                    epoch_ns,
-                    state,
-                )
-            if kind & IS_RECORDS:
-                put_record(words, position, size, slots, slot, arena, arena_words)
-        elif reason != NOT_WANTED:
+        size = RECORD_HEAD + length
+        if data[position] != MESSAGE:
+            reason = DEFINITION
             break
+        if size < HEAD:
+            state[WRONG] += 1
+            position += size
+            continue
+        publish_ns = words[position + 23]
+        if publish_ns > state[LATEST_NS]:
+            if state[CYCLES] == state[MOST_CYCLES]:
+                reason = CUT
+                break
+            state[CYCLES] += 1
+            state[LATEST_NS] = publish_ns
+        channel = words[position + 9] & 0xFFFF
+        slot = channels[channel]
+        if slot == UNWANTED:
+            position += size
+            continue
+        if slot == UNKNOWN:
+            state[CULPRIT] = channel
+            reason = UNDEFINED
+            break
+        state[CULPRIT] = slot
+        kind = slots[slot, KIND]
+        if kind & IS_VARYING:
+            reason = VARYING
+            break
+        tail = slots[slot, TAIL]
+        most = slots[slot, SIZE]
+        count = size - tail
+        is_right = size == most
+        if tail < most:
+            is_right = 0 <= count <= most - tail and words[position + slots[slot, COUNT]] & 0xFFFFFFFF == count
+        if not is_right:
+            state[WRONG] += 1
+            position += size
+            continue
+        if kind & IS_FRAME:
+            place = state[FRAMES] * frame_bytes
+            if place + frame_bytes > len(frames) - WORD:
+                reason = FRAMES_FULL
+                break
+            is_long = 1 if kind & IS_LONG else 0
+            if is_long and frame_bytes == FRAME_DATA + WORD:
+                reason = LONG
+                break
+        if kind & IS_RECORDS and slots[slot, FILLED] == slots[slot, ROOM]:
+            reason = FULL
+            break
+        if kind & IS_FRAME:
+            stamp = words[position + HEAD + 4]
+            start = position + frame_places[is_long, 3]
+            frame_words[place] = (stamp & 0xFFFFFFFF) * 1_000_000_000 + ((stamp >> 32) & 0xFFFFFFFF) - epoch_ns
+            frame_words[place + 8] = publish_ns - epoch_ns
+            frame_words[place + 16] = words[position + frame_places[is_long, 0]]
+            frames[place + 20] = 1 if kind & IS_SENT else 0
+            frames[place + 21] = data[position + frame_places[is_long, 1]]
+            frames[place + 22] = data[position + frame_places[is_long, 2]]
+            count = position + size - start
+            if count == WORD:
+                frame_words[place + FRAME_DATA] = words[start]
+            else:
+                for index in range(count):
+                    frames[place + FRAME_DATA + index] = data[start + index]
+            for index in range(place + FRAME_DATA + count, place + frame_bytes):
+                frames[index] = 0
+            state[FRAMES] += 1
+        if kind & IS_RECORDS:
+            place = slots[slot, START] + slots[slot, FILLED] * most
+            last = size - WORD
+            for offset in range(0, last, WORD):
+                arena_words[place + offset] = words[position + offset]
+            arena_words[place + last] = words[position + last]
+            for index in range(place + size, place + most):
+                arena[index] = 0
+            slots[slot, FILLED] += 1
         position += size
-        reason = DONE
     state[POSITION] = position
     return reason
+
+
+@compiled
+def whole_size(words: Numbers, position: int, end: int) -> int:
+    """Return how many bytes the record at `position` has; 0 when it isn't whole up to `end`."""
+    if end - position < RECORD_HEAD:
+        return 0
+    length = words[position + 1]
+    return RECORD_HEAD + length if 0 <= length <= end - position - RECORD_HEAD else 0
 
 
 @compiled(nogil=True)

@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from adacd_hil.log import compiled_records as compiled
-from adacd_hil.log.chunks import DAMAGE, Block, Record, items_ahead, read_items
+from adacd_hil.log.chunks import DAMAGE, Block, Record, read_items, read_others
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.gathering import Gathered, Gathering
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
@@ -65,7 +65,7 @@ class _Part(NamedTuple):
 def _read_head(path: Path) -> _Extras:
     """Read what comes before the messages. Raises LogError when the file can't be read or isn't MCAP."""
     extras = _Extras()
-    for item in read_items(path, has_chunks=False):
+    for item in read_others(path):
         if isinstance(item, Record):
             try:
                 extras.take(item)
@@ -221,7 +221,7 @@ class _PartWalk:
 
     def pieces(self) -> Iterator[Gathered]:
         """Read the file; yield whenever enough is gathered."""
-        for item in items_ahead(self._path):
+        for item in read_items(self._path):
             if isinstance(item, Block):
                 yield from self._take_block(item)
             elif isinstance(item, Record):
@@ -243,6 +243,8 @@ class _PartWalk:
                     self._note(f"damaged at byte {block.position}")
                 else:
                     self._define(block.data[stop.position : stop.end].tobytes(), block.position)
+        if block.problem:
+            self._note(block.problem)
         if self._gathering.take_wrong():
             self._note("a message is not as long as its schema says")
 
@@ -286,7 +288,7 @@ def _defined_in(path: Path) -> Iterator[Definition]:
     definitions = _Definitions()
     nothing = Gathering(cycles=np.iinfo(np.int64).max, epoch_ns=0, has_frame_records=False)
     unwanted = np.full(_CHANNELS, compiled.UNWANTED, np.int64)
-    for item in items_ahead(path):
+    for item in read_items(path):
         if not isinstance(item, Block):
             continue
         for start, end in pairwise((0, *item.ends)):
