@@ -16,7 +16,7 @@ from adacd_hil.scheme.selection import layout_of, pipeline_of
 REST = 60
 """Cycles at rest, the first of them without drives."""
 PAUSES_S = ((4.6, 5.5), (6.2, 7.5), (8.0, 9.2))
-PUSHES = ((4.55, 4.7, (3.0, 0.8)), (6.15, 6.25, (0.0, -0.6)), (7.9, 8.03, (1.5, 0.0)))
+PUSHES = ((4.55, 4.7, (3.0, 0.8)), (6.15, 6.5, (0.0, -0.6)), (6.5, 6.6, (0.0, -3.0)), (7.9, 8.03, (1.5, 0.3)))
 REQUESTS = (
     (4.6, Request.ACKNOWLEDGE),  # too early
     (5.2, Request.ACKNOWLEDGE),
@@ -29,13 +29,14 @@ SECONDS = 11.7
 
 
 def settings_of(scheme):
-    """Return settings with which either scheme soon monitors, and promotes models while it does."""
+    """Return settings with which either scheme soon monitors, promotes models while it does, and has no patience."""
     return replace(
         SETTINGS,
         scheme=scheme,
         termination=replace(SETTINGS.termination, hold_s=0.3, beta_Nm=0.4, excitation_Nm2s=1e-6),
         detector=replace(SETTINGS.detector, threshold_Nm=(0.3, 0.3)),
         certified=replace(SETTINGS.certified, refine_s=0.2),
+        reaction=replace(SETTINGS.reaction, patience_s=0.25, contact=("slow_down", "stop")),
     )
 
 
@@ -152,7 +153,7 @@ def test_the_life_has_all_of_it(lived):
     assert missing == ({"FAULT", "CERTIFY"} if scheme == "paper" else {"FAULT"})
     assert len([output for output in outputs if output.contact is not None]) >= 6
     if scheme == "certified":
-        assert {output.reaction.name for output in outputs} == {"NONE", "STOP", "WITHDRAW"}
+        assert {output.reaction.name for output in outputs} == {"NONE", "STOP", "WITHDRAW", "SLOW_DOWN"}
         assert outputs[6000].block[layout_of(settings_of(scheme)).slices["promotions"]] >= 5
         assert [event.name for event in pipeline._events] == ["margin"]
 
@@ -200,6 +201,11 @@ def pushed(torque):
     return change
 
 
+def one_joint_then_the_other(arms, begin, end):
+    arms.tau_J[begin:end, 0] -= 1.0
+    arms.tau_J[begin + 20 : begin + 40, 1] -= 1.5
+
+
 def at_rest(arms, begin, end):
     arms.q[begin:end] = arms.q[begin]
     arms.dq[begin:end] = 0.0
@@ -225,6 +231,7 @@ DISTURBANCES = {
     "a timeout of periods": (changed("periods", 100_000), 1),
     "pushed along": (pushed((-2.0, -0.5)), 60),
     "pushed against": (pushed((6.0, 1.0)), 150),
+    "pushed on one joint, then on the other for a moment": (one_joint_then_the_other, 80),
     "touched": (pushed((-0.5, 0.0)), 120),
     "at rest": (at_rest, 140),
     "stamps stand still": (changed("t_ns", 0), 2),
@@ -252,7 +259,8 @@ def test_whatever_disturbs_a_state_is_seen_as_step_sees_it(life, scheme, place):
     begin = REST + round(PLACES_S[place] / PERIOD_S)
     random = np.random.default_rng(sorted(PLACES_S).index(place))
     names = random.permutation(list(DISTURBANCES)).tolist()
-    for few in (names[k : k + 4] for k in range(0, len(names), 4)):
+    alone = [], ["pushed against"], ["pushed on one joint, then on the other for a moment"]
+    for few in (*alone, *(names[k : k + 4] for k in range(0, len(names), 4))):
         tail = ArmBatch(*(column[begin : begin + TAIL].copy() for column in arms))
         asked = requests[begin : begin + TAIL].copy()
         for name in few:

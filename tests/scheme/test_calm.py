@@ -1,6 +1,7 @@
 """What the supervisor lets pass without a look is what it would have let pass with one."""
 
 import numpy as np
+import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState
@@ -12,7 +13,7 @@ from adacd_hil.scheme.supervisor import Supervisor
 SETTINGS = settings_with(
     safety={"commission_cycles": 12, "phase_timeout_s": 0.15},
     termination={"timeout_s": 1.0},
-    reaction={"clear_s": 0.06, "patience_s": 0.3, "rebound_s": 0.02},
+    reaction={"clear_s": 0.07, "patience_s": 0.3, "rebound_s": 0.02},
     bus={"max_age_cycles": 3},
 )
 COUNT = 6000
@@ -60,24 +61,26 @@ def walk(seed):
 def test_calm_cycles_change_nothing_but_the_counts():
     visited = set()
     for seed in range(4):
-        states, looks = follow(seed)
+        random = np.random.default_rng(seed)
+        states, looks = follow(*walk(seed), lambda random=random: random.integers(0, 2, 2).astype(bool).tolist())
         visited |= states
         assert looks < 0.6 * COUNT
     assert visited == set(SchemeState)
 
 
-def follow(seed):
-    """Compare both along a walk; return the states they were in, and how many cycles were looked at."""
-    arms, observations, requests = walk(seed)
-    random = np.random.default_rng(seed)
+def follow(arms, observations, requests, draw):
+    """Compare both along a walk; return the states they were in, and how many cycles were looked at.
+
+    draw: gives is_reporting and goes_on, which stay until the next look.
+    """
     each, few = Supervisor(SETTINGS), Supervisor(SETTINGS)
     findings = observations | few.findings(arms)
     visited, looks, k = set(), 0, 0
-    while k < COUNT:
-        is_reporting, goes_on = (bool(value) for value in random.integers(0, 2, 2))
+    while k < len(requests):
+        is_reporting, goes_on = draw()
         calm, before, first, passed = few.calm(is_reporting, goes_on), few.state, k, 0
         visited.add(before)
-        while k < COUNT:
+        while k < len(requests):
             passed += int(arms.periods[k])
             given = arm_at(arms, k), Request(requests[k]), int(observations[k]), is_reporting, goes_on
             each.step(*given)
@@ -85,13 +88,47 @@ def follow(seed):
                 break
             k += 1
         few.pass_by(observations[first:k], arms.periods[first:k])
-        if k < COUNT:
+        if k < len(requests):
             few.step(*given)
         assert vars(few) == vars(each)
         if before is few.state is SchemeState.FAULT:
             each, few = Supervisor(SETTINGS), Supervisor(SETTINGS)
         k, looks = k + 1, looks + 1
     return visited, looks
+
+
+def healthy(count):
+    """Return an arm to which nothing happens, what is found of it until it monitors, and no requests."""
+    observations = np.full(count, int(REST))
+    observations[20] = int(Observation.ADAPTED)
+    zeros, ages, no = np.zeros((count, 2)), np.zeros((count, 2), dtype=np.int64), np.zeros(count, dtype=bool)
+    cycle = np.arange(count)
+    arms = ArmBatch(
+        cycle, cycle, np.ones_like(cycle), zeros, zeros, zeros, ages, ages, ~no, ~no, no.astype(np.uint8), no
+    )
+    return arms, observations, np.zeros(count, dtype=np.uint8)
+
+
+@pytest.mark.parametrize("touched", [Observation.CONTACT, Observation.CONTACT | Observation.AT_REST])
+@pytest.mark.parametrize("cycles", [20, 200, 400])
+def test_a_contact_clears_and_loses_patience_in_its_cycle(touched, cycles):
+    """A contact, then rest; an acknowledgement waits for its end, and is too late for one that has cleared."""
+    arms, observations, requests = healthy(1000)
+    observations[30 : 30 + cycles] = int(touched)
+    requests[380] = Request.ACKNOWLEDGE
+    states, looks = follow(arms, observations, requests, lambda: (False, False))
+    assert SchemeState.REACT in states
+    assert (SchemeState.STOPPED in states) == (cycles == 400)
+    assert looks < 30
+
+
+def test_a_changed_payload_waits_for_rest():
+    arms, observations, requests = healthy(300)
+    observations[40:100] = int(Observation.NONE)
+    requests[[30, 60]] = Request.PAYLOAD, Request.PAYLOAD_CHANGED
+    states, looks = follow(arms, observations, requests, lambda: (False, False))
+    assert SchemeState.PAYLOAD in states
+    assert looks < 30
 
 
 def test_the_arm_s_findings_are_bits_of_their_own():
