@@ -19,15 +19,15 @@ The first SYNC after boot-up or an NMT reset communication (of all nodes or of d
 0 for a master that begins at 1; from there the counter 1…240 is unwrapped.
 """
 
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Literal, Protocol
 
 import numpy as np
 
 from adacd_hil.records import JOINTS, TRUTH_LAYOUT, Vector
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec, contract_folder
-from firmware_sim.body import Body
+from firmware_sim.body import Body, Measurement
 from firmware_sim.contact import TICK_S
 from firmware_sim.contracts import Contract, answers_to_sync, contract_of, longest_pdo
 from firmware_sim.device import RESET_COMMUNICATION, RESET_NODE, Device
@@ -52,6 +52,44 @@ _PLANNED_PERIOD_NS = 1_000_000
 _ALL = (True,) * len(_NODES)
 
 _FAULTS = TRUTH_LAYOUT.slices["faults"]
+
+
+class Movable(Protocol):
+    """The arm itself, as far as its devices have to do with it; `Body` says what each means."""
+
+    @property
+    def motor_torque_Nm(self) -> tuple[float, float]:
+        """Torque that the drives know."""
+
+    @property
+    def is_torque_limited(self) -> tuple[bool, bool]:
+        """Whether each drive wants more torque than it may have."""
+
+    @property
+    def motor_error_code(self) -> tuple[int, int]:
+        """Fault that each motor calls for, 0 for none."""
+
+    @property
+    def joint_temperature_C(self) -> tuple[float, float]:
+        """Temperature of each joint."""
+
+    @property
+    def drive_velocity_rad_s(self) -> tuple[float, float]:
+        """Velocity that the drives know."""
+
+    def start_scenario(self) -> None:
+        """Take note that the drives are enabled."""
+
+    def advance(
+        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int | None = None
+    ) -> None:
+        """Move by some ticks."""
+
+    def sample(self) -> Measurement:
+        """Measure."""
+
+    def truth(self, out: Vector) -> None:
+        """Fill in what is true."""
 
 
 class Bench:
@@ -471,10 +509,13 @@ class Bench:
             lambda: self._body.joint_temperature_C[joint],
         )
 
-    def _make_body(self) -> Body:
+    def _make_body(self) -> Movable:
         """Make the arm as at power-on; by SYNC, one that moves by whole periods."""
         self._body_period_ns = _TICK_NS if self._is_wall else self._period_ns
         self._has_moved = self._has_been_operational = self._is_started = False
+        return self._build_body()
+
+    def _build_body(self) -> Movable:
         return Body(self._scenario, self._body_period_ns * 1e-9, self._seed)
 
     def _check_period(self, period_us: int) -> None:

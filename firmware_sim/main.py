@@ -2,39 +2,36 @@
 
 import json
 import logging
-import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, NoReturn, get_args
 
 import click
 
-from adacd_hil.clock import Clock, MonotonicClock, wall_ns
+from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
 from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
-from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame, InterfaceDownError, open_bus
-from adacd_hil.wire.codec import Codec, CodecError, load_codec
+from adacd_hil.wire.bus import BusError, BusMissingError
+from adacd_hil.wire.codec import CodecError, load_codec
 from adacd_hil.wire.node_offset import HOST_NODE, move_contract
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
-from firmware_sim.contracts import CONTRACTS, is_fd
+from firmware_sim.contracts import CONTRACTS
 from firmware_sim.departure import Departure
 from firmware_sim.injector import OnEvent
-from firmware_sim.pdo_record import LAST_NODE, LISTENED_IDS
+from firmware_sim.pdo_record import LAST_NODE
+from firmware_sim.play_command import play
 from firmware_sim.scenario import Scenario, load_scenario
 from firmware_sim.scenario_list import as_text, check, describe_all, show, show_as_table
-from firmware_sim.time_marks import HOST_MARK
+from firmware_sim.service import Service, open_devices_end, stop_by_signal
 from firmware_sim.truth import TRUTH_NAME, TruthLog
 
-_IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
-_LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus
 _DEVICES = 4
-_SILENCE_NS = 2_000_000_000  # a host that says nothing for this long has gone
 
 
 class ExitCode(IntEnum):
@@ -60,118 +57,6 @@ _CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
     (LogError, ExitCode.FAILURE),
     (OSError, ExitCode.FAILURE),
 )
-
-
-class StopRequest:
-    """Whether the user wants the emulator to end."""
-
-    def __init__(self) -> None:
-        self.is_made = False
-
-    def make(self, *_signal: object) -> None:
-        """Ask for the end; callable as a signal handler."""
-        self.is_made = True
-
-
-class Service:
-    """Carries frames and time to a bench until a stop is requested."""
-
-    def __init__(
-        self,
-        bench: Bench,
-        bus: Bus,
-        departure: Departure,
-        clock: Clock,
-        clock_mode: ClockMode,
-        stop: StopRequest,
-        is_once: bool = False,
-    ) -> None:
-        """Prepare. `departure`: where the bench puts its frames.
-
-        `is_once`: also end when the host that started the nodes stops or resets them or falls silent.
-        """
-        self._bench = bench
-        self._bus = bus
-        self._departure = departure
-        self._clock = clock
-        self._is_wall = clock_mode == "wall"
-        self._stop = stop
-        self._is_once = is_once
-        self._has_been_operational = False
-        self._time_ns = 0  # up to here the bench's time has followed the clock
-        self._heard_ns = 0  # last frame
-
-    def boot(self) -> None:
-        """Announce the nodes, having dropped what the bus carried before. Raises BusError."""
-        while self._bus.receive(0.0) is not None and not self._stop.is_made:
-            pass
-        self._time_ns = self._heard_ns = self._clock.now_ns()
-        self._bench.boot(self._time_ns)
-        self._departure.go()
-
-    def run(self) -> None:
-        """Serve; an interface that goes down is awaited, as by a device whose cable is pulled. Raises BusError."""
-        while not self._stop.is_made:
-            try:
-                frame = self._serve()
-            except InterfaceDownError:
-                self._await_interface()
-                continue
-            if self._is_once and frame is None and self._is_host_gone():
-                return
-
-    def _serve(self) -> Frame | None:
-        """Wait for one frame and act on it; without one, let time pass."""
-        bench = self._bench
-        cycle = bench.cycle
-        frame = self._bus.receive(self._patience_s())
-        if frame is not None:
-            self._heard_ns = frame.t_ns
-            bench.on_frame(frame)
-            self._has_been_operational = self._has_been_operational or bench.is_operational
-        if bench.cycle != cycle:
-            self._time_ns = self._heard_ns
-        else:
-            self._pass_time(self._clock.now_ns() if frame is None else frame.t_ns, frame is None)
-        self._departure.go()
-        return frame
-
-    def _await_interface(self) -> None:
-        while not self._stop.is_made:
-            try:
-                self._bus.recover()
-            except BusError:
-                self._clock.sleep_until_ns(self._clock.now_ns() + _LONGEST_WAIT_NS)
-            else:
-                return
-
-    def _patience_s(self) -> float:
-        """Say how long to wait for a frame."""
-        if not self._is_wall:
-            return _IDLE_NS * 1e-9
-        due_ns = self._bench.due_ns - self._clock.now_ns()
-        return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
-
-    def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when none has come for a while.
-
-        A host in lockstep says the time itself, until it has gone.
-        """
-        if self._bench.is_paced:
-            self._time_ns = now_ns
-            if now_ns - self._heard_ns > _SILENCE_NS:
-                self._bench.release()
-            return
-        if self._is_wall:
-            if is_idle:
-                self._bench.advance_to(now_ns)
-        elif now_ns - self._time_ns >= _IDLE_NS:
-            self._bench.advance_to(self._bench.now_ns + now_ns - self._time_ns)
-            self._time_ns = now_ns
-
-    def _is_host_gone(self) -> bool:
-        is_silent = self._clock.now_ns() - self._heard_ns > _SILENCE_NS
-        return self._has_been_operational and (is_silent or not self._bench.is_operational)
 
 
 _CONTEXT = {"auto_envvar_prefix": "FIRMWARE_SIM", "help_option_names": ["-h", "--help"]}
@@ -249,9 +134,9 @@ def run(
         _make_folder(out)
     clock = MonotonicClock()
     with ExitStack() as stack:
-        bus = _open_bus(interface, channel, clock, codec)
+        bus = open_devices_end(interface, channel, clock, codec)
         stack.callback(bus.close)
-        stop = stack.enter_context(_stop_by_signal())
+        stop = stack.enter_context(stop_by_signal())
         truth = None
         if out is not None:
             metadata = {"scenario": resolved.name, "profile": resolved.profile, "seed": str(resolved.seed)}
@@ -320,6 +205,9 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
     return ExitCode.USAGE if any(finding.problems for finding in findings) else ExitCode.OK
 
 
+cli.add_command(play)
+
+
 def _stamp_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> Callable[[int, int, Vector], None]:
     """Stamp the truth by the host's clock in lockstep, else by the wall clock."""
 
@@ -338,31 +226,11 @@ def _stamp_events(truth: TruthLog, bench: Bench, epoch_ns: int) -> OnEvent:
     return write
 
 
-def _open_bus(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
-    """Open the devices' end; CAN FD only where the contract has such frames."""
-    heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
-    heard.add(HOST_MARK)
-    options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}
-    return open_bus(interface, channel, clock, sorted(heard), **options)
-
-
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--out {path} can't be made a folder: {error.strerror}") from None
-
-
-@contextmanager
-def _stop_by_signal() -> Iterator[StopRequest]:
-    """Let SIGINT and SIGTERM ask for the end instead of ending the process."""
-    stop = StopRequest()
-    previous = {number: signal.signal(number, stop.make) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool) -> ExitCode:

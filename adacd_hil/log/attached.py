@@ -1,10 +1,12 @@
-"""What is attached to a log, found without reading the log: our files have it before the first chunk."""
+"""What precedes the first chunk of a log, read without the log itself: attachments and metadata of the run."""
 
 from pathlib import Path
 
 from mcap.exceptions import McapError
-from mcap.records import Attachment, Chunk
+from mcap.records import Attachment, Chunk, Metadata
 from mcap.stream_reader import StreamReader
+
+from adacd_hil.log.mcap_file import RUN_METADATA
 
 
 def attachment(path: Path, name: str) -> bytes | None:
@@ -19,3 +21,17 @@ def attachment(path: Path, name: str) -> bytes | None:
     except (McapError, OSError, ValueError):
         pass  # who reads the log says what is wrong with it
     return None
+
+
+def run_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata of the run in an MCAP file; empty when they aren't among what precedes the first chunk."""
+    try:
+        with path.open("rb") as file:
+            for record in StreamReader(file, emit_chunks=True).records:
+                if isinstance(record, Metadata) and record.name == RUN_METADATA:
+                    return record.metadata
+                if isinstance(record, Chunk):
+                    break
+    except (McapError, OSError, ValueError):
+        pass  # who reads the log says what is wrong with it
+    return {}

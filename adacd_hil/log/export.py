@@ -13,13 +13,13 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from adacd_hil.log.channels import DECODED
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.frame_log import open_frames
-from adacd_hil.log.reader import read_log
+from adacd_hil.log.stream import LogStream
 from adacd_hil.log.tables import Tables, event_columns, frame_columns, series_columns
 from adacd_hil.wire.codec import Codec
 
 _EVENTS = "/events"
 _RAW = ("to_can_bus", "from_can_bus", "to_can_bus_fd", "from_can_bus_fd")
-"""Ends of the topics of frames: tables only when asked for by name."""
+"""Ends of the topics of frames, which other formats are for."""
 
 
 class TableSummary(NamedTuple):
@@ -39,12 +39,13 @@ def export_tables(
 ) -> TableSummary:
     """Write the tables of a recording into the folder `out`.
 
-    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all but raw frames. codec:
+    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. codec:
     decodes the frames of recordings that have no decoded topics. progress: is told the rows so far.
     Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
     """
     topics = _topics(path) if path.suffix.lower() == ".mcap" else []
-    if not all(map(_is_raw, topics)):
+    topics = [topic for topic in topics if topic.rsplit("/", 1)[-1] not in _RAW]
+    if topics:
         return _export_topics(path, out, kind, choose_topics(topics, wanted), progress)
     return _export_frames(path, out, kind, wanted, codec, progress)
 
@@ -52,7 +53,7 @@ def export_tables(
 def choose_topics(topics: Collection[str], wanted: Collection[str]) -> list[str]:
     """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest."""
     if not wanted:
-        return [topic for topic in topics if not _is_raw(topic)]
+        return list(topics)
     chosen: list[str] = []
     for pattern in wanted:
         slashed = "/" + pattern.strip("/")
@@ -64,25 +65,22 @@ def choose_topics(topics: Collection[str], wanted: Collection[str]) -> list[str]
     return list(dict.fromkeys(chosen))
 
 
-def _is_raw(topic: str) -> bool:
-    return topic.rsplit("/", 1)[-1] in _RAW
-
-
 def _export_topics(
     path: Path, out: Path, kind: str, topics: list[str], progress: Callable[[int], None]
 ) -> TableSummary:
-    log = read_log(path, topics)
-    tables = Tables(out, kind, log.metadata)
+    stream = LogStream(path, topics)
+    tables = Tables(out, kind, stream.metadata)
     try:
-        for topic in topics:
-            if topic in log.topics:
-                tables.write(topic, series_columns(log.topics[topic], log.epoch_ns))
-            elif topic == _EVENTS and log.events:
-                tables.write(_EVENTS, event_columns(log.events))
+        for piece in stream:
+            for topic, series in piece.series.items():
+                if topic in topics:
+                    tables.write(topic, series_columns(series, stream.epoch_ns))
+            if payloads := piece.payloads.get(_EVENTS):
+                tables.write(_EVENTS, event_columns(payloads, stream.epoch_ns))
             progress(sum(tables.rows.values()))
     finally:
         tables.close()
-    return TableSummary(tables.rows, log.problem)
+    return TableSummary(tables.rows, stream.problem)
 
 
 def _export_frames(

@@ -1,6 +1,6 @@
 """Frames as recordings have them, in arrays: all that any of the formats knows of a frame.
 
-The fields of `reader.LONG_FRAME_DTYPE` come first and mean the same; what is beyond them is what our own bus never
+The fields of `bus_frames.LONG_FRAME_DTYPE` come first and mean the same; what is beyond them is what our own bus never
 has: remote frames, 29-bit identifiers below 0x800, FD frames without bit rate switch, several channels.
 """
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.reader import LONG_FRAME_DTYPE
+from adacd_hil.log.bus_frames import LONG_FRAME_DTYPE
 from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, MAX_STANDARD_ID
 
 RECORDED_FRAME_DTYPE = np.dtype(

@@ -6,6 +6,7 @@ and reasons are the numbers that the schemas name.
 """
 
 import csv
+import struct
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
@@ -13,12 +14,15 @@ from typing import IO, Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.log.cdr import ENCAPSULATION
 from adacd_hil.log.decoding import Decoder
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.log.reader import Series
+from adacd_hil.log.ros_types import unpack_log
 from adacd_hil.wire.codec import Codec
 
 TABLE_FORMATS: Final = ("parquet", "csv")
+_STAMP = struct.Struct("<II")
 _PARQUET_HINT = "Parquet is written with pyarrow; pip install 'adacd-hil[tables]', or choose csv"
 
 Columns = Mapping[str, Any]
@@ -40,9 +44,12 @@ def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
     return columns
 
 
-def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
+def event_columns(payloads: Iterable[bytes], epoch_ns: int) -> dict[str, Any]:
     """Make the columns of /events."""
-    rows = [(event.t_ns, *event.event) for event in events]
+    rows = []
+    for payload in payloads:
+        seconds, nanoseconds = _STAMP.unpack_from(payload, len(ENCAPSULATION))
+        rows.append((seconds * 1_000_000_000 + nanoseconds - epoch_ns, *unpack_log(payload)))
     return {name: [row[place] for row in rows] for place, name in enumerate(("t_ns", "level", "name", "message"))}
 
 
@@ -96,7 +103,9 @@ class Tables:
             if topic not in self._tables:
                 self._tables[topic] = _Csv(path) if self._kind == "csv" else _Parquet(path, self._metadata)
                 self.rows[path] = 0
-            self._tables[topic].write(columns)
+                self._tables[topic].write(columns)
+            elif len(columns["t_ns"]):
+                self._tables[topic].write(columns)
         except OSError as error:
             raise LogError(f"{path} can't be written: {error.strerror or error}") from None
         self.rows[path] += len(columns["t_ns"])

@@ -18,7 +18,8 @@ from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench import Bench
 from firmware_sim.departure import Departure
-from firmware_sim.main import EPILOG, Service, StopRequest, main
+from firmware_sim.main import EPILOG, main
+from firmware_sim.service import Service, StopRequest
 
 SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
 
@@ -218,7 +219,7 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
     bus.script.extend(((t_ms + 1) * MS, can_id, data) for t_ms, can_id, data in enabling_script(60))
     monkeypatch.setattr("firmware_sim.main.MonotonicClock", lambda: clock)
     monkeypatch.setattr("firmware_sim.main.wall_ns", lambda: 10**18)
-    monkeypatch.setattr("firmware_sim.main._open_bus", lambda *_: bus)
+    monkeypatch.setattr("firmware_sim.main.open_devices_end", lambda *_: bus)
     monkeypatch.setattr("firmware_sim.main.request_realtime", lambda: RealtimeGrant("SCHED_OTHER"))
     monkeypatch.setattr("firmware_sim.main.freeze_garbage", lambda: None)
     scenario = tmp_path / "scenario.toml"

@@ -3,6 +3,7 @@
 import gzip
 import importlib.metadata
 import itertools
+import struct
 import sys
 import tomllib
 from decimal import Decimal
@@ -13,13 +14,16 @@ import can.logconvert
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 
 from adacd_hil.log.can_io import McapReader, McapWriter
 from adacd_hil.log.can_messages import TimedMessage, to_messages
+from adacd_hil.log.cdr import ENCAPSULATION
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.frame_log import read_frames
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME
 
 NOON_NS = 1_790_000_000_123_456_789
 
@@ -191,6 +195,50 @@ def test_a_flipped_bit_in_a_chunk_costs_the_chunk_and_is_said(messages, path, tm
     log = read_frames(tmp_path / "x.mcap")
     assert 0 < len(log.frames) < len(messages)
     assert "x.mcap is damaged at byte" in log.problem
+
+
+def test_a_flipped_bit_outside_the_chunks_is_said(path, tmp_path):
+    with path.open("rb") as file:
+        chunk = make_reader(file).get_summary().chunk_indexes[0]
+    whole = bytearray(path.read_bytes())
+    whole[chunk.chunk_start_offset + chunk.chunk_length + 20] ^= 1  # in its message index
+    (tmp_path / "x.mcap").write_bytes(whole)
+    assert read_frames(tmp_path / "x.mcap").problem == "x.mcap: the data section fails its CRC"
+    assert read_frames(path).problem == ""
+
+
+def test_log_times_never_run_backwards_within_a_topic(tmp_path):
+    times_ns = [5_000, 3_000, 4_000, 9_000]
+    write(tmp_path / "x.mcap", [TimedMessage(t_ns) for t_ns in times_ns])
+    with (tmp_path / "x.mcap").open("rb") as file:
+        messages = [message for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+    assert [message.log_time for message in messages] == [5_000, 5_000, 5_000, 9_000]
+    assert [message.t_ns for message in McapReader(tmp_path / "x.mcap")] == times_ns
+
+
+@pytest.mark.parametrize("frame_id", ["", "a", "abc", "can_bus0"])
+def test_frames_of_others_are_read_whatever_their_frame_id_is(tmp_path, frame_id):
+    text = frame_id.encode() + b"\0"
+    head = struct.pack("<4s2II", ENCAPSULATION, 7, 8, len(text)) + text
+    head += bytes(-len(head) % 4)
+    bodies = {
+        CAN_FRAME: struct.pack("<I???B8s", 0x123, True, False, False, 5, b"notdata!"),
+        FD_FRAME: struct.pack("<I??BxI12s", 0x124, True, False, 12, 12, bytes(range(12))),
+    }
+    with (tmp_path / "x.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for kind, body in bodies.items():
+            schema = writer.register_schema(kind.name, "ros2msg", kind.text.encode())
+            channel = writer.register_channel("/arm/from_can_bus", "cdr", schema)
+            writer.add_message(channel, 9, head + body, 10)
+        writer.finish()
+    remote, long = McapReader(tmp_path / "x.mcap")
+    assert content(remote) == (0x123, False, True, False, None, 5, b"", False, True, False, False)
+    assert content(long) == (0x124, True, False, False, None, 12, bytes(range(12)), True, True, True, False)
+    assert (remote.t_ns, long.t_ns) == (7_000_000_008, 7_000_000_008)
+    frames = read_frames(tmp_path / "x.mcap").frames
+    assert (frames["cycle_t_ns"].tolist(), frames["data"][0].any()) == ([10, 10], False)
 
 
 def test_a_gzipped_log_is_read(messages, path, tmp_path):

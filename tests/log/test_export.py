@@ -125,6 +125,7 @@ def test_frames_out_of_order_and_names_are_counted(tmp_path):
         "1 error frames lose that they were FD",
     )
     assert read_frames(tmp_path / "x.blf").frames["t_ns"].tolist() == [times_ns[0], times_ns[0], times_ns[2]]
+    assert read_frames(tmp_path / "x.asc").frames["t_ns"].tolist() == [0, 0, 1_000_000]
 
 
 def test_a_run_in_lockstep_keeps_its_times_in_blf(tmp_path):
@@ -208,9 +209,10 @@ def test_frames_of_others_become_tables_by_the_contract(log, tmp_path):
 
 
 def test_a_topic_that_is_not_there_names_the_nearest():
-    topics = ["/scheme", "/control", "/decoded/Sync", "/to_can_bus"]
-    assert choose_topics(topics, ()) == topics[:3]
-    assert choose_topics(topics, ("decoded/*", "Sync", "/to_can_bus")) == ["/decoded/Sync", "/to_can_bus"]
+    topics = ["/scheme", "/control", "/decoded/Sync", "/decoded/Sensor1Torque"]
+    assert choose_topics(topics, ()) == topics
+    assert choose_topics(topics, ("decoded/S*", "Sync", "/control")) == [*topics[2:], "/control"]
+    assert choose_topics(topics, ("S*",)) == topics[2:]
     with pytest.raises(LogError, match="the log has no topic sceme, did you mean /scheme"):
         choose_topics(topics, ("sceme",))
 

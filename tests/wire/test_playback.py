@@ -54,7 +54,9 @@ def test_a_millisecond_is_not_late_yet():
 
 
 def test_a_frame_out_of_order_goes_with_those_before_it():
-    assert played([1_000, 3_000, 2_000, 4_000])[0] == [(0, 0), (1, 2_000), (2, 2_000), (3, 3_000)]
+    sent, lateness = played([1_000, 3_000, 2_000, 4_000])
+    assert sent == [(0, 0), (1, 2_000), (2, 2_000), (3, 3_000)]
+    assert lateness.worst_ns == 0
 
 
 def test_long_pauses_are_cut():

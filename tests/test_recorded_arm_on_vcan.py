@@ -1,0 +1,58 @@
+"""A host against yesterday's arm, as two processes on real SocketCAN in lockstep."""
+
+import contextlib
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from experiment_runs import BIN, emulator, run_on_vcan
+
+from adacd_hil.log.reader import topic_bytes
+
+pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+
+SHORT = """
+[operator]
+script = [{ at_s = 0.3, request = "finish" }]
+"""
+
+
+@contextlib.contextmanager
+def recorded_arm(log: Path, said: list[str]) -> Iterator[None]:
+    """Play a recorded arm on vcan0 while the block lasts; `said` gets what it prints at the end."""
+    command = [BIN / "firmware-sim", "play", log, "-i", "socketcan", "-c", "vcan0", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            for line in process.stderr:
+                if line.strip() == "ready":
+                    break
+            yield
+        finally:
+            process.terminate()
+            said.append(process.communicate(timeout=30)[0])
+
+
+def test_a_host_against_the_recorded_arm_logs_the_same_decisions(tmp_path: Path) -> None:
+    folders = [tmp_path / name for name in ("first", "again")]
+    config = tmp_path / "short.toml"
+    config.write_text(SHORT)
+    for folder in folders:
+        folder.mkdir()
+    options = ("--clock", "lockstep", "--config", str(config))
+    with emulator(folders[0], "--scenario", "idle"):
+        first = run_on_vcan(folders[0], *options)
+    said: list[str] = []
+    with recorded_arm(first.log, said):
+        again = run_on_vcan(folders[1], *options)
+    assert (first.status, again.status) == (0, 0), again.stderr
+    differing = [topic for topic in TOPICS if topic_bytes(first.log, topic) != topic_bytes(again.log, topic)]
+    assert differing == []
+    played = json.loads(said[0])
+    assert (played["problem"], played["rejected_commands"]) == ("", [0, 0])
+    assert played["answered"] == again.json["cycles"]
+
+
+TOPICS = ("/scheme", "/control", "/cycle", "/to_can_bus", "/from_can_bus")
