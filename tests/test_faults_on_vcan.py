@@ -19,8 +19,9 @@ import pytest
 from experiment_runs import BIN, emulator
 
 from adacd_hil.log.reader import read_log
+from adacd_hil.records import SchemeState
 
-pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.wallclock]
+pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.wallclock, pytest.mark.alone]
 
 AGE_CYCLES = 25
 SYNC_WATCHDOG = 1  # number in byte 3 of an EMCY
@@ -222,10 +223,13 @@ def test_drives_stop_by_themselves_when_the_host_is_stopped_and_it_wakes_up_with
 def test_the_host_sends_no_torque_to_an_arm_that_went_away(tmp_path: Path) -> None:
     with scene(tmp_path) as played:
         played.wait_until_moving()
-        os.kill(played.emulator.pid, signal.SIGSTOP)  # SIGKILL: tests/cli/test_bad_input.py
+        os.kill(played.emulator.pid, signal.SIGKILL)
         assert played.finish() == 4
         assert_torque_ends_with(played, 0x181)
         assert any("DATA_AGE" in line for line in played.said)
+        log = read_log(tmp_path / "run.mcap")
+        assert log.is_complete
+        assert log.scheme["state"][-1] == SchemeState.FAULT
 
 
 def test_a_node_that_falls_silent_is_named_and_torque_ends(tmp_path: Path) -> None:

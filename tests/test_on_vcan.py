@@ -85,6 +85,7 @@ sample_period = "nominal"
 
 
 @pytest.mark.wallclock
+@pytest.mark.realtime
 def test_real_time_at_1_khz_detects_the_same_contacts(tmp_path: Path) -> None:
     # A shared machine stalls for longer than an arm should forgive. Here it may: stalls are counted, not hidden, and
     # contacts are judged only where the bus kept up as it has to on an arm.

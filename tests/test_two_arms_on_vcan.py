@@ -18,7 +18,7 @@ from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.wire.can_interface import CanInterface
 from adacd_hil.wire.socketcan import SocketCanBus
 
-pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.realtime]
 
 FIRST, SECOND = 0, 1
 # User-mode Linux has one processor for two hosts and two arms, and stalls for longer than an arm should forgive. Here

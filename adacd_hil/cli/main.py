@@ -9,6 +9,7 @@ import click
 from adacd_hil import __version__
 from adacd_hil.cli.compare_command import compare
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
+from adacd_hil.cli.identify_command import identify
 from adacd_hil.cli.options import clock_option, config_option, explained, json_option, on_bus, profile_option
 from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
@@ -293,6 +294,7 @@ def monitor(
 cli.add_command(play)
 cli.add_command(replay)
 cli.add_command(compare)
+cli.add_command(identify)
 
 
 def main() -> None:

@@ -74,12 +74,12 @@ class Monitor:
         accept: Callable[[Frame], None] = self._view.accept
         while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
             accept(frame)
-            if self.is_stopped:
-                return
             while (waiting := self._bus.receive(0.0)) is not None:  # a batch, looking at the clock every so often
                 accept(waiting)
                 if self._view.frames % 256 == 0:
                     break
+            if self.is_stopped:
+                return
 
     def describe(self) -> dict[str, Any]:
         """Put what has been seen into plain values."""

@@ -3,8 +3,9 @@
 The steps, each a function over a `Record`:
 
 - `identify`: recursive least squares of all parameters that the torque can tell: base parameters of the links, F_v and
-  F_c of each joint, an offset of each torque sensor. It starts from what is known before, with honest uncertainty
-  (`Prior`), and ends with the uncertainty P that is left.
+  F_c of each joint, an offset of each torque sensor, and, where torques are those of motors, the inertia of each rotor
+  as the joint feels it through the gear. It starts from what is known before, with honest uncertainty (`Prior`), and
+  ends with the uncertainty P that is left.
 - `certify`: the same parameters, frozen, on motion that was not used. It says how large the residual is, and how much
   larger than noise and P explain: what the model lacks.
 - `detect`: the external torque of each joint, its threshold, and the contacts.
@@ -88,10 +89,11 @@ class Record:
 
 @dataclass(frozen=True)
 class ArmModel:
-    """The columns of an arm: base parameters of the links, F_v, F_c, then the torque sensors' offsets."""
+    """The columns of an arm: base parameters of the links, F_v, F_c, the torque sensors' offsets, then the rotors."""
 
     chain: Chain
     base: BaseParameters
+    has_rotors: bool = False
 
     @cached_property
     def joints(self) -> int:
@@ -101,19 +103,23 @@ class ArmModel:
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
         """Name the p parameters."""
-        per_joint = (f"{kind}{i + 1}" for kind in ("F_v", "F_c", "offset") for i in range(self.joints))
+        kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
+        per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
         return (*self.base.names, *per_joint)
 
     def place_of(self, kind: str) -> slice:
-        """Return the parameters of one kind: "base", "F_v", "F_c" or "offset"."""
+        """Return the parameters of one kind: "base", "F_v", "F_c", "offset" or, where there are some, "rotor"."""
         first, n = self.base.columns.size, self.joints
-        starts = {"F_v": first, "F_c": first + n, "offset": first + 2 * n}
+        starts = {"F_v": first, "F_c": first + n, "offset": first + 2 * n, "rotor": first + 3 * n}
         return slice(0, first) if kind == "base" else slice(starts[kind], starts[kind] + n)
 
 
-def model_of(arm: Chain) -> ArmModel:
-    """Find the columns of an arm; takes about 0.1 s for seven joints."""
-    return ArmModel(arm, chain.find_base(arm))
+def model_of(arm: Chain, has_rotors: bool = False) -> ArmModel:
+    """Find the columns of an arm; takes about 0.1 s for seven joints.
+
+    has_rotors: torques are those of geared motors, which turn their rotors too; a link-side sensor doesn't see them.
+    """
+    return ArmModel(arm, chain.find_base(arm), has_rotors)
 
 
 @dataclass(frozen=True)
@@ -131,15 +137,16 @@ def prior(
     F_v: float = 10.0,
     F_c: float = 10.0,
     offset_Nm: float = 1.0,
+    rotor_kg_m2: float = 2.0,
 ) -> Estimate:
     """Return what is known before any motion.
 
     theta_full (10 n,): the designer's parameters, zero if unknown. deviation_full (10 n,): their standard deviations;
-    without, any link that a human could stand beside. F_v, F_c, offset_Nm: standard deviations from zero.
+    without, any link that a human could stand beside. F_v, F_c, offset_Nm, rotor_kg_m2: standard deviations from zero.
     """
     n = model.joints
     deviation = np.tile(_UNKNOWN_LINK, n) if deviation_full is None else deviation_full
-    rest = np.repeat([F_v, F_c, offset_Nm], n) ** 2
+    rest = np.repeat([F_v, F_c, offset_Nm, *((rotor_kg_m2,) if model.has_rotors else ())], n) ** 2
     theta = np.zeros(len(model.parameter_names))
     if theta_full is not None:
         theta[model.place_of("base")] = model.base.map @ theta_full
@@ -307,6 +314,7 @@ def _trace(
         model.chain,
         model.base.place,
         model.place_of("F_v").start,
+        model.place_of("rotor").start if model.has_rotors else chain.NOT_USED,
         record.q,
         record.dq,
         record.tau_J,
@@ -332,6 +340,7 @@ def _run(
     arm: Chain,
     place: Indices,
     friction_column: int,
+    rotor_column: int,
     q: Vector,
     dq: Vector,
     tau_J: Vector,
@@ -359,6 +368,7 @@ def _run(
     for k in range(q.shape[0]):
         chain.fill(arm, place, q[k], dq[k], scratch, m.Y_p, m.Y_h)
         chain.fill_friction(dq[k], friction_column, m.Y_h)
+        _fill_rotors(dq[k], rotor_column, m.Y_p)
         if k == 0:
             filters.resume(
                 cutoff_rad_s, cutoff_rad_s, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f
@@ -381,7 +391,7 @@ def _run(
         detector.predict(m.W_f, theta, m.tau_f_hat)
         detector.estimate_external(m.tau_f, m.tau_f_hat, 1.0, trace.tau_ext_hat[k])
         if passed_rad_s2 > 0.0 and k % fit_every == 0:
-            _fill_mass(arm, place, q[k], theta, scratch, m.unit, m.Y_unit, m.Y_rest, m.through)
+            _fill_mass(arm, place, rotor_column, q[k], theta, scratch, m.unit, m.Y_unit, m.Y_rest, m.through)
         for i in range(n):
             m.noise[i] = np.sqrt(noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
         fill_deviation(m.W_f, P, m.noise, m.WP, trace.deviation[k])
@@ -400,6 +410,7 @@ def _run(
 def _fill_mass(
     arm: Chain,
     place: Indices,
+    rotor_column: int,
     q: Vector,
     theta: Vector,
     scratch: Scratch,
@@ -414,11 +425,20 @@ def _fill_mass(
         unit[:] = 0.0
         unit[j] = 1.0
         chain.fill(arm, place, q, unit, scratch, Y_unit, Y_rest)
+        _fill_rotors(unit, rotor_column, Y_unit)
         for i in range(q.shape[0]):
             mass = 0.0
             for column in range(theta.shape[0]):
                 mass += Y_unit[i, column] * theta[column]
             through[i] += mass * mass
+
+
+@compiled
+def _fill_rotors(dq: Vector, rotor_column: int, Y_p: Vector) -> None:
+    """Fill the columns of the rotors' inertia, one per joint from `rotor_column` on, if there are any."""
+    if rotor_column != chain.NOT_USED:
+        for i in range(dq.shape[0]):
+            Y_p[i, rotor_column + i] = dq[i]
 
 
 @compiled

@@ -1,0 +1,126 @@
+"""`adacd-hil identify`: a model of somebody else's arm from somebody else's recordings, and contacts in them."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.options import explained, json_option
+
+if TYPE_CHECKING:
+    from adacd_hil.analysis.recording_identification import Identified, Watched
+    from adacd_hil.analysis.recording_import import Recording
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command(
+    epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
+    "test: a residual reached its threshold."
+)
+@click.argument("recordings", nargs=-1, required=True, type=_FILE)
+@click.option("--map", "map_path", required=True, type=_FILE, help="TOML: what the columns are, and of which arm.")
+@click.option("--test", type=_FILE, help="Recording to test on; default: the last part of the last one fitted.")
+@click.option("--watch", multiple=True, type=_FILE, help="Recording in which to look for contacts; repeatable.")
+@click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
+@click.option("--until", "end_s", type=float, default=float("inf"), help="Fit until this time, s; default: the end.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for pictures and identify.json.")
+@json_option
+@explained
+def identify(
+    recordings: tuple[Path, ...],
+    map_path: Path,
+    test: Path | None,
+    watch: tuple[Path, ...],
+    start_s: float,
+    end_s: float,
+    out: Path | None,
+    as_json: bool,
+) -> ExitCode:
+    """Identify an arm from RECORDINGS, CSV files with positions, torques and, if there are some, velocities.
+
+    RECORDINGS are of free motion. What they don't explain of the test is told per joint; with the model frozen,
+    contacts are looked for in the recordings of --watch.
+    """
+    from adacd_hil.analysis.recording_identification import identify as run
+    from adacd_hil.analysis.recording_import import read_recording
+    from adacd_hil.analysis.recording_map import read_map
+    from adacd_hil.cli.progress import Progress
+
+    if not start_s < end_s:
+        raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)
+    described = read_map(map_path)
+    progress = Progress()
+    try:
+        read: list[Recording] = []
+        for path in (*recordings, *((test,) if test else ()), *watch):
+            progress(f"reading {path}")
+            read.append(read_recording(path, described, read[0].period_s if read else 0.0))
+        fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]
+        tested = read[len(recordings)] if test else None
+        progress(f"fitting {sum(recording.duration_s for recording in fitted):.1f} s")
+        found = run(described, fitted, tested, read[len(recordings) + bool(test) :])
+        if out is not None:
+            _write(found, out)
+            progress(f"pictures in {out}")
+    finally:
+        progress.close()
+    print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
+    return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
+
+
+def _write(found: "Identified", out: Path) -> None:
+    from adacd_hil.analysis.recording_figure import draw_watched
+
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "identify.json").write_text(json.dumps(found.as_json(), indent=2), encoding="utf-8")
+    names = ["test", *(f"watch{index + 1}" for index in range(len(found.watched)))]
+    for name, watched in zip(names, (found.test, *found.watched), strict=True):
+        (out / f"{name}.png").write_bytes(draw_watched(found, watched, name).png())
+
+
+def _as_text(found: "Identified") -> str:
+    from adacd_hil.cli.table import format_table
+
+    certificate = found.certificate
+    deviation = found.estimate.P.diagonal() ** 0.5
+    parameters = [
+        (name, f"{value:.5g}", f"± {std:.2g}")
+        for name, value, std in zip(found.model.parameter_names, found.estimate.theta, deviation, strict=True)
+    ]
+    joints = [
+        (name, *(f"{value:.3g}" for value in (noise, rms, largest)), f"{100.0 * share:.1f} %")
+        for name, noise, rms, largest, share in zip(
+            found.joint_names,
+            found.settings.noise_Nm,
+            certificate.residual_rms_Nm,
+            certificate.residual_max_Nm,
+            found.explained,
+            strict=True,
+        )
+    ]
+    verdict = "explained" if found.is_explained else "NOT explained: a residual reached its threshold"
+    lines = [
+        f"fitted {found.fit_s:.1f} s at {found.settings.period_s * 1e3:g} ms",
+        format_table(("parameter", "value", "std"), parameters, right=(1,)),
+        "",
+        f"tested on {found.test.recording.duration_s:.1f} s: {verdict}; margin {certificate.margin:.2f}",
+        format_table(
+            ("joint", "noise, Nm", "residual rms, Nm", "largest, Nm", "torque explained"), joints, right=(1, 2, 3, 4)
+        ),
+    ]
+    return "\n".join([*lines, *(_describe(watched) for watched in found.watched)])
+
+
+def _describe(watched: "Watched") -> str:
+    lines = ["", f"{watched.recording.path}: {len(watched.contacts)} contacts in {watched.recording.duration_s:.1f} s"]
+    if watched.touches is not None:
+        found = watched.touches - (watched.missed or 0)
+        lines[-1] += f"; {found} of {watched.touches} touches found, {watched.false_contacts} false"
+    for contact in watched.contacts:
+        signs = " ".join("0+-"[sign] for sign in contact.direction)
+        truth = "  false" if contact.is_true is False else ""
+        lines.append(f"  {contact.start_s:9.3f} s  link {contact.link}  {signs}{truth}")
+    return "\n".join(lines)

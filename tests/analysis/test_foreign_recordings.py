@@ -1,0 +1,220 @@
+"""Recordings of arms that others made: read by a map, identified, tested and searched for contacts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.testing import assert_allclose
+
+from adacd_hil.analysis.recording_identification import identify
+from adacd_hil.analysis.recording_import import read_recording
+from adacd_hil.analysis.recording_map import read_map
+from adacd_hil.cli.main import cli
+from adacd_hil.config import ConfigError
+from adacd_hil.log.errors import LogError
+from adacd_hil.scheme.regressor import inverse_dynamics
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "foreign"
+THETA = np.array([0.19205, 0.034125, 0.020175, 0.03, 0.015, 0.0375, 0.02])
+LENGTH_M = 0.35
+PERIOD_S = 2e-3
+NOISE_NM = 0.005
+TOUCH_S = (6.0, 6.3)
+TOUCH_NM = np.array([0.5, 0.25])
+
+
+def motion(time_s):
+    """Return q, dq, ddq (n, 2) of two sines per joint."""
+    amplitudes, rates = np.array([[0.5, 0.9], [0.15, 0.2]]), np.array([[1.7, 1.1], [4.1, 3.3]])
+    phase = rates[:, None, :] * time_s[None, :, None] + np.array([[[0.3, 1.0]], [[0.0, 2.0]]])
+    factors = amplitudes[:, None, :] * rates[:, None, :] ** np.arange(3)[:, None, None, None]
+    return (
+        (factors[0] * np.sin(phase)).sum(axis=0),
+        (factors[1] * np.cos(phase)).sum(axis=0),
+        (-factors[2] * np.sin(phase)).sum(axis=0),
+    )
+
+
+def table(seconds: float, start_s: float = 0.0, touch=None):
+    """Return time ms, q deg, tau mNm, touched, elbow turned, as the example's map wants it."""
+    time_s = start_s + PERIOD_S * np.arange(round(seconds / PERIOD_S))
+    q, dq, ddq = motion(time_s)
+    tau_J = np.array([inverse_dynamics(*row, THETA) for row in zip(q, dq, ddq, strict=True)])
+    tau_J += NOISE_NM * np.random.default_rng(7).standard_normal(tau_J.shape)
+    touched = np.zeros(len(time_s))
+    if touch:
+        touched[(time_s >= touch[0]) & (time_s < touch[1])] = 1.0
+        tau_J -= touched[:, None] * TOUCH_NM
+    turned = np.array([1.0, -1.0])
+    return np.column_stack([time_s * 1e3, np.degrees(q) * turned, tau_J * 1e3 * turned, touched])
+
+
+HEAD = "time_ms,j1_deg,j2_deg,j1_mNm,j2_mNm,touched"
+
+
+def write(path: Path, rows) -> Path:
+    np.savetxt(path, rows, delimiter=",", header=HEAD, comments="", fmt="%.6f")
+    return path
+
+
+@pytest.fixture(scope="module")
+def free(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("free") / "free.csv", table(10.0))
+
+
+@pytest.fixture(scope="module")
+def touched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("touched") / "touched.csv", table(3.0, 4.5, TOUCH_S))
+
+
+@pytest.fixture(scope="module")
+def example():
+    return read_map(EXAMPLE / "map.toml")
+
+
+def test_units_and_signs_are_those_of_the_map(free: Path, example) -> None:
+    (stretch,) = read_recording(free, example).stretches
+    q, dq, ddq = motion(PERIOD_S * np.arange(len(stretch.record.q)))
+    assert_allclose(stretch.record.q, q, atol=1e-7)
+    assert_allclose(stretch.record.dq[20:-20], dq[20:-20], atol=2e-3)
+    expected = np.array([inverse_dynamics(*row, THETA) for row in zip(q[:200], dq[:200], ddq[:200], strict=True)])
+    assert_allclose(stretch.record.tau_J[:200], expected, atol=6 * NOISE_NM)
+
+
+def test_period_and_noise_are_found_in_the_recording(free: Path, example) -> None:
+    recording = read_recording(free, example)
+    assert recording.period_s == pytest.approx(PERIOD_S)
+    assert_allclose(recording.noise_Nm, NOISE_NM, rtol=0.1)
+    assert recording.duration_s == pytest.approx(10.0)
+
+
+def test_parameters_torque_and_touches_are_found(free: Path, touched: Path, example) -> None:
+    found = identify(example, [read_recording(free, example)], None, [read_recording(touched, example)])
+    estimates = dict(zip(found.model.parameter_names, found.estimate.theta, strict=True))
+    assert estimates["Izz_1"] == pytest.approx(THETA[0] - THETA[2], rel=0.01)
+    assert estimates["mx_2"] == pytest.approx(THETA[1] / LENGTH_M, rel=0.02)
+    assert estimates["Izz_2"] == pytest.approx(THETA[2], rel=0.03)
+    assert [estimates["F_v1"], estimates["F_v2"]] == pytest.approx(THETA[3:5], abs=0.004)
+    assert [estimates["F_c1"], estimates["F_c2"]] == pytest.approx(THETA[5:7], abs=0.004)
+    assert found.explained.min() > 0.98
+    assert found.fit_s == pytest.approx(6.0)
+    (watched,) = found.watched
+    (contact,) = watched.contacts
+    assert (watched.touches, watched.missed, watched.false_contacts) == (1, 0, 0)
+    assert (contact.link, contact.direction, contact.is_true) == (2, (1, 1), True)
+    assert contact.start_s == pytest.approx(TOUCH_S[0] - 4.5, abs=0.02)
+
+
+def test_what_is_touched_is_not_learnt(touched: Path, example) -> None:
+    recording = read_recording(touched, example)
+    before, after = recording.free.stretches
+    blur_s = recording.blur_s
+    assert before.start_s + len(before.record.q) * PERIOD_S == pytest.approx(
+        TOUCH_S[0] - 4.5 - blur_s, abs=2 * PERIOD_S
+    )
+    assert after.start_s == pytest.approx(TOUCH_S[1] - 4.5 + blur_s, abs=2 * PERIOD_S)
+
+
+def test_a_gap_and_a_missing_value_part_a_recording(tmp_path: Path, example) -> None:
+    rows = table(2.0)
+    rows[500:540, 3] = np.nan  # 80 ms
+    recording = read_recording(write(tmp_path / "gap.csv", np.delete(rows, slice(200, 240), axis=0)), example)
+    assert [round(stretch.start_s, 3) for stretch in recording.stretches] == [0.0, 0.48, 1.08]
+    assert [len(stretch.record.q) for stretch in recording.stretches] == [200, 260, 460]
+
+
+def test_a_test_in_two_stretches_is_judged_by_the_worse(free: Path, tmp_path: Path, example) -> None:
+    rows = table(4.0)
+    rows[1200:, 3:5] *= 1.5
+    tested = read_recording(write(tmp_path / "two.csv", np.delete(rows, slice(1100, 1200), axis=0)), example)
+    whole, first = (
+        identify(example, [read_recording(free, example)], part).certificate for part in (tested, tested.between(0, 2))
+    )
+    assert len(tested.stretches) == 2
+    assert first.margin > 1.0 > whole.margin
+    assert (whole.residual_max_Nm > 3.0 * first.residual_max_Nm).all()
+
+
+def test_rotors_are_parameters_only_of_motors(tmp_path: Path, example) -> None:
+    text = (EXAMPLE / "map.toml").read_text().replace("planar-arm.urdf", str(EXAMPLE / "planar-arm.urdf"))
+    path = tmp_path / "map.toml"
+    path.write_text(text.replace("[columns]", "has_rotors = true\n\n[columns]"))
+    rows = table(6.0)
+    acceleration = motion(rows[:, 0] * 1e-3)[2] * np.array([0.0, -0.05])
+    rows[:, 3:5] += acceleration * 1e3
+    described = read_map(path)
+    found = identify(described, [read_recording(write(tmp_path / "geared.csv", rows), described)], None)
+    names = found.model.parameter_names
+    assert names[-2:] == ("rotor1", "rotor2")
+    assert found.estimate.theta[names.index("rotor2")] == pytest.approx(0.05, abs=0.005)
+    assert not any(name.startswith("rotor") for name in identify_names(example))
+
+
+def identify_names(described):
+    from adacd_hil.scheme import offline
+
+    return offline.model_of(described.urdf.chain, described.arm.has_rotors).parameter_names
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ('time = "time_ms"', 'time = "tme_ms"', "has no column 'tme_ms'; did you mean 'time_ms'?"),
+        ('time = "time_ms"', 'time = "9"', "has no column '9'"),
+        ('q = "deg"', 'q = "degree"', "did you mean 'deg'?"),
+        ('["j1_mNm", "j2_mNm"]', '["j1_mNm"]', "`columns.tau_J` has 1 values; the arm has 2 moving joints"),
+        ("planar-arm.urdf", "none.urdf", "none.urdf: No such file"),
+        ("[scheme]", "[schemes]", "unknown section `schemes`"),
+        ("detection_cutoff_rad_s", "detection_cutof_rad_s", "did you mean `scheme.detection_cutoff_rad_s`?"),
+    ],
+)
+def test_a_wrong_map_is_one_line(tmp_path: Path, free: Path, old: str, new: str, line: str) -> None:
+    text = (EXAMPLE / "map.toml").read_text()
+    assert old in text
+    text = text.replace(old, new)
+    (tmp_path / "map.toml").write_text(text)
+    (tmp_path / "planar-arm.urdf").write_text((EXAMPLE / "planar-arm.urdf").read_text())
+    with pytest.raises(ConfigError) as refusal:
+        read_recording(free, read_map(tmp_path / "map.toml"))
+    assert line in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", "has no column 'time_ms'"),
+        (HEAD + "\n", "has 0 rows"),
+        (HEAD + "\n" + "1,2,3,4,5,0\n" * 60, "time does not increase after row 2"),
+        (HEAD + "\n" + "1,2,3,x,5,0\n" * 60, "could not convert"),
+    ],
+)
+def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line: str) -> None:
+    (tmp_path / "bad.csv").write_text(text)
+    with pytest.raises((LogError, ConfigError)) as refusal:
+        read_recording(tmp_path / "bad.csv", example)
+    assert line in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_the_command_says_by_its_status_whether_the_test_is_explained(
+    tmp_path: Path, free: Path, touched: Path
+) -> None:
+    mapped = ("--map", str(EXAMPLE / "map.toml"), "--json")
+    explained = CliRunner().invoke(cli, ["identify", str(free), *mapped, "--out", str(tmp_path / "out")])
+    result = json.loads(explained.stdout)
+    assert (explained.exit_code, result["test"]["margin"] > 1.0) == (0, True), explained.stderr
+    assert json.loads((tmp_path / "out" / "identify.json").read_text()) == result
+    assert (tmp_path / "out" / "test.png").stat().st_size > 10_000
+    payload = write(tmp_path / "payload.csv", table(3.0) * np.array([1.0, 1.0, 1.0, 1.5, 1.5, 1.0]))
+    other = CliRunner().invoke(cli, ["identify", str(free), "--test", str(payload), *mapped])
+    assert other.exit_code == 3
+
+
+def test_a_span_that_ends_before_it_begins_is_usage(free: Path) -> None:
+    arguments = ["identify", str(free), "--map", str(EXAMPLE / "map.toml"), "--from", "5", "--until", "4"]
+    played = CliRunner().invoke(cli, arguments)
+    assert (played.exit_code, played.stdout) == (2, "")
+    assert "--from 5 s is not before --until 4 s" in played.stderr
