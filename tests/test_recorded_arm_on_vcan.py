@@ -1,4 +1,4 @@
-"""A host against yesterday's arm, as two processes on real SocketCAN in lockstep."""
+"""A host against an arm that another bus has recorded, as two processes on real SocketCAN in lockstep."""
 
 import contextlib
 import json
@@ -7,16 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from experiment_runs import BIN, emulator, run_on_vcan
+from experiment_runs import BIN, run_on_vcan
+from lockstep_rig import play
 
+from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings
 from adacd_hil.log.reader import topic_bytes
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
-SHORT = """
-[operator]
-script = [{ at_s = 0.3, request = "finish" }]
-"""
+AT_S = 0.1
 
 
 @contextlib.contextmanager
@@ -36,19 +35,15 @@ def recorded_arm(log: Path, said: list[str]) -> Iterator[None]:
 
 
 def test_a_host_against_the_recorded_arm_logs_the_same_decisions(tmp_path: Path) -> None:
-    folders = [tmp_path / name for name in ("first", "again")]
+    operator = OperatorSettings(script=(RequestSettings(at_s=AT_S, request="finish"),))
+    first, _ = play(tmp_path / "embedded", operator, LockstepSettings())
     config = tmp_path / "short.toml"
-    config.write_text(SHORT)
-    for folder in folders:
-        folder.mkdir()
-    options = ("--clock", "lockstep", "--config", str(config))
-    with emulator(folders[0], "--scenario", "idle"):
-        first = run_on_vcan(folders[0], *options)
+    config.write_text(f'[operator]\nscript = [{{ at_s = {AT_S}, request = "finish" }}]\n')
     said: list[str] = []
-    with recorded_arm(first.log, said):
-        again = run_on_vcan(folders[1], *options)
-    assert (first.status, again.status) == (0, 0), again.stderr
-    differing = [topic for topic in TOPICS if topic_bytes(first.log, topic) != topic_bytes(again.log, topic)]
+    with recorded_arm(first.path, said):
+        again = run_on_vcan(tmp_path, "--clock", "lockstep", "--config", str(config))
+    assert again.status == 0, again.stderr
+    differing = [topic for topic in TOPICS if topic_bytes(first.path, topic) != topic_bytes(again.log, topic)]
     assert differing == []
     played = json.loads(said[0])
     assert (played["problem"], played["rejected_commands"]) == ("", [0, 0])

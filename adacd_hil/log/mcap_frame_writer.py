@@ -44,7 +44,8 @@ class FrameWriter:
     """Writes frames to a stream, which stays open."""
 
     def __init__(self, stream: IO[bytes]) -> None:
-        self.frames = 0
+        self._messages = 0
+        self._frames = 0  # of the first CAN channel, which has the topics of our logs
         self._stream = stream
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         self._writer.start("", f"adacd-hil {__version__}; {LIBRARY_IDENTIFIER}")
@@ -78,7 +79,8 @@ class FrameWriter:
                 stamp, frame.can_id, frame.data, frame.length, frame.is_error, frame.is_remote, frame.is_extended
             )
         self._writer.add_message(channel_id, log_time_ns, payload, frame.t_ns)
-        self.frames += 1
+        self._messages += 1
+        self._frames += frame.channel == self._first_channel
 
     def _add_channel(self, frame: RecordedFrame) -> int:
         """Register what such frames need."""
@@ -100,8 +102,8 @@ class FrameWriter:
 
     def finish(self) -> None:
         """End the file."""
-        summary = {"frames": str(self.frames), "messages": str(self.frames), "dropped": "0", ENDING_KEY: "closed"}
-        self._writer.add_metadata(SUMMARY_METADATA, summary)
+        counts = {"frames": str(self._frames), "messages": str(self._messages), "dropped": "0"}
+        self._writer.add_metadata(SUMMARY_METADATA, {**counts, ENDING_KEY: "closed"})
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.flush()
 

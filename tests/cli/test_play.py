@@ -9,8 +9,16 @@ from recorded_frames_log import write_frames
 
 from adacd_hil.cli import play as play_module
 from adacd_hil.cli.play_command import play
+from adacd_hil.scheduling import RealtimeGrant
 
 CHANNEL = "test_play"
+
+
+@pytest.fixture(autouse=True)
+def plain_process(monkeypatch):
+    """Keep this process, which other tests share, from becoming a real-time one."""
+    monkeypatch.setattr(play_module, "request_realtime", lambda: RealtimeGrant("SCHED_OTHER"))
+    monkeypatch.setattr(play_module, "freeze_garbage", lambda: None)
 
 
 @pytest.fixture

@@ -160,7 +160,7 @@ def test_others_decode_the_frames(messages, path):
 def test_our_reader_has_the_first_channels_frames(messages, path):
     log = read_log(path)
     assert log.is_complete
-    assert log.summary["frames"] == str(len(messages))
+    assert (log.summary["frames"], log.summary["messages"]) == (str(len(log.frames)), str(len(messages)))
     assert log.frames["t_ns"].tolist() == [message.t_ns for message in messages if message.channel == 0]
 
 
