@@ -81,6 +81,7 @@ def run(blocks: int, block_s: float, folder: Path) -> dict[str, Any]:
         "dropped": summary.log.dropped,
         **_compare(log.cycle, log.epoch_ns, blocks_of),
         "received": _rates(blocks_of["received"]),
+        "age_ms": _ages(blocks_of["received"]),
     }
 
 
@@ -131,6 +132,15 @@ def _rates(received: list[dict[str, Any]]) -> dict[str, str]:
         if blocks:
             rates[name] = f"{sum(block['slots'] for block in blocks)}/{sum(block['expected'] for block in blocks)}"
     return rates
+
+
+def _ages(received: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the ages of /scheme when it arrived, ms: medians over the blocks."""
+    names = {"p50": "age_p50_ms", "p99": "age_p99_ms"}
+    return {
+        short: round(float(np.median([block["/scheme"][name] for block in received if name in block["/scheme"]])), 1)
+        for short, name in names.items()
+    }
 
 
 def main() -> None:
