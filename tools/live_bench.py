@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from live_client import watch
+from numpy.typing import NDArray
 from side_by_side import patient_config
 
 from adacd_hil.cli.demo import Cast, resolve, run_embedded
@@ -44,12 +45,15 @@ class BenchError(Exception):
 def view(url: str, blocks: int, block_s: float) -> dict[str, Any]:
     """Watch every other block, the second first; say when each began and ended, and what came."""
     found: dict[str, Any] = {"idle": [], "watched": [], "received": []}
+    due_s = time.monotonic()
     for block in range(blocks):
+        due_s += block_s  # a client that was late doesn't move the other blocks
         begin_ns = time.time_ns()
+        left_s = max(0.0, due_s - time.monotonic())
         if block % 2:
-            found["received"].append(watch(url, block_s))
+            found["received"].append(watch(url, left_s))
         else:
-            time.sleep(block_s)
+            time.sleep(left_s)
         found["watched" if block % 2 else "idle"].append((begin_ns, time.time_ns()))
     return found
 
@@ -67,8 +71,9 @@ def run(blocks: int, block_s: float, folder: Path) -> dict[str, Any]:
 
     summary, _ = run_embedded(cast, "realtime", folder, on_progress, LiveAddress("127.0.0.1", 0))
     viewed, _ = viewers[0].communicate(timeout=60.0) if viewers else (b"", b"")
-    if summary.error or summary.result is None or viewers[0].returncode:
-        raise BenchError(summary.error or "the viewer failed")
+    if summary.error or summary.result is None or not viewers or viewers[0].returncode:
+        ended = "" if summary.result is None else f" after {summary.result.cycles} cycles, {summary.result.fault.name}"
+        raise BenchError(summary.error or f"the run ended before the viewer was done{ended}")
     log = read_log(summary.log.path, ("/cycle",))
     blocks_of = json.loads(viewed)
     return {
@@ -76,6 +81,7 @@ def run(blocks: int, block_s: float, folder: Path) -> dict[str, Any]:
         "dropped": summary.log.dropped,
         **_compare(log.cycle, log.epoch_ns, blocks_of),
         "received": _rates(blocks_of["received"]),
+        "age_ms": _ages(blocks_of["received"]),
     }
 
 
@@ -87,23 +93,35 @@ def _cast(seconds: float, folder: Path) -> Cast:
 
 
 def _compare(cycle: Series, epoch_ns: int, blocks: dict[str, Any]) -> dict[str, Any]:
-    """Return percentiles in µs of both kinds of blocks, and their ratios."""
+    """Return percentiles in µs of both kinds of blocks and their ratio; beside it, that of two halves of the idle ones.
+
+    The latter is what the machine does by itself: a ratio within it shows nothing.
+    """
     wall_ns = cycle.t_ns + epoch_ns
-    compared: dict[str, Any] = {}
+    parts = {"idle": blocks["idle"], "watched": blocks["watched"]}
+    parts |= {"idle_even": blocks["idle"][::2], "idle_odd": blocks["idle"][1::2]}
+    places = {kind: _within(wall_ns, part) for kind, part in parts.items()}
+    compared: dict[str, Any] = {"cycles": {kind: int(places[kind].sum()) for kind in ("idle", "watched")}}
     for field in FIELDS:
-        values = {}
-        for kind in ("idle", "watched"):
-            is_in = np.zeros(len(wall_ns), np.bool_)
-            for begin_ns, end_ns in blocks[kind]:
-                is_in |= (wall_ns >= begin_ns + SETTLE_NS) & (wall_ns < end_ns)
-            values[kind] = cycle[field][is_in] * 1e-3
-            compared.setdefault("cycles", {})[kind] = int(is_in.sum())
-        idle, watched = (np.percentile(values[kind], PERCENTILES) for kind in ("idle", "watched"))
+        values = cycle[field] * 1e-3
+        found = {kind: np.percentile(values[place], PERCENTILES) for kind, place in places.items()}
         compared[field.replace("_ns", "_us")] = {
-            f"p{percentile:g}": {"idle": round(a, 1), "watched": round(b, 1), "ratio": round(b / a, 3)}
-            for percentile, a, b in zip(PERCENTILES, idle.tolist(), watched.tolist(), strict=True)
+            f"p{percentile:g}": {
+                "idle": round(float(found["idle"][index]), 1),
+                "watched": round(float(found["watched"][index]), 1),
+                "ratio": round(float(found["watched"][index] / found["idle"][index]), 3),
+                "ratio_of_idle_halves": round(float(found["idle_odd"][index] / found["idle_even"][index]), 3),
+            }
+            for index, percentile in enumerate(PERCENTILES)
         }
     return compared
+
+
+def _within(wall_ns: NDArray[np.int64], blocks: list[tuple[int, int]]) -> NDArray[np.bool_]:
+    is_in = np.zeros(len(wall_ns), np.bool_)
+    for begin_ns, end_ns in blocks:
+        is_in |= (wall_ns >= begin_ns + SETTLE_NS) & (wall_ns < end_ns)
+    return is_in
 
 
 def _rates(received: list[dict[str, Any]]) -> dict[str, str]:
@@ -116,10 +134,19 @@ def _rates(received: list[dict[str, Any]]) -> dict[str, str]:
     return rates
 
 
+def _ages(received: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the ages of /scheme when it arrived, ms: medians over the blocks."""
+    names = {"p50": "age_p50_ms", "p99": "age_p99_ms"}
+    return {
+        short: round(float(np.median([block["/scheme"][name] for block in received if name in block["/scheme"]])), 1)
+        for short, name in names.items()
+    }
+
+
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--blocks", type=int, default=10)
+    parser.add_argument("--blocks", type=int, default=12, help="at least 4")
     parser.add_argument("--block-s", type=float, default=3.0)
     parser.add_argument("--view", metavar="URL", help=argparse.SUPPRESS)
     options = parser.parse_args()

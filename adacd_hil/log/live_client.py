@@ -119,7 +119,13 @@ def live_client(url: str, topics: Collection[str] | None = None) -> Iterator[Liv
     """Connect to a live view while the block lasts; `topics`: to subscribe to, None: all. Raises LogError."""
     try:
         connection = connect(
-            url, subprotocols=[SUBPROTOCOL], compression=None, max_size=None, open_timeout=OPEN_TIMEOUT_S, proxy=None
+            url,
+            subprotocols=[SUBPROTOCOL],
+            compression=None,
+            max_size=None,
+            max_queue=None,  # a full queue would keep the server's goodbye from being heard when the block ends
+            open_timeout=OPEN_TIMEOUT_S,
+            proxy=None,
         )
         with connection as opened:
             yield LiveClient(opened, topics)

@@ -6,6 +6,7 @@ import os
 import socket
 import struct
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -266,6 +267,17 @@ def test_no_server_is_one_line():
         url = f"ws://127.0.0.1:{other.getsockname()[1]}"
         with pytest.raises(LogError, match=f"live view {url}: .*refused"), live_client(url):
             pass
+
+
+@pytest.mark.wallclock
+def test_a_viewer_that_leaves_amid_what_it_has_not_read_leaves_at_once(run):
+    fed = Feed()
+    with live_client(fed.live.url) as client:
+        fed.cycles(run, 100)
+        assert client.receive(10.0) is not None
+        leaves_s = time.monotonic()
+    assert time.monotonic() - leaves_s < 5.0
+    fed.close()
 
 
 class OtherEnd:
