@@ -28,6 +28,7 @@ from adacd_hil.log.ros_types import (
     LOG,
     unpack_log,
 )
+from adacd_hil.log.summary import LOST_KEY
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactKind,
@@ -143,8 +144,8 @@ class RunLog:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the file is whole and no packet was dropped on the way to it."""
-        return not self.problem and self.summary.get("dropped", "0") == "0"
+        """Whether the file is whole, no packet was dropped on the way to it, and nothing was lost before a recovery."""
+        return not self.problem and self.summary.get("dropped", "0") == "0" and LOST_KEY not in self.summary
 
     @property
     def epoch_ns(self) -> int:
