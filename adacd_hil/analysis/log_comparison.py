@@ -4,6 +4,7 @@ Cycles are compared that lie equally long after *motion start*, the first cycle 
 first of the log. Contacts are matched by the time of their detection since then.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,10 @@ class FieldDifference(NamedTuple):
     first_s: float
     cycles: int
     largest: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values; `largest` is None where it is infinite."""
+        return self._asdict() | {"largest": self.largest if math.isfinite(self.largest) else None}
 
 
 class ContactPair(NamedTuple):
@@ -78,7 +83,7 @@ class LogComparison:
             "metadata": self.metadata,
             "cycles": self.cycles,
             "only": list(self.only),
-            "fields": [field._asdict() for field in self.fields],
+            "fields": [field.as_json() for field in self.fields],
             "contacts": [{"first": a and a._asdict(), "second": b and b._asdict()} for a, b in self.contacts],
             "notes": list(self.notes),
         }

@@ -168,6 +168,9 @@ class _Player:
         self.comparison.compare(stretch.scheme, ticks, batch)
         if self._asking is not None:
             self.requests.compare(ticks, stretch.requests, self._asking.requests(ticks, batch))
+        else:  # whatever a user could ask is believed
+            is_known = stretch.requests <= max(Request)
+            self.requests.compare(ticks, stretch.requests, np.where(is_known, stretch.requests, 0))
         times = ticks.t_ns[batch.contact_places].tolist()
         self._reports |= zip(times, batch.contacts, strict=True)
         self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
@@ -184,7 +187,8 @@ class _Player:
     def _run(self, stretch: Stretch, arms: ArmBatch) -> SchemeBatch:
         """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
         if stretch.requests is not None:
-            return self._pipeline.run(arms, stretch.requests)
+            is_known = stretch.requests <= max(Request)
+            return self._pipeline.run(arms, np.where(is_known, stretch.requests, np.uint8(Request.NONE)))
         outputs = []
         for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
             request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)

@@ -7,6 +7,7 @@ list of such numbers.
 import dataclasses
 import difflib
 import itertools
+import math
 import statistics
 import tomllib
 import typing
@@ -256,7 +257,7 @@ def as_json(found: Replay) -> dict[str, Any]:
         else [found.time_s(t_ns) for t_ns in found.false_alarms_ns],
         "missed": found.missed,
         "adaptation_s": list(found.adaptation_s),
-        "parameters": found.parameters,
+        "parameters": {name: value if math.isfinite(value) else None for name, value in found.parameters.items()},
         "states": [
             {
                 "cycle": each.cycle,

@@ -70,3 +70,9 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> No
         (None, second[2]),
         (first[2], None),
     ]
+
+
+def test_a_contact_has_one_counterpart_at_most() -> None:
+    first, second = [contact(1.0), contact(1.25)], [contact(1.125)]
+    assert match_contacts(first, second) == [(first[0], second[0]), (first[1], None)]
+    assert match_contacts(second, first) == [(second[0], first[0]), (None, first[1])]

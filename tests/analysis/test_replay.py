@@ -67,6 +67,19 @@ def test_every_flipped_bit_is_found_and_named(log: Path) -> None:
     assert "/scheme.state" in by_field["state"].line()
 
 
+@pytest.mark.parametrize("script_of", [ScriptedOperator, None])
+def test_a_request_that_nobody_can_make_is_named(log: Path, script_of) -> None:
+    def change(piece):
+        records = writable(piece.series["/scheme"])
+        flip(records, 900, "request", bit=6)
+        return with_records(piece, "/scheme", records)
+
+    source = ChangedLog(log, change)
+    (found,) = replay_source(source, [source.settings], script_of=script_of)
+    (mismatch,) = found.mismatches
+    assert (mismatch.name, mismatch.logged, mismatch.replayed) == ("/scheme.request", "64", "0")
+
+
 def test_a_flipped_bit_of_any_field_of_a_contact_report_is_found_and_named(log: Path) -> None:
     names: list[str] = []
 
