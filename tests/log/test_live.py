@@ -328,7 +328,7 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_outlives_the_l
         live=SETUP,
     )
     process = WriterProcess(theirs, reader, sink, setup, clock)
-    thread = threading.Thread(target=process.run)
+    thread = threading.Thread(target=process.run, daemon=True)  # a failure must not keep it waiting
     thread.start()
     with live_client(process.live.url) as client:
         assert client.receive(10.0)[:2] == ("/robot_description", EPOCH_NS + 3_000_000_000)
