@@ -41,12 +41,14 @@ class Replay:
     """What one replay came to.
 
     cycles: replayed, of which `compared` were compared with the log; compared is 0 where the settings are not the
-    log's. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`. parameters: of
-    the end of the log. true_contacts, false_alarms_ns: None where the truth is not known. zero_ns: of the first ADAPT.
+    log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
+    `mismatched_fields`. parameters: of the end of the log. true_contacts, false_alarms_ns: None where the truth is not
+    known. zero_ns: of the first ADAPT.
     """
 
     settings: Settings
     cycles: int
+    monitored_s: float
     compared: int
     attempts: int
     states: tuple[Transition, ...]
@@ -298,6 +300,7 @@ def _result(player: _Player, source: Source, tolerance: float) -> Replay:
     return Replay(
         settings=player.settings,
         cycles=gatherer.cycles,
+        monitored_s=gatherer.monitored * player.settings.bus.period_s,
         compared=0 if comparison is None else comparison.cycles,
         attempts=player.attempts,
         states=tuple(gatherer.transitions),

@@ -69,6 +69,7 @@ class OutcomeGatherer:
 
     def __init__(self, settings: Settings, contacts: tuple[TrueContact, ...] | None) -> None:
         self.cycles = 0
+        self.monitored = 0  # cycles in MONITOR
         self.transitions: list[Transition] = []
         self.reports: list[LoggedContact] = []
         self.adaptations: list[Adaptation] = []
@@ -91,6 +92,7 @@ class OutcomeGatherer:
         if count == 0:
             return
         self.cycles += count
+        self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
         over = batch.contact_joints != 0
         self._mark_onsets(ticks, batch)
         rises = np.flatnonzero(over & ~np.concatenate(([self._was_over], over[:-1])))

@@ -89,7 +89,7 @@ def finished(subject: Subject, row: Row, found: Replay) -> Values:
         "adaptations": sum(each is not None for each in took_s),
         "adaptation_first_s": took_s[0] if took_s else None,
         "adaptation_last_s": took_s[-1] if took_s else None,
-        "monitored_s": monitored_s(found),
+        "monitored_s": found.monitored_s,
         "detections": len(found.detections_ns),
         "touches_armed": None if truth is None else len(armed),
         "touches_found": None if truth is None else len(delays_ms),
@@ -99,13 +99,3 @@ def finished(subject: Subject, row: Row, found: Replay) -> Values:
         "delay_max_ms": max(delays_ms, default=None),
         **{f"theta_hat.{name}": value for name, value in found.parameters.items()},
     }
-
-
-def monitored_s(found: Replay) -> float:
-    """Sum the time in MONITOR up to the last change of state, s: what a rate of false alarms refers to."""
-    total_ns, since_ns = 0, None
-    for each in found.states:
-        if since_ns is not None:
-            total_ns += each.t_ns - since_ns
-        since_ns = each.t_ns if each.state is SchemeState.MONITOR else None
-    return total_ns * 1e-9
