@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from adacd_hil.analysis.replay import Replay
 from adacd_hil.analysis.sweep import run_sweep
 from adacd_hil.analysis.sweep_plan import Plan, plan_logs, plan_scenarios
+from adacd_hil.analysis.sweep_rows import replay_task
 from adacd_hil.analysis.sweep_store import SweepStore
 from adacd_hil.cli.main import cli
 from adacd_hil.log.errors import LogError
@@ -152,3 +154,26 @@ def test_a_wrong_plan_is_one_line_before_anything_runs(tmp_path: Path, arguments
     assert line in played.stderr
     assert len(played.stderr.splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_row_of_a_log_says_what_its_replay_came_to(log: Path, whole: Replay) -> None:
+    variants = [{}, {"detector.threshold_Nm": "9.0"}, {"detector.threshold_Nm": "-1"}]
+    (task,) = plan_logs([log], variants, "", "", "1").tasks(frozenset(), 10)
+    own, deaf, wrong = replay_task(task)
+    assert [row["key"] for row in (own, deaf, wrong)] == [row.key for row in task.rows]
+    assert (own["status"], own["identical"], own["cycles"], own["attempts"]) == ("ok", True, whole.cycles, 2)
+    assert (own["detections"], own["missed"]) == (len(whole.detections_ns), whole.missed)
+    assert own["theta_hat.a1"] == whole.parameters["a1"]
+    assert 0.0 < own["monitored_s"] < whole.cycles * 1e-3
+    assert (deaf["status"], deaf["identical"], deaf["detections"]) == ("ok", None, 0)
+    assert deaf["set.detector.threshold_Nm"] == "9.0"
+    assert wrong["status"] == "failed"
+    assert "detector.threshold_Nm" in wrong["error"]
+
+
+def test_a_log_that_is_none_makes_rows_that_say_so(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(b"hello")
+    (task,) = plan_logs([tmp_path / "run.mcap"], THRESHOLDS, "", "", "1").tasks(frozenset(), 10)
+    rows = replay_task(task)
+    assert [row["status"] for row in rows] == ["failed", "failed"]
+    assert "run.mcap" in rows[0]["error"]
