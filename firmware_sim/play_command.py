@@ -9,7 +9,7 @@ from typing import get_args
 import click
 
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.log.attached import run_metadata
+from adacd_hil.log.editing.attached import run_metadata
 from adacd_hil.log.errors import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.codec import Codec, load_codec

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.log.frame_log import open_frames
+from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.wire.codec import Codec
 from firmware_sim.contracts import answers_to_sync
 

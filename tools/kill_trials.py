@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from damage_trials import messages_of
 
-from adacd_hil.log.check import check_log
+from adacd_hil.log.check.check import check_log
+from adacd_hil.log.editing.recover import recover
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.recover import recover
 
 VICTIMS = ("writer", "control", "both")
 LOSS_BOUND_S = 0.3

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.live_client import LiveMessage, live_client
-from adacd_hil.log.live_rates import EVERY_RECORD, rate_of
+from adacd_hil.log.live.client import LiveMessage, live_client
+from adacd_hil.log.live.rates import EVERY_RECORD, rate_of
 
 WALL_NS = 1_000_000_000_000_000_000
 """Log times below this, the year 2001, are those of lockstep: they have no age."""

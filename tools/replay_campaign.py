@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from adacd_hil.analysis.replay import Replay, replay
+from adacd_hil.analysis.replay.replay import Replay, replay
 from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.config import ConfigError
 from firmware_sim.scenario import builtin_scenarios

@@ -139,9 +139,9 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     Returns what was written, the page first; nothing without a cycle. Raises LogError when it can't be written.
     """
     # Here and not above: plots take a second to import, and memory that the test itself has no use for.
-    from adacd_hil.analysis.page import document, heading
+    from adacd_hil.analysis.report.page import document, heading
+    from adacd_hil.analysis.report.timing_page import timing_section
     from adacd_hil.analysis.timing_figures import draw_timing
-    from adacd_hil.analysis.timing_page import timing_section
 
     if not len(report.columns):
         return []

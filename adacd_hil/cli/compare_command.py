@@ -10,8 +10,8 @@ from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.options import explained, json_option
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.log_comparison import LogComparison
-    from adacd_hil.analysis.run_digest import Detection
+    from adacd_hil.analysis.replay.log_comparison import LogComparison
+    from adacd_hil.analysis.replay.run_digest import Detection
 
 _EPILOG = (
     "Exit status: 0 both decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
@@ -29,7 +29,7 @@ def compare(first: Path, second: Path, as_json: bool) -> ExitCode:
 
     Times count from motion start, the first cycle in ADAPT. A folder stands for the run log in it.
     """
-    from adacd_hil.analysis.log_comparison import compare_logs
+    from adacd_hil.analysis.replay.log_comparison import compare_logs
     from adacd_hil.control.session import LOG_NAME
 
     paths = (given / LOG_NAME if given.is_dir() else given for given in (first, second))

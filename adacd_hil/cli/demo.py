@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.analysis.report import Report, write_report
+from adacd_hil.analysis.report.report import Report, write_report
 from adacd_hil.cli.connection import check_shared, contract_of, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress

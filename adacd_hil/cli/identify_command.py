@@ -10,8 +10,8 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.recording_identification import Identified, Watched
-    from adacd_hil.analysis.recording_import import Recording
+    from adacd_hil.analysis.foreign.recording_identification import Identified, Watched
+    from adacd_hil.analysis.foreign.recording_import import Recording
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -44,9 +44,9 @@ def identify(
     RECORDINGS are of free motion. What they don't explain of the test is told per joint; with the model frozen,
     contacts are looked for in the recordings of --watch.
     """
-    from adacd_hil.analysis.recording_identification import identify as run
-    from adacd_hil.analysis.recording_import import read_recording
-    from adacd_hil.analysis.recording_map import read_map
+    from adacd_hil.analysis.foreign.recording_identification import identify as run
+    from adacd_hil.analysis.foreign.recording_import import read_recording
+    from adacd_hil.analysis.foreign.recording_map import read_map
     from adacd_hil.cli.progress import Progress
 
     if not start_s < end_s:
@@ -72,7 +72,7 @@ def identify(
 
 
 def _write(found: "Identified", out: Path) -> None:
-    from adacd_hil.analysis.recording_figure import draw_watched
+    from adacd_hil.analysis.foreign.recording_figure import draw_watched
 
     out.mkdir(parents=True, exist_ok=True)
     (out / "identify.json").write_text(json.dumps(found.as_json(), indent=2), encoding="utf-8")

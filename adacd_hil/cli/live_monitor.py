@@ -13,7 +13,7 @@ from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.monitor import Screen
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.log.live_client import LiveClient, LiveMessage, live_client
+from adacd_hil.log.live.client import LiveClient, LiveMessage, live_client
 from adacd_hil.log.ros_types import unpack_log
 from adacd_hil.records import (
     GRAVITY_PARAMETER_NAMES,

@@ -33,8 +33,8 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     A folder stands for the logs in it.
     """
     from adacd_hil.cli import log_text
-    from adacd_hil.log.check import find_logs
-    from adacd_hil.log.info import read_info
+    from adacd_hil.log.check.check import find_logs
+    from adacd_hil.log.editing.info import read_info
 
     found = [read_info(path) for path in find_logs(logs)]
     if as_json:
@@ -54,7 +54,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     A folder stands for the logs in it. docs/log-tools.md lists the rules.
     """
     from adacd_hil.cli import log_text
-    from adacd_hil.log.check import check_log, find_logs
+    from adacd_hil.log.check.check import check_log, find_logs
 
     checked = [check_log(path, _tell) for path in find_logs(logs)]
     if as_json:
@@ -79,7 +79,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     --out: default NAME.recovered.mcap. The log itself stays as it is. No message is saved that no CRC vouches for.
     """
     from adacd_hil.cli import log_text
-    from adacd_hil.log.recover import recover as recover_log
+    from adacd_hil.log.editing.recover import recover as recover_log
 
     recovery = recover_log(log, out, _tell)
     as_table = log_text.recovery_as_json(recovery)
@@ -115,8 +115,8 @@ def cut(
     as_json: bool,
 ) -> ExitCode:
     """Cut a stretch out of a log, whole cycles, with attachments and metadata. --out: default NAME.cut.mcap."""
-    from adacd_hil.log.cut import Stretch, default_out, find_contact
-    from adacd_hil.log.cut import cut as cut_log
+    from adacd_hil.log.editing.cut import Stretch, default_out, find_contact
+    from adacd_hil.log.editing.cut import cut as cut_log
 
     if contact is not None and (from_s is not None or until_s is not None):
         raise CommandError("--contact says where to cut: without --from and --until", ExitCode.USAGE)
@@ -145,7 +145,7 @@ def _finite(value: float) -> float | str | None:
 @explained
 def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) -> ExitCode:
     """Merge logs into one by their log times: of several hosts, of a run and the emulator, or of one log's parts."""
-    from adacd_hil.log.merge import merge as merge_logs
+    from adacd_hil.log.editing.merge import merge as merge_logs
 
     done = merge_logs(logs, out, has_prefix, _tell)
     if done.shared and not has_prefix:

@@ -3,9 +3,9 @@
 from typing import Any
 
 from adacd_hil.cli.table import format_table
-from adacd_hil.log.check import Check
-from adacd_hil.log.info import LogInfo
-from adacd_hil.log.recover import Recovery
+from adacd_hil.log.check.check import Check
+from adacd_hil.log.editing.info import LogInfo
+from adacd_hil.log.editing.recover import Recovery
 
 _TOLD_FAULTS = 5
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report_reading import RUN_TOPICS, run_from_log
+from adacd_hil.analysis.report.reading import RUN_TOPICS, run_from_log
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason

@@ -15,9 +15,9 @@ from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.frame_choice import FrameChoice
-from adacd_hil.log.frame_log import open_frames
-from adacd_hil.log.recorded_frames import is_sendable
+from adacd_hil.log.formats.frame_choice import FrameChoice
+from adacd_hil.log.formats.frame_log import open_frames
+from adacd_hil.log.formats.recorded_frames import is_sendable
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError, is_hardware, open_bus
 from adacd_hil.wire.playback import PlayedFrame, play, repeat

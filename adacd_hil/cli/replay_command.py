@@ -10,8 +10,8 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.replay import Replay
-    from adacd_hil.analysis.replay_source import Source
+    from adacd_hil.analysis.replay.replay import Replay
+    from adacd_hil.analysis.replay.source import Source
     from adacd_hil.config import Settings
 
 _EPILOG = (
@@ -91,8 +91,8 @@ def _replay_one(
     shown: int,
     progress: Any,
 ) -> _Result:
-    from adacd_hil.analysis.replay import contacts_beside, replay_source
-    from adacd_hil.analysis.what_if import apply_settings, keep_facts, parse_changes, parse_variations
+    from adacd_hil.analysis.replay.replay import contacts_beside, replay_source
+    from adacd_hil.analysis.replay.what_if import apply_settings, keep_facts, parse_changes, parse_variations
     from adacd_hil.config import load_settings
     from adacd_hil.control.operator import ScriptedOperator
 
@@ -122,8 +122,8 @@ def _open(
     given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
 ) -> "tuple[Source, bool]":
     """Open a log or a recording; also say whether it is a recording alone."""
-    from adacd_hil.analysis.can_recording import RecordingAgainstLog, RecordingAlone
-    from adacd_hil.analysis.replay_source import LogSource
+    from adacd_hil.analysis.replay.can_recording import RecordingAgainstLog, RecordingAlone
+    from adacd_hil.analysis.replay.source import LogSource
     from adacd_hil.config import load_settings
     from adacd_hil.device.contract import load_contract
     from adacd_hil.wire.codec import load_codec
@@ -163,7 +163,7 @@ def _verdict(own: "Replay") -> str:
 
 
 def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int) -> str:
-    from adacd_hil.analysis.what_if import NOTE, side_by_side
+    from adacd_hil.analysis.replay.what_if import NOTE, side_by_side
     from adacd_hil.cli.table import format_table
 
     own = replays[0]
@@ -188,7 +188,7 @@ def _counts(own: "Replay") -> str:
 
 
 def _as_json(path: Path, replays: "list[Replay]", names: list[str], shown: int) -> dict[str, Any]:
-    from adacd_hil.analysis.what_if import as_json, changed_keys
+    from adacd_hil.analysis.replay.what_if import as_json, changed_keys
 
     own = replays[0]
     return {

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from adacd_hil.analysis.report import Report, write_report
+from adacd_hil.analysis.report.report import Report, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.control.session import LOG_NAME
 

@@ -12,7 +12,7 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.sweep_plan import Plan
+    from adacd_hil.analysis.sweep.plan import Plan
 
 _LOG_NAME = "run.mcap"
 
@@ -48,9 +48,9 @@ def sweep(
 
     A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
     """
-    from adacd_hil.analysis.sweep import connect, run_sweep
-    from adacd_hil.analysis.sweep_rows import replay_task
-    from adacd_hil.analysis.sweep_store import SweepStore
+    from adacd_hil.analysis.sweep.rows import replay_task
+    from adacd_hil.analysis.sweep.store import SweepStore
+    from adacd_hil.analysis.sweep.sweep import connect, run_sweep
     from adacd_hil.cli.progress import Progress
 
     if bool(logs) == bool(scenarios):
@@ -89,8 +89,8 @@ def _plan(
     logs: Sequence[Path], scenarios: Sequence[str], seeds: str, vary: Sequence[str], config: str, profile: str
 ) -> "Plan":
     from adacd_hil import __version__
-    from adacd_hil.analysis.sweep_plan import plan_logs, plan_scenarios
-    from adacd_hil.analysis.what_if import apply_settings, parse_variations
+    from adacd_hil.analysis.replay.what_if import apply_settings, parse_variations
+    from adacd_hil.analysis.sweep.plan import plan_logs, plan_scenarios
     from adacd_hil.compiled import source_digest
     from adacd_hil.config import load_settings
 

@@ -3,10 +3,10 @@
 import tempfile
 from pathlib import Path
 
-from adacd_hil.analysis.replay import replay
-from adacd_hil.analysis.sweep_plan import Row, Task
-from adacd_hil.analysis.sweep_rows import REFUSALS, Values, failed, finished
-from adacd_hil.analysis.what_if import apply_settings
+from adacd_hil.analysis.replay.replay import replay
+from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.sweep.plan import Row, Task
+from adacd_hil.analysis.sweep.rows import REFUSALS, Values, failed, finished
 from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.config import Settings
 

@@ -18,9 +18,9 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
+from adacd_hil.log.live.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.recorder import LogSummary, Recorder
-from adacd_hil.log.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.setup import LiveSetup
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name

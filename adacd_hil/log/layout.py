@@ -4,8 +4,8 @@ import base64
 import json
 from typing import Any
 
-from adacd_hil.log.live_rates import SCENE_TOPIC
-from adacd_hil.log.robot_description import WORLD
+from adacd_hil.log.live.rates import SCENE_TOPIC
+from adacd_hil.log.live.robot_description import WORLD
 
 LAYOUT_NAME = "viewer-layout.json"
 

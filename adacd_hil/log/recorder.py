@@ -22,9 +22,9 @@ from adacd_hil.log import packet, words
 from adacd_hil.log.channels import MessageLike
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
+from adacd_hil.log.live.robot_description import ROBOT_NAME
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.ring import Ring, room_of
-from adacd_hil.log.robot_description import ROBOT_NAME
 from adacd_hil.log.setup import LiveSetup, Setup, tell_messages
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.wire.bus import Frame

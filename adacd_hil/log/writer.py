@@ -35,7 +35,7 @@ from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
 
 if TYPE_CHECKING:
-    from adacd_hil.log.live import LiveView
+    from adacd_hil.log.live.server import LiveView
 
 FLUSH_PERIOD_NS = 250_000_000
 POLL_PERIOD_US = 25_000
@@ -85,7 +85,7 @@ class WriterProcess:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
 
     def _open_live(self) -> "LiveView":
-        from adacd_hil.log.live import LiveView  # with an SDK that nothing else needs
+        from adacd_hil.log.live.server import LiveView  # with an SDK that nothing else needs
 
         assert self._setup.live is not None
         start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())

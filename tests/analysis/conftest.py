@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from analysis.replay_rig import record
 
-from adacd_hil.analysis.replay import Replay, replay
+from adacd_hil.analysis.replay.replay import Replay, replay
 from adacd_hil.control.operator import ScriptedOperator
 
 

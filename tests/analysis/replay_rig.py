@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.analysis.replay_source import LogSource
+from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.cli.demo import Cast, run_embedded
 from adacd_hil.config import RequestSettings, Settings, load_settings
-from adacd_hil.log.frame_log import read_frames
+from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import Piece
 from firmware_sim.scenario import load_scenario

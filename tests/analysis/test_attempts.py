@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adacd_hil.analysis.attempts import AttemptSplitter
+from adacd_hil.analysis.replay.attempts import AttemptSplitter
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.mcap_walk import record_dtype
 from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, Series

@@ -8,9 +8,9 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
-from adacd_hil.analysis.recording_identification import identify
-from adacd_hil.analysis.recording_import import read_recording
-from adacd_hil.analysis.recording_map import read_map
+from adacd_hil.analysis.foreign.recording_identification import identify
+from adacd_hil.analysis.foreign.recording_import import read_recording
+from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError

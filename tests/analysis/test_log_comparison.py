@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from log.recorded_run import make_run, record
 
-from adacd_hil.analysis.log_comparison import MATCH_S, compare_logs, match_contacts
-from adacd_hil.analysis.run_digest import Detection
-from adacd_hil.analysis.what_if import apply_settings
+from adacd_hil.analysis.replay.log_comparison import MATCH_S, compare_logs, match_contacts
+from adacd_hil.analysis.replay.run_digest import Detection
+from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.config import load_settings, to_toml
 
 SETTINGS = load_settings("paper")

@@ -8,9 +8,9 @@ import pytest
 from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
 
 from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.replay import Replay, contacts_beside, replay, replay_many, replay_source
-from adacd_hil.analysis.report import RUN_TOPICS, run_from_log
-from adacd_hil.analysis.what_if import apply_settings
+from adacd_hil.analysis.replay.replay import Replay, contacts_beside, replay, replay_many, replay_source
+from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.report.report import RUN_TOPICS, run_from_log
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log

@@ -16,10 +16,10 @@ import pytest
 from hand_made_run import A, M, like_an_old_log, make_run, react, touched_run
 
 from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report import write_report, write_run_report
-from adacd_hil.analysis.report_json import report_json
-from adacd_hil.analysis.report_reading import Source
-from adacd_hil.analysis.timing_page import timing_section
+from adacd_hil.analysis.report.json_form import report_json
+from adacd_hil.analysis.report.reading import Source
+from adacd_hil.analysis.report.report import write_report, write_run_report
+from adacd_hil.analysis.report.timing_page import timing_section
 from adacd_hil.config import to_toml
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_scheme, pack_truth
 from adacd_hil.log.errors import LogError

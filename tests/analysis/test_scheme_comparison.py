@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.analysis.scheme_comparison import SchemeComparison, different_arithmetic
+from adacd_hil.analysis.replay.scheme_comparison import SchemeComparison, different_arithmetic
 from adacd_hil.config import load_settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.channels import run_channels

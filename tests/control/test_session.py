@@ -20,7 +20,7 @@ from session_rig import (
 from adacd_hil.control.gate import GateFlag
 from adacd_hil.control.session import LiveAddress
 from adacd_hil.log.layout import LAYOUT_NAME
-from adacd_hil.log.robot_description import ROBOT_NAME
+from adacd_hil.log.live.robot_description import ROBOT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
 from adacd_hil.scheme.urdf import read_urdf
 from adacd_hil.wire.bus import Frame

@@ -12,7 +12,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.config import BusSettings, LockstepSettings, OperatorSettings, RequestSettings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
-from adacd_hil.log.mcap_frame_writer import FrameWriter, RecordedFrame
+from adacd_hil.log.formats.mcap_frame_writer import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import topic_bytes
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from firmware_sim.recorded_bench import RecordedBench

@@ -8,8 +8,8 @@ from recorded_run import CODEC, Run
 from reference_writer import MemorySink
 
 from adacd_hil.log.channels import run_channels
-from adacd_hil.log.live import LiveView
-from adacd_hil.log.live_client import LiveClient, LiveMessage
+from adacd_hil.log.live.client import LiveClient, LiveMessage
+from adacd_hil.log.live.server import LiveView
 from adacd_hil.log.mcap_file import McapFile
 from adacd_hil.log.packet import ROOM, pack_cycle, pack_event
 from adacd_hil.log.packet_writer import PacketWriter

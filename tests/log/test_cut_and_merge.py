@@ -6,10 +6,10 @@ from made_log import ATTACHMENTS, MILLISECOND, RUN, SUMMARY, kinds, make_log, pu
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
-from adacd_hil.log.check import check_log
-from adacd_hil.log.cut import Stretch, contacts_begun, cut, find_contact
+from adacd_hil.log.check.check import check_log
+from adacd_hil.log.editing.cut import Stretch, contacts_begun, cut, find_contact
+from adacd_hil.log.editing.merge import log_names, merge
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.merge import log_names, merge
 from adacd_hil.log.reader import LoggedContact, read_log
 from adacd_hil.records import ContactReport
 

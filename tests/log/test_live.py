@@ -31,8 +31,8 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.log import words
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.live_client import SUBPROTOCOL, LiveClient, live_client
-from adacd_hil.log.live_rates import Decimator, rate_of
+from adacd_hil.log.live.client import SUBPROTOCOL, LiveClient, live_client
+from adacd_hil.log.live.rates import Decimator, rate_of
 from adacd_hil.log.packet import pack_cycle, pack_event
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.log.ring import Ring, RingReader

@@ -15,7 +15,7 @@ from adacd_hil.cli.live_monitor import TOPICS, LiveMonitor, as_text
 from adacd_hil.cli.main import cli
 from adacd_hil.log.cdr import payload_dtype
 from adacd_hil.log.channels import run_channels
-from adacd_hil.log.live_client import LiveMessage, live_client
+from adacd_hil.log.live.client import LiveMessage, live_client
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactKind,

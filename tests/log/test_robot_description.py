@@ -10,8 +10,8 @@ import pytest
 
 from adacd_hil.config import load_settings
 from adacd_hil.log.layout import viewer_layout
-from adacd_hil.log.robot_description import robot_description
-from adacd_hil.log.scene import Shape, transforms_of
+from adacd_hil.log.live.robot_description import robot_description
+from adacd_hil.log.live.scene import Shape, transforms_of
 from adacd_hil.scheme.urdf import read_urdf
 
 LENGTHS_M = (0.42, 0.27)

@@ -8,7 +8,7 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from adacd_hil.log.channels import pack_contact, unpack_contact
-from adacd_hil.log.scene import (
+from adacd_hil.log.live.scene import (
     ARROW_LIFETIME_NS,
     GREEN,
     GREY,
@@ -22,7 +22,7 @@ from adacd_hil.log.scene import (
     share_of_threshold,
     transforms_of,
 )
-from adacd_hil.log.scene_types import SCENE, TRANSFORMS, MessageType, pack_scene, pack_transforms
+from adacd_hil.log.live.scene_types import SCENE, TRANSFORMS, MessageType, pack_scene, pack_transforms
 from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
 
 SHAPE = Shape((0.35, 0.30))

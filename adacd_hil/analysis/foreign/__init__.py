@@ -1,0 +1,1 @@
+"""Recordings of arms that others made."""

@@ -1,0 +1,216 @@
+"""A foreign recording through the scheme: parameters from free motion, their test on other motion, contacts in a third.
+
+The fit learns whatever is in its recording, a touch too; where the map names a column of touches, those are left out.
+"""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adacd_hil.analysis.foreign.recording_import import Recording, Stretch
+from adacd_hil.analysis.foreign.recording_map import RecordingMap
+from adacd_hil.log.errors import LogError
+from adacd_hil.records import Vector
+from adacd_hil.scheme import offline
+from adacd_hil.scheme.offline import Certificate, Estimate, OfflineSettings
+
+FIT_SHARE = 0.6
+"""Of a recording that is both fitted and tested: the part that is fitted."""
+
+
+class Spell(NamedTuple):
+    """A contact that was found: times from the recording's start, links counted from 1, signs of each joint (n,)."""
+
+    start_s: float
+    link: int
+    direction: tuple[int, ...]
+    is_true: bool | None  # None where nobody knows
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What was found in a recording that the model has not seen."""
+
+    recording: Recording
+    tau_ext_hat: tuple[Vector, ...]  # per stretch (k, n), Nm
+    threshold: tuple[Vector, ...]
+    contacts: tuple[Spell, ...]
+    touches: int | None  # None where nobody knows
+    missed: int | None
+    delays_s: tuple[float, ...]  # of the touches that were found
+
+    @property
+    def false_contacts(self) -> int | None:
+        """Contacts where nobody touched; None where nobody knows."""
+        return None if self.touches is None else sum(contact.is_true is False for contact in self.contacts)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Parameters (p,), and how much of the torque (n,) they explain on motion that was not fitted."""
+
+    model: offline.ArmModel
+    settings: OfflineSettings
+    joint_names: tuple[str, ...]
+    estimate: Estimate
+    certificate: Certificate
+    explained: Vector
+    fit_s: float
+    test: Watched
+    watched: tuple[Watched, ...]
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether no residual of the test reached its threshold."""
+        return self.certificate.margin > 1.0
+
+    def as_json(self) -> dict[str, Any]:
+        """Describe it for machines."""
+        deviation = np.sqrt(np.diag(self.estimate.P)).tolist()
+        names, certificate = self.model.parameter_names, self.certificate
+        return {
+            "parameters": {
+                name: {"value": value, "std": std}
+                for name, value, std in zip(names, self.estimate.theta.tolist(), deviation, strict=True)
+            },
+            "fit_s": self.fit_s,
+            "period_s": self.settings.period_s,
+            "noise_Nm": list(self.settings.noise_Nm),
+            "velocity_noise_rad_s": self.settings.velocity_noise_rad_s,
+            "test": {
+                "seconds": self.test.recording.duration_s,
+                "margin": certificate.margin,
+                "explained": dict(zip(self.joint_names, self.explained.tolist(), strict=True)),
+                "residual_rms_Nm": certificate.residual_rms_Nm.tolist(),
+                "residual_max_Nm": certificate.residual_max_Nm.tolist(),
+                "lack_Nm": certificate.lack_Nm.tolist(),
+            },
+            "watched": [
+                {
+                    "recording": str(watched.recording.path),
+                    "contacts": [contact._asdict() for contact in watched.contacts],
+                    "touches": watched.touches,
+                    "missed": watched.missed,
+                    "false_contacts": watched.false_contacts,
+                    "delays_s": list(watched.delays_s),
+                }
+                for watched in self.watched
+            ],
+        }
+
+
+def identify(
+    described: RecordingMap,
+    fitted: Sequence[Recording],
+    tested: Recording | None,
+    watched: Sequence[Recording] = (),
+) -> Identified:
+    """Fit recordings one after the other, test on another, and look for contacts in further ones.
+
+    tested: None takes the last part of the last recording that is to be fitted. Raises ConfigError, LogError.
+    """
+    recordings = [recording.free for recording in fitted]
+    if tested is None:
+        last = recordings[-1]
+        if not last.stretches:
+            raise LogError(f"{last.path}: nothing is free of touches")
+        first, final = last.stretches[0], last.stretches[-1]
+        end_s = final.start_s + len(final.record.q) * last.period_s
+        split_s = first.start_s + FIT_SHARE * (end_s - first.start_s)
+        recordings[-1], tested = last.between(-np.inf, split_s), last.between(split_s, np.inf)
+    tested = tested.free
+    if not tested.stretches or not any(recording.stretches for recording in recordings):
+        raise LogError("too little free motion: nothing is left to fit or to test")
+    source = recordings[-1]
+    settings = described.settings(source.noise_Nm, source.period_s, source.velocity_noise_rad_s)
+    model = offline.model_of(described.urdf.chain, described.arm.has_rotors)
+    estimate = offline.prior(model)
+    for stretch in itertools.chain.from_iterable(recording.stretches for recording in recordings):
+        estimate = offline.identify(model, stretch.record, estimate, settings)
+    certificate = _joined(
+        [offline.certify(model, part.record, estimate, settings) for part in tested.stretches], tested
+    )
+    test = watch(model, settings, estimate, certificate.lack_Nm, tested)
+    return Identified(
+        model=model,
+        settings=settings,
+        joint_names=described.urdf.joint_names,
+        estimate=estimate,
+        certificate=certificate,
+        explained=_explained(test),
+        fit_s=sum(recording.duration_s for recording in recordings),
+        test=test,
+        watched=tuple(watch(model, settings, estimate, certificate.lack_Nm, recording) for recording in watched),
+    )
+
+
+def _joined(parts: list[Certificate], tested: Recording) -> Certificate:
+    """Join the certificates of all stretches, each by its length."""
+    weights = np.array([len(stretch.record.q) for stretch in tested.stretches], np.float64)
+    weights /= weights.sum()
+    return Certificate(
+        residual_rms_Nm=np.sqrt(sum(w * part.residual_rms_Nm**2 for w, part in zip(weights, parts, strict=True))),
+        residual_max_Nm=np.max([part.residual_max_Nm for part in parts], axis=0),
+        lack_Nm=np.sqrt(sum(w * part.lack_Nm**2 for w, part in zip(weights, parts, strict=True))),
+        margin=min(part.margin for part in parts),
+    )
+
+
+def _explained(test: Watched) -> Vector:
+    """Return the share of each torque's variance (n,) that the model predicts."""
+    tau_J = np.concatenate([stretch.record.tau_J for stretch in test.recording.stretches])
+    residual = np.concatenate(test.tau_ext_hat)
+    return np.asarray(1.0 - np.mean(residual**2, axis=0) / np.maximum(np.var(tau_J, axis=0), 1e-12))
+
+
+def watch(
+    model: offline.ArmModel, settings: OfflineSettings, estimate: Estimate, lack_Nm: Vector, recording: Recording
+) -> Watched:
+    """Look for contacts in a recording, and compare them with its touches where these are known."""
+    detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]
+    spells: list[Spell] = []
+    delays: list[float] = []
+    touches: int | None = None
+    for stretch, detection in zip(recording.stretches, detections, strict=True):
+        bounds = _touches(stretch)
+        early = round(recording.blur_s / recording.period_s)
+        late = round(settings.isolation_s / settings.period_s)
+        for contact in detection.contacts:
+            is_true = None
+            if stretch.is_touched is not None:
+                is_true = any(first - early <= contact.sample <= last + late for first, last in bounds)
+            start_s = stretch.start_s + contact.sample * recording.period_s
+            spells.append(Spell(start_s, contact.link + 1, contact.direction, is_true))
+        if stretch.is_touched is not None:
+            touches = (touches or 0) + len(bounds)
+            delays += _delays(
+                bounds, [contact.sample for contact in detection.contacts], early, late, recording.period_s
+            )
+    return Watched(
+        recording=recording,
+        tau_ext_hat=tuple(detection.tau_ext_hat for detection in detections),
+        threshold=tuple(detection.threshold for detection in detections),
+        contacts=tuple(spells),
+        touches=touches,
+        missed=None if touches is None else touches - len(delays),
+        delays_s=tuple(delays),
+    )
+
+
+def _touches(stretch: Stretch) -> list[tuple[int, int]]:
+    """Return the first and the last sample of each touch."""
+    if stretch.is_touched is None:
+        return []
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], stretch.is_touched, [False])).astype(np.int8)))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+
+
+def _delays(
+    bounds: Iterable[tuple[int, int]], samples: Sequence[int], early: int, late: int, period_s: float
+) -> list[float]:
+    """Return how long after its beginning each touch was found, of those that were."""
+    found = [next((k - first for k in samples if first - early <= k <= last + late), None) for first, last in bounds]
+    return [delay * period_s for delay in found if delay is not None]

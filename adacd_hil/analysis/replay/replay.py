@@ -1,0 +1,324 @@
+"""Replay: the raw frames of a log once more through codec, arm and scheme, and what that comes to beside the log.
+
+The log is read in pieces, in constant memory. Each attempt of the run has an arm and a pipeline of its own, as it had
+on the arm. What the user asked for is in the log, and so is how the arm moved: a replay with other settings decides
+other things about the same motion.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
+from adacd_hil.analysis.replay.attempts import Stretch
+from adacd_hil.analysis.replay.outcome import Adaptation, ContactOutcome, OutcomeGatherer, Transition
+from adacd_hil.analysis.replay.scheme_comparison import (
+    SHOWN,
+    TOLERANCE,
+    Mismatch,
+    SchemeComparison,
+    different_arithmetic,
+)
+from adacd_hil.analysis.replay.source import LogSource, Source
+from adacd_hil.analysis.replay.truth_contacts import TrueContact, read_contacts
+from adacd_hil.config import Settings
+from adacd_hil.device.recorded_arm import RecordedArm
+from adacd_hil.log.reader import LoggedContact
+from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
+from adacd_hil.scheme.batch import SchemeBatch, arm_at
+from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.scheme.selection import pipeline_of
+from adacd_hil.wire.codec import Codec
+
+TRUTH_NAME: Final = "truth.mcap"
+SCRIPTED: Final = "script"
+"""Of a log's metadata `operator`: nobody could type anything."""
+_PROGRESS_CYCLES: Final = 200_000
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What one replay came to.
+
+    cycles: replayed, of which `compared` were compared with the log; compared is 0 where the settings are not the
+    log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
+    `mismatched_fields`. parameters: of the end of the log. true_contacts, false_alarms_ns: None where the truth is not
+    known. zero_ns: of the first ADAPT.
+    """
+
+    settings: Settings
+    cycles: int
+    monitored_s: float
+    compared: int
+    attempts: int
+    states: tuple[Transition, ...]
+    contacts: tuple[LoggedContact, ...]
+    adaptations: tuple[Adaptation, ...]
+    parameters: dict[str, float]
+    true_contacts: tuple[ContactOutcome, ...] | None
+    false_alarms_ns: tuple[int, ...] | None
+    detections_ns: tuple[int, ...]
+    mismatches: tuple[Mismatch, ...]
+    mismatch_count: int
+    mismatched_fields: dict[str, int]
+    tolerance: float
+    notes: tuple[str, ...] = ()
+    """What of the log could not be compared, a line each."""
+
+    @property
+    def is_identical(self) -> bool:
+        """Whether something was compared and all of it was the same."""
+        return self.compared > 0 and self.mismatch_count == 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all that the log should have could be compared."""
+        return not self.notes
+
+    @property
+    def adaptation_s(self) -> tuple[float | None, ...]:
+        """How long each adaptation took; None if it came to nothing."""
+        return tuple(adaptation.took_s for adaptation in self.adaptations)
+
+    @property
+    def missed(self) -> int | None:
+        """Armed contacts that were not detected; None where the truth is not known."""
+        if self.true_contacts is None:
+            return None
+        return sum(contact.is_armed and contact.detected_ns is None for contact in self.true_contacts)
+
+    @property
+    def false_alarms(self) -> int | None:
+        """Detections that no contact explains; None where the truth is not known."""
+        return None if self.false_alarms_ns is None else len(self.false_alarms_ns)
+
+    @property
+    def zero_ns(self) -> int:
+        """When the arm first moved: the first ADAPT."""
+        return next((each.t_ns for each in self.states if each.state is SchemeState.ADAPT), 0)
+
+    def time_s(self, t_ns: int) -> float:
+        """Give a time since motion start."""
+        return (t_ns - self.zero_ns) * 1e-9
+
+
+def replay(
+    path: Path,
+    settings: Settings | None = None,
+    progress: Progress = lambda _: None,
+    *,
+    tolerance: float | None = None,
+    script_of: ScriptOf | None = None,
+) -> Replay:
+    """Replay a log with its own settings, or with others. Raises LogError, ConfigError, CodecError.
+
+    tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed otherwise.
+    script_of: plays the user of a configuration; with it, the requests of a run that nobody typed into are compared.
+    """
+    source = LogSource(path)
+    return replay_source(source, [settings or source.settings], contacts_beside(path), progress, tolerance, script_of)[
+        0
+    ]
+
+
+def replay_many(path: Path, variants: Sequence[Settings], progress: Progress = lambda _: None) -> list[Replay]:
+    """Replay a log once for each of the settings; the log is read and decoded once.
+
+    Raises LogError, ConfigError, CodecError.
+    """
+    return replay_source(LogSource(path), variants, contacts_beside(path), progress)
+
+
+def contacts_beside(path: Path) -> tuple[TrueContact, ...] | None:
+    """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError."""
+    truth = path.with_name(TRUTH_NAME)
+    return read_contacts(truth) if truth.exists() else None
+
+
+class _Player:
+    """One variant on its way through the log."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        truth: tuple[TrueContact, ...] | None,
+        comparison: SchemeComparison | None,
+        asking: Asking | None,
+    ) -> None:
+        self.settings = settings
+        self.comparison = comparison
+        self.requests = RequestCheck()
+        self.gatherer = OutcomeGatherer(settings, truth)
+        self.attempts = 0
+        self._asking = asking
+        self._pipeline: Pipeline | CertifiedPipeline = pipeline_of(settings)
+        self._state = SchemeState.INIT
+        self._reports: dict[int, ContactReport] = {}  # of this part, by time
+        self._cycles: dict[int, int] = {}
+
+    def play(self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]]) -> None:
+        """Take in a stretch."""
+        ticks = stretch.ticks
+        if stretch.is_begin:
+            self._begin()
+            self.gatherer.begin(stretch.attempt, int(ticks.cycle[0]))
+        batch = self._run(stretch, arms)
+        texts = [event.message for event in self._pipeline.take_events()]
+        self.gatherer.take(ticks, batch)
+        if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
+            return
+        self.comparison.compare(stretch.scheme, ticks, batch)
+        if self._asking is not None:
+            self.requests.compare(ticks, stretch.requests, self._asking.requests(ticks, batch))
+        else:  # whatever a user could ask is believed
+            is_known = stretch.requests <= max(Request)
+            self.requests.compare(ticks, stretch.requests, np.where(is_known, stretch.requests, 0))
+        times = ticks.t_ns[batch.contact_places].tolist()
+        self._reports |= zip(times, batch.contacts, strict=True)
+        self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
+        logged = [margin for margin in margins if ticks.t_ns[0] <= margin[0] <= ticks.t_ns[-1]]
+        self.comparison.compare_events(logged, texts, int(ticks.cycle[0]))
+
+    def _begin(self) -> None:
+        self._pipeline = pipeline_of(self.settings)
+        self._state = SchemeState.INIT
+        self.attempts += 1
+        if self._asking is not None:
+            self._asking.begin()
+
+    def _run(self, stretch: Stretch, arms: ArmBatch) -> SchemeBatch:
+        """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
+        if stretch.requests is not None:
+            is_known = stretch.requests <= max(Request)
+            return self._pipeline.run(arms, np.where(is_known, stretch.requests, np.uint8(Request.NONE)))
+        outputs = []
+        for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
+            request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
+            output = self._pipeline.step(arm_at(arms, row), request)
+            self._state = output.state
+            if self._asking is not None:
+                self._asking.note(cycle, self._state)
+            outputs.append(output)
+        return _columns(outputs)
+
+    def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
+        """Compare the reports of a part; exact: from when to when, ns, it can be compared."""
+        if self.comparison is not None:
+            judged = {t_ns: record for t_ns, record in logged.items() if any(a <= t_ns <= b for a, b in exact)}
+            self.comparison.compare_contacts(judged, self._reports, self._cycles)
+        self._reports, self._cycles = {}, {}
+
+
+def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
+    """Put the decisions of single cycles into columns."""
+    states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
+    wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
+    columns: dict[str, Any] = {
+        name: np.array([getattr(output, name) for output in outputs], kind) for name, kind in wholes
+    }
+    contacts = {row: output.contact for row, output in enumerate(outputs) if output.contact is not None}
+    return SchemeBatch(
+        **columns,
+        block=np.array([output.block for output in outputs]),
+        contacts=list(contacts.values()),
+        contact_places=np.array(list(contacts), np.int64),
+    )
+
+
+def replay_source(
+    source: Source,
+    variants: Sequence[Settings],
+    truth: tuple[TrueContact, ...] | None = None,
+    progress: Progress = lambda _: None,
+    tolerance: float | None = None,
+    script_of: ScriptOf | None = None,
+    shown: int = SHOWN,
+) -> list[Replay]:
+    """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
+
+    Raises LogError, ConfigError, CodecError.
+    """
+    if tolerance is None:
+        tolerance = TOLERANCE if different_arithmetic(source.metadata) else 0.0
+    is_scripted = source.metadata.get("operator", SCRIPTED if not source.metadata else "") == SCRIPTED
+    players = []
+    for settings in variants:
+        comparison = SchemeComparison(settings, tolerance, shown) if settings == source.settings else None
+        asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
+        players.append(_Player(settings, truth, comparison, asking))
+    decoders = _Decoders(source.codec, variants)
+    done = announced = 0
+    for part in source:
+        exact: list[tuple[int, int]] = []
+        for stretch in part.stretches:
+            for player, arms in zip(players, decoders.read(stretch), strict=True):
+                player.play(stretch, arms, part.margins)
+            if stretch.is_exact:
+                exact.append((int(stretch.ticks.t_ns[0]), int(stretch.ticks.t_ns[-1])))
+            done += len(stretch.ticks.cycle)
+        for player in players:
+            player.compare_contacts(part.contacts, exact)
+        if done - announced >= _PROGRESS_CYCLES:
+            announced = done
+            progress(f"{done} cycles replayed")
+    return [_result(player, source, tolerance) for player in players]
+
+
+class _Decoders:
+    """Recorded arms: one for all settings that make the same of the frames."""
+
+    def __init__(self, codec: Codec, variants: Sequence[Settings]) -> None:
+        self._codec = codec
+        self._keys = [_decoding_key(settings) for settings in variants]
+        self._settings = dict(zip(self._keys, variants, strict=True))
+        self._arms: dict[Any, RecordedArm] = {}
+
+    def read(self, stretch: Stretch) -> list[ArmBatch]:
+        """Return the states of a stretch, for each of the variants."""
+        if stretch.is_begin:
+            self._arms = {key: RecordedArm(settings, self._codec) for key, settings in self._settings.items()}
+        batches = {key: arm.read(stretch.ticks, stretch.frames) for key, arm in self._arms.items()}
+        return [batches[key] for key in self._keys]
+
+
+def _decoding_key(settings: Settings) -> Any:
+    """Return what of the settings the arm goes by."""
+    arm = settings.arm
+    shape = (arm.sign, arm.torque_offset_Nm, arm.rated_torque_Nm, arm.torque_limit_Nm)
+    return (*shape, settings.bus, settings.devices, settings.realtime)
+
+
+def _result(player: _Player, source: Source, tolerance: float) -> Replay:
+    gatherer, comparison, notes = player.gatherer, player.comparison, list(source.notes())
+    gatherer.end()
+    judged = gatherer.judge()
+    if comparison is not None:
+        for cycle, t_ns, logged, asked in player.requests.unexplained:
+            comparison.add(Mismatch("/scheme", "request", "", cycle, t_ns, str(logged), str(asked)))
+        if comparison.missing_fields:
+            notes.append(f"/scheme lacks {', '.join(comparison.missing_fields)}, an older format")
+    return Replay(
+        settings=player.settings,
+        cycles=gatherer.cycles,
+        monitored_s=gatherer.monitored * player.settings.bus.period_s,
+        compared=0 if comparison is None else comparison.cycles,
+        attempts=player.attempts,
+        states=tuple(gatherer.transitions),
+        contacts=tuple(gatherer.reports),
+        adaptations=tuple(gatherer.adaptations),
+        parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
+        true_contacts=None if judged is None else judged[0],
+        false_alarms_ns=None if judged is None else judged[1],
+        detections_ns=tuple(each.t_ns for each in gatherer.detections),
+        mismatches=() if comparison is None else comparison.first(),
+        mismatch_count=0 if comparison is None else comparison.count,
+        mismatched_fields={} if comparison is None else dict(comparison.fields),
+        tolerance=tolerance,
+        notes=tuple(notes),
+    )

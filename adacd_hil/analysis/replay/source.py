@@ -1,0 +1,118 @@
+"""Where a replay gets its cycles from: the stretches of a log of ours, with what was attached to it.
+
+Settings, contract and torque offsets are those that are attached to the log.
+"""
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+
+from adacd_hil.analysis.replay.attempts import AttemptSplitter, Stretch
+from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
+from adacd_hil.config import Settings, parse
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.ros_types import unpack_log
+from adacd_hil.log.stream import LogStream, Piece
+from adacd_hil.wire.codec import Codec, parse_codec
+
+FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
+TOPICS: Final = (*FRAME_TOPICS, "/scheme", "/cycle", "/contact", "/events")
+CYCLES_PER_PIECE: Final = 20_000
+_MARGIN: Final = "margin"
+"""Name of the events that the scheme itself says."""
+
+
+class Source(Protocol):
+    """Where stretches come from: a log of ours, or a recording by others. Iterated once; notes are complete then."""
+
+    settings: Settings
+    codec: Codec
+    metadata: Mapping[str, str]
+
+    def __iter__(self) -> Iterator["Part"]:
+        """Give the parts, in order."""
+
+    def notes(self) -> list[str]:
+        """Say what is missing."""
+
+
+class Part(NamedTuple):
+    """What one piece of a log holds. contacts: logged reports by time, ns; margins: (time, text)."""
+
+    stretches: Iterable[Stretch]
+    contacts: Mapping[int, Mapping[str, Any]]
+    margins: Sequence[tuple[int, str]]
+
+
+class LogSource:
+    """A log of ours."""
+
+    def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
+        """Open the log. Raises LogError, ConfigError, CodecError."""
+        self._stream = LogStream(path, TOPICS, cycles_per_piece)
+        self._path = path
+        self.metadata: Mapping[str, str] = self._stream.metadata
+        self.settings = settings_of(path, self._stream.attachments)
+        self.codec = codec_of(path, self._stream.attachments)
+        self._splitter = AttemptSplitter(self._stream.epoch_ns)
+
+    def __iter__(self) -> Iterator[Part]:
+        """Give the parts, in order."""
+        for read in self._stream:
+            piece = self._piece(read)
+            margins = list(_margins(piece, self._stream.epoch_ns))
+            yield Part(self._splitter.split(piece), contact_records(piece.series["/contact"]), margins)
+
+    def _piece(self, piece: Piece) -> Piece:
+        """Return what is to be replayed of a piece: all of it."""
+        return piece
+
+    def notes(self) -> list[str]:
+        """Say what is missing."""
+        splitter = self._splitter
+        notes = [f"the log is not whole: {self._stream.problem}"] if self._stream.problem else []
+        dropped = self._stream.summary.get("dropped", "0")
+        if dropped != "0":
+            notes.append(f"{dropped} packets never reached the log")
+        if splitter.headless_cycles:
+            notes.append(
+                f"{splitter.headless_cycles} cycles at its beginning can't be replayed: the attempt began before"
+            )
+        for gap in splitter.gaps[:SHOWN]:
+            notes.append(
+                f"{gap.missing} cycles with their frames are missing before cycle {gap.cycle}: what follows in that "
+                "attempt is replayed but can't be compared"
+            )
+        if len(splitter.gaps) > SHOWN:
+            notes.append(f"and {len(splitter.gaps) - SHOWN} more gaps")
+        if splitter.unpaired:
+            notes.append(f"{splitter.unpaired} records of /scheme or /cycle lack the other one of their cycle")
+        return notes
+
+
+def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
+    """Read the settings that a run had. Raises LogError, ConfigError."""
+    if "config.toml" not in attachments:
+        raise LogError(f"log {path} has no config.toml attached: its settings are not known")
+    try:
+        return parse(Settings, tomllib.loads(attachments["config.toml"].decode()))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise LogError(f"log {path}: its config.toml can't be read: {error}") from None
+
+
+def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
+    """Generate the codec of the DBC that a run had. Raises LogError, CodecError."""
+    if "arm.dbc" not in attachments:
+        raise LogError(f"log {path} has no arm.dbc attached: its frames can't be decoded")
+    return parse_codec(attachments["arm.dbc"], path.with_name("arm.dbc"))
+
+
+def _margins(piece: Piece, epoch_ns: int) -> Iterator[tuple[int, str]]:
+    for payload in piece.payloads.get("/events", ()):
+        event = unpack_log(payload)
+        if event.name == _MARGIN:
+            sec, nanosec = np.frombuffer(payload, "<u4", 2, 4).tolist()
+            yield sec * 1_000_000_000 + nanosec - epoch_ns, event.message

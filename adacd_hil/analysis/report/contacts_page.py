@@ -1,0 +1,144 @@
+"""The contacts of a run on a page: a table, and a card for each with the arm at its moment."""
+
+from collections.abc import Sequence
+from html import escape
+from typing import Final
+
+from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.report.arm_drawing import Push, draw_arm
+from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
+from adacd_hil.analysis.report.words import contact_rows, scaled, signs_text, uncertain_text
+from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.touches import row_at
+from adacd_hil.records import Vector
+
+CARDS: Final = 48
+"""Contacts with a card of their own; the table has all."""
+
+
+def contacts_table(metrics: Metrics) -> str:
+    """Write a row per contact, marked where something went wrong."""
+    if not metrics.contacts:
+        return '<p class="note">None.</p>'
+    rows: list[Sequence[Cell]] = []
+    head, words = contact_rows(metrics)
+    for contact, row in zip(metrics.contacts, words, strict=True):
+        cells: list[Cell] = [escape(word) for word in row]
+        if contact.detected_s is None:
+            cells[6] = (str(cells[6]), "bad")
+        if contact.link is not None and contact.link_detected not in (None, contact.link):
+            cells[3] = (str(cells[3]), "bad")
+        if contact.direction_ok is False:
+            cells[10] = (str(cells[10]), "bad")
+        rows.append(cells)
+    note = ""
+    if metrics.false_alarms_s:
+        times = ", ".join(number_text(time_s, 3) for time_s in metrics.false_alarms_s)
+        note = f'<p class="note bad">False alarms at {times} s.</p>'
+    return make_table(head, rows, left=()) + note
+
+
+def contact_cards(metrics: Metrics, run: Run) -> str:
+    """Write what is known of each contact: what the report says with its uncertainty, the truth, the arm."""
+    contacts = metrics.contacts[:CARDS]
+    if not contacts:
+        return ""
+    strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
+    cards = "".join(_card(contact, run, strongest_N) for contact in contacts)
+    more = f'<p class="note">The first {CARDS} of {len(metrics.contacts)}.</p>' if len(metrics.contacts) > CARDS else ""
+    return f'<div class="cards">{cards}</div>{more}'
+
+
+_PLACES: Final = {
+    "KNOWN": "one contact on the link",
+    "LINK_1": "only the moment is known: the least force that has it",
+    "SINGULAR": "not known: the elbow stands square",
+    "UNCERTAIN": "too weak for a lever arm",
+    "BEYOND_TIP": "lever arm past the tip",
+    "INCONSISTENT": "no single contact without friction",
+    "NOT_SOUGHT": "not sought",
+}
+
+
+def _card(contact: Contact, run: Run, strongest_N: float) -> str:
+    entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
+    entries += _torques(contact)
+    if contact.link is not None:
+        force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
+        entries.append(("truth", f"link {contact.link}, {force}"))
+    items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries if text != NONE)
+    found = contact.link if contact.link_detected is None else contact.link_detected
+    at_s = contact.at_s
+    is_right = contact.detected_s is not None and contact.link in (None, contact.link_detected)
+    tone = "" if is_right or not contact.is_armed else ' class="wrong"'
+    place = f'data-from="{at_s - 0.15:.4f}" data-to="{at_s + 0.6:.4f}"'
+    return (
+        f"<div{tone} {place}>{_arm(contact, run, strongest_N)}<h3>{contact.number}  link {number_text(found, 0)}"
+        f"<small>{number_text(at_s, 2, 's')}</small></h3><p>{escape(_kind(contact))}</p><dl>{items}</dl></div>"
+    )
+
+
+def _kind(contact: Contact) -> str:
+    words = [contact.level, contact.kind if contact.kind != "UNKNOWN" else None, contact.reaction]
+    kind = " · ".join(word.lower().replace("_", " ") for word in words if word)
+    return kind + (" · two-sided" if contact.is_two_sided else "")
+
+
+def _why_not(contact: Contact) -> str:
+    return "missed" if contact.is_armed else f"not armed in {contact.state}"
+
+
+def _found(contact: Contact) -> list[tuple[str, str]]:
+    """Give what the report says."""
+    lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
+    return [
+        ("found after", number_text(contact.delay_ms, 0, "ms")),
+        ("direction", signs_text(contact.direction)),
+        ("force", uncertain_text(contact.force_N, contact.force_sigma_N, 1, "N")),
+        ("lever arm", lever),
+        ("place", _PLACES.get(contact.location or "", NONE)),
+        ("blind within", number_text(contact.blind_deg, 1, "°")),
+    ]
+
+
+def _torques(contact: Contact) -> list[tuple[str, str]]:
+    """Give each joint's peak and impulse; a peak without its deviation where that is not told."""
+    unknown = (None, None)
+    impulses = contact.impulse_Nm_s or unknown
+    impulse_sigmas = contact.impulse_sigma_Nm_s or unknown
+    peak_sigmas = contact.tau_ext_peak_sigma_Nm or unknown
+    entries = []
+    for joint, peak_Nm in enumerate(contact.tau_ext_peak_hat_Nm or ()):
+        peak = uncertain_text(peak_Nm, peak_sigmas[joint], 2, "Nm")
+        impulse = uncertain_text(impulses[joint], impulse_sigmas[joint], 3, "Nm s")
+        words = f"peak {number_text(peak_Nm, 2, 'Nm') if peak == NONE else peak}"
+        entries.append((f"joint {joint + 1}", words if impulse == NONE else f"{words}, impulse {impulse}"))
+    return entries
+
+
+def _arm(contact: Contact, run: Run, strongest_N: float) -> str:
+    """Draw the arm where it was when the contact was found, or began; nothing without measured positions."""
+    if run.motion is None:
+        return ""
+    at_s = contact.at_s if contact.detected_s is None else contact.detected_s
+    q: Vector = run.motion.q[row_at(run, at_s)]
+    push = _push(contact, strongest_N, run.settings.arm.link_length_m[0])
+    words = [f"Arm at contact {contact.number}", f"joints at {q[0]:.2f} and {q[1]:.2f} rad"]
+    if push is not None:
+        words.append(f"link {push.link} touched")
+    return draw_arm(q, run.settings.arm.link_length_m, push, ", ".join(words))
+
+
+def _push(contact: Contact, strongest_N: float, length1_m: float) -> Push | None:
+    """Say where the force of a contact is drawn: as reported, else as true, else not at all."""
+    link = contact.link if contact.link_detected is None else contact.link_detected
+    if link is None:
+        return None
+    if contact.location in ("KNOWN", "LINK_1") and contact.force_N is not None:
+        side = 1 if contact.force_N > 0.0 else -1
+        share = abs(contact.force_N) / strongest_N if strongest_N > 0.0 else 0.0
+        if contact.location == "KNOWN":
+            return Push(link, side, share, contact.lever_m, contact.lever_sigma_m)
+        return Push(link, side, share, length1_m, None)
+    side = 0 if contact.direction is None else contact.direction[link - 1]
+    return Push(link, side, 0.5, None, None)

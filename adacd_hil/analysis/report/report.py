@@ -1,0 +1,108 @@
+"""The report of a run: one self-contained HTML page, the same numbers as JSON and CSV, and the paper's figures as PNG.
+
+Where it is asked for, it is printed, too: report.pdf and report.png have the words and all figures.
+
+The same log gives the same bytes.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from adacd_hil.analysis.figures import draw
+from adacd_hil.analysis.metrics import Metrics, evaluate
+from adacd_hil.analysis.report.csv_tables import report_tables
+from adacd_hil.analysis.report.json_form import report_json
+from adacd_hil.analysis.report.print_form import report_pdf, report_png
+from adacd_hil.analysis.report.reading import Source, read_run
+from adacd_hil.analysis.report.run_page import report_page
+from adacd_hil.analysis.report.words import align_columns, contact_rows, paper_cells, paper_head
+from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.timing_figures import draw_timing
+from adacd_hil.log.errors import LogError
+
+HTML_NAME: Final = "report.html"
+JSON_NAME: Final = "report.json"
+_PNG_FIGURES: Final = ("fig5", "fig6", "fig7")
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report that has been written."""
+
+    metrics: Metrics
+    metadata: Mapping[str, str]
+    source: Source
+    html_path: Path
+    json_path: Path
+    figure_paths: tuple[Path, ...]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the log is whole and nothing was dropped on the way to it."""
+        return self.source.is_complete
+
+    def as_json(self) -> dict[str, Any]:
+        """Give the content of report.json."""
+        return report_json(self.metrics, self.metadata, self.source)
+
+    def as_text(self) -> str:
+        """Give the verdict, what the paper had, the contacts and where the report is, for a terminal."""
+        lines = [self.metrics.verdict, *_tables(self.metrics, self.source)]
+        return "\n".join([*lines, "", f"Report: {self.html_path}"])
+
+
+def _tables(metrics: Metrics, source: Source) -> list[str]:
+    """Give what the log lacks, what the paper had and the contacts, line by line."""
+    lines = [f"The log is not whole: {source.problem}"] if source.problem else []
+    lines += ["", *align_columns([paper_head(metrics), *paper_cells(metrics)])]
+    if metrics.contacts:
+        head, rows = contact_rows(metrics)
+        lines += ["", *align_columns([head, *rows])]
+    return lines
+
+
+def write_report(log_path: Path, truth_path: Path | None, out_dir: Path, *, is_printed: bool = False) -> Report:
+    """Read a log, and the emulator's truth if there is one, and write the report into `out_dir`.
+
+    Raises LogError when a log can't be read or the report can't be written.
+    """
+    run, source = read_run(log_path, truth_path)
+    return write_run_report(run, out_dir, source, is_printed=is_printed)
+
+
+def write_run_report(run: Run, out_dir: Path, source: Source, *, is_printed: bool = False) -> Report:
+    """Write the report of a run that is in memory. Raises LogError when it can't be written."""
+    metrics = evaluate(run)
+    drawings = draw(run, metrics)
+    timing = draw_timing(run.timing, metrics.timing, run.zero_ns, "motion start")
+    pngs = {drawing.name: drawing.png() for drawing in drawings if drawing.name in _PNG_FIGURES}
+    report = Report(
+        metrics=metrics,
+        metadata=run.metadata,
+        source=source,
+        html_path=out_dir / HTML_NAME,
+        json_path=out_dir / JSON_NAME,
+        figure_paths=tuple(out_dir / f"{name}.png" for name in pngs),
+    )
+    table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
+    texts = {
+        **report_tables(run, metrics),
+        report.json_path.name: table + "\n",
+        report.html_path.name: report_page(metrics, run, source, drawings, timing),
+    }
+    files = {f"{name}.png": png for name, png in pngs.items()}
+    files |= {name: text.encode() for name, text in texts.items()}
+    if is_printed:
+        shown, verdict = [*drawings, *timing], (metrics.verdict, metrics.is_clean)
+        files["report.pdf"] = report_pdf(*verdict, _tables(metrics, source), shown)
+        files["report.png"] = report_png(*verdict, shown)
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            (out_dir / name).write_bytes(content)
+    except OSError as error:
+        raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
+    return report

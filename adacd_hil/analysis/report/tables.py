@@ -1,0 +1,142 @@
+"""The tables of a report's page, but that of the contacts."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from string import ascii_letters
+from typing import Final
+
+from adacd_hil.analysis.evidence import Evidence
+from adacd_hil.analysis.metrics import Metrics, Residual
+from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
+from adacd_hil.analysis.report.reading import Source
+from adacd_hil.analysis.report.words import pair_text, paper_cells, paper_head, signed_text
+from adacd_hil.analysis.run import Run
+from adacd_hil.records import PARAMETER_UNITS
+
+
+def paper_table(metrics: Metrics) -> str:
+    """Write what the paper printed beside what was measured."""
+    rows: list[Sequence[Cell]] = [
+        [*map(escape, cells[:-1]), (escape(cells[-1]), "strong")] for cells in paper_cells(metrics)
+    ]
+    head = ("quantity", *paper_head(metrics)[1:])
+    return make_table(head, rows, left=range(len(head)))
+
+
+def margins_table(evidence: Evidence | None) -> str:
+    """Write threshold over residual of each channel and section."""
+    if evidence is None or not evidence.margins:
+        return ""
+    head = ("section", "filter, rad/s", "", "largest residual, Nm", "threshold, Nm", "margin")
+    rows: list[Sequence[Cell]] = []
+    for label, channels in evidence.margins.items():
+        for row in channels:
+            cutoff = f"{row.cutoff_rad_s:g}"
+            kind = "bare" if row.smoothing_rad_s is None else "smoothed"
+            margin = (pair_text(row.margin, 1), "bad" if min(row.margin) < 1.0 else "strong")
+            pairs = (pair_text(row.residual_max_Nm, 3), pair_text(row.threshold_Nm, 3))
+            name = (label, "strong") if row is channels[0] else ""
+            rows.append((name, cutoff, kind, *pairs, margin))
+    note = (
+        "Joint 1 / joint 2, where nothing touches the arm. Threshold: median. Margin: the smallest threshold over "
+        "residual of any cycle; below 1 it would have been a false alarm. In an adaptation the threshold is as high as "
+        "the model is uncertain."
+    )
+    return make_table(head, rows, left=(0, 2)) + f'<p class="note">{note}</p>'
+
+
+def further_table(metrics: Metrics) -> str:
+    """Write all parameters of the certified scheme with the standard deviations that it gives them."""
+    if metrics.evidence is None or not metrics.evidence.estimates:
+        return ""
+    estimates = metrics.evidence.estimates
+    head = ["", "unit"]
+    for label in estimates:
+        head += [f"certified ({label})", "±"]
+    rows = []
+    for name in next(iter(estimates.values())):
+        cells: list[Cell] = [_symbol(name), escape(PARAMETER_UNITS.get(name, "Nm"))]
+        for found in estimates.values():
+            cells += [(number_text(found[name].value, 5), "strong"), number_text(found[name].std, 5)]
+        rows.append(cells)
+    note = '<p class="note">±: standard deviation that the scheme gives its own estimate.</p>'
+    return make_table(head, rows, left=(0, 1)) + note
+
+
+_KINDS: Final = {
+    "adaptation": "adaptation",
+    "detection": "collision detection",
+    "payload": "payload change",
+    "fault": "fault",
+}
+
+
+def sections_table(metrics: Metrics, run: Run) -> str:
+    """Write a row per section, with its frozen residuals."""
+    threshold = run.settings.detector.threshold_Nm
+    rows = []
+    for section in metrics.sections:
+        residual = metrics.frozen_residual_max_Nm.get(section.label, Residual(None, None, 0))
+        rows.append(
+            (
+                (section.label, "strong"),
+                _KINDS[section.kind]
+                + ("" if section.is_complete or section.kind != "adaptation" else ", not finished"),
+                number_text(section.start_s, 3),
+                number_text(section.end_s, 3),
+                number_text(section.duration_s, 3),
+                _judged(residual.identified, threshold),
+                _judged(residual.cad, threshold),
+                str(residual.cycles) if residual.cycles else NONE,
+            )
+        )
+    head = (
+        "section", "", "from, s", "to, s", "lasts, s", "largest residual, frozen, Nm", "with CAD, Nm", "over cycles",
+    )  # fmt: skip
+    note = "Residuals of joint 1 / joint 2 where nobody touches the arm; marked where over the threshold."
+    return make_table(head, rows, left=(0, 1)) + f'<p class="note">{note}</p>'
+
+
+def _judged(values: tuple[float, float] | None, threshold: tuple[float, float]) -> Cell:
+    if values is None:
+        return NONE
+    is_over = any(value > bound for value, bound in zip(values, threshold, strict=True))
+    return (pair_text(values, 3), "bad" if is_over else "")
+
+
+def _symbol(name: str) -> str:
+    """Write a parameter's name with its index below: F_v1, a1, offset1."""
+    stem, index = name.split("_", 1) if "_" in name else (name.rstrip("0123456789"), name.lstrip(ascii_letters))
+    return f"<i>{escape(stem)}</i><sub>{escape(index)}</sub>"
+
+
+def parameters_table(metrics: Metrics, run: Run) -> str:
+    """Write the identified parameters beside the true ones and the CAD model's."""
+    if not metrics.parameters:
+        return ""
+    cad = dict(zip(run.parameter_names, run.settings.arm.cad_theta, strict=True)) if run.has_cad else {}
+    head = ["", "unit", "CAD"]
+    for label, payload_kg in metrics.payload_kg.items():
+        with_payload = "" if payload_kg is None else f", {payload_kg:g} kg"
+        head += [f"true ({label}{with_payload})", f"identified ({label})", "error"]
+    rows = []
+    for name in run.parameter_names:
+        cells: list[Cell] = [_symbol(name), escape(PARAMETER_UNITS[name]), number_text(cad.get(name), 4)]
+        for found in metrics.parameters.values():
+            true, identified = found[name]
+            error = f"{signed_text(100.0 * (identified - true) / true)} %" if true else NONE
+            cells += [number_text(true, 4), (number_text(identified, 4), "strong"), error]
+        rows.append(cells)
+    note = (
+        '<p class="note">Least squares stops when the residual is small enough, not when the parameters are exact: '
+        "what the motion hardly excites is hardly identified, and hardly matters to it.</p>"
+    )
+    return make_table(head, rows, left=(0, 1)) + note
+
+
+def run_table(metrics: Metrics, metadata: Mapping[str, str], source: Source) -> str:
+    """Write where the run comes from."""
+    log = [("log", source.log_name), ("frames", metrics.frames), ("packets dropped", metrics.dropped)]
+    rows = [(label, NONE if value is None else str(value)) for label, value in log]
+    rows += [(key.replace("_", " "), value or NONE) for key, value in sorted(metadata.items())]
+    return make_table(("", ""), [(escape(key), escape(value)) for key, value in rows], left=(0, 1))

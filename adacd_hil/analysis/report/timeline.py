@@ -1,0 +1,198 @@
+"""The timeline of a run: states, contacts and notices over time, as a fragment for a page.
+
+Marks carry the stretch that they stand for (`data-from`, `data-to`, s since motion start), so that a script can show it
+closer; without one they still say what they are.
+"""
+
+from collections.abc import Iterator
+from html import escape
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.report.page import number_text
+from adacd_hil.analysis.run import Run
+from adacd_hil.records import SchemeState
+
+STATE_COLOURS: Final = {
+    SchemeState.ADAPT: "adaptation",
+    SchemeState.CERTIFY: "certify",
+    SchemeState.REACT: "react",
+    SchemeState.STOPPED: "stopped",
+    SchemeState.PAYLOAD: "payload",
+    SchemeState.FAULT: "fault",
+}
+"""Variables of the page; a state that is not here has the ground's colour."""
+
+_LEFT, _RIGHT = 78.0, 996.0
+_STATE_LANE, _CONTACT_LANE, _NOTICE_LANE, _AXIS = 8.0, 44.0, 82.0, 112.0
+_LANE_HEIGHT: Final = 24.0
+_LETTER: Final = 6.4
+"""Width of a letter and room beside it."""
+_NARROWEST: Final = 1.5
+_APART: Final = 15.0
+"""Numbers of contacts that are nearer than this would overlap."""
+_TICKS: Final = 12
+_MOST_NOTICES: Final = 300
+
+
+class Stay(NamedTuple):
+    """A stretch in one state, s."""
+
+    state: SchemeState
+    start_s: float
+    end_s: float
+
+
+class Notice(NamedTuple):
+    """Something that went wrong, or nearly: a warning or an error of the log, a fault, a false alarm."""
+
+    at_s: float
+    is_bad: bool
+    text: str
+
+
+def stays_of(run: Run) -> list[Stay]:
+    """Split a run by its states."""
+    if run.state.size == 0:
+        return []
+    edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
+    starts = np.concatenate(([0], edges))
+    time_s = run.time_s()
+    ends_s = [*time_s[edges].tolist(), float(time_s[-1])]
+    return [
+        Stay(SchemeState(int(run.state[row])), float(time_s[row]), end_s)
+        for row, end_s in zip(starts, ends_s, strict=True)
+    ]
+
+
+def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
+    """List what went wrong in the order of time, at most `_MOST_NOTICES`, the bad ones first to stay."""
+    notices = [
+        Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")
+        for t_ns, event in run.events
+        if event.level in ("warning", "error")
+    ]
+    notices += [Notice(stay.start_s, True, "FAULT") for stay in stays_of(run) if stay.state is SchemeState.FAULT]
+    notices += [Notice(at_s, True, "false alarm") for at_s in metrics.false_alarms_s or ()]
+    notices.sort(key=lambda notice: not notice.is_bad)
+    return sorted(notices[:_MOST_NOTICES])
+
+
+def state_key(run: Run) -> str:
+    """Name the colours of the states that the run has been in."""
+    there = {stay.state for stay in stays_of(run)}
+    entries = [f'<i class="key {colour}"></i>{state.name}' for state, colour in STATE_COLOURS.items() if state in there]
+    return f'<span class="keys">{" ".join(entries)}</span>'
+
+
+def timeline(run: Run, metrics: Metrics) -> str:
+    """Write the figure; nothing of a run without cycles."""
+    if run.state.size == 0:
+        return ""
+    time_s = run.time_s()
+    scale = _Scale(float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3))
+    lanes = [
+        _lane("states", _STATE_LANE, "".join(_state_marks(run, scale))),
+        _lane("contacts", _CONTACT_LANE, "".join(_contact_marks(metrics, scale))),
+        _lane("notices", _NOTICE_LANE, "".join(_notice_marks(run, metrics, scale))),
+        "".join(_axis(scale)),
+    ]
+    label = "Timeline of states, contacts and notices"
+    svg = f'<svg viewBox="0 0 1000 140" role="group" aria-label="{label}">\n{"".join(lanes)}</svg>'
+    caption = (
+        "<b>Timeline.</b> States, contacts by number (a bar as long as the touch, hollow if it was not detected), and "
+        'below them warnings, faults and false alarms.<span class="scripted"> Choose any of them to see the traces '
+        f"there.</span> {state_key(run)}"
+    )
+    return f'<figure id="timeline">\n<div class="scroll">{svg}</div>\n<figcaption>{caption}</figcaption>\n</figure>\n'
+
+
+class _Scale(NamedTuple):
+    start_s: float
+    end_s: float
+
+    def x(self, time_s: float) -> float:
+        share = (time_s - self.start_s) / (self.end_s - self.start_s)
+        return _LEFT + min(max(share, 0.0), 1.0) * (_RIGHT - _LEFT)
+
+
+def _lane(name: str, top: float, marks: str) -> str:
+    ground = f'<rect x="{_LEFT}" y="{top}" width="{_RIGHT - _LEFT}" height="{_LANE_HEIGHT}" class="ground"/>'
+    return f'<text x="0" y="{top + 16}" class="lane">{name}</text>{ground}{marks}\n'
+
+
+def _mark(from_s: float, to_s: float, title: str, inner: str) -> str:
+    words = escape(title)
+    return f'<g data-from="{from_s:.4f}" data-to="{to_s:.4f}"><title>{words}</title>{inner}</g>'
+
+
+def _state_marks(run: Run, scale: _Scale) -> Iterator[str]:
+    for stay in stays_of(run):
+        left, right = scale.x(stay.start_s), scale.x(stay.end_s)
+        name, width = stay.state.name, max(right - left, _NARROWEST)
+        colour = STATE_COLOURS.get(stay.state, "paper")
+        box = f'x="{left:.1f}" y="{_STATE_LANE}" width="{width:.1f}" height="{_LANE_HEIGHT}"'
+        inner = f'<rect {box} fill="var(--{colour})"/>'
+        if width > _LETTER * len(name) + 8:
+            inner += f'<text x="{left + width / 2:.1f}" y="{_STATE_LANE + 16}" class="inside">{name}</text>'
+        margin_s = 0.05 * (stay.end_s - stay.start_s) + 0.005
+        title = f"{name}, {number_text(stay.start_s, 2)} to {number_text(stay.end_s, 2, 's')}"
+        yield _mark(stay.start_s - margin_s, stay.end_s + margin_s, title, inner)
+
+
+def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[str]:
+    labelled = -1e9
+    for contact in metrics.contacts:
+        at_s = contact.at_s
+        left = scale.x(at_s)
+        end_s = contact.end_s if contact.end_s is not None else at_s
+        width = max(scale.x(end_s) - left, 2.5)
+        kind = "touch" if contact.detected_s is not None else "touch missed"
+        inner = f'<rect x="{left:.1f}" y="{_CONTACT_LANE + 15}" width="{width:.1f}" height="8" class="{kind}"/>'
+        if left - labelled >= _APART:
+            labelled = left
+            inner += f'<text x="{left + width / 2:.1f}" y="{_CONTACT_LANE + 11}" class="number">{contact.number}</text>'
+        yield _mark(at_s - 0.15, max(at_s + 0.6, end_s + 0.15), _contact_title(contact, at_s), inner)
+
+
+def _contact_title(contact: Contact, at_s: float) -> str:
+    words = [f"contact {contact.number} at {number_text(at_s, 2, 's')}"]
+    if contact.link is not None:
+        words.append(f"on link {contact.link}")
+    if contact.detected_s is None:
+        words.append("missed" if contact.is_armed else "detection not armed")
+    else:
+        words.append(f"found on link {number_text(contact.link_detected, 0)}")
+        if contact.delay_ms is not None:
+            words.append(f"after {number_text(contact.delay_ms, 0, 'ms')}")
+    return ", ".join(words)
+
+
+def _notice_marks(run: Run, metrics: Metrics, scale: _Scale) -> Iterator[str]:
+    notices = notices_of(run, metrics)
+    for notice in notices:
+        x, middle = scale.x(notice.at_s), _NOTICE_LANE + _LANE_HEIGHT / 2
+        kind = "bad" if notice.is_bad else "warn"
+        inner = f'<path d="M{x - 5:.1f} {middle + 5}h10l-5 -10z" class="{kind}"/>'
+        title = f"{notice.text}, at {number_text(notice.at_s, 2, 's')}"
+        yield _mark(notice.at_s - 0.25, notice.at_s + 0.25, title, inner)
+    if not notices:
+        yield f'<text x="{_LEFT + 8}" y="{_NOTICE_LANE + 16}" class="none">none</text>'
+
+
+def _axis(scale: _Scale) -> Iterator[str]:
+    span_s = scale.end_s - scale.start_s
+    step_s = next(
+        step
+        for power in range(-4, 9)
+        for step in (10.0**power, 2.0 * 10.0**power, 5.0 * 10.0**power)
+        if span_s / step <= _TICKS
+    )
+    digits = max(0, -int(np.floor(np.log10(step_s))))
+    for number in range(int(np.ceil(scale.start_s / step_s)), int(scale.end_s / step_s) + 1):
+        x = scale.x(number * step_s)
+        yield f'<path d="M{x:.1f} {_AXIS}v5" class="tick"/>'
+        yield f'<text x="{x:.1f}" y="{_AXIS + 17}" class="time">{number_text(number * step_s, digits)}</text>'
+    yield f'<text x="0" y="{_AXIS + 17}" class="lane">s</text>'

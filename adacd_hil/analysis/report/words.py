@@ -1,0 +1,97 @@
+"""The words of a report, for the terminal and the page: contacts, paper against measured, values with errors."""
+
+from collections.abc import Sequence
+from typing import Final
+
+from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.report.page import NONE, number_text
+
+
+def pair_text(values: Sequence[float] | None, digits: int) -> str:
+    """Write the values of both joints; a dash for None."""
+    return NONE if values is None else " / ".join(number_text(value, digits) for value in values)
+
+
+def yes_text(value: bool | None) -> str:
+    """Write yes or no; a dash for None."""
+    return NONE if value is None else "yes" if value else "no"
+
+
+def signs_text(direction: tuple[int, int] | None) -> str:
+    """Write the signs of both joints; a dash for None."""
+    return NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
+
+
+_CONTACT_HEAD: Final = (
+    "contact", "section", "link", "found", "at alarm", "onset s", "delay ms", "law ms", "ideal ms", "direction",
+    "right", "true Nm", "peak ratio",
+)  # fmt: skip
+
+
+def _contact_words(contact: Contact) -> tuple[str, ...]:
+    delay = number_text(contact.delay_ms, 0)
+    if contact.detected_s is None:
+        delay = "missed" if contact.is_armed else "not armed"
+    onset_s = contact.detected_s if contact.onset_s is None else contact.onset_s
+    return (
+        str(contact.number),
+        contact.section or NONE,
+        number_text(contact.link, 0),
+        number_text(contact.link_detected, 0),
+        number_text(contact.link_at_alarm, 0),
+        number_text(onset_s, 3),
+        delay,
+        number_text(contact.law_ms, 1),
+        number_text(contact.ideal_ms, 0),
+        signs_text(contact.direction),
+        yes_text(contact.direction_ok),
+        pair_text(contact.tau_ext_Nm, 2),
+        number_text(contact.torque_error_ratio, 2),
+    )
+
+
+def contact_rows(metrics: Metrics) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Give head and rows of the list of contacts, where it is known with the delay of the paper's scheme beside."""
+    rows = [_contact_words(contact) for contact in metrics.contacts]
+    beside = None if metrics.evidence is None else metrics.evidence.paper_beside
+    if beside is None or not beside.contacts:
+        return _CONTACT_HEAD, rows
+    delays = [number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts]
+    return (*_CONTACT_HEAD, "paper's ms"), [(*row, delay) for row, delay in zip(rows, delays, strict=True)]
+
+
+def paper_head(metrics: Metrics) -> tuple[str, ...]:
+    """Name the columns of paper against measured."""
+    if metrics.evidence is None:
+        return ("", "paper", "measured")
+    return ("", "paper (printed)", "paper's scheme, same stream", "certified")
+
+
+def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
+    """Write a row per quantity."""
+    if metrics.evidence is None:
+        return [(row.quantity, row.paper, row.measured) for row in metrics.paper]
+    return [(row.quantity, row.paper, row.beside or NONE, row.measured) for row in metrics.paper]
+
+
+def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Align rows of words for a terminal."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def signed_text(value: float) -> str:
+    """Write a number with its sign and one decimal."""
+    return f"{value:+.1f}".replace("-", "−")
+
+
+def scaled(value: float | None, factor: float) -> float | None:
+    """Multiply what is known."""
+    return None if value is None else factor * value
+
+
+def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
+    """Write a value with its standard deviation; a dash where either is not known."""
+    if value is None or sigma is None:
+        return NONE
+    return f"{number_text(value, digits)} ± {number_text(sigma, digits)} {unit}"

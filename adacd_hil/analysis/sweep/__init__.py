@@ -1,0 +1,1 @@
+"""Many replays or runs, and settings found from logs."""

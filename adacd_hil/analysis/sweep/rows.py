@@ -1,0 +1,101 @@
+"""Rows of a sweep's table: what one replay came to, in numbers that a table can hold."""
+
+import statistics
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from adacd_hil.analysis.replay.replay import Replay, replay_many
+from adacd_hil.analysis.replay.source import LogSource
+from adacd_hil.analysis.replay.what_if import apply_settings, keep_facts
+from adacd_hil.analysis.sweep.plan import Row, Subject, Task
+from adacd_hil.config import ConfigError, Settings, load_settings
+from adacd_hil.log.errors import LogError
+from adacd_hil.records import SchemeState
+from adacd_hil.wire.codec import CodecError
+
+SET: Final = "set."
+"""Prefix of the columns of varied settings."""
+REFUSALS: Final = (ConfigError, CodecError, LogError)
+"""What makes a row of its own that says why, however often it is tried."""
+
+Value = str | int | float | bool | None
+Values = dict[str, Value]
+
+
+def replay_task(task: Task) -> list[Values]:
+    """Replay a log with the settings of each row; it is decoded once for all of them."""
+    subject = task.subject
+    path = Path(subject.log)
+    found: dict[str, Values] = {}
+    variants: dict[str, Settings] = {}
+    try:
+        own = LogSource(path).settings
+        base = keep_facts(own, load_settings(task.config, task.profile or own.arm.profile)) if task.config else own
+    except REFUSALS as refusal:
+        return [failed(subject, row, str(refusal)) for row in task.rows]
+    for row in task.rows:
+        try:
+            variants[row.key] = apply_settings(base, dict(row.changes))
+        except ConfigError as refusal:
+            found[row.key] = failed(subject, row, str(refusal))
+    rows = [row for row in task.rows if row.key in variants]
+    for row, result in zip(rows, _replay_all(path, list(variants.values())), strict=True):
+        found[row.key] = failed(subject, row, result) if isinstance(result, str) else finished(subject, row, result)
+    return [found[row.key] for row in task.rows]
+
+
+def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
+    """Replay with each of the settings, or say why one can't be."""
+    try:
+        return list(replay_many(path, variants))
+    except REFUSALS as refusal:
+        if len(variants) == 1:
+            return [str(refusal)]
+    return [result for settings in variants for result in _replay_all(path, [settings])]
+
+
+def _labels(subject: Subject, row: Row) -> Values:
+    changes: Mapping[str, str] = dict(row.changes)
+    return {
+        "key": row.key,
+        "log": subject.log or None,
+        "scenario": subject.scenario or None,
+        "seed": subject.seed if subject.scenario else None,
+        **{SET + key: value for key, value in changes.items()},
+    }
+
+
+def failed(subject: Subject, row: Row, error: str) -> Values:
+    """Make a row that says why there is no result."""
+    return _labels(subject, row) | {"status": "failed", "error": " ".join(error.split())}
+
+
+def finished(subject: Subject, row: Row, found: Replay) -> Values:
+    """Make a row of a replay."""
+    truth = found.true_contacts
+    armed = [contact for contact in truth or () if contact.is_armed]
+    delays_ms = [contact.delay_ms for contact in truth or () if contact.delay_ms is not None]
+    took_s = found.adaptation_s
+    last = found.states[-1] if found.states else None
+    return _labels(subject, row) | {
+        "status": "ok",
+        "error": None,
+        "cycles": found.cycles,
+        "attempts": found.attempts,
+        "identical": found.is_identical if found.compared else None,
+        "ends_in": last.state.name if last else SchemeState.INIT.name,
+        "fault": last.fault.name if last else "NONE",
+        "adaptations": sum(each is not None for each in took_s),
+        "adaptation_first_s": took_s[0] if took_s else None,
+        "adaptation_last_s": took_s[-1] if took_s else None,
+        "monitored_s": found.monitored_s,
+        "detections": len(found.detections_ns),
+        "touches_armed": None if truth is None else len(armed),
+        "touches_found": None if truth is None else len(delays_ms),
+        "missed": found.missed,
+        "false_alarms": found.false_alarms,
+        "delay_median_ms": statistics.median(delays_ms) if delays_ms else None,
+        "delay_max_ms": max(delays_ms, default=None),
+        **{f"theta_hat.{name}": value for name, value in found.parameters.items()},
+    }

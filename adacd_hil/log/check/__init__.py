@@ -1,0 +1,1 @@
+"""Whether a log is sound: the rules, and what breaks them."""

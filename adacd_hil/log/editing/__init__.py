@@ -1,0 +1,1 @@
+"""Logs made from logs: recovered, cut, merged; and what a log holds."""

@@ -1,0 +1,207 @@
+"""A log that is made of the records of others: recovered, cut or merged. It appears when it is whole.
+
+Records stay as they are, but for the numbers of their channels: each source has channels of its own, and schemas are
+shared where they are equal.
+"""
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+import numpy as np
+from mcap.records import Attachment, Channel, Schema
+from numpy.typing import NDArray
+
+from adacd_hil.log.chunked_file import ChunkedFile
+from adacd_hil.log.editing.chunk_contents import Contents
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap_file import LIBRARY, SUMMARY_METADATA
+
+_CHANNEL_NUMBERS = 2**16
+_CHANNEL = 9
+"""Where the number of the channel is in a message record, bytes."""
+
+
+class Messages(NamedTuple):
+    """Message records one after the other, with the copy's numbers of channels. Columns (n,)."""
+
+    records: NDArray[np.uint8]
+    channels: NDArray[np.uint16]
+    log_times: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+    def select(self, chosen: NDArray[np.int64]) -> "Messages":
+        """Take the messages of these numbers, in this order."""
+        starts = np.concatenate(([0], self.ends[:-1]))
+        records, ends = _gather(self.records, starts[chosen], self.ends[chosen])
+        return Messages(records, self.channels[chosen], self.log_times[chosen], ends)
+
+
+class LogCopy:
+    """The log in the making: `NAME.part` until `finish`."""
+
+    def __init__(self, path: Path) -> None:
+        """Begin a log at `path`. Raises LogError."""
+        self.path = path
+        self._target = _Target(path)
+        self.file = ChunkedFile(self._target, LIBRARY)
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels = 0
+        self._metadata: set[str] = set()
+
+    def source(self, prefix: str = "", topics: frozenset[str] | None = None) -> "Source":
+        """Begin to copy from another log: put `prefix` before its topics, copy only `topics` if given."""
+        return Source(self, prefix, topics)
+
+    def attach(self, attachment: Attachment) -> None:
+        """Add an attachment."""
+        self.file.attach(attachment)
+
+    def add_all_metadata(self, records: Mapping[str, dict[str, str]]) -> None:
+        """Add the metadata records whose names are new."""
+        for name in [name for name in records if name not in self._metadata]:
+            self._metadata.add(name)
+            self.file.add_metadata(name, records[name])
+
+    def add(self, messages: Messages) -> None:
+        """Add messages."""
+        if len(messages.ends):
+            none_end = np.empty(0, np.int64)
+            self.file.add(messages.records, messages.channels, messages.log_times, messages.ends, none_end)
+
+    def define(self, channel: Channel, schema: Schema | None) -> int:
+        """Define a channel of a source; return its number here."""
+        schema_id = 0
+        if schema is not None:
+            key = schema.name, schema.encoding, schema.data
+            if key not in self._schemas:
+                self._schemas[key] = len(self._schemas) + 1
+                self.file.define_schema(
+                    Schema(id=self._schemas[key], data=schema.data, encoding=schema.encoding, name=schema.name)
+                )
+            schema_id = self._schemas[key]
+        self._channels += 1
+        if self._channels >= _CHANNEL_NUMBERS:
+            raise LogError(f"more than {_CHANNEL_NUMBERS - 1} channels don't go into one file")
+        self.file.define_channel(
+            Channel(
+                id=self._channels,
+                topic=channel.topic,
+                message_encoding=channel.message_encoding,
+                metadata=channel.metadata,
+                schema_id=schema_id,
+            )
+        )
+        return self._channels
+
+    def finish(self, summary: dict[str, str]) -> None:
+        """End the log, say what is to be said of it, and give it its name. Raises LogError."""
+        self.file.flush_definitions()
+        self.file.add_metadata(SUMMARY_METADATA, summary)
+        self.file.complete()
+        self._target.commit()
+
+    def __enter__(self) -> "LogCopy":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._target.discard()
+
+
+class Source:
+    """One log that is copied from."""
+
+    def __init__(self, copy: LogCopy, prefix: str, topics: frozenset[str] | None) -> None:
+        self._copy = copy
+        self._prefix = prefix
+        self._topics = topics
+        self.topics: dict[int, str] = {}
+        """Topics by the copy's number of their channel."""
+        self._numbers: dict[int, tuple[Channel, int]] = {}
+        self._map = np.full(_CHANNEL_NUMBERS, -1, np.int32)
+
+    def define(self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]) -> None:
+        """Take in what the source has defined so far."""
+        for number, channel in channels.items():
+            if number in self._numbers or (channel.schema_id and channel.schema_id not in schemas):
+                continue
+            if self._topics is not None and channel.topic not in self._topics:
+                continue
+            named = Channel(
+                number, self._prefix + channel.topic, channel.message_encoding, channel.metadata, channel.schema_id
+            )
+            self._map[number] = self._copy.define(named, schemas.get(channel.schema_id))
+            self._numbers[number] = channel, int(self._map[number])
+            self.topics[int(self._map[number])] = named.topic
+
+    def take(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> Messages:
+        """Take messages of a chunk, those of channels that aren't copied left out."""
+        numbers = self._map[contents.channels]
+        is_taken = numbers >= 0 if is_chosen is None else (numbers >= 0) & is_chosen
+        channels = numbers[is_taken].astype(np.uint16)
+        data = np.frombuffer(contents.data, np.uint8)
+        records, ends = _gather(data, contents.starts[is_taken], contents.ends[is_taken])
+        starts = np.concatenate(([0], ends[:-1])) if len(ends) else ends
+        records[starts + _CHANNEL] = channels & 0xFF
+        records[starts + _CHANNEL + 1] = channels >> 8
+        return Messages(records, channels, contents.log_times[is_taken].astype(np.int64), ends)
+
+
+def _gather(
+    data: NDArray[np.uint8], starts: NDArray[np.int64], ends: NDArray[np.int64]
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Copy stretches of `data` one after the other; return them and where each ends."""
+    lengths = ends - starts
+    new_ends = np.cumsum(lengths)
+    if len(starts) and (starts[1:] == ends[:-1]).all():
+        return data[starts[0] : ends[-1]].copy(), new_ends
+    shifts = starts - (new_ends - lengths)
+    return data[np.arange(lengths.sum()) + np.repeat(shifts, lengths)], new_ends
+
+
+class _Target:
+    """A file beside the one that it becomes."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._part = path.with_name(path.name + ".part")
+        self._position = 0
+        try:
+            self._file = self._part.open("wb")
+        except OSError as error:
+            raise LogError(f"log {self._part} can't be created: {error.strerror}") from None
+
+    def write(self, data: bytes, packets: int = 0) -> int:
+        del packets
+        try:
+            self._file.write(data)
+        except OSError as error:
+            raise self._error(error) from None
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def commit(self) -> None:
+        try:
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._part.replace(self._path)
+        except OSError as error:
+            raise self._error(error) from None
+
+    def discard(self) -> None:
+        """Remove what was not committed."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        self._part.unlink(missing_ok=True)
+
+    def _error(self, error: OSError) -> LogError:
+        return LogError(f"log {self._part} can't be written: {error.strerror}")

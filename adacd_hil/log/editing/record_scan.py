@@ -1,0 +1,201 @@
+"""The records of an MCAP file in order, whole, cut or damaged: what is no record is said, and what follows is found.
+
+Constant memory: one record at a time. Chunks stay closed; `open_chunk` opens one that can be trusted.
+"""
+
+import io
+import os
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import IO, Any, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.stream_reader import get_chunk_data_stream
+
+from adacd_hil.log.editing.record_shapes import fits, has_shape
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap_walk import MAGIC
+
+HEAD = struct.Struct("<BQ")
+MOST_OPENED = 1 << 30
+"""Bytes of a chunk, before compression, that are believed."""
+_WINDOW = 1 << 20
+_READERS: dict[int, Any] = {
+    Opcode.HEADER: Header.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.MESSAGE_INDEX: MessageIndex.read,
+    Opcode.CHUNK_INDEX: ChunkIndex.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
+    Opcode.STATISTICS: Statistics.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.METADATA_INDEX: MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: SummaryOffset.read,
+    Opcode.DATA_END: DataEnd.read,
+}
+_BEGINNING = re.compile(rb"(?=[\x01-\x04\x06-\x0f].{5}\0\0\0)", re.DOTALL)
+"""Where a record of less than a TiB may begin."""
+
+
+class RawRecord(NamedTuple):
+    """A record as it is in the file."""
+
+    offset: int
+    opcode: int
+    body: bytes
+
+    @property
+    def end(self) -> int:
+        """Where the next one begins."""
+        return self.offset + HEAD.size + len(self.body)
+
+
+class Gap(NamedTuple):
+    """Bytes that are no record."""
+
+    offset: int
+    size: int
+
+
+class Trailer(NamedTuple):
+    """The magic behind the footer."""
+
+    offset: int
+
+
+class ChunkError(Exception):
+    """A chunk that can't be trusted; the message says why."""
+
+
+def name_of(opcode: int) -> str:
+    """Name a kind of record as the specification does."""
+    if opcode not in set(Opcode):
+        return f"record 0x{opcode:02x}"
+    return "".join(word.capitalize() for word in Opcode(opcode).name.split("_"))
+
+
+def parse(opcode: int, body: bytes) -> Any:
+    """Read a record with mcap's class for it. Raises LogError when it makes no sense."""
+    try:
+        return _READERS[opcode](ReadDataStream(io.BytesIO(body)))
+    except (McapError, struct.error, ValueError) as error:
+        raise LogError(f"{name_of(opcode)} can't be read: {error or type(error).__name__}") from None
+
+
+def scan(file: IO[bytes]) -> Iterator[RawRecord | Gap | Trailer]:
+    """List the records of a file, and the gaps between them."""
+    return _Scan(file).items()
+
+
+class _Scan:
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._size = os.fstat(file.fileno()).st_size
+
+    def items(self) -> Iterator[RawRecord | Gap | Trailer]:
+        position = len(MAGIC)
+        if self._read(0, position) != MAGIC:
+            position = 0
+        while position < self._size:
+            head = self._head(position)
+            if head is None:
+                found = self._find(position + 1)
+                yield Gap(position, found - position)
+                position = found
+                continue
+            record = RawRecord(position, head[0], self._read(position + HEAD.size, head[1]))
+            yield record
+            position = record.end
+            if record.opcode == Opcode.FOOTER and self._read(position, len(MAGIC)) == MAGIC:
+                yield Trailer(position)
+                return
+
+    def _read(self, position: int, count: int) -> bytes:
+        self._file.seek(position)
+        return self._file.read(count)
+
+    def _head(self, position: int) -> tuple[int, int] | None:
+        """Return opcode and length of the record at `position`, if one is there."""
+        head = self._read(position, HEAD.size)
+        if len(head) < HEAD.size:
+            return None
+        opcode, length = HEAD.unpack(head)
+        start = position + HEAD.size
+        if not opcode or length > self._size - start:
+            return None
+        if opcode in set(Opcode):
+            is_there = fits(opcode, length, lambda place, count: self._read(start + place, count))
+        else:  # a kind that is not known, if a known one follows
+            is_there = self._is_shaped(start + length)
+        return (opcode, length) if is_there else None
+
+    def _is_shaped(self, position: int) -> bool:
+        """Say whether a record that repeats its length is at `position`."""
+        head = self._read(position, HEAD.size)
+        if len(head) < HEAD.size or not has_shape(head[0]):
+            return False
+        opcode, length = HEAD.unpack(head)
+        start = position + HEAD.size
+        return length <= self._size - start and fits(
+            opcode, length, lambda place, count: self._read(start + place, count)
+        )
+
+    def _find(self, position: int) -> int:
+        """Find the next record that repeats its length; the end of the file if there is none."""
+        while position < self._size:
+            window = self._read(position, _WINDOW + HEAD.size)
+            for match in _BEGINNING.finditer(window):
+                if self._is_shaped(position + match.start()):
+                    return position + match.start()
+            position += _WINDOW
+        return self._size
+
+
+def open_chunk(chunk: Chunk) -> bytes:
+    """Return what a chunk holds. Raises ChunkError when it isn't what was put in, as far as that can be told."""
+    if chunk.compression not in ("", "zstd", "lz4"):
+        raise ChunkError(f"unknown compression {chunk.compression!r}")
+    if chunk.uncompressed_size > MOST_OPENED:
+        raise ChunkError(f"claims {chunk.uncompressed_size} bytes, more than {MOST_OPENED}")
+    try:
+        if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > MOST_OPENED:
+            raise ChunkError(f"claims more than {MOST_OPENED} bytes")
+        stream, size = get_chunk_data_stream(chunk)
+        data: bytes = stream.read(size)
+    except (McapError, zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+        raise ChunkError(f"can't be decompressed: {error or type(error).__name__}") from None
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ChunkError("fails its CRC")
+    if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
+        raise ChunkError(f"holds {len(data)} bytes, not {chunk.uncompressed_size}")
+    return data
+
+
+def attachment_crc_fits(body: bytes, is_vouched: bool = True) -> bool:
+    """Say whether the body of an attachment fits its CRC; 0, for none, does if something else vouches for it."""
+    stored = int.from_bytes(body[-4:], "little")
+    return stored == zlib.crc32(body[:-4]) or (stored == 0 and is_vouched)

@@ -1,0 +1,230 @@
+"""What of a file can be trusted, whatever happened to it.
+
+A message is trusted when a CRC vouches for it: that of its chunk, or that of the whole data section. So the beginning
+of a chunk that was cut or damaged is left alone: of 1000 decompressed so, two gave wrong messages. Metadata and
+message indexes have no CRC of their own; indexes are made anew, metadata are taken where their shape is right.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Chunk, Metadata, Statistics
+from numpy.typing import NDArray
+
+from adacd_hil.log.editing.chunk_contents import Contents, message_contents, read_contents
+from adacd_hil.log.editing.definitions import Definitions
+from adacd_hil.log.editing.file_end import crc_of, read_end
+from adacd_hil.log.editing.record_scan import (
+    ChunkError,
+    Gap,
+    RawRecord,
+    attachment_crc_fits,
+    open_chunk,
+    parse,
+    scan,
+)
+from adacd_hil.log.errors import LogError
+
+_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
+_NOTES = 20
+"""Damages that are told one by one."""
+
+
+class Hole(NamedTuple):
+    """Where messages are missing: log times before and after."""
+
+    start_ns: int
+    end_ns: int
+
+    @property
+    def seconds(self) -> float:
+        """How long nothing was saved."""
+        return max(0, self.end_ns - self.start_ns) * 1e-9
+
+
+@dataclass
+class Losses:
+    """What could not be saved. `messages`: None where nothing says how many there were."""
+
+    chunks: int = 0
+    bytes: int = 0
+    messages: int | None = 0
+    attachments: int = 0
+    metadata: int = 0
+    is_cut: bool = False
+    is_doubtful: bool = False  # the data section fails its CRC for no reason that was found: metadata may be wrong
+    notes: list[str] = field(default_factory=list)
+    holes: list[Hole] = field(default_factory=list)
+
+    @property
+    def is_any(self) -> bool:
+        """Whether anything is lost, or may be."""
+        counts = self.chunks, self.messages != 0, self.attachments, self.metadata
+        return any(counts) or self.is_cut or self.is_doubtful
+
+    def note(self, text: str) -> None:
+        """Tell of a damage."""
+        if len(self.notes) < _NOTES:
+            self.notes.append(text)
+
+    def add(self, other: "Losses") -> None:
+        """Add what another file lost."""
+        self.chunks += other.chunks
+        self.bytes += other.bytes
+        is_known = self.messages is not None and other.messages is not None
+        self.messages = (self.messages or 0) + (other.messages or 0) if is_known else None
+        self.attachments += other.attachments
+        self.metadata += other.metadata
+        self.is_cut |= other.is_cut
+        self.is_doubtful |= other.is_doubtful
+        self.holes += other.holes
+        for note in other.notes:
+            self.note(note)
+
+
+class Salvage:
+    """One file: iterate for what can be trusted, then ask for `losses`. `definitions` fill up on the way."""
+
+    def __init__(self, path: Path) -> None:
+        """Look at both ends of a file. Raises LogError when it can't be read."""
+        self.losses = Losses()
+        self.definitions = Definitions()
+        self.is_vouched = False
+        """Whether the CRC of the data section fits: then everything is as it was written."""
+        self._path = path
+        self._statistics: Statistics | None = None
+        self._saved_messages = self._saved_attachments = self._saved_metadata = 0
+        self._latest_ns = 0
+        self._is_hole = False
+        self._is_explained = False  # why the CRC of the data section doesn't fit
+        self._has_data_end = self._has_footer = False
+        self._chunk: tuple[Contents, NDArray[np.void]] | None = None  # the latest one, and what its index must say
+        self._data_end = RawRecord(0, Opcode.DATA_END, b"")
+        self._left_out = 0  # messages for lack of what vouches for them, or of their channel
+        try:
+            with path.open("rb") as file:
+                self._look_at_end(file)
+        except OSError as error:
+            raise LogError(f"log {path} can't be read: {error.strerror}") from None
+
+    def _look_at_end(self, file: IO[bytes]) -> None:
+        """Take the summary where its CRC fits, and compare the CRC of the data section."""
+        end = read_end(file)
+        if end is None:
+            return
+        self.is_vouched = end.data_crc != 0 and end.data_crc == crc_of(file, 0, end.data_end)
+        with contextlib.suppress(LogError):  # written wrong: of no use
+            self.definitions.take(record for record in end.summary if record.opcode in _DEFINITIONS)
+            for record in end.summary:
+                if record.opcode == Opcode.STATISTICS:
+                    self._statistics = parse(record.opcode, record.body)
+
+    def __iter__(self) -> Iterator[Attachment | Metadata | Contents]:
+        with self._path.open("rb") as file:
+            for item in scan(file):
+                if self._has_data_end:
+                    break
+                if isinstance(item, RawRecord):
+                    yield from self._take(item)
+                elif isinstance(item, Gap):
+                    self._lose(item.offset, item.size, "no record")
+            if self._has_data_end and not self.is_vouched and not self._is_explained:
+                self._doubt(file)
+        self._sum_up()
+
+    def _take(self, record: RawRecord) -> Iterator[Attachment | Metadata | Contents]:
+        """Give what is in a record and can be trusted."""
+        opcode = record.opcode
+        try:
+            if opcode == Opcode.CHUNK:
+                yield from self._take_chunk(record)
+            elif opcode == Opcode.MESSAGE and self.is_vouched:
+                yield from self._give(message_contents(record))
+            elif opcode == Opcode.MESSAGE:
+                self._left_out += 1
+            elif opcode in _DEFINITIONS and self.is_vouched:
+                self.definitions.take((record,))
+            elif opcode == Opcode.ATTACHMENT:
+                if not attachment_crc_fits(record.body, self.is_vouched):
+                    self._lose(record.offset, len(record.body), "attachment fails its CRC")
+                    return
+                self._saved_attachments += 1
+                yield parse(opcode, record.body)
+            elif opcode == Opcode.METADATA:
+                metadata = parse(opcode, record.body)
+                self._saved_metadata += 1
+                yield metadata
+            elif opcode == Opcode.MESSAGE_INDEX:
+                self._compare_index(record.body)
+            elif opcode == Opcode.FOOTER:
+                self._has_footer = True
+            elif opcode == Opcode.DATA_END:
+                self._has_data_end = True
+                self._data_end = record
+        except (ChunkError, LogError) as error:
+            self.losses.chunks += opcode == Opcode.CHUNK
+            self._lose(record.offset, len(record.body), str(error))
+
+    def _take_chunk(self, record: RawRecord) -> Iterator[Contents]:
+        self._chunk = None
+        chunk: Chunk = parse(record.opcode, record.body)
+        if not chunk.uncompressed_crc and not self.is_vouched:
+            raise ChunkError("has no CRC, and that of the whole doesn't fit")
+        contents = read_contents(open_chunk(chunk))
+        self.definitions.take(contents.definitions)
+        if not self.is_vouched:
+            self._chunk = contents, contents.entries
+        if len(contents.log_times):
+            times = int(contents.log_times.min()), int(contents.log_times.max())
+            self._is_explained |= times != (chunk.message_start_time, chunk.message_end_time)
+        self._is_explained |= len(contents.data) != chunk.uncompressed_size
+        yield from self._give(contents)
+
+    def _give(self, contents: Contents) -> Iterator[Contents]:
+        known = np.isin(contents.channels, list(self.definitions.channels))
+        self._left_out += int(np.count_nonzero(~known))
+        self._saved_messages += int(np.count_nonzero(known))
+        if len(contents.log_times):
+            if self._is_hole:
+                self.losses.holes.append(Hole(self._latest_ns, int(contents.log_times.min())))
+            self._is_hole = not known.all()
+            self._latest_ns = max(self._latest_ns, int(contents.log_times.max()))
+        yield contents
+
+    def _compare_index(self, body: bytes) -> None:
+        """Notice an index that doesn't fit its chunk: it is made anew, but it explains a CRC."""
+        if self._chunk is not None:
+            contents, entries = self._chunk
+            is_own = contents.channels == int.from_bytes(body[:2], "little")
+            self._is_explained |= body[6:] != entries[is_own].tobytes()
+
+    def _doubt(self, file: IO[bytes]) -> None:
+        """Say so when the CRC of the data section fails though nothing was found that is wrong."""
+        stored = int.from_bytes(self._data_end.body, "little")
+        if stored and stored != crc_of(file, 0, self._data_end.offset):
+            self.losses.is_doubtful = True
+            self.losses.note(f"{self._path.name}: fails the CRC of the whole, nothing shows where: perhaps in metadata")
+
+    def _lose(self, offset: int, size: int, reason: str) -> None:
+        self.losses.note(f"{self._path.name}: byte {offset}, {size} bytes: {reason}")
+        self.losses.bytes += size
+        self._is_hole = True
+        self._is_explained = True
+
+    def _sum_up(self) -> None:
+        """Say what is lost, by the statistics where they can be trusted."""
+        losses, statistics = self.losses, self._statistics
+        losses.is_cut = not self._has_data_end and not self._has_footer and statistics is None
+        if losses.is_cut:
+            losses.note(f"{self._path.name}: cut, it has no end")
+        if statistics is not None:
+            losses.messages = max(0, statistics.message_count - self._saved_messages)
+            losses.attachments = max(0, statistics.attachment_count - self._saved_attachments)
+            losses.metadata = max(0, statistics.metadata_count - self._saved_metadata)
+            return
+        losses.messages = None if losses.bytes or losses.is_cut else self._left_out

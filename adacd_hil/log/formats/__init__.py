@@ -1,0 +1,1 @@
+"""Frames and tables in the forms of other programs, in and out."""

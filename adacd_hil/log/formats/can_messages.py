@@ -1,0 +1,160 @@
+"""python-can's messages from and to rows of frames, and the formats that are read through python-can.
+
+A channel of digits is a number to python-can and a name here: "0" is its 0, "" its None.
+
+Times: python-can's are float64 seconds, which stand 238 ns apart at today's dates. BLF and MF4 count from the start of
+the recording, so their nanoseconds are had by reading without the start, and adding it as an integer.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+from can.io.generic import TextIOMessageReader
+from can.io.player import MESSAGE_READERS
+from numpy.typing import NDArray
+
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
+
+_PIECE = 10_000
+"""Frames that are gathered."""
+_MAX_DATA = 64
+
+
+class TimedMessage(can.Message):
+    """A message that knows its time in whole nanoseconds, besides python-can's `timestamp`."""
+
+    def __init__(self, t_ns: int, **fields: Any) -> None:
+        super().__init__(timestamp=t_ns / 1_000_000_000, **fields)
+        self.t_ns = t_ns
+
+
+def time_ns(message: can.Message) -> int:
+    """Return the time of a message: in whole nanoseconds if it knows it and nobody has changed `timestamp` since."""
+    seconds = message.timestamp or 0.0
+    t_ns = getattr(message, "t_ns", None)
+    if t_ns is not None and t_ns / 1_000_000_000 == seconds:
+        return int(t_ns)
+    whole, rest = divmod(seconds, 1.0)
+    return int(whole) * 1_000_000_000 + round(rest * 1e9)
+
+
+def channel_name(channel: object) -> str:
+    """Name a channel of python-can."""
+    return "" if channel is None else str(channel)
+
+
+def to_row(message: can.Message, channel: int = 0, start_ns: int = 0) -> tuple[Any, ...]:
+    """Make a row of RECORDED_FRAME_DTYPE; `start_ns` is added to its time.
+
+    Raises LogError for data or an identifier that no frame has.
+    """
+    data = bytes(message.data)
+    length = len(data) if not (message.is_remote_frame or message.is_error_frame) else message.dlc
+    if max(len(data), length) > (_MAX_DATA if message.is_fd else 8):
+        raise LogError(f"frame 0x{message.arbitration_id:X} has {max(len(data), length)} bytes of data")
+    if not 0 <= message.arbitration_id < 1 << 29:
+        raise LogError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")
+    t_ns = time_ns(message) + start_ns
+    return (
+        t_ns,
+        t_ns,
+        message.arbitration_id,
+        not message.is_rx,
+        message.is_error_frame,
+        length,
+        list(data.ljust(_MAX_DATA, b"\0")),
+        channel,
+        message.is_extended_id,
+        message.is_remote_frame,
+        message.is_fd,
+        message.is_fd and message.bitrate_switch,
+        message.is_fd and message.error_state_indicator,
+    )
+
+
+def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) -> Iterator[TimedMessage]:
+    """Make a message of each row; `epoch_ns` is added to its time."""
+    names = [int(name) if name.isdecimal() else name or None for name in channels]
+    for row in frames:
+        (t_ns, _, can_id, is_tx, is_error, length, _, channel, is_extended, is_remote, is_fd, has_switch, has_error) = (
+            row.item()
+        )
+        yield TimedMessage(
+            t_ns + epoch_ns,
+            arbitration_id=can_id,
+            is_extended_id=is_extended,
+            is_remote_frame=is_remote,
+            is_error_frame=is_error,
+            channel=names[channel],
+            dlc=length,
+            data=b"" if is_remote else row["data"][:length].tobytes(),
+            is_fd=is_fd,
+            is_rx=not is_tx,
+            bitrate_switch=has_switch,
+            error_state_indicator=has_error,
+        )
+
+
+class PythonCanFrames:
+    """The frames of a file that python-can reads: iterate once; `channels` and `problem` grow meanwhile."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises LogError when it can't be read or isn't of its format."""
+        self.channels: list[str] = []
+        self.epoch_ns = 0
+        self.problem = ""
+        self._path = path
+        kind: Any = MESSAGE_READERS[path.suffix.lower()]
+        try:
+            # Vendors' tools write their texts in the Windows of the country; frames are ASCII.
+            file = path.open(encoding="latin-1") if issubclass(kind, TextIOMessageReader) else path.open("rb")
+        except OSError as error:
+            raise LogError(f"{path} can't be read: {error.strerror}") from None
+        try:
+            self._reader = kind(file)
+            self._start_ns = _take_start(self._reader)
+        except Exception as error:  # each reader has failures of its own
+            file.close()
+            raise LogError(f"{path} can't be read as {path.suffix}: {_line(error)}") from None
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        """Give the frames, (n,) of RECORDED_FRAME_DTYPE; what can't be read ends them and is the problem."""
+        rows: list[tuple[Any, ...]] = []
+        count = 0
+        with self._reader:
+            try:
+                for message in self._reader:
+                    rows.append(to_row(message, self._channel(message), self._start_ns))
+                    count += 1
+                    if len(rows) == _PIECE:
+                        yield np.array(rows, RECORDED_FRAME_DTYPE)
+                        rows = []
+            except Exception as error:  # each reader has failures of its own
+                if not count:
+                    raise LogError(f"{self._path} can't be read as {self._path.suffix}: {_line(error)}") from None
+                self.problem = f"{self._path.name} is damaged after {count} frames: {_line(error)}"
+        if rows:
+            yield np.array(rows, RECORDED_FRAME_DTYPE)
+
+    def _channel(self, message: can.Message) -> int:
+        name = channel_name(message.channel)
+        if name not in self.channels:
+            self.channels.append(name)
+        return self.channels.index(name)
+
+
+def _take_start(reader: Any) -> int:
+    """Take the start out of a reader that would add it to each time as a float; return it in ns."""
+    for name in ("start_timestamp", "_start_timestamp"):
+        if isinstance(start_s := getattr(reader, name, None), float):
+            setattr(reader, name, 0.0)
+            return round(start_s * 1e3) * 1_000_000
+    return 0
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

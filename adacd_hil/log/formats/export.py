@@ -1,0 +1,117 @@
+"""Recordings to tables: topics of our logs as they are, and frames of any recording decoded by a contract."""
+
+import difflib
+import fnmatch
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from adacd_hil.log.channels import DECODED
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.formats.frame_log import open_frames
+from adacd_hil.log.formats.tables import Tables, event_columns, frame_columns, series_columns
+from adacd_hil.log.stream import LogStream
+from adacd_hil.wire.codec import Codec
+
+_EVENTS = "/events"
+_RAW = ("to_can_bus", "from_can_bus", "to_can_bus_fd", "from_can_bus_fd")
+"""Ends of the topics of frames, which other formats are for."""
+
+
+class TableSummary(NamedTuple):
+    """What was written: rows of each file. `problem`: what is missing of the recording, one line."""
+
+    rows: Mapping[Path, int]
+    problem: str
+
+
+def export_tables(
+    path: Path,
+    out: Path,
+    kind: str,
+    wanted: Collection[str],
+    codec: Codec,
+    progress: Callable[[int], None] = lambda _: None,
+) -> TableSummary:
+    """Write the tables of a recording into the folder `out`.
+
+    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. codec:
+    decodes the frames of recordings that have no decoded topics. progress: is told the rows so far.
+    Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
+    """
+    topics = _topics(path) if path.suffix.lower() == ".mcap" else []
+    topics = [topic for topic in topics if topic.rsplit("/", 1)[-1] not in _RAW]
+    if topics:
+        return _export_topics(path, out, kind, choose_topics(topics, wanted), progress)
+    return _export_frames(path, out, kind, wanted, codec, progress)
+
+
+def choose_topics(topics: Collection[str], wanted: Collection[str]) -> list[str]:
+    """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest."""
+    if not wanted:
+        return list(topics)
+    chosen: list[str] = []
+    for pattern in wanted:
+        slashed = "/" + pattern.strip("/")
+        found = [t for t in topics if any(fnmatch.fnmatchcase(t, form) for form in (slashed, DECODED + pattern))]
+        if not found:
+            near = difflib.get_close_matches(slashed, topics, 1, 0.0)
+            raise LogError(f"the log has no topic {pattern}{f', did you mean {near[0]}' if near else ''}")
+        chosen += found
+    return list(dict.fromkeys(chosen))
+
+
+def _export_topics(
+    path: Path, out: Path, kind: str, topics: list[str], progress: Callable[[int], None]
+) -> TableSummary:
+    stream = LogStream(path, topics)
+    tables = Tables(out, kind, stream.metadata)
+    try:
+        for piece in stream:
+            for topic, series in piece.series.items():
+                if topic in topics:
+                    tables.write(topic, series_columns(series, stream.epoch_ns))
+            if payloads := piece.payloads.get(_EVENTS):
+                tables.write(_EVENTS, event_columns(payloads, stream.epoch_ns))
+            progress(sum(tables.rows.values()))
+    finally:
+        tables.close()
+    return TableSummary(tables.rows, stream.problem)
+
+
+def _export_frames(
+    path: Path, out: Path, kind: str, wanted: Collection[str], codec: Codec, progress: Callable[[int], None]
+) -> TableSummary:
+    chosen = choose_topics([DECODED + name for name in codec.messages], wanted)
+    source = open_frames(path)
+    pieces = iter(source)
+    tables = Tables(out, kind, {"contract": codec.path.name})
+    try:
+        for frames in pieces:
+            for name, columns in frame_columns(frames, codec):
+                if DECODED + name in chosen:
+                    tables.write(DECODED + name, columns)
+            progress(sum(tables.rows.values()))
+    finally:
+        tables.close()
+    return TableSummary(tables.rows, source.problem)
+
+
+def _topics(path: Path) -> list[str]:
+    """List the topics that the first chunk of an MCAP file defines."""
+    topics: list[str] = []
+    try:
+        with path.open("rb") as file:
+            for record in StreamReader(file, emit_chunks=True).records:
+                if isinstance(record, Channel):
+                    topics.append(record.topic)
+                elif isinstance(record, Chunk):
+                    topics += [inner.topic for inner in breakup_chunk(record) if isinstance(inner, Channel)]
+                    break
+    except (McapError, OSError, ValueError):
+        pass  # who reads the log says what is wrong with it
+    return list(dict.fromkeys(topics))

@@ -1,0 +1,187 @@
+"""Frames to BLF, ASC and candump files, with a count of what each format can't hold.
+
+Times are exact to what the format has: BLF 1 ns, ASC and candump 1 µs. BLF and ASC begin at a whole millisecond; a time
+before 1990, as of a run in lockstep, has no date in BLF and counts from 0.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.formats import candump
+from adacd_hil.log.formats.can_messages import to_messages
+from adacd_hil.log.formats.frame_log import FrameSource
+
+FRAME_FORMATS: Final = ("blf", "asc", "candump")
+_MS_NS = 1_000_000
+_US_NS = 1_000
+_OLDEST_BLF_NS = 631_152_000 * 1_000_000_000
+"""Before it BLF has no date: python-can takes it for a clock of its own."""
+_HALF_NS_S = 0.25e-9
+"""Keeps a product that python-can cuts to whole ns from falling below them."""
+
+
+class ExportSummary(NamedTuple):
+    """What was written; `losses` say in a line each what the format couldn't hold."""
+
+    frames: int
+    losses: tuple[str, ...]
+
+
+_Loss = tuple[str, NDArray[np.bool_]]
+"""What is lost, and of which frames."""
+
+
+class _Target(Protocol):
+    """A file of one format."""
+
+    def write(self, frames: NDArray[Any], channels: list[str], epoch_ns: int) -> "list[_Loss]":
+        """Write frames; say of which of them something is lost."""
+
+    def close(self) -> None:
+        """End the file."""
+
+
+def export_frames(
+    source: FrameSource,
+    pieces: Iterable[NDArray[Any]],
+    path: Path,
+    kind: str,
+    progress: Callable[[int], None] = lambda _: None,
+) -> ExportSummary:
+    """Write the chosen pieces of a recording; `progress` is told the frames so far.
+
+    Raises LogError when the recording can't be read or the file not be written.
+    """
+    losses: Counter[str] = Counter()
+    count = 0
+    try:
+        target = _TARGETS[kind](path)
+        try:
+            for frames in pieces:
+                for what, is_lost in target.write(frames, source.channels, source.epoch_ns):
+                    losses[what] += int(np.count_nonzero(is_lost))
+                count += len(frames)
+                progress(count)
+        finally:
+            target.close()
+    except OSError as error:
+        raise LogError(f"{path} can't be written: {error.strerror or error}") from None
+    return ExportSummary(count, tuple(f"{number} {what}" for what, number in losses.items() if number))
+
+
+class _Start:
+    """Times of a recording counted from the whole millisecond before its first frame."""
+
+    def __init__(self) -> None:
+        self.ns: int | None = None
+
+    def is_early(self, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Say which times come before the start."""
+        return np.asarray(times_ns < (self.ns or 0))
+
+    def seconds(self, times_ns: NDArray[np.int64]) -> list[float]:
+        """Return times since the start in s, those before it as 0."""
+        if self.ns is None:
+            self.ns = start_of(int(times_ns[0]))
+        return [float(t_ns) for t_ns in np.maximum(times_ns - self.ns, 0) / 1e9]
+
+
+def start_of(first_ns: int) -> int:
+    """Return where a recording begins whose first frame has this time."""
+    return first_ns // _MS_NS * _MS_NS if first_ns >= _OLDEST_BLF_NS else 0
+
+
+class _Blf:
+    def __init__(self, path: Path) -> None:
+        self._writer = can.BLFWriter(path)
+        self._writer.start_timestamp = 0.0
+        self._start = _Start()
+        self._last_s = 0.0
+
+    def write(self, frames: NDArray[Any], channels: list[str], epoch_ns: int) -> list[_Loss]:
+        seconds = self._start.seconds(frames["t_ns"] + epoch_ns)
+        for message, second in zip(to_messages(frames, channels), seconds, strict=True):
+            message.timestamp = second + _HALF_NS_S
+            self._writer.on_message_received(message)
+        self._last_s = seconds[-1]
+        return [
+            *_losses_of_both(frames, channels, self._start.is_early(frames["t_ns"] + epoch_ns)),
+            ("error frames lose that they were sent", frames["is_error"] & frames["is_tx"]),
+            _fd_errors(frames),
+        ]
+
+    def close(self) -> None:
+        start_s = (self._start.ns or 0) / 1_000_000_000
+        self._writer.start_timestamp = start_s
+        self._writer.stop_timestamp = start_s + self._last_s
+        self._writer.stop()
+
+
+class _Asc:
+    def __init__(self, path: Path) -> None:
+        self._writer = can.ASCWriter(path)
+        self._start = _Start()
+
+    def write(self, frames: NDArray[Any], channels: list[str], epoch_ns: int) -> list[_Loss]:
+        seconds = self._start.seconds(frames["t_ns"] + epoch_ns)
+        if not self._writer.header_written:
+            self._writer.log_event("Start of measurement", (self._start.ns or 0) / 1_000_000_000)
+            self._writer.started = 0.0
+        for message, second in zip(to_messages(frames, channels), seconds, strict=True):
+            message.timestamp = second
+            self._writer.on_message_received(message)
+        is_empty_fd = frames["is_fd"] & ~frames["is_error"] & (frames["length"] == 0)
+        return [
+            *_losses_of_both(frames, channels, self._start.is_early(frames["t_ns"] + epoch_ns)),
+            _nanoseconds(frames, epoch_ns),
+            ("error frames lose class, data and direction", frames["is_error"]),
+            ("FD frames without data will read as remote frames", is_empty_fd),
+        ]
+
+    def close(self) -> None:
+        self._writer.stop()
+
+
+class _Candump:
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="ascii", errors="replace", newline="\n")
+
+    def write(self, frames: NDArray[Any], channels: list[str], epoch_ns: int) -> list[_Loss]:
+        self._file.writelines(_lines(frames, channels, epoch_ns))
+        return [_nanoseconds(frames, epoch_ns), _fd_errors(frames)]
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _lines(frames: NDArray[Any], channels: list[str], epoch_ns: int) -> Iterator[str]:
+    names = [candump.channel_name(name) for name in channels]
+    for row in frames:
+        yield candump.line(row, names[row["channel"]], epoch_ns)
+
+
+_TARGETS: dict[str, Callable[[Path], _Target]] = {"blf": _Blf, "asc": _Asc, "candump": _Candump}
+
+
+def _losses_of_both(frames: NDArray[Any], channels: list[str], is_early: NDArray[np.bool_]) -> list[_Loss]:
+    """Say what BLF and ASC lose alike."""
+    is_named = np.array([bool(name) and not name.isdecimal() for name in channels])
+    return [
+        ("frames keep of their channel's name no more than its number", is_named[frames["channel"]]),
+        ("frames that precede the first one move up to the beginning", is_early),
+    ]
+
+
+def _nanoseconds(frames: NDArray[Any], epoch_ns: int) -> _Loss:
+    return "frames lose what their times have below 1 µs", (frames["t_ns"] + epoch_ns) % _US_NS != 0
+
+
+def _fd_errors(frames: NDArray[Any]) -> _Loss:
+    return "error frames lose that they were FD", frames["is_error"] & frames["is_fd"]
