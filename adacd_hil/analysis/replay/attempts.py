@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import Piece
@@ -18,7 +19,7 @@ from adacd_hil.records import SchemeState
 
 NMT_ID, RESET_COMMUNICATION = 0x000, 0x82
 """What an attempt begins with on the bus. Source: CiA 301 (4.2), clause 7.2.8.3.1."""
-SYNC_ID, SYNC_OVERFLOW = 0x080, 240
+SYNC_ID = 0x080
 
 Places = NDArray[np.int64]
 

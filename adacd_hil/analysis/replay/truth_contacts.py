@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.replay.attempts import SYNC_OVERFLOW
 from adacd_hil.analysis.timing import Cycles
 from adacd_hil.analysis.touches import filtered
+from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.log.stream import LogStream
 from adacd_hil.records import Vector
 

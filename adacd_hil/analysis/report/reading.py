@@ -9,14 +9,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.analysis.run import CertifiedStream, Motion, PaperStream, Run, Truth
-from adacd_hil.analysis.timing import columns_of_series
+from adacd_hil.analysis.timing import Cycles, columns_of_series
 from adacd_hil.config import Settings, parse
+from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import RunLog, Series, read_log
-from adacd_hil.records import JOINTS, Request
+from adacd_hil.records import JOINTS, Request, SchemeState
 
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact", "/events")
 """Of a run's log, what a report reads."""
+_BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
 
 
 class Source(NamedTuple):
@@ -62,7 +64,7 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
         timing=columns_of_series(log.cycle),
         finish_cycle=_finish_cycle(scheme),
         contact_joints=scheme["contact_joints"],
-        truth=_truth(truth_log),
+        truth=_truth(truth_log, scheme),
         settings=settings,
         metadata=metadata,
         frames=_count(log.summary, "frames"),
@@ -107,12 +109,12 @@ def _finish_cycle(scheme: Series) -> int | None:
     return int(scheme["cycle"][asked[0]]) if asked.size else None
 
 
-def _truth(log: RunLog | None) -> Truth | None:
+def _truth(log: RunLog | None, scheme: Series) -> Truth | None:
     if log is None or len(log.truth) == 0:
         return None
     truth = log.truth
     return Truth(
-        cycle=truth["cycle"].astype(np.int64),
+        cycle=_host_cycles(truth["cycle"].astype(np.int64), scheme),
         tau_ext=truth["tau_ext"],
         contact_link=truth["contact_link"],
         contact_index=truth["contact_index"],
@@ -120,6 +122,20 @@ def _truth(log: RunLog | None) -> Truth | None:
         theta=truth["theta"],
         force_N=truth["contact_force"] if "contact_force" in truth.fields else None,
     )
+
+
+def _host_cycles(cycle: Cycles, scheme: Series) -> Cycles:
+    """Turn the emulator's cycles into the host's.
+
+    The emulator counts by the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the
+    counter that the host had counted before.
+    """
+    is_beginning = np.isin(scheme["state"], _BEGINNING)
+    first = np.flatnonzero(is_beginning & ~np.concatenate(([False], is_beginning[:-1])))
+    begins = scheme["cycle"][first].astype(np.int64) if first.size else np.zeros(1, np.int64)
+    attempt = np.cumsum(np.diff(cycle, prepend=cycle[0]) < 0)
+    shift = begins - begins % SYNC_OVERFLOW
+    return np.asarray(cycle + shift[np.minimum(attempt, len(shift) - 1)])
 
 
 def _settings(log: RunLog) -> Settings:
