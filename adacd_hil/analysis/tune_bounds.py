@@ -5,29 +5,26 @@ Biometrika 26 (1934); Garwood, "Fiducial limits for the Poisson distribution", B
 """
 
 import math
+from typing import Final
 
-CONFIDENCE = 0.95
+from scipy.special import betaincinv, gammaincinv
+
+CONFIDENCE: Final = 0.95
 
 
 def share_bounds(found: int, count: int) -> tuple[float, float]:
     """Give the 95 % interval of a share of which `found` of `count` were seen; (0, 1) of none."""
-    from scipy.stats import beta
-
     rest = 0.5 * (1.0 - CONFIDENCE)
-    low = float(beta.ppf(rest, found, count - found + 1)) if found > 0 else 0.0
-    high = float(beta.ppf(1.0 - rest, found + 1, count - found)) if found < count else 1.0
+    low = float(betaincinv(found, count - found + 1, rest)) if found > 0 else 0.0
+    high = float(betaincinv(found + 1, count - found, 1.0 - rest)) if found < count else 1.0
     return low, high
 
 
 def rate_bound_per_h(alarms: int, hours: float) -> float:
     """Give the upper 95 % bound of a rate, one-sided: 3 / T after T hours without an alarm; infinite without time."""
-    from scipy.stats import chi2
-
-    return float(chi2.ppf(CONFIDENCE, 2 * (alarms + 1))) / 2.0 / hours if hours > 0.0 else math.inf
+    return float(gammaincinv(alarms + 1, CONFIDENCE)) / hours if hours > 0.0 else math.inf
 
 
 def least_rate_per_h(alarms: int, hours: float) -> float:
     """Give the lower 95 % bound of a rate, one-sided; 0 after no alarm."""
-    from scipy.stats import chi2
-
-    return float(chi2.ppf(1.0 - CONFIDENCE, 2 * alarms)) / 2.0 / hours if alarms > 0 and hours > 0.0 else 0.0
+    return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0

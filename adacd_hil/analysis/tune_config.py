@@ -1,6 +1,6 @@
 """The suggested configuration as TOML: what it extends, the keys that change, and where they come from, as comments."""
 
-import dataclasses
+import json
 import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,10 +34,10 @@ def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settin
     lines = [*_provenance(tuning, best)]
     if differing:
         lines.append(f"the logs' settings differ from {base_name} in {', '.join(differing)}")
-    text = [*(f"# {line}" for line in lines), "", f"extends = {_quoted(base_name)}"]
+    text = [*(f"# {line}" for line in lines), "", f"extends = {json.dumps(base_name, ensure_ascii=False)}"]
     sections: dict[str, list[str]] = {}
     if own.arm.profile != load_settings(base_name).arm.profile:
-        sections["arm"] = [f"profile = {_quoted(own.arm.profile)}"]
+        sections["arm"] = [f"profile = {json.dumps(own.arm.profile)}"]
     for key in changed_keys(base, apply_settings(base, best.changes)):
         section, _, last = key.rpartition(".")
         value: Any = table
@@ -47,14 +47,6 @@ def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settin
     for section, entries in sections.items():
         text += ["", f"[{section}]", *entries]
     return "\n".join(text) + "\n"
-
-
-def _quoted(text: str) -> str:
-    @dataclasses.dataclass
-    class _One:
-        value: str
-
-    return to_toml(_One(text)).removeprefix("value = ").strip()
 
 
 def _provenance(tuning: Tuning, best: Candidate) -> list[str]:

@@ -16,6 +16,9 @@ from adacd_hil.log.errors import LogError
 
 _LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "queue_log", "beside", "queue_receive", "muted")
 
+_LEAST_RATE: Final = 1e-6
+"""Per hour; what the model predicts below this nobody will ever check."""
+
 
 def curves(tuning: Tuning) -> list[tuple[str, Choice]]:
     """Return what is drawn: the suggestion or else the logs' own filter, then the detectors."""
@@ -42,6 +45,8 @@ def draw_roc(tuning: Tuning) -> Drawing:
                 continue
             shares = np.array([len(each.delays_ms) / max(each.contacts or 0, 1) for each in found])
             axes.plot(bounds, 100.0 * shares, marker="o", markersize=3.0, **look)
+            predicted = [np.nan if rate is None or rate < _LEAST_RATE else rate for _, _, rate in choice.roc]
+            axes.plot(predicted, 100.0 * shares, linestyle=":", **(look | {"label": None}))
             if colour == "alarm":
                 low, high = np.array([each.share_bounds for each in found]).T
                 axes.fill_between(bounds, 100.0 * low, 100.0 * high, color=COLOURS[colour], alpha=0.12, linewidth=0.0)
@@ -52,7 +57,7 @@ def draw_roc(tuning: Tuning) -> Drawing:
         else:
             axes.set(xscale="log", yscale="log", xlabel="factor on the thresholds", ylabel=bound_label)
         axes.set_title("False alarms and contacts found")
-        note(axes, "counted where thresholds were not chosen")
+        note(axes, "counted where thresholds were not chosen; dotted: predicted by the tail model")
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
         hours = tuning.candidates[0].choice.checked.hours
         caption = (

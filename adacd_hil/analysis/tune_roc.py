@@ -121,7 +121,10 @@ class Choice:
         """Say where the thresholds come from."""
         if self.calibration is None:
             return "the largest value seen: too little motion for a tail"
-        return "tail model, extrapolated" if self.calibration.is_extrapolated else "tail model"
+        if not self.calibration.is_extrapolated:
+            return "tail model"
+        times = 1.0 / (self.calibration.rate_per_h * self.calibration.tail.hours)
+        return f"tail model, extrapolated {times:.2g}-fold"
 
 
 def choose(observed: Observed, rate_per_h: float) -> Choice:
