@@ -3,8 +3,9 @@
 Every candidate gets the thresholds that one half of the logs gives it for the wanted rate of false alarms: those at
 which the tail's upper 95 % bound is that rate. Then the logs are replayed with it, thresholds and all. It is fit if it
 adapts as often as the logs' own settings do, misses none of the contacts that those were armed for, and has no more
-false alarms than the wanted rate allows; of the fit ones the one with the smallest median delay is suggested. Without
-the truth beside the logs nobody knows a delay: only thresholds are found then.
+false alarms than the wanted rate allows; of the fit ones the one with the smallest median delay is suggested. Where a
+wanted rate is extrapolated too far, the bounds of the tails differ more by chance than the candidates do: then filter
+and gain stay as they are. Without the truth nobody knows a delay: only thresholds are found then, too.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,6 +36,8 @@ LIMITS: Final = (
     "excitation was the recorded one, and a payload was changed when it was: what an earlier reaction, another motion "
     "or another arm would have come to is not in these figures. Delays are on the host's clock, from the true onset."
 )
+FARTHEST: Final = 100.0
+"""Extrapolation beyond which filters and gains are not told apart: thresholds of equal ones differ by a factor of 4."""
 
 
 @dataclass(frozen=True)
@@ -157,9 +160,8 @@ def tune(paths: Sequence[Path], rate_per_h: float, config: str | None, progress:
     except TooLittleMotionError as error:
         notes.append(f"the detectors can't be compared: {error}")
     tried = candidates(logs[0].settings) if has_truth else [{}]
-    observed = observe_candidates(logs, tried, progress)
-    choices = [choose(each, rate_per_h) for each in observed]
     settings = logs[0].settings
+    tried, choices = _choices(logs, tried, rate_per_h, progress, notes)
     changes = [
         filter_and_gain | thresholds_as_changes(apply_settings(settings, filter_and_gain), choice.thresholds)
         for filter_and_gain, choice in zip(tried, choices, strict=True)
@@ -169,7 +171,28 @@ def tune(paths: Sequence[Path], rate_per_h: float, config: str | None, progress:
         Candidate(name_of(filter_and_gain), change, choice, outcome, _problems(choice, outcome, own, rate_per_h))
         for filter_and_gain, change, choice, outcome in zip(tried, changes, choices, outcomes, strict=True)
     ]
+    if len(judged) > 1 and judged[0].choice.extrapolation > FARTHEST:
+        notes.append(f"a rate of {rate_per_h:g} per hour is too far from this motion to choose filter and gain by it")
     return Tuning(rate_per_h, tuple(logs), own, tuple(judged), _best(judged), tuple(detectors), tuple(notes))
+
+
+def _choices(
+    logs: Sequence[TunedLog],
+    tried: Sequence[Changes],
+    rate_per_h: float,
+    progress: Callable[[str], None],
+    notes: list[str],
+) -> tuple[list[Changes], list[Choice]]:
+    """Choose thresholds for each filter and gain; leave out, with a note, what never monitors untouched motion."""
+    chosen: list[tuple[Changes, Choice]] = []
+    for changes, observed in zip(tried, observe_candidates(logs, tried, progress), strict=True):
+        try:
+            chosen.append((changes, choose(observed, rate_per_h)))
+        except TooLittleMotionError as error:
+            if not changes:
+                raise TooLittleMotionError(f"{error}, with the settings to start from") from None
+            notes.append(f"{name_of(changes)}: {error}")
+    return [changes for changes, _ in chosen], [choice for _, choice in chosen]
 
 
 def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Callable[[str], None]) -> list[Outcome]:
@@ -221,6 +244,10 @@ def _problems(choice: Choice, outcome: Outcome, own: Outcome, rate_per_h: float)
 
 
 def _best(judged: Sequence[Candidate]) -> Candidate | None:
-    """Return the fit candidate with the smallest median delay of the half that thresholds are chosen on."""
-    fit = [candidate for candidate in judged if not candidate.problems]
+    """Return the fit candidate with the smallest median delay of the half that thresholds are chosen on.
+
+    Of a rate that is extrapolated too far, only the logs' own filter and gain, which come first, are looked at.
+    """
+    looked_at = judged[:1] if judged[0].choice.extrapolation > FARTHEST else judged
+    fit = [candidate for candidate in looked_at if not candidate.problems]
     return min(fit, key=lambda each: delay_figures(each.choice.chosen.delays_ms)[0] or np.inf, default=None)

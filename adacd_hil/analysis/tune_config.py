@@ -11,7 +11,6 @@ from adacd_hil.analysis.tune import Candidate, Tuning, free_hours
 from adacd_hil.analysis.tune_roc import Found, delay_figures
 from adacd_hil.analysis.what_if import apply_settings, changed_keys, keep_facts
 from adacd_hil.clock import wall_ns
-from adacd_hil.compiled import source_digest
 from adacd_hil.config import ConfigError, Settings, builtin_names, load_settings, to_toml
 
 
@@ -53,7 +52,7 @@ def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
     date = datetime.fromtimestamp(wall_ns() // 1_000_000_000, tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
     choice, tail = best.choice, best.choice.calibration
     lines = [
-        f"Suggested by adacd-hil tune, version {__version__}, code {source_digest()}, {date}.",
+        f"Suggested by adacd-hil tune, version {__version__}, {date}.",
         f"From {len(tuning.logs)} logs, {sum(map(free_hours, tuning.logs)):.4f} h of motion that nobody touched:",
         *(f"  {_plain(log.path)}, SHA-256 {log.digest}, {free_hours(log):.4f} h" for log in tuning.logs),
         f"Wanted: {tuning.rate_per_h:g} false alarms per hour. Thresholds: {choice.method}, whose upper 95 % bound is "

@@ -57,7 +57,7 @@ def draw_roc(tuning: Tuning) -> Drawing:
         else:
             axes.set(xscale="log", yscale="log", xlabel="factor on the thresholds", ylabel=bound_label)
         axes.set_title("False alarms and contacts found")
-        note(axes, "counted where thresholds were not chosen; dotted: predicted by the tail model")
+        note(axes, "counted where nothing was chosen; dotted: the tail model's prediction")
         axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
         hours = tuning.candidates[0].choice.checked.hours
         caption = (

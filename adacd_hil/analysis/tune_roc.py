@@ -117,14 +117,20 @@ class Choice:
     """Factor, what it comes to, and the rate that the tail predicts, of those factors that it can speak of."""
 
     @property
+    def extrapolation(self) -> float:
+        """How far the wanted rate is below one alarm in the time thresholds are chosen on; infinite without a tail."""
+        if self.calibration is None:
+            return math.inf
+        return 1.0 / (self.calibration.rate_per_h * self.calibration.tail.hours)
+
+    @property
     def method(self) -> str:
         """Say where the thresholds come from."""
         if self.calibration is None:
             return "the largest value seen: too little motion for a tail"
-        if not self.calibration.is_extrapolated:
+        if self.extrapolation <= 1.0:
             return "tail model"
-        times = 1.0 / (self.calibration.rate_per_h * self.calibration.tail.hours)
-        return f"tail model, extrapolated {times:.2g}-fold"
+        return f"tail model, extrapolated {self.extrapolation:.4g}-fold"
 
 
 def choose(observed: Observed, rate_per_h: float) -> Choice:

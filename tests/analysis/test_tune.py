@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from adacd_hil.analysis import tune_logs
 from adacd_hil.analysis.false_alarms import TooLittleMotionError
 from adacd_hil.analysis.replay import contacts_beside
+from adacd_hil.analysis.replay_source import LogSource
 from adacd_hil.analysis.tune import Candidate, Outcome, Tuning, _best, _problems
 from adacd_hil.analysis.tune_bounds import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.analysis.tune_config import base_of, suggested_toml
@@ -25,7 +26,7 @@ from adacd_hil.analysis.tune_scheme import _Shown, candidates, observe_candidate
 from adacd_hil.analysis.what_if import apply_settings
 from adacd_hil.cli.demo import Cast, run_embedded
 from adacd_hil.cli.main import cli
-from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, load_settings
+from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, load_settings, to_toml
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState
@@ -275,6 +276,20 @@ def test_of_the_fit_ones_the_fastest_is_suggested():
     assert _best([unfit]) is None
 
 
+def test_a_rate_too_far_from_the_motion_leaves_filter_and_gain_as_they_are():
+    def far(delay_ms, rate_per_h):
+        made = candidate(delay_ms)
+        return dataclasses.replace(
+            made, choice=dataclasses.replace(choose(observed(), rate_per_h), chosen=made.choice.chosen)
+        )
+
+    assert [round(far(1.0, rate).choice.extrapolation, 6) for rate in (0.125, 0.12)] == [96.0, 100.0]
+    own, faster = far(4.0, 0.1), far(3.0, 0.1)
+    assert _best([own, faster]) is own
+    own, faster = far(4.0, 0.125), far(3.0, 0.125)
+    assert _best([own, faster]) is faster
+
+
 def tuning_of(best, rate_per_h=1.0, path="run.mcap", **changes):
     free = SimpleNamespace(is_free=np.ones(7200, bool), period_s=1e-3)
     settings = apply_settings(load_settings("paper"), changes.pop("settings", {}))
@@ -340,21 +355,25 @@ def test_the_report_has_the_figures_and_what_they_show(tmp_path):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """Five seconds of the paper's scheme in a hurry: it has adapted in less than one, and is pushed twice."""
+    """Six seconds of the paper's scheme in a hurry: it has adapted in less than one, and is pushed twice."""
     folder = tmp_path_factory.mktemp("tune")
     file = folder / "pushed.toml"
     contact = "link = 1, point_m = 0.25, angle_deg = 90.0, duration_s = 0.1"
     file.write_text(
-        'about = "x"\ngroup = "x"\nlasts_s = 5.0\nstart_deg = [-30.0, -60.0]\ncontacts = [\n'
+        'about = "x"\ngroup = "x"\nlasts_s = 5.8\nstart_deg = [-30.0, -60.0]\ncontacts = [\n'
         f"{{at_s = 2.0, force_N = 20.0, {contact}}}, {{at_s = 3.2, force_N = 20.0, {contact}}}]\n"
         "[expect]\nadaptations = 1\ncontacts = 2\n"
     )
-    operator = OperatorSettings(script=(RequestSettings(at_s=5.0, request="finish"),), acknowledge_after_s=0.1)
+    operator = OperatorSettings(script=(RequestSettings(at_s=5.8, request="finish"),), acknowledge_after_s=0.1)
     hasty = {"termination.hold_s": "0.1", "termination.beta_Nm": "1.0", "termination.travel_deg": "5"}
     hasty |= {"termination.velocity_deg_s": "0", "termination.excitation_Nm2s": "1e-9"}
     settings = dataclasses.replace(apply_settings(load_settings("paper"), hasty), operator=operator)
     summary, _ = run_embedded(Cast(settings, load_scenario(str(file), "P", None)), "lockstep", folder)
     return summary.log.path
+
+
+def log_settings(log):
+    return LogSource(log).settings
 
 
 def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
@@ -396,8 +415,9 @@ def test_the_candidate_without_changes_shows_the_logged_residual(log):
 
 
 def test_tune_says_that_so_little_motion_shows_nothing(log, tmp_path):
+    (tmp_path / "hasty.toml").write_text(to_toml(log_settings(log)).replace('name = "paper"', 'name = "hasty"'))
     arguments = ["tune", str(log.parent), "--out", str(tmp_path / "tuned.toml"), "--report", str(tmp_path / "report")]
-    done = CliRunner().invoke(cli, [*arguments, "--json", "--config", "paper"])
+    done = CliRunner().invoke(cli, [*arguments, "--json", "--config", str(tmp_path / "hasty.toml")])
     assert done.exit_code == 3, done.output
     found = json.loads(done.stdout)
     assert found["suggested"] is None
@@ -422,6 +442,7 @@ def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
         ("tune", str(log), str(log)): (2, "a log is given twice"),
         ("tune", str(tmp_path / "no.mcap")): (1, "no.mcap"),
         ("tune", str(log), "--config", "papre"): (2, "did you mean 'paper'"),
+        ("tune", str(log), "--config", "paper"): (1, "with the settings to start from"),
     }
     for arguments, (code, words) in cases.items():
         done = CliRunner().invoke(cli, list(arguments))
