@@ -8,12 +8,11 @@ wanted rate is extrapolated too far, the bounds of the tails differ more by chan
 and gain stay as they are. Without the truth nobody knows a delay: only thresholds are found then, too.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
-
-import numpy as np
 
 from adacd_hil.analysis.false_alarms import TooLittleMotionError
 from adacd_hil.analysis.replay import Replay, replay_many
@@ -250,4 +249,10 @@ def _best(judged: Sequence[Candidate]) -> Candidate | None:
     """
     looked_at = judged[:1] if judged[0].choice.extrapolation > FARTHEST else judged
     fit = [candidate for candidate in looked_at if not candidate.problems]
-    return min(fit, key=lambda each: delay_figures(each.choice.chosen.delays_ms)[0] or np.inf, default=None)
+    return min(fit, key=_delays, default=None)
+
+
+def _delays(candidate: Candidate) -> tuple[float, ...]:
+    """Give median, 90th percentile and largest, by which equal medians are told apart; infinite of no contact."""
+    figures = delay_figures(candidate.choice.chosen.delays_ms)
+    return tuple(math.inf if each is None else each for each in figures)
