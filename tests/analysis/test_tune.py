@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.analysis import tune_logs
-from adacd_hil.analysis.false_alarms import TooLittleMotionError
+from adacd_hil.analysis.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.analysis.replay import contacts_beside
 from adacd_hil.analysis.replay_source import LogSource
 from adacd_hil.analysis.tune import Candidate, Outcome, Tuning, _best, _problems
@@ -88,11 +88,12 @@ NOTHING = Touched(np.zeros(0), np.zeros((0, 1, 2)), False)
 def test_thresholds_are_chosen_on_one_half_and_checked_on_the_other():
     before = choose(observed(), 1.0)
     made = observed()
-    made.peaks[-100, 0, 1] = 9.0
+    made.peaks[-100, 0, 1] = 99.0
     after = choose(made, 1.0)
     np.testing.assert_array_equal(after.thresholds, before.thresholds)
     assert (after.chosen.alarms, before.checked.alarms, after.checked.alarms) == (0, 0, 1)
     assert before.checked.hours == pytest.approx(300.0 / 3600.0)
+    assert (before.roc[-1][1].alarms, after.roc[-1][1].alarms) == (0, 1)
 
 
 def test_the_bound_of_the_tail_is_the_wanted_rate():
@@ -101,6 +102,9 @@ def test_the_bound_of_the_tail_is_the_wanted_rate():
     assert choice.method == "tail model, extrapolated 12-fold"
     assert choose(observed(), 60.0).method == "tail model"
     assert calibration.bound > 1.05 * calibration.threshold
+    calibrated = calibrate_detector(observed().half(True), 0.1, 1.0)
+    surer = calibrated.calibration.bound / calibrated.calibration.threshold
+    np.testing.assert_allclose(choice.thresholds, surer * calibrated.thresholds, rtol=1e-12)
     predicted = dict(zip(FACTORS, (rate for _, _, rate in choice.roc), strict=True))
     assert predicted[1.0] < 1.0
     assert predicted[FACTORS[0]] is None
@@ -394,6 +398,8 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     contacts = contacts_beside(log)
     assert [cycle[window.first] for window in read.windows] == [contact.onset for contact in contacts]
     assert [(window.is_armed, window.is_chosen_on) for window in read.windows] == [(True, True)]
+    second = tune_logs._window(2, contacts[0], read_log(log, ("/scheme",)).scheme, read.settings, None)
+    assert not second.is_chosen_on, "in one log contacts alternate"
     for window, contact in zip(read.windows, contacts, strict=True):
         assert contact.end < cycle[window.last] < contact.end + 1000
         assert not read.motion.is_free[window.first - 600 : window.last + 600].any()
