@@ -398,8 +398,6 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     contacts = contacts_beside(log)
     assert [cycle[window.first] for window in read.windows] == [contact.onset for contact in contacts]
     assert [(window.is_armed, window.is_chosen_on) for window in read.windows] == [(True, True)]
-    second = tune_logs._window(2, contacts[0], read_log(log, ("/scheme",)).scheme, read.settings, None)
-    assert not second.is_chosen_on, "in one log contacts alternate"
     for window, contact in zip(read.windows, contacts, strict=True):
         assert contact.end < cycle[window.last] < contact.end + 1000
         assert not read.motion.is_free[window.first - 600 : window.last + 600].any()
@@ -407,6 +405,12 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
         k * 10 // len(read.is_chosen_on) % 2 == 0 for k in range(len(read.is_chosen_on))
     ]
     assert read.digest == hashlib.sha256(log.read_bytes()).hexdigest()
+
+
+def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
+    contacts = contacts_beside(log)
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda _: contacts * 3)
+    assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 
 def test_every_other_log_is_for_choosing(log, tmp_path):
