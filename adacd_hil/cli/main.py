@@ -24,6 +24,7 @@ from adacd_hil.cli.options import (
 from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
 from adacd_hil.cli.sweep_command import sweep
+from adacd_hil.cli.tune_command import tune
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -326,6 +327,7 @@ cli.add_command(replay)
 cli.add_command(compare)
 cli.add_command(log)
 cli.add_command(sweep)
+cli.add_command(tune)
 
 
 def main() -> None:

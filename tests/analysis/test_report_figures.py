@@ -188,13 +188,13 @@ def test_a_fragments_colours_are_the_pages_own(name, fragments):
 
 
 def test_every_colour_is_a_variable_of_the_page_in_light_and_dark():
-    css = resources.files("adacd_hil.analysis").joinpath("assets", "report.css").read_text(encoding="utf-8")
+    css = resources.files("adacd_hil.analysis.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
     counts = {name: len(re.findall(rf"--{name}:", css)) for name in (*COLOURS, "paper")}
     assert counts == dict.fromkeys((*COLOURS, "paper"), 2)
 
 
 def test_the_page_is_as_light_as_the_printed_figures():
-    css = resources.files("adacd_hil.analysis").joinpath("assets", "report.css").read_text(encoding="utf-8")
+    css = resources.files("adacd_hil.analysis.report").joinpath("assets", "report.css").read_text(encoding="utf-8")
     light = {name: re.search(rf"--{name}: (#[0-9a-f]+)", css)[1] for name in COLOURS}
     assert light == COLOURS
 

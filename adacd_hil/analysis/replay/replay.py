@@ -25,7 +25,7 @@ from adacd_hil.analysis.replay.scheme_comparison import (
 from adacd_hil.analysis.replay.source import LogSource, Source
 from adacd_hil.analysis.replay.truth_contacts import TrueContact, read_contacts
 from adacd_hil.config import Settings
-from adacd_hil.device.recorded_arm import RecordedArm
+from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.batch import SchemeBatch, arm_at
@@ -40,6 +40,8 @@ SCRIPTED: Final = "script"
 _PROGRESS_CYCLES: Final = 200_000
 
 Progress = Callable[[str], None]
+Watch = Callable[[int, Ticks, SchemeBatch], None]
+"""Is shown the decisions of each variant, by its place among them, as they are made."""
 
 
 @dataclass(frozen=True)
@@ -127,12 +129,14 @@ def replay(
     ]
 
 
-def replay_many(path: Path, variants: Sequence[Settings], progress: Progress = lambda _: None) -> list[Replay]:
+def replay_many(
+    path: Path, variants: Sequence[Settings], progress: Progress = lambda _: None, *, watch: Watch | None = None
+) -> list[Replay]:
     """Replay a log once for each of the settings; the log is read and decoded once.
 
     Raises LogError, ConfigError, CodecError.
     """
-    return replay_source(LogSource(path), variants, contacts_beside(path), progress)
+    return replay_source(LogSource(path), variants, contacts_beside(path), progress, watch=watch)
 
 
 def contacts_beside(path: Path) -> tuple[TrueContact, ...] | None:
@@ -162,8 +166,8 @@ class _Player:
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
 
-    def play(self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]]) -> None:
-        """Take in a stretch."""
+    def play(self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]]) -> SchemeBatch:
+        """Take in a stretch; return what the scheme decided."""
         ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
@@ -172,7 +176,7 @@ class _Player:
         texts = [event.message for event in self._pipeline.take_events()]
         self.gatherer.take(ticks, batch)
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
-            return
+            return batch
         self.comparison.compare(stretch.scheme, ticks, batch)
         if self._asking is not None:
             self.requests.compare(ticks, stretch.requests, self._asking.requests(ticks, batch))
@@ -184,6 +188,7 @@ class _Player:
         self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
         logged = [margin for margin in margins if ticks.t_ns[0] <= margin[0] <= ticks.t_ns[-1]]
         self.comparison.compare_events(logged, texts, int(ticks.cycle[0]))
+        return batch
 
     def _begin(self) -> None:
         self._pipeline = pipeline_of(self.settings)
@@ -239,6 +244,7 @@ def replay_source(
     tolerance: float | None = None,
     script_of: ScriptOf | None = None,
     shown: int = SHOWN,
+    watch: Watch | None = None,
 ) -> list[Replay]:
     """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
 
@@ -257,8 +263,10 @@ def replay_source(
     for part in source:
         exact: list[tuple[int, int]] = []
         for stretch in part.stretches:
-            for player, arms in zip(players, decoders.read(stretch), strict=True):
-                player.play(stretch, arms, part.margins)
+            for place, (player, arms) in enumerate(zip(players, decoders.read(stretch), strict=True)):
+                batch = player.play(stretch, arms, part.margins)
+                if watch is not None:
+                    watch(place, stretch.ticks, batch)
             if stretch.is_exact:
                 exact.append((int(stretch.ticks.t_ns[0]), int(stretch.ticks.t_ns[-1])))
             done += len(stretch.ticks.cycle)

@@ -1,0 +1,257 @@
+"""Thresholds, filter and gain found from logs: candidates, how each is judged, and which one is suggested.
+
+Every candidate gets the thresholds that one half of the logs gives it for the wanted rate of false alarms: those at
+which the tail's upper 95 % bound is that rate. Then the logs are replayed with it, thresholds and all. It is fit if it
+adapts as often as the logs' own settings do, misses none of the contacts that those were armed for, and has no more
+false alarms than the wanted rate allows; of the fit ones the one with the smallest median delay is suggested. Where a
+wanted rate is extrapolated too far, the bounds of the tails differ more by chance than the candidates do: then filter
+and gain stay as they are. Without the truth nobody knows a delay: only thresholds are found then, too.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from adacd_hil.analysis.false_alarms import TooLittleMotionError
+from adacd_hil.analysis.replay.replay import Replay, replay_many
+from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.sweep.tune_bounds import least_rate_per_h
+from adacd_hil.analysis.sweep.tune_detectors import observe_detectors
+from adacd_hil.analysis.sweep.tune_logs import TunedLog, read_logs
+from adacd_hil.analysis.sweep.tune_roc import Choice, choose, delay_figures
+from adacd_hil.analysis.sweep.tune_scheme import (
+    Changes,
+    candidates,
+    name_of,
+    observe_candidates,
+    thresholds_as_changes,
+)
+
+LIMITS: Final = (
+    "The arm in the logs moved as its own scheme had it move. After a contact it braked when that scheme found it, the "
+    "excitation was the recorded one, and a payload was changed when it was: what an earlier reaction, another motion "
+    "or another arm would have come to is not in these figures. Delays are on the host's clock, from the true onset."
+)
+FARTHEST: Final = 100.0
+"""Extrapolation beyond which filters and gains are not told apart: thresholds of equal ones differ by a factor of 4."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What replays of all logs with the same settings came to. missed, false_alarms: None without the truth."""
+
+    adaptation_s: tuple[float, ...]
+    unfinished: int
+    missed: int | None
+    false_alarms: int | None
+    hours: float
+    delays_ms: tuple[float, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "adaptations": len(self.adaptation_s),
+            "unfinished": self.unfinished,
+            "adaptation_s": list(self.adaptation_s),
+            "missed": self.missed,
+            "false_alarms": self.false_alarms,
+            "monitored_h": self.hours,
+            "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
+        }
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A filter and a gain with the thresholds chosen for them, what they come to, and why they are not fit."""
+
+    name: str
+    changes: Changes
+    choice: Choice
+    outcome: Outcome
+    problems: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "name": self.name,
+            "changes": self.changes,
+            "problems": list(self.problems),
+            "thresholds": choice_as_json(self.choice),
+            "replayed": self.outcome.as_json(),
+        }
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What was found. detectors: those of `scheme.detectors`, empty where the motion is too short for them."""
+
+    rate_per_h: float
+    logs: tuple[TunedLog, ...]
+    own: Outcome
+    candidates: tuple[Candidate, ...]
+    best: Candidate | None
+    detectors: tuple[Choice, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the other half shows the wanted rate: its upper 95 % bound is not above it."""
+        return self.best is not None and self.best.choice.checked.rate_bound_per_h <= self.rate_per_h
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "rate_per_h": self.rate_per_h,
+            "is_shown": self.is_shown,
+            "logs": [
+                {
+                    "path": str(log.path),
+                    "sha256": log.digest,
+                    "free_h": free_hours(log),
+                    "contacts": None if log.windows is None else len(log.windows),
+                }
+                for log in self.logs
+            ],
+            "own": self.own.as_json(),
+            "suggested": None if self.best is None else self.best.as_json(),
+            "candidates": [candidate.as_json() for candidate in self.candidates],
+            "detectors": [choice_as_json(choice) | {"name": choice.name} for choice in self.detectors],
+            "notes": list(self.notes),
+            "limits": LIMITS,
+        }
+
+
+def free_hours(log: TunedLog) -> float:
+    """Give how long nobody touched the arm while it monitored, h."""
+    return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
+
+
+def choice_as_json(choice: Choice) -> dict[str, Any]:
+    """Give thresholds and their ROC in plain values."""
+    return {
+        "thresholds": choice.thresholds.tolist(),
+        "method": choice.method,
+        "chosen_on": choice.chosen.as_json(),
+        "checked_on": choice.checked.as_json(),
+        "roc": [
+            {"factor": factor, "predicted_per_h": predicted} | found.as_json()
+            for factor, found, predicted in choice.roc
+        ],
+    }
+
+
+def tune(paths: Sequence[Path], rate_per_h: float, config: str | None, progress: Callable[[str], None]) -> Tuning:
+    """Find thresholds, filter and gain. config: name or file of the settings to start from.
+
+    Raises LogError, ConfigError, CodecError, TooLittleMotionError.
+    """
+    progress(f"reading {len(paths)} logs")
+    logs = read_logs(paths, config)
+    has_truth = any(log.windows is not None for log in logs)
+    notes = [] if has_truth else ["no truth.mcap beside the logs: contacts and delays are not known, and an alarm of a "
+                                  "logged run counts as a contact"]  # fmt: skip
+    detectors: list[Choice] = []
+    try:
+        detectors = [choose(observed, rate_per_h) for observed in observe_detectors(logs)]
+    except TooLittleMotionError as error:
+        notes.append(f"the detectors can't be compared: {error}")
+    tried = candidates(logs[0].settings) if has_truth else [{}]
+    settings = logs[0].settings
+    tried, choices = _choices(logs, tried, rate_per_h, progress, notes)
+    changes = [
+        filter_and_gain | thresholds_as_changes(apply_settings(settings, filter_and_gain), choice.thresholds)
+        for filter_and_gain, choice in zip(tried, choices, strict=True)
+    ]
+    own, *outcomes = replay_all(logs, [{}, *changes], progress)
+    judged = [
+        Candidate(name_of(filter_and_gain), change, choice, outcome, _problems(choice, outcome, own, rate_per_h))
+        for filter_and_gain, change, choice, outcome in zip(tried, changes, choices, outcomes, strict=True)
+    ]
+    if len(judged) > 1 and judged[0].choice.extrapolation > FARTHEST:
+        notes.append(f"a rate of {rate_per_h:g} per hour is too far from this motion to choose filter and gain by it")
+    return Tuning(rate_per_h, tuple(logs), own, tuple(judged), _best(judged), tuple(detectors), tuple(notes))
+
+
+def _choices(
+    logs: Sequence[TunedLog],
+    tried: Sequence[Changes],
+    rate_per_h: float,
+    progress: Callable[[str], None],
+    notes: list[str],
+) -> tuple[list[Changes], list[Choice]]:
+    """Choose thresholds for each filter and gain; leave out, with a note, what never monitors untouched motion."""
+    chosen: list[tuple[Changes, Choice]] = []
+    for changes, observed in zip(tried, observe_candidates(logs, tried, progress), strict=True):
+        try:
+            chosen.append((changes, choose(observed, rate_per_h)))
+        except TooLittleMotionError as error:
+            if not changes:
+                raise TooLittleMotionError(f"{error}, with the settings to start from") from None
+            notes.append(f"{name_of(changes)}: {error}")
+    return [changes for changes, _ in chosen], [choice for _, choice in chosen]
+
+
+def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Callable[[str], None]) -> list[Outcome]:
+    """Replay all logs with each of the variants. Raises LogError, ConfigError, CodecError."""
+    results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
+    for log in logs:
+        progress(f"replaying {log.path} with the thresholds found")
+        replays = replay_many(log.path, [apply_settings(log.settings, changes) for changes in variants])
+        for gathered, found in zip(results, replays, strict=True):
+            gathered.append((log, found))
+    return [_outcome(gathered) for gathered in results]
+
+
+def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> Outcome:
+    took_s = [each for _, found in replays for each in found.adaptation_s]
+    judged = [found for _, found in replays if found.true_contacts is not None]
+    armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
+    contacts = [
+        contact
+        for log, found in replays
+        for contact in found.true_contacts or ()
+        if (log.path, contact.number) in armed
+    ]
+    delays = [contact.delay_ms for contact in contacts if contact.delay_ms is not None]
+    return Outcome(
+        adaptation_s=tuple(each for each in took_s if each is not None),
+        unfinished=sum(each is None for each in took_s),
+        missed=len(armed) - len(delays) if judged else None,
+        false_alarms=sum(found.false_alarms or 0 for found in judged) if judged else None,
+        hours=sum(found.monitored_s for found in judged) / 3600.0,
+        delays_ms=tuple(delays),
+    )
+
+
+def _problems(choice: Choice, outcome: Outcome, own: Outcome, rate_per_h: float) -> tuple[str, ...]:
+    """Say why a candidate is not fit."""
+    problems = []
+    if choice.calibration is None:
+        problems.append("too little motion for a tail")
+    if len(outcome.adaptation_s) < len(own.adaptation_s):
+        problems.append(f"{len(own.adaptation_s) - len(outcome.adaptation_s)} adaptations don't finish")
+    if outcome.missed:
+        problems.append(f"{outcome.missed} missed")
+    if least_rate_per_h(choice.checked.alarms, choice.checked.hours) > rate_per_h:
+        problems.append(f"{choice.checked.alarms} false alarms in the half to check on")
+    elif outcome.false_alarms and least_rate_per_h(outcome.false_alarms, outcome.hours) > rate_per_h:
+        problems.append(f"{outcome.false_alarms} false alarms")
+    return tuple(problems)
+
+
+def _best(judged: Sequence[Candidate]) -> Candidate | None:
+    """Return the fit candidate with the smallest median delay of the half that thresholds are chosen on.
+
+    Of a rate that is extrapolated too far, only the logs' own filter and gain, which come first, are looked at.
+    """
+    looked_at = judged[:1] if judged[0].choice.extrapolation > FARTHEST else judged
+    fit = [candidate for candidate in looked_at if not candidate.problems]
+    return min(fit, key=_delays, default=None)
+
+
+def _delays(candidate: Candidate) -> tuple[float, ...]:
+    """Give median, 90th percentile and largest, by which equal medians are told apart; infinite of no contact."""
+    figures = delay_figures(candidate.choice.chosen.delays_ms)
+    return tuple(math.inf if each is None else each for each in figures)

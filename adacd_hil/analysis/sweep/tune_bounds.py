@@ -1,0 +1,30 @@
+"""Exact confidence bounds of what was counted: of a share, and of a rate.
+
+Sources: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
+Biometrika 26 (1934); Garwood, "Fiducial limits for the Poisson distribution", Biometrika 28 (1936).
+"""
+
+import math
+from typing import Final
+
+from scipy.special import betaincinv, gammaincinv
+
+CONFIDENCE: Final = 0.95
+
+
+def share_bounds(found: int, count: int) -> tuple[float, float]:
+    """Give the 95 % interval of a share of which `found` of `count` were seen; (0, 1) of none."""
+    rest = 0.5 * (1.0 - CONFIDENCE)
+    low = float(betaincinv(found, count - found + 1, rest)) if found > 0 else 0.0
+    high = float(betaincinv(found + 1, count - found, 1.0 - rest)) if found < count else 1.0
+    return low, high
+
+
+def rate_bound_per_h(alarms: int, hours: float) -> float:
+    """Give the upper 95 % bound of a rate, one-sided: 3 / T after T hours without an alarm; infinite without time."""
+    return float(gammaincinv(alarms + 1, CONFIDENCE)) / hours if hours > 0.0 else math.inf
+
+
+def least_rate_per_h(alarms: int, hours: float) -> float:
+    """Give the lower 95 % bound of a rate, one-sided; 0 after no alarm."""
+    return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0

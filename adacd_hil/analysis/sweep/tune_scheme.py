@@ -1,0 +1,184 @@
+"""The logs' own scheme with other filters and gains, replayed: what its residuals show to a ROC.
+
+The paper's scheme is replayed with thresholds that nothing exceeds, so that every candidate keeps monitoring and its
+residual is seen; the model is frozen while it does. The certified scheme learns on, and what is over a threshold it
+does not learn: it is replayed with its own thresholds, and its statistic is the largest ratio to them, which grow with
+`certified.noise_sigmas` and `certified.model_sigmas` (but for the friction that is allowed at standstill).
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from adacd_hil.analysis.replay.replay import Watch, replay_many
+from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.sweep.tune_logs import TunedLog
+from adacd_hil.analysis.sweep.tune_roc import Observed, Touched
+from adacd_hil.config import ConfigError, Settings
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.scheme.batch import SchemeBatch
+from adacd_hil.scheme.selection import layout_of
+
+_FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)
+_GAIN_FACTORS: Final = (1.0, 0.3, 3.0)
+_NOTHING_EXCEEDS_Nm: Final = 100.0
+"""The largest threshold that a configuration may have."""
+
+Changes = dict[str, str]
+
+
+def candidates(settings: Settings) -> list[Changes]:
+    """List changes of filter and gain to try, none first; what a configuration can't have is left out."""
+    tried: list[Changes] = []
+    for filter_factor in _FILTER_FACTORS:
+        for gain_factor in _GAIN_FACTORS:
+            changes: Changes = {}
+            if filter_factor != 1.0:
+                changes |= _filter(settings, filter_factor)
+            if gain_factor != 1.0:
+                changes |= _gain(settings, gain_factor)
+            try:
+                apply_settings(settings, changes)
+            except ConfigError:
+                continue
+            tried.append(changes)
+    return tried
+
+
+def _filter(settings: Settings, factor: float) -> Changes:
+    """Change the cut-offs; of the paper's filter b, too, which keeps its gain at rest."""
+    if settings.scheme == "certified":
+        return {"certified.cutoffs_rad_s": in_toml([factor * each for each in settings.certified.cutoffs_rad_s])}
+    pair = {"a_rad_s": settings.filter.a_rad_s, "b_rad_s": settings.filter.b_rad_s}
+    return {f"filter.{name}": in_toml(factor * value) for name, value in pair.items()}
+
+
+def _gain(settings: Settings, factor: float) -> Changes:
+    """Change how much a sample corrects: P(0), or what is believed of a sample's residual, whose square divides."""
+    if settings.scheme == "certified":
+        return {"certified.residual_Nm": in_toml(settings.certified.residual_Nm / factor**0.5)}
+    return {"estimator.P0": in_toml([factor * each for each in settings.estimator.P0])}
+
+
+def in_toml(value: float | Sequence[float]) -> str:
+    """Write a number, or several, with four digits."""
+    if isinstance(value, int | float):
+        return repr(float(f"{value:.4g}"))
+    return "[" + ", ".join(in_toml(each) for each in value) + "]"
+
+
+def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
+    """Say thresholds (1, n) of `observe_candidates` as settings, rounded up; within what a configuration may have."""
+    up = 1.0005  # four digits are never less than what was chosen
+    if settings.scheme == "certified":
+        factor = up * float(thresholds[0, 0])
+        own = {"noise_sigmas": settings.certified.noise_sigmas, "model_sigmas": settings.certified.model_sigmas}
+        return {f"certified.{name}": in_toml(min(max(factor * each, 1.0), 50.0)) for name, each in own.items()}
+    low, high = 1e-3, _NOTHING_EXCEEDS_Nm
+    return {"detector.threshold_Nm": in_toml([min(max(up * each, low), high) for each in thresholds[0].tolist()])}
+
+
+def observe_candidates(
+    logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Callable[[str], None]
+) -> list[Observed]:
+    """Replay the logs with every candidate. Raises LogError, ConfigError, CodecError."""
+    gathered: list[list[_Shown]] = [[] for _ in tried]
+    for log in logs:
+        progress(f"replaying {log.path} with {len(tried)} filters and gains")
+        variants = [_monitoring(apply_settings(log.settings, changes)) for changes in tried]
+        shown = [_Shown(log, settings) for settings in variants]
+        replay_many(log.path, variants, watch=_show_to(shown))
+        for place, one in enumerate(shown):
+            gathered[place].append(one)
+    has_truth = any(log.windows is not None for log in logs)
+    return [
+        Observed(
+            name_of(changes),
+            np.concatenate([one.peaks() for one in all_logs]),
+            np.concatenate([log.is_chosen_on for log in logs]),
+            tuple(touched for one in all_logs for touched in one.touches()) if has_truth else None,
+        )
+        for changes, all_logs in zip(tried, gathered, strict=True)
+    ]
+
+
+def _show_to(shown: "Sequence[_Shown]") -> Watch:
+    return lambda place, ticks, batch: shown[place].take(ticks, batch)
+
+
+def name_of(changes: Mapping[str, str]) -> str:
+    """Name a candidate by what it changes."""
+    return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
+
+
+def _monitoring(settings: Settings) -> Settings:
+    """Return settings of the paper's scheme with which it never reacts; those of the certified scheme as they are."""
+    if settings.scheme == "certified":
+        return settings
+    thresholds = (_NOTHING_EXCEEDS_Nm, _NOTHING_EXCEEDS_Nm)
+    return dataclasses.replace(settings, detector=dataclasses.replace(settings.detector, threshold_Nm=thresholds))
+
+
+class _Shown:
+    """What one candidate shows on one log of N cycles, stretch by stretch."""
+
+    def __init__(self, log: TunedLog, settings: Settings) -> None:
+        self._log = log
+        self._is_certified = settings.scheme == "certified"
+        self._slices = layout_of(settings).slices
+        channels = 1 if self._is_certified else JOINTS
+        self._peaks = np.full((len(log.is_chosen_on), 1, channels), -np.inf)
+        self._is_armed = np.zeros(len(log.t_ns), dtype=np.bool_)
+        self._windows = [window for window in log.windows or () if window.is_armed]
+        self._kept = np.zeros(len(log.t_ns), dtype=np.bool_)
+        for window in self._windows:
+            self._kept[window.first : window.last + 1] = True
+        self._place = np.cumsum(self._kept) - 1
+        self._statistic = np.zeros((int(self._kept.sum()), 1, channels))
+
+    def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Take in a stretch; of cycles that the log knows nothing of, nothing is taken."""
+        rows = np.minimum(np.searchsorted(self._log.t_ns, ticks.t_ns), len(self._log.t_ns) - 1)
+        known = np.flatnonzero(self._log.t_ns[rows] == ticks.t_ns)
+        if known.size == 0:
+            return
+        rows, statistic = rows[known], self._statistic_of(batch.block[known])
+        self._is_armed[rows] = batch.previous_state[known] == SchemeState.MONITOR
+        counted = np.flatnonzero(self._is_armed[rows] & self._log.motion.is_free[rows])
+        if counted.size:
+            blocks = rows[counted] // self._log.block
+            starts = np.flatnonzero(np.diff(blocks, prepend=-1))
+            largest = np.maximum.reduceat(statistic[counted], starts, axis=0)
+            self._peaks[blocks[starts]] = np.maximum(self._peaks[blocks[starts]], largest)
+        kept = self._kept[rows]
+        self._statistic[self._place[rows[kept]]] = statistic[kept]
+
+    def _statistic_of(self, block: Vector) -> Vector:
+        """Return what is compared with the thresholds that are to be chosen (k, 1, channels)."""
+        if self._is_certified:
+            bank, threshold = (block[:, self._slices[name]] for name in ("tau_ext_bank", "threshold_bank"))
+            return np.asarray((np.abs(bank) / threshold).max(axis=1))[:, None, None]
+        allowance = block[:, self._slices["threshold"]] - _NOTHING_EXCEEDS_Nm
+        return np.asarray(np.abs(block[:, self._slices["tau_ext_hat"]]) - allowance)[:, None, :]
+
+    def peaks(self) -> Vector:
+        """Return the peaks (B, 1, channels), NaN where not all of a block could be counted."""
+        peaks = np.where(np.isfinite(self._peaks), self._peaks, np.nan)
+        whole = np.logical_and.reduceat(self._log.motion.is_free, np.arange(len(peaks)) * self._log.block)
+        peaks[~whole] = np.nan
+        return peaks
+
+    def touches(self) -> list[Touched]:
+        """Return what was shown of the contacts that the log's scheme was armed for."""
+        touches = []
+        for window in self._windows:
+            rows = slice(window.first, window.last + 1)
+            since_s = (self._log.t_ns[rows] - self._log.t_ns[window.first]) * 1e-9
+            statistic = self._statistic[self._place[rows]]
+            if not self._is_armed[window.first]:
+                since_s, statistic = since_s[:0], statistic[:0]
+            touches.append(Touched(since_s, statistic, window.is_chosen_on))
+        return touches

@@ -1,0 +1,479 @@
+"""Tuning: what is counted and bounded, what is chosen on one half, which candidate is suggested, and as what."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from adacd_hil.analysis import tune_logs
+from adacd_hil.analysis.false_alarms import TooLittleMotionError, calibrate_detector
+from adacd_hil.analysis.replay.replay import contacts_beside
+from adacd_hil.analysis.replay.source import LogSource
+from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.sweep.tune import Candidate, Outcome, Tuning, _best, _problems
+from adacd_hil.analysis.sweep.tune_bounds import least_rate_per_h, rate_bound_per_h, share_bounds
+from adacd_hil.analysis.sweep.tune_config import base_of, suggested_toml
+from adacd_hil.analysis.sweep.tune_figures import write_tuning
+from adacd_hil.analysis.sweep.tune_logs import Window, read_logs
+from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, choose
+from adacd_hil.analysis.sweep.tune_scheme import _Shown, candidates, observe_candidates, thresholds_as_changes
+from adacd_hil.cli.demo import Cast, run_embedded
+from adacd_hil.cli.main import cli
+from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, load_settings, to_toml
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import read_log
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme.selection import layout_of
+from firmware_sim.scenario import load_scenario
+
+M, A = SchemeState.MONITOR, SchemeState.ADAPT
+
+
+# what was counted
+
+
+@pytest.mark.parametrize(
+    ("alarms", "hours", "bound"), [(0, 10.0, 0.299573), (3, 1.0, 7.753657), (3, 2.0, 3.876828), (0, 0.0, math.inf)]
+)
+def test_a_rate_has_an_exact_upper_bound(alarms, hours, bound):
+    assert rate_bound_per_h(alarms, hours) == pytest.approx(bound, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("alarms", "hours", "bound"), [(0, 1.0, 0.0), (1, 1.0, 0.0512933), (3, 2.0, 0.408846), (1, 0.0, 0.0)]
+)
+def test_a_rate_has_an_exact_lower_bound(alarms, hours, bound):
+    assert least_rate_per_h(alarms, hours) == pytest.approx(bound, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("found", "count", "bounds"),
+    [(0, 10, (0.0, 0.308497)), (10, 10, (0.691503, 1.0)), (8, 10, (0.443905, 0.974789)), (0, 0, (0.0, 1.0))],
+)
+def test_a_share_has_the_interval_of_clopper_and_pearson(found, count, bounds):
+    assert share_bounds(found, count) == pytest.approx(bounds, rel=1e-5)
+
+
+# thresholds from one half
+
+
+def observed(seconds=600.0, touches=(), seed=1):
+    """Peaks of two joints: most are 0, some exponential ones stand apart; the first half chooses."""
+    generator = np.random.default_rng(seed)
+    count = round(seconds / 0.1)
+    peaks = 0.01 * generator.random((count, 1, 2))
+    peaks[::20, 0] += generator.exponential(0.02, (len(peaks[::20]), 2))
+    return Observed("made", peaks, np.arange(count) < count // 2, touches)
+
+
+def touched(height, is_chosen_on=False):
+    """The statistic of joint 2 rises by `height` each 10 ms."""
+    since_s = np.arange(20) * 0.01
+    statistic = np.zeros((20, 1, 2))
+    statistic[:, 0, 1] = height * np.arange(20)
+    return Touched(since_s, statistic, is_chosen_on)
+
+
+NOTHING = Touched(np.zeros(0), np.zeros((0, 1, 2)), False)
+
+
+def test_thresholds_are_chosen_on_one_half_and_checked_on_the_other():
+    before = choose(observed(), 1.0)
+    made = observed()
+    made.peaks[-100, 0, 1] = 99.0
+    after = choose(made, 1.0)
+    np.testing.assert_array_equal(after.thresholds, before.thresholds)
+    assert (after.chosen.alarms, before.checked.alarms, after.checked.alarms) == (0, 0, 1)
+    assert before.checked.hours == pytest.approx(300.0 / 3600.0)
+    assert (before.roc[-1][1].alarms, after.roc[-1][1].alarms) == (0, 1)
+
+
+def test_the_bound_of_the_tail_is_the_wanted_rate():
+    choice = choose(observed(), 1.0)
+    calibration = choice.calibration
+    assert choice.method == "tail model, extrapolated 12-fold"
+    assert choose(observed(), 60.0).method == "tail model"
+    assert calibration.bound > 1.05 * calibration.threshold
+    calibrated = calibrate_detector(observed().half(True), 0.1, 1.0)
+    surer = calibrated.calibration.bound / calibrated.calibration.threshold
+    np.testing.assert_allclose(choice.thresholds, surer * calibrated.thresholds, rtol=1e-12)
+    predicted = dict(zip(FACTORS, (rate for _, _, rate in choice.roc), strict=True))
+    assert predicted[1.0] < 1.0
+    assert predicted[FACTORS[0]] is None
+    assert predicted[1.0] == pytest.approx(calibration.tail.rate_at(calibration.bound / calibration.threshold))
+
+
+def test_a_delay_is_that_of_the_first_sample_over_a_threshold_and_what_was_not_armed_is_missed():
+    made = observed(touches=(touched(1e4), touched(1e-9), NOTHING, touched(1e4, is_chosen_on=True)))
+    choice = choose(made, 1.0)
+    assert (choice.chosen.contacts, choice.checked.contacts) == (1, 3)
+    assert choice.checked.delays_ms == pytest.approx((10.0,))
+    exact = choose(observed(touches=(touched(choice.thresholds[0, 1] / 5.0),)), 1.0)
+    assert exact.checked.delays_ms == pytest.approx((60.0,)), "over, not equal"
+
+
+def test_along_a_roc_fewer_alarms_are_paid_with_fewer_contacts():
+    choice = choose(observed(touches=tuple(touched(0.002 * k) for k in range(1, 30))), 1.0)
+    alarms = [found.alarms for _, found, _ in choice.roc]
+    shares = [len(found.delays_ms) for _, found, _ in choice.roc]
+    assert alarms == sorted(alarms, reverse=True)
+    assert shares == sorted(shares, reverse=True)
+    assert alarms[0] > 10 > alarms[-1] == 0
+    assert shares[0] > 20 > shares[-1]
+    assert choice.roc[0][1].hours == pytest.approx(300.0 / 3600.0), "alarms are counted where nothing was chosen"
+
+
+def test_too_little_motion_gives_the_largest_value_seen_and_says_so():
+    made = observed(20.0)
+    choice = choose(made, 1.0)
+    assert choice.calibration is None
+    assert "too little motion" in choice.method
+    np.testing.assert_array_equal(choice.thresholds, made.peaks[:100].max(axis=0))
+    assert {rate for _, _, rate in choice.roc} == {None}
+    made.peaks[:100] = np.nan
+    with pytest.raises(TooLittleMotionError, match="no contact-free motion"):
+        choose(made, 1.0)
+
+
+def test_without_truth_there_are_no_contacts():
+    found = choose(observed(touches=None), 1.0).checked
+    assert found.contacts is None
+    assert set(found.as_json()) == {"hours", "false_alarms", "rate_bound_per_h", "contacts"}
+
+
+# candidates
+
+
+def test_candidates_change_filter_and_gain_within_what_a_configuration_can_have():
+    paper = load_settings("paper")
+    tried = candidates(paper)
+    assert len(tried) == 12
+    assert tried[0] == {}
+    fast = next(each for each in tried if each.get("filter.a_rad_s") == "20.0" and len(each) == 2)
+    assert fast["filter.b_rad_s"] == "20.0"
+    assert {"estimator.P0": "[2.4, 1.2, 1.2, 0.15, 0.15, 0.15, 0.15]"} in tried
+    near_the_end = apply_settings(paper, {"filter.a_rad_s": "400"})
+    assert not [each for each in candidates(near_the_end) if each.get("filter.a_rad_s") == "1600.0"]
+    certified = candidates(load_settings("certified"))
+    assert {"certified.cutoffs_rad_s": "[20.0, 100.0, 400.0]"} in certified
+    assert {"certified.residual_Nm": "0.03651"} in certified, "a third of the gain"
+
+
+def test_thresholds_become_settings_that_are_never_lower():
+    paper, certified = load_settings("paper"), load_settings("certified")
+    assert thresholds_as_changes(paper, np.array([[0.12344, 1e-5]])) == {"detector.threshold_Nm": "[0.1235, 0.001]"}
+    assert thresholds_as_changes(paper, np.array([[400.0, 0.2]]))["detector.threshold_Nm"].startswith("[100.0, ")
+    raised = thresholds_as_changes(certified, np.array([[2.0]]))
+    assert raised == {"certified.noise_sigmas": "13.01", "certified.model_sigmas": "10.0"}
+    assert set(thresholds_as_changes(certified, np.array([[1e-3]])).values()) == {"1.0"}
+    assert set(thresholds_as_changes(certified, np.array([[1e3]])).values()) == {"50.0"}
+
+
+def hand_made_log(count=400):
+    """400 cycles, all free but for a contact in rows 200 to 249; a second one, of which nobody was armed."""
+    is_free = np.ones(count, bool)
+    is_free[150:300] = False
+    windows = (Window(1, 1, 200, 249, True, True), Window(2, 1, 260, 270, False, False))
+    return SimpleNamespace(
+        t_ns=np.arange(count) * 1_000_000,
+        windows=windows,
+        motion=SimpleNamespace(is_free=is_free, period_s=1e-3),
+        is_chosen_on=np.ones(4, bool),
+        block=100,
+    )
+
+
+def batch_of(settings, states, **fields):
+    """Decisions of some cycles: their states, and what a block has in each."""
+    layout = layout_of(settings)
+    block = np.zeros((len(states), layout.size))
+    for name, value in fields.items():
+        block[:, layout.slices[name]] = value
+    return SimpleNamespace(block=block, previous_state=np.array(states, np.uint8))
+
+
+def test_the_paper_s_residual_is_taken_less_what_friction_may_hold_where_it_monitors_untouched():
+    settings = load_settings("paper")
+    shown = _Shown(hand_made_log(), settings)
+    states = [A] * 50 + [M] * 350
+    value = np.linspace(0.0, 1.0, 400)[:, None] * [1.0, -2.0]
+    rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
+    shown.take(rows, batch_of(settings, states, tau_ext_hat=value, threshold=100.0 + np.array([0.0, 0.5])))
+    peaks = shown.peaks()
+    np.testing.assert_allclose(peaks[0, 0], [99 / 399, 2 * 99 / 399 - 0.5], atol=1e-12)
+    assert np.isnan(peaks[1:3]).all(), "a block of which a part doesn't count"
+    np.testing.assert_allclose(peaks[3, 0], [1.0, 1.5])
+    (contact,) = shown.touches()
+    assert len(contact.since_s) == 50
+    np.testing.assert_allclose(contact.statistic[0, 0], [200 / 399, 400 / 399 - 0.5])
+    assert contact.since_s[-1] == pytest.approx(0.049)
+
+
+def test_a_candidate_that_does_not_monitor_misses_the_contact_and_counts_no_motion():
+    settings = load_settings("paper")
+    shown = _Shown(hand_made_log(), settings)
+    states = [M] * 100 + [A] * 300
+    rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000)
+    shown.take(rows, batch_of(settings, states, tau_ext_hat=1.0, threshold=100.0))
+    assert np.isfinite(shown.peaks()[:, 0, 0]).tolist() == [True, False, False, False]
+    assert [len(contact.since_s) for contact in shown.touches()] == [0]
+
+
+def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds():
+    settings = load_settings("certified")
+    shown = _Shown(hand_made_log(), settings)
+    bank = np.zeros(2 * settings.channel_count)
+    bank[3] = -0.3
+    rows = SimpleNamespace(t_ns=np.arange(400) * 1_000_000 + np.where(np.arange(400) < 100, 0, 7))
+    shown.take(rows, batch_of(settings, [M] * 400, tau_ext_bank=bank, threshold_bank=0.2))
+    peaks = shown.peaks()
+    assert peaks[0].item() == pytest.approx(1.5)
+    assert np.isnan(peaks[1:]).all(), "cycles that the log knows nothing of"
+
+
+# which one is suggested
+
+
+def outcome(**changes):
+    return dataclasses.replace(Outcome((5.0, 6.0), 0, 0, 0, 0.01, (2.0, 4.0)), **changes)
+
+
+@functools.cache
+def choice_of(seconds):
+    return choose(observed(seconds, touches=(touched(1.0), touched(1.0, True))), 1.0)
+
+
+def candidate(delay_ms=2.0, name="made", changes=None, problems=(), seconds=600.0):
+    choice = choice_of(seconds)
+    chosen = choice.chosen._replace(delays_ms=() if delay_ms is None else (delay_ms,))
+    choice = dataclasses.replace(choice, chosen=chosen)
+    return Candidate(name, changes or {"filter.a_rad_s": "20.0"}, choice, outcome(), problems)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({}, ()),
+        ({"adaptation_s": (5.0,)}, ("1 adaptations don't finish",)),
+        ({"missed": 1}, ("1 missed",)),
+        ({"missed": None, "false_alarms": None}, ()),
+        ({"false_alarms": 1}, ("1 false alarms",)),
+        ({"false_alarms": 1, "hours": 10.0}, ()),
+    ],
+)
+def test_a_candidate_is_fit_if_it_adapts_misses_nothing_and_alarms_no_more_than_wanted(changes, problem):
+    assert _problems(candidate().choice, outcome(**changes), outcome(), 1.0) == problem
+
+
+def test_alarms_in_the_half_to_check_on_and_too_short_a_motion_are_no_fit():
+    choice = candidate().choice
+    alarmed = dataclasses.replace(choice, checked=choice.checked._replace(alarms=2))
+    assert _problems(alarmed, outcome(), outcome(), 1.0) == ("2 false alarms in the half to check on",)
+    assert _problems(candidate(seconds=20.0).choice, outcome(), outcome(), 1.0)[0] == "too little motion for a tail"
+
+
+def test_of_the_fit_ones_the_fastest_is_suggested():
+    slow, fast, unfit = candidate(4.0), candidate(3.0), candidate(1.0, problems=("1 missed",))
+    assert _best([slow, fast, unfit, candidate(None)]) is fast
+    assert _best([unfit]) is None
+    early, late = (
+        dataclasses.replace(
+            each, choice=dataclasses.replace(each.choice, chosen=each.choice.chosen._replace(delays_ms=d))
+        )
+        for each, d in ((fast, (2.0, 3.0, 8.0)), (slow, (2.0, 3.0, 9.0)))
+    )
+    assert _best([late, early]) is early
+
+
+def test_a_rate_too_far_from_the_motion_leaves_filter_and_gain_as_they_are():
+    def far(delay_ms, rate_per_h):
+        made = candidate(delay_ms)
+        return dataclasses.replace(
+            made, choice=dataclasses.replace(choose(observed(), rate_per_h), chosen=made.choice.chosen)
+        )
+
+    assert [round(far(1.0, rate).choice.extrapolation, 6) for rate in (0.125, 0.12)] == [96.0, 100.0]
+    own, faster = far(4.0, 0.1), far(3.0, 0.1)
+    assert _best([own, faster]) is own
+    own, faster = far(4.0, 0.125), far(3.0, 0.125)
+    assert _best([own, faster]) is faster
+
+
+def tuning_of(best, rate_per_h=1.0, path="run.mcap", **changes):
+    free = SimpleNamespace(is_free=np.ones(7200, bool), period_s=1e-3)
+    settings = apply_settings(load_settings("paper"), changes.pop("settings", {}))
+    log = SimpleNamespace(path=Path(path), digest="ab" * 32, settings=settings, motion=free, windows=())
+    others = {"own": outcome(), "detectors": (), "notes": (), **changes}
+    return Tuning(rate_per_h, (log,), candidates=(best,), best=best, **others)
+
+
+def test_the_suggestion_is_a_configuration_of_the_changed_keys_with_where_they_come_from(tmp_path):
+    best = candidate(
+        changes={"filter.a_rad_s": "20.0", "filter.b_rad_s": "10.0", "detector.threshold_Nm": "[0.2, 0.3]"}
+    )
+    tuning = tuning_of(best, path="a\nb.mcap", settings={"arm.profile": "M", "termination.beta_Nm": "0.2"})
+    text = suggested_toml(tuning, best, "paper", load_settings("paper", "M"))
+    file = tmp_path / "tuned.toml"
+    file.write_text(text)
+    settings = load_settings(str(file))
+    assert settings.filter.a_rad_s == 20.0
+    assert settings.detector.threshold_Nm == (0.2, 0.3)
+    assert settings == dataclasses.replace(apply_settings(load_settings("paper", "M"), best.changes), name="tuned")
+    rows = [line for line in text.splitlines() if line and not line.startswith("#")]
+    assert rows == [
+        'extends = "paper"', "[arm]", 'profile = "M"', "[filter]", "a_rad_s = 20.0", "[detector]",
+        "threshold_Nm = [0.2, 0.3]",
+    ]  # fmt: skip
+    for words in (
+        "version",
+        "SHA-256 " + "ab" * 32, "0.0020 h", "a?b.mcap", "1 false alarms per hour", "tail model, extrapolated 12-fold",
+        "Checked on: 0 false alarms in 0.0833 h, 95 % bound 35.9 per hour; 1 of 1 contacts found (3 to 100 %)",
+        "not shown", "2 adaptations of 5.00 to 6.00 s, 0 missed, 0 false alarms, after 3.0 ms", "termination.beta_Nm",
+    ):  # fmt: skip
+        assert words in text
+
+
+def test_the_wanted_rate_is_shown_only_by_what_was_counted():
+    assert not tuning_of(candidate(), 35.0).is_shown
+    assert tuning_of(candidate(), 36.0).is_shown
+    assert not dataclasses.replace(tuning_of(candidate(), 36.0), best=None).is_shown
+
+
+def test_a_configuration_that_nobody_can_extend_is_asked_for():
+    own = dataclasses.replace(load_settings("paper"), name="mine")
+    with pytest.raises(ConfigError, match=r"'mine' isn't built in.*--config"):
+        base_of(own, None)
+    assert base_of(own, "certified")[1].scheme == "certified"
+
+
+def test_the_report_has_the_figures_and_what_they_show(tmp_path):
+    with_truth = write_tuning(tuning_of(candidate()), tmp_path / "a")
+    assert [path.name for path in with_truth] == ["tune.json", "roc.png", "roc.svg", "delays.png", "delays.svg"]
+    content = json.loads(with_truth[0].read_text())
+    assert content["suggested"]["thresholds"]["checked_on"]["found"] == 1
+    assert len(content["suggested"]["thresholds"]["roc"]) == len(FACTORS)
+    blind = dataclasses.replace(candidate(), choice=choose(observed(touches=None), 1.0))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogError, match="can't be written"):
+        write_tuning(tuning_of(blind), tmp_path / "file")
+
+
+# a log
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """Five seconds of the paper's scheme in a hurry: it has adapted in less than one, and is pushed once."""
+    folder = tmp_path_factory.mktemp("tune")
+    file = folder / "pushed.toml"
+    contact = "link = 1, point_m = 0.25, angle_deg = 90.0, duration_s = 0.1"
+    file.write_text(
+        'about = "x"\ngroup = "x"\nlasts_s = 4.4\nstart_deg = [-30.0, -60.0]\ncontacts = [\n'
+        f"{{at_s = 2.0, force_N = 20.0, {contact}}}]\n"
+        "[expect]\nadaptations = 1\ncontacts = 1\n"
+    )
+    operator = OperatorSettings(script=(RequestSettings(at_s=4.4, request="finish"),), acknowledge_after_s=0.1)
+    hasty = {"termination.hold_s": "0.1", "termination.beta_Nm": "1.0", "termination.travel_deg": "5"}
+    hasty |= {"termination.velocity_deg_s": "0", "termination.excitation_Nm2s": "1e-9"}
+    settings = dataclasses.replace(apply_settings(load_settings("paper"), hasty), operator=operator)
+    summary, _ = run_embedded(Cast(settings, load_scenario(str(file), "P", None)), "lockstep", folder)
+    return summary.log.path
+
+
+def log_settings(log):
+    return LogSource(log).settings
+
+
+def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
+    (read,) = read_logs([log])
+    cycle = read_log(log, ("/scheme",)).scheme["cycle"]
+    contacts = contacts_beside(log)
+    assert [cycle[window.first] for window in read.windows] == [contact.onset for contact in contacts]
+    assert [(window.is_armed, window.is_chosen_on) for window in read.windows] == [(True, True)]
+    for window, contact in zip(read.windows, contacts, strict=True):
+        assert contact.end < cycle[window.last] < contact.end + 1000
+        assert not read.motion.is_free[window.first - 600 : window.last + 600].any()
+    assert read.is_chosen_on.tolist() == [
+        k * 10 // len(read.is_chosen_on) % 2 == 0 for k in range(len(read.is_chosen_on))
+    ]
+    assert read.digest == hashlib.sha256(log.read_bytes()).hexdigest()
+
+
+def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
+    contacts = contacts_beside(log)
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda _: contacts * 3)
+    assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
+
+
+def test_every_other_log_is_for_choosing(log, tmp_path):
+    for name in ("run.mcap", "truth.mcap"):
+        shutil.copy(log.with_name(name), tmp_path / name)
+    first, second = read_logs([log, tmp_path / "run.mcap"])
+    assert first.is_chosen_on.all()
+    assert not second.is_chosen_on.any()
+    assert [window.is_chosen_on for window in first.windows + second.windows] == [True, False]
+
+
+def test_the_candidate_without_changes_shows_the_logged_residual(log):
+    (read,) = read_logs([log])
+    (shown,) = observe_candidates([read], [{}], lambda _: None)
+    scheme = read_log(log, ("/scheme",)).scheme
+    for window, contact in zip(read.windows, shown.touches, strict=True):
+        rows = slice(window.first, window.last + 1)
+        allowance = scheme["threshold"][rows] - read.settings.detector.threshold_Nm
+        known = np.isfinite(allowance).all(axis=1)
+        logged = (np.abs(scheme["tau_ext_hat"][rows]) - allowance)[known]
+        np.testing.assert_allclose(contact.statistic[known, 0], logged, atol=1e-12)
+        assert known.sum() > 50
+
+
+def test_tune_says_that_so_little_motion_shows_nothing(log, tmp_path):
+    (tmp_path / "hasty.toml").write_text(to_toml(log_settings(log)).replace('name = "paper"', 'name = "hasty"'))
+    arguments = ["tune", str(log.parent), "--out", str(tmp_path / "tuned.toml")]
+    done = CliRunner().invoke(cli, [*arguments, "--json", "--config", str(tmp_path / "hasty.toml")])
+    assert done.exit_code == 3, done.output
+    found = json.loads(done.stdout)
+    assert found["suggested"] is None
+    assert not (tmp_path / "tuned.toml").exists()
+    assert (found["own"]["missed"], found["own"]["false_alarms"]) == (0, 0)
+    assert len(found["candidates"]) == 12
+    assert {"too little motion for a tail"} <= {word for each in found["candidates"] for word in each["problems"]}
+    assert found["logs"][0]["contacts"] == 1
+
+
+def test_without_truth_only_thresholds_are_looked_for(log, tmp_path):
+    shutil.copy(log, tmp_path / "run.mcap")
+    done = CliRunner().invoke(cli, ["tune", str(tmp_path)])
+    assert done.exit_code == 3, done.output
+    assert "contacts and delays are not known" in done.stdout
+    assert "filter.a_rad_s" not in done.stdout
+
+
+def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
+    cases = {
+        ("tune", str(log), str(log)): (2, "a log is given twice"),
+        ("tune", str(tmp_path / "no.mcap")): (1, "no.mcap"),
+        ("tune", str(log), "--config", "papre"): (2, "did you mean 'paper'"),
+        ("tune", str(log), "--config", "paper"): (1, "with the settings to start from"),
+    }
+    for arguments, (code, words) in cases.items():
+        done = CliRunner().invoke(cli, list(arguments))
+        assert done.exit_code == code
+        assert words in done.stderr.splitlines()[-1]
+        assert "Traceback" not in done.output
+
+
+def test_logs_of_different_settings_are_not_tuned_together(log, monkeypatch):
+    one = read_logs([log])[0]
+    others = iter([one, dataclasses.replace(one, settings=apply_settings(one.settings, {"filter.a_rad_s": "12"}))])
+    monkeypatch.setattr(tune_logs, "_read", lambda *_: next(others))
+    with pytest.raises(LogError, match=r"different settings, such as filter.a_rad_s"):
+        read_logs([log, log])
