@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import Any, NoReturn
 
 import click
 
@@ -18,20 +18,18 @@ from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError, load_codec
-from adacd_hil.wire.node_offset import HOST_NODE, move_contract
+from adacd_hil.wire.node_offset import move_contract
 from firmware_sim.arms import ARMS
 from firmware_sim.bench import Bench, ClockMode
 from firmware_sim.contracts import CONTRACTS
 from firmware_sim.departure import Departure
 from firmware_sim.injector import OnEvent
-from firmware_sim.pdo_record import LAST_NODE
+from firmware_sim.options import on_bus
 from firmware_sim.play_command import play
 from firmware_sim.scenario import Scenario, load_scenario
 from firmware_sim.scenario_list import as_text, check, describe_all, show, show_as_table
 from firmware_sim.service import Service, open_devices_end, stop_by_signal
 from firmware_sim.truth import TRUTH_NAME, TruthLog
-
-_DEVICES = 4
 
 
 class ExitCode(IntEnum):
@@ -68,37 +66,7 @@ def cli() -> None:
 
 
 @cli.command(epilog=EPILOG)
-@click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
-@click.option("-c", "--channel", required=True, help="Channel of the interface, such as vcan0.")
-@click.option(
-    "--contract",
-    type=click.Choice(list(CONTRACTS)),
-    default="arm",
-    show_default=True,
-    help="Which devices: DBC and EDS files of this name.",
-)
-@click.option(
-    "--node-offset",
-    type=click.IntRange(0, LAST_NODE - _DEVICES),
-    default=0,
-    show_default=True,
-    help="Added to the devices' node ids: another arm on the bus.",
-)
-@click.option(
-    "--host-node",
-    type=click.IntRange(1, 127),
-    default=HOST_NODE,
-    show_default=True,
-    help="Node id of the arm's host: bus.host_node of its configuration.",
-)
-@click.option(
-    "--clock",
-    "clock_mode",
-    type=click.Choice(get_args(ClockMode)),
-    default="sync",
-    show_default=True,
-    help="sync: the arm moves one period per SYNC. wall: it moves by itself, and the drives watch for SYNC.",
-)
+@on_bus
 @click.option(
     "--scenario",
     default="paper",

@@ -4,7 +4,6 @@ import json
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import get_args
 
 import click
 
@@ -13,18 +12,17 @@ from adacd_hil.log.editing.attached import run_metadata
 from adacd_hil.log.errors import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.codec import Codec, load_codec
-from adacd_hil.wire.node_offset import HOST_NODE, move_contract
+from adacd_hil.wire.node_offset import move_contract
 from firmware_sim.bench import ClockMode
 from firmware_sim.contracts import CONTRACTS
 from firmware_sim.departure import Departure
-from firmware_sim.pdo_record import LAST_NODE
+from firmware_sim.options import on_bus
 from firmware_sim.recorded_bench import RecordedBench
 from firmware_sim.recorded_cycles import RecordedCycles
 from firmware_sim.scenario import load_scenario
 from firmware_sim.service import Service, open_devices_end, stop_by_signal
 
 _OK, _FAILURE = 0, 1
-_DEVICES = 4
 _QUIET_SCENARIO = "idle"
 
 
@@ -34,31 +32,7 @@ _QUIET_SCENARIO = "idle"
     "of another contract); 2 wrong usage; 5 bus missing.",
 )
 @click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
-@click.option("-c", "--channel", required=True, help="Channel of the interface, such as vcan0.")
-@click.option("--contract", type=click.Choice(list(CONTRACTS)), default="arm", show_default=True, help="Which devices.")
-@click.option(
-    "--node-offset",
-    type=click.IntRange(0, LAST_NODE - _DEVICES),
-    default=0,
-    show_default=True,
-    help="Added to the devices' node ids.",
-)
-@click.option(
-    "--host-node",
-    type=click.IntRange(1, 127),
-    default=HOST_NODE,
-    show_default=True,
-    help="Node id of the arm's host: bus.host_node of its configuration.",
-)
-@click.option(
-    "--clock",
-    "clock_mode",
-    type=click.Choice(get_args(ClockMode)),
-    default="sync",
-    show_default=True,
-    help="sync: the devices' time goes by SYNC. wall: by the clock, and the drives watch for SYNC.",
-)
+@on_bus
 @click.option(
     "--answers-only", is_flag=True, help="Leave the answers to SYNC to somebody else on the bus, such as canplayer."
 )
