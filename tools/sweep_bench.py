@@ -30,6 +30,7 @@ def sweep(logs: Path, out: Path, settings: int, *more: str, kill_at: float | Non
     is_killed = kill_at is None
     for line in process.stderr:
         said.append(line)
+        print(f"  {line}", end="", file=sys.stderr)
         words = line.split()
         if not is_killed and len(words) > 3 and words[1] == "of" and int(words[0]) >= kill_at * int(words[2]):
             os.kill(worker_of(process.pid), signal.SIGKILL)
@@ -46,9 +47,13 @@ def worker_of(pid: int) -> int:
     below, found = [pid], []
     while below:
         parent = below.pop()
-        children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-        found += [int(child) for child in children]
-        below += [int(child) for child in children]
+        children = [
+            int(child)
+            for thread in Path(f"/proc/{parent}/task").glob("*/children")
+            for child in thread.read_text().split()
+        ]
+        found += children
+        below += children
     spent = {child: sum(map(int, Path(f"/proc/{child}/stat").read_text().split()[13:15])) for child in found}
     return max(spent, key=lambda child: spent[child])
 
