@@ -7,7 +7,7 @@ before 1990, as of a run in lockstep, has no date in BLF and counts from 0.
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import can
 import numpy as np
@@ -18,7 +18,6 @@ from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import FrameSource
 
-FRAME_FORMATS: Final = ("blf", "asc", "candump")
 _MS_NS = 1_000_000
 _US_NS = 1_000
 _OLDEST_BLF_NS = 631_152_000 * 1_000_000_000

@@ -9,7 +9,7 @@ import csv
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, Final, Protocol
+from typing import IO, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from adacd_hil.log.reader import Series
 from adacd_hil.log.ros_types import unpack_log
 from adacd_hil.wire.codec import Codec
 
-TABLE_FORMATS: Final = ("parquet", "csv")
 _STAMP = struct.Struct("<II")
 _PARQUET_HINT = "Parquet is written with pyarrow; pip install 'adacd-hil[tables]', or choose csv"
 
