@@ -1,0 +1,370 @@
+"""Every command line, TOML, path, link and Python example in README and docs/ is parsed, loaded, found or run.
+
+Each block and each piece of inline code falls under one rule here. A block under none fails: give it a language.
+`text` is for what is neither typed nor read by a program; indented blocks are equations.
+"""
+
+import contextlib
+import io
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import documented_commands as check
+import numpy as np
+import pytest
+from documents import PAGES, ROOT, Document, Piece, read_document
+
+from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.config import load_settings
+from adacd_hil.device.recorded_arm import RecordedArm, Ticks
+from adacd_hil.log.reader import FRAME_DTYPE
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.wire.codec import load_codec
+from firmware_sim.main import main as emulator_main
+
+PAGE_NAMES = [str(path.relative_to(ROOT)) for path in PAGES]
+COMMAND = re.compile(r"(\$ )?(\.venv/bin/)?(adacd-hil|firmware-sim|make|tools/\S+|python|pip|can_\w+) \S")
+"""How a line begins that somebody would type."""
+EXPERIMENT = """
+lasts_s = 0.6
+start_deg = [-30.0, -60.0]
+contacts = [{ at_s = 0.3, link = 2, point_m = 0.2, force_N = 20.0, duration_s = 0.1 }]
+"""
+"""One contact, which `log cut --contact 1` finds; certified, whose detection is on from the start."""
+
+
+@pytest.fixture(scope="session")
+def documents() -> dict[str, Document]:
+    return {name: read_document(ROOT / name) for name in PAGE_NAMES}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, documents: dict[str, Document]) -> Iterator[Path]:
+    """A folder in which the files lie that the documents name: a short run, what comes of it, TOML from the pages."""
+    folder = tmp_path_factory.mktemp("documented")
+    for name in ("adacd_hil", "firmware_sim", "dbc", "docs", "tools"):
+        (folder / name).symlink_to(ROOT / name)
+    (folder / "experiment.toml").write_text(EXPERIMENT)
+    run_embedded(resolve("certified", str(folder / "experiment.toml"), None, None), "lockstep", folder / "runs/demo")
+    for place in ("runs/run", "runs/vcan", "runs/today"):
+        shutil.copytree(folder / "runs/demo", folder / place)
+    shutil.copy(folder / "runs/demo/run.mcap", folder)
+    (folder / "my").mkdir()
+    shutil.copy(ROOT / "adacd_hil/device_profiles/stock-drive.toml", folder / "my/drive.toml")
+    shutil.copy(ROOT / "dbc/arm.dbc", folder)
+    for name, source in (("map.toml", "map.toml"), ("planar-arm.urdf",) * 2, ("arm.urdf", "planar-arm.urdf")):
+        shutil.copy(ROOT / "docs/examples/foreign" / source, folder / name)
+    for name, block in named_toml(documents).items():
+        (folder / name).write_text(block.text)
+    for name in ("recording.csv", "cyclic.log", "host.toml", "tare.toml"):
+        (folder / name).touch()
+    with contextlib.chdir(folder):
+        export = ["log", "export", "run.mcap", "--format"]
+        for kind, name in (("candump", "bus.log"), ("blf", "bus.blf")):
+            assert run("adacd-hil", [*export, kind, "--out", name])[0] == 0
+        shutil.copy("bus.blf", "theirs.blf")
+        yield folder
+
+
+def named_toml(documents: dict[str, Document]) -> dict[str, Piece]:
+    """Return the TOML blocks that begin with their file's name."""
+    blocks = (block for page in documents.values() for block in page.blocks if block.language == "toml")
+    found = {}
+    for block in blocks:
+        name = re.match(r"# (\S+\.toml)\b", block.text)
+        if name:
+            found[name[1]] = block
+    return found
+
+
+def run(program: str, words: list[str]) -> tuple[object, str]:
+    """Run a command in this process; return its exit status and the last line that it complained with."""
+    main = emulator_main if program == "firmware-sim" else check.PROGRAMS[program].main
+    complaints = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(complaints):
+        try:
+            main(words)
+        except SystemExit as ending:
+            return ending.code, (complaints.getvalue().splitlines() or [""])[-1]
+    return 0, ""
+
+
+def failures(pieces: list[tuple[Piece, list[str]]]) -> str:
+    return "\n".join(f"{piece.place}: {line}" for piece, lines in pieces for line in lines)
+
+
+# -- blocks ----------------------------------------------------------------------------------------------------------
+
+
+def block_complaints(block: Piece, folder: Path) -> list[str]:
+    """Check a block by its language; a language that has no rule is a complaint."""
+    rule = RULES.get(block.language)
+    if rule is None:
+        return [f"a block of language {block.language!r}; known: {', '.join(RULES)}"]
+    return rule(block, folder)
+
+
+def shell_complaints(block: Piece, folder: Path) -> list[str]:
+    return [line for words in check.split_commands(block.text) for line in check.command_complaints(words)]
+
+
+def console_complaints(block: Piece, folder: Path) -> list[str]:
+    typed = [line.removeprefix("$ ") for line in block.text.splitlines() if line.startswith("$ ")]
+    if not typed:
+        return ["a block of language 'console' has no line that begins with `$ `"]
+    return [line for text in typed for words in check.split_commands(text) for line in check.command_complaints(words)]
+
+
+def toml_complaints(block: Piece, folder: Path) -> list[str]:
+    path = folder / f"{block.page.stem}-{block.line}.toml"
+    path.write_text(block.text)
+    return check.toml_complaints(block.text, path)
+
+
+def plain_complaints(block: Piece, folder: Path) -> list[str]:
+    """Plain text has nothing that somebody would type or a program would read."""
+    lines = [line for line in block.text.splitlines() if COMMAND.match(line)]
+    lines += re.findall(r"^\[\[?[\w.]+\]\]?\s*(?:#.*)?$|^(?:import|from) .+", block.text, re.MULTILINE)
+    return [f"{line!r} in a block that says it is plain text: fence it as sh, toml or python" for line in lines]
+
+
+def python_complaints(block: Piece, folder: Path) -> list[str]:
+    """Python is run by `test_a_python_example_runs`; here it need only be listed there."""
+    known = block.page.name in EXAMPLES
+    return [] if known else [f"a Python block on a page without names to run it with: see EXAMPLES in {__file__}"]
+
+
+RULES = {
+    "sh": shell_complaints,
+    "console": console_complaints,
+    "toml": toml_complaints,
+    "python": python_complaints,
+    "text": plain_complaints,
+    "text tree": lambda block, folder: check.tree_complaints(block.text),
+    "indented": plain_complaints,
+}
+
+
+@pytest.mark.parametrize("page", PAGE_NAMES)
+def test_every_block_is_right(page, documents, folder):
+    found = [(block, block_complaints(block, folder)) for block in documents[page].blocks]
+    assert failures(found) == ""
+
+
+# -- inline code -----------------------------------------------------------------------------------------------------
+
+ASSIGNMENT = re.compile(r"(\[\w+\] )?[a-z][\w.]*(?<!value) = [^=]*|kind = .*")
+OUTPUTS = re.compile(r"[\w*-]+\.(mcap|html|pdf|json|csv|png|svg|txt|toml|parquet|urdf|part|blf|log|dbc)(/\S*)?")
+"""Files that the commands write, or that a reader has; their names stand for themselves."""
+NOT_OURS = {"can_id", "can_channel", "can_msgs"}
+
+
+def span_complaints(span: Piece) -> list[str]:
+    """Check a piece of inline code. What is no command, path, key, option or TOML is a word, and free."""
+    text = span.text.strip()
+    first = text.split(" ")[0].removeprefix(".venv/bin/")
+    if first in check.PROGRAMS or (first in ("python", "make", "pip") and " " in text) or check.TOOL.fullmatch(first):
+        return [line for words in check.split_commands(text) for line in check.command_complaints(words, False)]
+    if first.startswith("can_") and first not in NOT_OURS and re.fullmatch(r"can_[a-z]+", first):
+        return check.command_complaints([first])
+    if re.match(r"\w+ --\w", text):
+        return subcommand_complaints(text)
+    if re.match(r"--?[a-z]", text):
+        return check.option_complaints(text, span.head)
+    if re.match(r"(ADACD_HIL|FIRMWARE_SIM)_\w+$", text):
+        return [] if text in check.environment_names() or is_in_source(text) else [f"nothing reads {text}"]
+    if re.match(r"adacd_hil(\.\w+)+|firmware_sim(\.\w+)+", text):
+        return check.name_complaints(text.partition("(")[0])
+    if re.fullmatch(r"(adacd_hil|firmware_sim|tests|tools|docs|dbc|[\w./]+)/[\w./-]*\.(py|md|c|sh|dbc|eds)", text):
+        return check.path_complaints(text, span.page)
+    if re.fullmatch(r"(adacd_hil|firmware_sim|tests|tools|docs|dbc)/[\w./-]*|\w+\.(py|eds|c)", text):
+        return check.path_complaints(text, span.page)
+    if re.fullmatch(r"[a-z]+\.\w+", text) and text.split(".")[0] in check.SETTING_SECTIONS:
+        return [] if OUTPUTS.fullmatch(text) else check.key_complaints(text)
+    if ASSIGNMENT.fullmatch(text) and "(" not in text:
+        return check.assignment_complaints(text)
+    return []
+
+
+def subcommand_complaints(text: str) -> list[str]:
+    """Check `name --option ...` of a command of adacd-hil, else of a tool."""
+    name, *rest = text.split(" ")
+    if name in check.PROGRAMS["adacd-hil"].commands:
+        return check.command_complaints(["adacd-hil", name, *rest], False)
+    owners = [tool for tool in check.tools() if name in check.flags(tool)]
+    if not owners:
+        return [f"`{text}`: neither a command of adacd-hil nor of a tool"]
+    return check.command_complaints([f"tools/{owners[0].name}", name, *rest])
+
+
+def is_in_source(name: str) -> bool:
+    return any(name in path.read_text() for path in (ROOT / "adacd_hil").rglob("*.py"))
+
+
+@pytest.mark.parametrize("page", PAGE_NAMES)
+def test_every_piece_of_inline_code_is_right(page, documents, folder):
+    assert failures([(span, span_complaints(span)) for span in documents[page].spans]) == ""
+
+
+@pytest.mark.parametrize("page", PAGE_NAMES)
+def test_every_link_leads_somewhere(page, documents):
+    found = []
+    for link in documents[page].links:
+        target, _, anchor = link.text.partition("#")
+        if re.match(r"https?:", target):
+            continue
+        path = (link.page.parent / target).resolve() if target else link.page
+        name = str(path.relative_to(ROOT))
+        lines = [] if path.exists() else [f"{link.text}: no such file"]
+        if anchor and (name not in documents or anchor not in documents[name].anchors):
+            lines.append(f"{link.text}: no such heading")
+        found.append((link, lines))
+    assert failures(found) == ""
+
+
+def test_every_page_is_reached_from_the_readme(documents):
+    readme = (ROOT / "README.md").read_text()
+    assert [path.name for path in PAGES[1:] if path.parent.name == "docs" and path.name not in readme] == []
+
+
+# -- what can be run without a bus -----------------------------------------------------------------------------------
+
+RUN = re.compile(
+    r"adacd-hil (replay|compare|budget|log (info|check|recover|cut|merge|export))|"
+    r"firmware-sim (list|show|check)"
+)
+"""Commands that need no bus, no terminal, and a second at most."""
+
+
+def test_what_needs_no_bus_runs(documents, folder):
+    lines = {}
+    for page in documents.values():
+        for block in page.blocks:
+            if block.language not in ("sh", "console"):
+                continue
+            for words in check.split_commands(block.text.replace("$ ", "")):
+                words[0] = words[0].removeprefix(".venv/bin/")
+                lines.setdefault(" ".join(words), (block, words))
+    played = [entry for line, entry in lines.items() if RUN.match(line)]
+    found = []
+    for block, words in played:
+        status, complaint = run(words[0], words[1:])
+        if status != 0:
+            found.append((block, [f"`{' '.join(words)}` ended with {status}: {complaint}"]))
+    assert failures(found) == ""
+    assert len(played) > 15
+
+
+def free_and_pushed_motion() -> dict[str, Any]:
+    """What docs/scheme-any-arm.md has at hand: free motion of a planar arm, then motion in which it is pushed."""
+    t_s = np.arange(14_000) * 1e-3
+    amplitude = np.array([0.5, 0.9])
+    rate, phase = np.array([[1.7, 1.1], [4.1, 3.3]]), np.array([[0.3, 1.0], [0.0, 2.0]])
+    angle = rate[:, None, :] * t_s[None, :, None] + phase[:, None, :]
+    q = np.sum(amplitude * np.sin(angle), axis=0)
+    dq = np.sum(amplitude * rate[:, None, :] * np.cos(angle), axis=0)
+    ddq = np.sum(-amplitude * rate[:, None, :] ** 2 * np.sin(angle), axis=0)
+    theta = np.array([0.24, 0.034, 0.020, 0.030, 0.015, 0.0375, 0.020])
+    tau_J = np.array([inverse_dynamics(*row, theta) for row in zip(q, dq, ddq, strict=True)])
+    tau_J += np.random.default_rng(1).normal(0.0, 0.03, tau_J.shape)
+    tau_J[13_000:13_300] -= 3.0, 2.0
+    free = {"q": q[:12_000], "dq": dq[:12_000], "tau_J": tau_J[:12_000]}
+    return free | {"q_later": q[12_000:], "dq_later": dq[12_000:], "tau_J_later": tau_J[12_000:]}
+
+
+def cycles_of_a_bus_without_devices() -> dict[str, Any]:
+    """What docs/scheme.md has at hand: cycles as a log has them, and what the user asked for."""
+    settings = load_settings("certified")
+    count = 300
+    ticks = Ticks(np.arange(count), 1_000_000 * np.arange(1, count + 1), np.ones(count, np.int64))
+    arms = RecordedArm(settings, load_codec()).read(ticks, np.empty(0, FRAME_DTYPE))
+    return {"settings": settings, "arms": arms, "requests": np.zeros(count, np.uint8), "SchemeState": SchemeState}
+
+
+EXAMPLES: dict[str, Callable[[], dict[str, Any]]] = {
+    "scheme-any-arm.md": free_and_pushed_motion,
+    "scheme.md": cycles_of_a_bus_without_devices,
+}
+"""What a page's Python takes as given."""
+
+
+@pytest.mark.parametrize("page", EXAMPLES)
+def test_a_python_example_runs(page, documents, folder, capsys):
+    names = EXAMPLES[page]()
+    blocks = [block for block in documents[f"docs/{page}"].blocks if block.language == "python"]
+    for block in blocks:
+        exec(compile(block.text, block.place, "exec"), names)
+    assert len(blocks) == 1
+    if page == "scheme-any-arm.md":  # the contact that it prints
+        assert re.fullmatch(r"10\d\d link2 \S.*\n", capsys.readouterr().out)
+    else:
+        assert names["tau_ext_hat"].shape == (300, 2)
+
+
+# -- the checks themselves ---------------------------------------------------------------------------------------------
+
+WRONG = [
+    ("sh", "adacd-hil replay run.mcap --set certified.deviations=8"),
+    ("sh", "adacd-hil replay run.mcap --vary filter.a_rad_s=10,wide"),
+    ("sh", "adacd-hil replai run.mcap"),
+    ("sh", "adacd-hil log check no-such-log.mcap"),
+    ("sh", "adacd-hil run -i socketcan -c can0 --fast"),
+    ("sh", "adacd-hil run -i socketcan"),
+    ("sh", "adacd-hil run -i sockercan -c can0"),
+    ("sh", "adacd-hil demo --clock fast"),
+    ("sh", "adacd-hil demo --scenario blow-chess"),
+    ("sh", "tools/with-vcan --can vcan0 -- sh -c '\n  firmware-sim run -i socketcan -c vcan0 --onse &\n  sleep 3'"),
+    ("sh", "tools/with-vcan --cam vcan0 -- sleep 1"),
+    ("sh", "python tools/campain.py my.toml"),
+    ("sh", "make tests"),
+    ("sh", "frobnicate run.mcap"),
+    ("sh", "adacd-hil tune LOG... --out tuned.toml [--rate 0.01]"),
+    ("sh", "pip install 'adacd-hil[lives]'"),
+    ("console", "$ adacd-hil compare run.mcap"),
+    ("toml", "[arm]\ntorque_limit = [6.0, 3.0]\n"),
+    ("toml", "[[contacts]]\nat_s = 12.0\nlimb = 2\n"),
+    ("toml", "[arm\n"),
+    ("", "adacd-hil demo"),
+    ("text", "adacd-hil demo"),
+    ("text", "[arm]\nsign = [1.0, 1.0]"),
+    ("indented", "import numpy"),
+    ("text tree", "adacd_hil/\n  wire/   bus · busses   # words"),
+    ("text tree", "adacd_hill/"),
+]
+
+
+@pytest.mark.parametrize(("language", "text"), WRONG)
+def test_a_wrong_block_is_refused(language, text, folder):
+    assert block_complaints(Piece(PAGES[0], 1, text, language), folder) != []
+
+
+@pytest.mark.parametrize(
+    ("text", "head"),
+    [
+        ("certified.deviations", ""),
+        ("adacd-hil replay LOG --sett", ""),
+        ("adacd-hil log cat", ""),
+        ("make tests", ""),
+        ("tools/campain.py", ""),
+        ("tools/campaign.py --onli x", ""),
+        ("wire/busses.py", ""),
+        ("adacd_hil/wire/busses.py", ""),
+        ("busses.py", ""),
+        ("--sett", ""),
+        ("--vary KEY=A,B", "`adacd-hil run`"),
+        ("--profile P|S|L", "`adacd-hil run`"),
+        ("commtest --enabled", ""),
+        ('on_misses = "wait"', ""),
+        ('[realtime] sample_period = "guessed"', ""),
+        ('kind = "lose", node = "sensor1", frame = "talk"', ""),
+        ("adacd_hil.wire.bus.Buss", ""),
+        ("ADACD_HIL_RUN_CONFIGURATION", ""),
+        ("can_log", ""),
+    ],
+)
+def test_wrong_inline_code_is_refused(text, head, folder):
+    assert span_complaints(Piece(PAGES[0], 1, text, head=head)) != []
