@@ -41,7 +41,7 @@ OTHERS = {"apt-get", "candump", "canbusload", "canplayer", "duckdb", "ip", "slee
 """Programs that aren't ours: known to be meant, their arguments are not looked at."""
 PREFIXES = {"chrt": 3, "nice": 3}
 """Programs that run another one, with the words before it."""
-TOOL = re.compile(r"tools/[\w-]+(\.py|\.sh)?")
+TOOL = re.compile(r"tools/[\w-]+(\.py|\.sh)?|tests/[\w/-]+\.py")
 PLACEHOLDER = re.compile(r"[A-Z][A-Z0-9_]*(=[A-Z,.…]+)?|\.\.\.|…")
 PACKAGES = ("", "adacd_hil", "firmware_sim", "dbc", "docs", "tests")
 """Folders that paths in documents count from."""
