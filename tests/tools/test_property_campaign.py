@@ -1,0 +1,341 @@
+"""tools/property_campaign.py: its decoder, each of its rules, what it draws, and a dozen of its runs."""
+
+import dataclasses
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cantools
+import numpy as np
+import pytest
+from crccheck.crc import Crc8Autosar, Crc16CcittFalse
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import property_campaign
+import random_run
+import run_rules
+import wire_record
+import witnessed_run
+from made_run import DISABLED_WORD, ENABLED, ENABLED_WORD, Made, states
+from wire_record import Passed, WireRecord
+
+from adacd_hil.config import load_settings, parse
+from adacd_hil.records import Request, SchemeState
+from adacd_hil.wire.codec import contract_folder
+from firmware_sim.scenario import Scenario
+
+ADAPT, MONITOR, REACT, STOPPED = SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED
+
+
+def violated(made: Made) -> set[str]:
+    return {violation.rule for violation in run_rules.judge(made.play())}
+
+
+# The decoder
+
+
+@pytest.mark.parametrize("name", ["arm", "arm_fd", "arm_fd_500us", "arm_stock"])
+def test_signals_are_read_as_cantools_reads_them(name: str) -> None:
+    path = contract_folder() / f"{name}.dbc"
+    random = np.random.default_rng(1)
+    for message in cantools.database.load_file(path).messages:
+        frames = [random.bytes(message.length) for _ in range(5)]
+        record = WireRecord(
+            path, [Passed(k, "HOST" in message.senders, message.frame_id, d) for k, d in enumerate(frames)]
+        )
+        sight = record[message.name]
+        for row, data in enumerate(frames):
+            decoded = message.decode(data, decode_choices=False)
+            assert {key: values[row] for key, values in sight.signals.items()} == pytest.approx(decoded)
+
+
+@pytest.mark.parametrize(("ids", "length"), [(bytes(range(200, 216)), 6), (b"\xc6\x8e", 24)])
+def test_crcs_are_those_of_crccheck(ids: bytes, length: int) -> None:
+    columns = np.frombuffer(np.random.default_rng(2).bytes(50 * length), np.uint8).reshape(50, length)
+    if len(ids) == 16:
+        expected = [Crc8Autosar.calc(bytes(row[1:]) + ids[row[1] & 15 : (row[1] & 15) + 1]) for row in columns]
+    else:
+        expected = [Crc16CcittFalse.calc(bytes(row[2:]) + ids) for row in columns]
+    assert wire_record.crc_of(columns, ids).tolist() == expected
+
+
+def test_a_frame_is_fresh_if_its_crc_is_right_and_its_counter_new() -> None:
+    played = Made(cycles=4).play()
+    frames = [frame for frame in played.wire.passed if frame.can_id == 0x183]
+    first, second = frames[0].data, frames[1].data
+    passed = [
+        Passed(k, False, 0x183, data) for k, data in enumerate((first, first, second[:-1] + b"\x55", second, b""))
+    ]
+    sight = WireRecord(contract_folder() / "arm.dbc", passed)["Sensor1Torque"]
+    assert sight.is_right.tolist() == [True, True, False, True, False]
+    assert sight.is_fresh.tolist() == [True, False, False, True, False]
+
+
+def test_resets_without_sync_between_them_are_one_boot() -> None:
+    frames = [(0x000, b"\x82\x01"), (0x000, b"\x82\x02"), (0x080, b"\1"), (0x000, b"\x01\x00"), (0x000, b"\x81\x00")]
+    record = WireRecord(contract_folder() / "arm.dbc", [Passed(k, True, *frame) for k, frame in enumerate(frames)])
+    assert record.boots.tolist() == [0, 4]
+    assert record.attempt(np.array([0, 3, 4])).tolist() == [0, 0, 1]
+
+
+def test_a_witness_passes_everything_on_and_ends_what_is_overdue() -> None:
+    class Bus:
+        channel = "made"
+
+        def send(self, can_id: int, data: bytes) -> None:
+            sent.append((can_id, data))
+
+    class Clock:
+        t_ns = 5
+
+        def now_ns(self) -> int:
+            return self.t_ns
+
+    sent: list[tuple[int, bytes]] = []
+    bus: Any = Bus()
+    clock: Any = Clock()
+    witness = wire_record.WitnessBus(bus, clock)
+    witness.send(0x080, b"\1")
+    assert sent == [(0x080, b"\1")]
+    assert (witness.passed, witness.syncs) == ([Passed(5, True, 0x080, b"\1")], 1)
+    witness.limit_ns = 4
+    with pytest.raises(wire_record.OverdueError, match="still running"):
+        witness.send(0x080, b"\2")
+
+
+# The rules
+
+
+def test_a_run_without_fault_violates_nothing() -> None:
+    assert violated(Made(torque=_ends_at(590))) == set()
+
+
+def _ends_at(last: int, torque: int = 10) -> Callable[[int], int]:
+    return lambda cycle: torque if ENABLED + 5 <= cycle < last else 0
+
+
+def _late(cycle: int, frame: tuple[bool, int, bytes]) -> dict[int, list[tuple[bool, int, bytes]]]:
+    return {cycle: [frame]}
+
+
+def _drops(cycle: int) -> Callable[[int], int]:
+    return lambda at: DISABLED_WORD if at < ENABLED + 3 or at == cycle else ENABLED_WORD
+
+
+def _pushed(begin: int, end: int, torque_Nm: float = 1.0) -> Callable[[int], float]:
+    return lambda cycle: torque_Nm if begin <= cycle < end else 0.0
+
+
+_STICK = parse(Scenario, {"faults": [{"kind": "stick", "node": "sensor1", "signal": "torque", "at_s": 0.1}]})
+
+BROKEN: dict[str, tuple[Made, str]] = {
+    "torque before the status": (Made(torque=lambda k: 10 if 231 <= k < 590 else 0), "torque-before-enabled"),
+    "torque while one drive is in another mode": (
+        Made(torque=_ends_at(590), extra=_late(400, (False, 0x282, b"\x27\x00\x08\0\0\0\0"))),
+        "torque-before-enabled torque-after-drive-fault",
+    ),
+    "enabled at once": (
+        Made(controlword=lambda k: 0x0F if k >= 100 else 0, torque=_ends_at(590)),
+        "enabled-too-early",
+    ),
+    "enabled in motion": (
+        Made(velocity_rad_s=lambda k: 0.1 if k == 150 else 0.0, torque=_ends_at(590)),
+        "enabled-in-motion",
+    ),
+    "too much": (Made(torque=lambda k: min(160 * max(k - 240, 0), 1002) if k < 590 else 0), "torque-limit"),
+    "too fast": (Made(torque=lambda k: 170 if k == 400 else _ends_at(590, 1)(k)), "torque-rate"),
+    "torque after a quick stop": (
+        Made(controlword=lambda k: 0x02 if k == 400 else 0x0F if k >= ENABLED else 0, torque=_ends_at(590)),
+        "torque-after-stop",
+    ),
+    "torque after a drive has dropped out": (
+        Made(statusword=_drops(400), torque=lambda k: 0 if k in (400, 401) else _ends_at(590)(k)),
+        "torque-after-drive-fault",
+    ),
+    "torque after an EMCY": (
+        Made(torque=_ends_at(590), extra=_late(400, (False, 0x081, b"\x10\x23\x03\0\0\0\0\0"))),
+        "torque-after-emergency",
+    ),
+    "torque after a sensor's value is not valid": (
+        Made(torque=_ends_at(590), extra=_late(400, (False, 0x283, b"\1\0"))),
+        "torque-after-emergency",
+    ),
+    "torque after a node has rebooted": (
+        Made(torque=_ends_at(590), extra={250: [(False, 0x703, b"\5")], 400: [(False, 0x703, b"\0")]}),
+        "torque-after-departure",
+    ),
+    "torque on old data": (
+        Made(torque=_ends_at(590), has_feedback=lambda k: not 400 <= k <= 404),
+        "torque-on-old-data",
+    ),
+    "torque that grows blindly": (
+        Made(torque=lambda k: 13 if k == 402 else _ends_at(590)(k), has_feedback=lambda k: not 400 <= k <= 402),
+        "torque-grew-blindly",
+    ),
+    "beyond the position limit": (
+        Made(torque=_ends_at(590), position_rad=lambda k: 1.32 if k >= 400 else 0.0),
+        "limit-not-stopped",
+    ),
+    "beyond the velocity limit": (
+        Made(torque=_ends_at(590), velocity_rad_s=lambda k: -5.3 if k >= 400 else 0.0),
+        "limit-not-stopped",
+    ),
+    "a SYNC counter that jumps": (Made(torque=_ends_at(590), sync=lambda k: 1 + (k + (k > 400)) % 240), "sync-counter"),
+    "a wrong CRC": (
+        Made(torque=_ends_at(590), command=lambda k, _, data: [b"\0" + data[1:]] if k == 400 else [data]),
+        "command-crc",
+    ),
+    "a counter that stands": (
+        Made(torque=_ends_at(590), command=lambda k, _, data: [data, data] if k == 400 else [data]),
+        "command-counter two-commands",
+    ),
+    "an object is written": (
+        Made(torque=_ends_at(590), extra=_late(400, (True, 0x601, b"\x2f\x00\x22\x00\xff\0\0\0"))),
+        "sdo-write-while-powered",
+    ),
+    "a model that stands still": (
+        Made(torque=_ends_at(590), tau_f=lambda k: 0.1 if 400 <= k < 410 else 1e-4 * k),
+        "blind",
+    ),
+    "a missed contact": (Made(cycles=1200, torque=_ends_at(1190), tau_ext=_pushed(700, 900)), "contact-missed"),
+    "a reaction to nothing": (
+        Made(cycles=2000, torque=_ends_at(1990), state=states((1600, REACT), (1700, MONITOR))),
+        "reaction-to-nothing",
+    ),
+    "a stop that goes by itself": (
+        Made(
+            cycles=2000,
+            torque=_ends_at(1990),
+            state=states((1000, REACT), (1100, STOPPED), (1800, MONITOR)),
+            tau_ext=_pushed(990, 1000, 0.2),
+        ),
+        "stop-not-latched",
+    ),
+    "motion while stopped": (
+        Made(
+            cycles=2000,
+            torque=_ends_at(1990),
+            state=states((1000, REACT), (1100, STOPPED)),
+            tau_ext=_pushed(990, 1000, 0.2),
+            true_speed=lambda k: 0.1,
+        ),
+        "moves-while-stopped",
+    ),
+    "a traceback": (Made(torque=_ends_at(590), changes={"crash": "KeyError: 3"}), "crash"),
+    "no end": (Made(torque=_ends_at(590), changes={"overdue": "still running"}), "unending"),
+    "torque in the last command": (Made(), "torque-at-the-end"),
+    "a drive left enabled": (
+        Made(torque=_ends_at(590), changes={"enabled_at_end": (True, False)}),
+        "enabled-at-the-end",
+    ),
+    "no log": (Made(torque=_ends_at(590), changes={"log": None}), "no-log"),
+    "a fault without cause": (
+        Made(torque=_ends_at(590), events=[(500, "error", "supervisor", "MONITOR -> FAULT: DRIVE")]),
+        "fault-not-named",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_breaks_a_rule_is_named(name: str) -> None:
+    made, rules = BROKEN[name]
+    assert violated(made) == set(rules.split())
+
+
+ALLOWED: dict[str, Made] = {
+    "torque that falls blindly": Made(
+        torque=lambda k: 3 if k == 402 else _ends_at(590)(k), has_feedback=lambda k: not 400 <= k <= 402
+    ),
+    "torque that goes to zero at once": Made(torque=lambda k: 0 if k == 400 else _ends_at(590)(k)),
+    "five cycles without a fresh sample": Made(
+        torque=_ends_at(590), tau_f=lambda k: 0.1 if 400 <= k < 406 else 1e-4 * k
+    ),
+    "an object that is read": Made(torque=_ends_at(590), extra=_late(400, (True, 0x601, b"\x40\x00\x22\x00\0\0\0\0"))),
+    "an EMCY that resets an error": Made(torque=_ends_at(590), extra=_late(400, (False, 0x081, bytes(8)))),
+    "a contact that was found": Made(
+        cycles=1200,
+        torque=_ends_at(1190),
+        tau_ext=_pushed(700, 900),
+        state=states((740, REACT), (800, STOPPED)),
+    ),
+    "a contact that a lying sensor hides": Made(
+        cycles=1200, torque=_ends_at(1190), tau_ext=_pushed(700, 900), scenario=_STICK, faults=lambda k: 1
+    ),
+    "a weak contact": Made(cycles=1200, torque=_ends_at(1190), tau_ext=_pushed(700, 900, 0.4)),
+    "a reaction to nothing that is named": Made(
+        cycles=2000,
+        torque=_ends_at(1990),
+        state=states((1600, REACT), (1700, MONITOR)),
+        events=[(1600, "warning", "supervisor", "MONITOR -> REACT: no fresh sample for 5 cycles; Sensor1")],
+    ),
+    "a stop that is acknowledged": Made(
+        cycles=2000,
+        torque=_ends_at(1990),
+        state=states((1000, REACT), (1100, STOPPED), (1800, MONITOR)),
+        request=lambda k: Request.ACKNOWLEDGE if k == 1800 else Request.NONE,
+        tau_ext=_pushed(990, 1000, 0.2),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ALLOWED)
+def test_what_is_allowed_is_not_named(name: str) -> None:
+    assert violated(ALLOWED[name]) == set()
+
+
+def test_runs_are_broken_where_the_group_changes() -> None:
+    holds = np.array([True, True, False, True, True, True])
+    assert list(run_rules.runs(holds)) == [(0, 1), (3, 5)]
+    assert list(run_rules.runs(holds, np.array([0, 0, 0, 0, 1, 1]))) == [(0, 1), (3, 3), (4, 5)]
+
+
+# What is drawn, and the command
+
+
+def test_the_same_seed_draws_the_same_run() -> None:
+    first, again, other = (random_run.draw_run(seed) for seed in (5, 5, 6))
+    assert first.files == again.files
+    assert (first.user, first.line) == (again.user, again.line)
+    assert first.files != other.files
+
+
+def test_seeds_draw_every_scheme_contract_profile_and_most_kinds_of_fault() -> None:
+    drawn = [random_run.draw_run(seed) for seed in range(60)]
+    assert {one.settings.scheme for one in drawn} == {"paper", "certified"}
+    assert {one.contract for one in drawn} == {"arm", "arm_fd", "arm_stock", "arm_fd_500us"}
+    assert {one.settings.arm.profile for one in drawn} == {"P", "S", "M"}
+    kinds = {row.kind for one in drawn for row in one.scenario.faults}
+    assert len(kinds) >= 15
+    late = [row.at_s > one.armed_s for one in drawn for row in one.scenario.faults if row.at_s is not None]
+    assert np.mean(late) > 0.8
+
+
+def test_what_is_asked_bounds_how_long_a_run_may_take() -> None:
+    settings = load_settings("certified")
+    operator = dataclasses.replace(settings.operator, acknowledge_faults=2, acknowledge_fault_after_s=1.0)
+    patient = dataclasses.replace(settings, operator=operator)
+    assert witnessed_run.allowed_after_finish_s(settings) == 20.0
+    assert witnessed_run.allowed_after_finish_s(patient) == 62.0
+    assert witnessed_run.allowed_s(patient) == 3 * (40.0 + 51.0 + 20.0)
+
+
+def test_the_summary_counts_runs_and_not_violations() -> None:
+    violation = run_rules.Violation("blind", 1.0, "text")
+    first = property_campaign.Result(1, "a", cycles=5, is_armed=True, violations=[violation, violation])
+    totals = property_campaign.summary([first, property_campaign.Result(2, "b", cycles=7)])
+    assert (totals["violated_runs"], totals["violations"]) == (1, {"blind": 1})
+    assert (totals["cycles"], totals["reached_monitor_share"]) == (12, 0.5)
+    table = property_campaign.as_table([first])
+    assert "blind" in table
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("3", range(3, 4)), ("2:5", range(2, 5))])
+def test_seeds_are_one_or_a_range(text: str, seeds: range) -> None:
+    assert property_campaign.parse_seeds(text) == seeds
+
+
+def test_a_seed_that_the_judge_itself_cannot_bear_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(property_campaign, "draw_run", lambda seed: 1 / 0)
+    result = property_campaign._run((4, None, False))
+    assert [violation.rule for violation in result.violations] == ["judge-crash"]
