@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 .PHONY: help demo test test-realtime check bench clean
 
 help:
-	@echo "make demo   the paper's experiment with an emulated arm, certified scheme and paper's side by side; report in runs/demo/report.html"
+	@echo "make demo   the paper's experiment with an emulated arm, certified scheme and paper's side by side; report in runs/demo/report.html (the last demo's)"
 	@echo "make test   all checks and tests, SocketCAN included"
 	@echo "make test-realtime   SocketCAN tests that need a machine which doesn't stall: 1 kHz contacts, two arms"
 	@echo "make check  format, lint, types, direction of imports"
@@ -51,4 +51,4 @@ bench: $(VENV)/.run
 	$(BIN)/python tools/bench.py
 
 clean:
-	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

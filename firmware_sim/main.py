@@ -13,7 +13,9 @@ import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.config import ConfigError
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.errors import LogError, LogExistsError
+from adacd_hil.log.run_folder import TRUTH_NAME, check_free
+from adacd_hil.output_files import tidied
 from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import BusError, BusMissingError
@@ -29,7 +31,7 @@ from firmware_sim.play_command import play
 from firmware_sim.scenario import Scenario, load_scenario
 from firmware_sim.scenario_list import as_text, check, describe_all, show, show_as_table
 from firmware_sim.service import Service, open_devices_end, stop_by_signal
-from firmware_sim.truth import TRUTH_NAME, TruthLog
+from firmware_sim.truth import TruthLog
 
 
 class ExitCode(IntEnum):
@@ -52,6 +54,7 @@ _CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
     (CodecError, ExitCode.USAGE),
     (BusMissingError, ExitCode.BUS_MISSING),
     (BusError, ExitCode.FAILURE),
+    (LogExistsError, ExitCode.USAGE),
     (LogError, ExitCode.FAILURE),
     (OSError, ExitCode.FAILURE),
 )
@@ -98,16 +101,18 @@ def run(
     """Run the emulated arm; prints "ready" on stderr once its nodes have announced themselves."""
     resolved = load_scenario(scenario, profile, seed)
     codec = move_contract(load_codec(CONTRACTS[contract].path), node_offset, host_node)
-    if out is not None:
-        _make_folder(out)
     clock = MonotonicClock()
     with ExitStack() as stack:
+        if out is not None:
+            check_free(out / TRUTH_NAME)
+            stack.enter_context(tidied(out))
         bus = open_devices_end(interface, channel, clock, codec)
         stack.callback(bus.close)
         stop = stack.enter_context(stop_by_signal())
         truth = None
         if out is not None:
             metadata = {"scenario": resolved.name, "profile": resolved.profile, "seed": str(resolved.seed)}
+            _make_folder(out)
             # By SYNC, time waits for the log; by wall clock nothing may.
             truth = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
             stack.enter_context(truth)
@@ -216,6 +221,8 @@ def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: Trut
     code = ExitCode.OK
     if truth is not None:
         summary = truth.close()
+        if not summary.messages and summary.is_complete:  # no host came
+            truth.discard()
         described |= {"truth": str(summary.path), "messages": summary.messages, "dropped": summary.dropped}
         if not summary.is_complete:
             _complain(summary.error or f"{summary.path} lacks {summary.dropped} cycles: the disk was too slow")

@@ -10,11 +10,11 @@ from types import TracebackType
 
 from adacd_hil.config import to_toml
 from adacd_hil.log.channels import ChannelId, pack_truth
+from adacd_hil.log.parts import find_parts
 from adacd_hil.log.recorder import LogSummary, Recorder
 from adacd_hil.records import Event, Vector
 from firmware_sim.scenario import Scenario
 
-TRUTH_NAME = "truth.mcap"
 SCENARIO_NAME = "scenario.toml"
 """The attachment."""
 
@@ -31,7 +31,10 @@ class TruthLog:
         metadata: Mapping[str, str] | None = None,
         scenario: Scenario | None = None,
     ) -> None:
-        """Create the file. `blocking`: wait for the writer rather than lose a cycle. Raises LogError."""
+        """Create the file. `blocking`: wait for the writer rather than lose a cycle.
+
+        Raises LogExistsError when there is one already, LogError.
+        """
         self.path = path
         faults = () if scenario is None else scenario.faults
         self._recorder = Recorder(
@@ -54,6 +57,12 @@ class TruthLog:
     def close(self) -> LogSummary:
         """End the file and say how it went; twice is once."""
         return self._recorder.close()
+
+    def discard(self) -> None:
+        """End the log and remove it. Raises OSError."""
+        self.close()
+        for part in find_parts(self.path).values():
+            part.unlink()
 
     def __enter__(self) -> "TruthLog":
         return self

@@ -19,7 +19,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.realtime import Tick, make_pacer
 from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.contract import load_contract, write_contract
+from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
@@ -257,7 +257,7 @@ def test_an_arm_at_other_node_ids_runs_in_lockstep_on_a_bus_of_its_own(tmp_path:
     devices = dataclasses.replace(load_settings("paper").devices, drive_node=(5, 6), sensor_node=(7, 8))
     script = OperatorSettings(script=(RequestSettings(at_s=0.1, request="finish"),))
     settings = dataclasses.replace(load_settings("paper"), devices=devices, operator=script)
-    codec = write_contract(load_contract(settings), tmp_path)
+    codec = load_contract(settings)
     clock = VirtualClock()
     embedded = EmbeddedBus(clock)
     bench = Bench(load_scenario("idle", "P"), codec, embedded.deliver)

@@ -29,9 +29,9 @@ from side_by_side import (
 )
 from witness import Seen, read_witness, times_after, witness
 
-from adacd_hil.control.session import LOG_NAME
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.run_folder import LOG_NAME
 
 SYNC_ID, FEEDBACK_ID, LAST_COMMAND_ID, STATUS_ID = 0x080, 0x181, 0x202, 0x281
 POSITION_RAD = 2.0 * np.pi / 2**20
@@ -39,6 +39,15 @@ DISK_CASES = ("undisturbed", "slow", "full", "killed", "stopped")
 SLOW_BYTES_S = 64 * 1024
 STOPPED_S = 5.0
 TMPFS_BYTES = 256 * 1024 * 1024
+HOST_WITH_PIPE = """
+import os, sys
+from adacd_hil.cli.main import main
+from adacd_hil.log import recorder
+pipe = sys.argv.pop(1)
+recorder.create_file = lambda path: os.open(pipe, os.O_WRONLY)
+main()
+"""
+"""The host, whose log goes into the FIFO that is its first argument."""
 
 
 class SlowDisk:
@@ -134,11 +143,14 @@ def run_disk_case(case: str, chosen: argparse.Namespace, folder: Path) -> dict[s
     with ExitStack() as stack:
         if case == "full":
             stack.enter_context(small_disk(out))
-        slow = SlowDisk(out / LOG_NAME, folder / "copy.mcap") if case == "slow" else None
+        slow = SlowDisk(folder / "slow", folder / "copy.mcap") if case == "slow" else None
         stack.enter_context(emulator(CHANNEL, "--scenario", "idle", "--clock", chosen.clock, folder=folder))
         counts = stack.enter_context(witness(CHANNEL, watched, seen_path, folder))
         config = patient_config(folder, more=chosen.settings)
-        begun = stack.enter_context(running(host_run(CHANNEL, folder, config), folder))
+        run = host_run(CHANNEL, folder, config)
+        if slow is not None:
+            run.command[:1] = [sys.executable, "-c", HOST_WITH_PIPE, folder / "slow"]
+        begun = stack.enter_context(running(run, folder))
         begin, end = disturbance(case, out, begun, slow)
         time.sleep(2.0)  # the drives are enabled by now
         marks_ns = [time.time_ns()]

@@ -21,6 +21,7 @@ from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
 from adacd_hil.analysis.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
 from adacd_hil.analysis.thresholds import BLOCK_S, Statistics
 from adacd_hil.log.errors import LogError
+from adacd_hil.output_files import replace_file
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme import detectors
 
@@ -260,7 +261,7 @@ def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
         for path, content in zip(paths, contents, strict=True):
-            path.write_bytes(content)
+            replace_file(path, content)
     except OSError as error:
         raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
     return paths

@@ -20,6 +20,8 @@ from adacd_hil.device.network import Master
 from adacd_hil.log.channels import ChannelId, pack_cycle
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.run_folder import check_free
+from adacd_hil.output_files import replace_file
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bitrate import read_bitrates
@@ -39,10 +41,12 @@ def run_commtest(
 ) -> tuple[dict[str, Any], ExitCode]:
     """Boot the arm, cycle at zero torque, judge. Exit code: FAILURE when the connection is not sufficient.
 
-    Raises ConfigError, CodecError, BusMissingError, LogError, CommandError.
+    Raises ConfigError, CodecError, BusMissingError, LogExistsError, LogError, CommandError.
     """
     settings, codec = connection.load()
     clock = MonotonicClock()
+    if out is not None:
+        check_free(out / LOG_NAME)
     with connection.bus(clock, codec.is_fd) as bus:
         tap = Tap(bus, clock)
         arm, master = Arm(settings, codec, tap), Master(settings, codec, tap)
@@ -153,7 +157,7 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     pictures = {HTML_NAME: page.encode()} | {f"{drawing.name}.png": drawing.png() for drawing in drawings}
     try:
         for name, data in pictures.items():
-            (out / name).write_bytes(data)
+            replace_file(out / name, data)
     except OSError as error:
         raise LogError(f"pictures in {out} can't be written: {error.strerror}") from None
     return [out / name for name in pictures]

@@ -8,6 +8,7 @@ import click
 
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.log.run_folder import log_in
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_comparison import LogComparison
@@ -30,10 +31,8 @@ def compare(first: Path, second: Path, as_json: bool) -> ExitCode:
     Times count from motion start, the first cycle in ADAPT. A folder stands for the run log in it.
     """
     from adacd_hil.analysis.replay.log_comparison import compare_logs
-    from adacd_hil.control.session import LOG_NAME
 
-    paths = (given / LOG_NAME if given.is_dir() else given for given in (first, second))
-    found = compare_logs(*paths)
+    found = compare_logs(log_in(first), log_in(second))
     print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
     if not found.is_same:
         return ExitCode.FAILURE

@@ -12,7 +12,7 @@ from typing import NoReturn
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.config import Settings, load_settings
-from adacd_hil.device.contract import load_contract, write_contract
+from adacd_hil.device.contract import load_contract
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, is_hardware, open_bus
 from adacd_hil.wire.codec import Codec
 
@@ -54,14 +54,6 @@ def received_ids(codec: Codec, is_following: bool = False) -> list[int]:
     if is_following:
         sent.discard("Sync")
     return [message.can_id for message in codec.messages.values() if message.name not in sent]
-
-
-def contract_of(settings: Settings, out: Path) -> Codec:
-    """Load the contract of the configured devices; one that is composed or moved is written to `out`.
-
-    Raises ConfigError, CodecError, OSError.
-    """
-    return write_contract(load_contract(settings), out)
 
 
 @dataclass(frozen=True)

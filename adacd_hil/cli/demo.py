@@ -1,19 +1,23 @@
 """A scenario in one process: host and emulated arm on the embedded bus, then the report."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.analysis.report.report import Report, write_report
-from adacd_hil.cli.connection import check_shared, contract_of, make_clock, model_time, on_interrupt
+from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
-from adacd_hil.cli.report import TRUTH_NAME
+from adacd_hil.cli.run_folder import run_folder
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import RequestSettings, Settings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
+from adacd_hil.device.contract import load_contract
+from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench import Bench
 from firmware_sim.scenario import Scenario, load_scenario, named_profile
@@ -53,14 +57,15 @@ def run_embedded(
     out: Path,
     progress: Callable[[str], None] = lambda _: None,
     live: LiveAddress | None = None,
+    on_started: Callable[[], None] = lambda: None,
 ) -> tuple[SessionSummary, Path]:
     """Run host and arm in this process, logs in `out`; return how it ended and where the truth is.
 
-    Raises ConfigError, CodecError, LogError.
+    Raises ConfigError, CodecError, LogError, OSError.
     """
     settings, scenario = cast
     check_shared("lockstep", settings)  # an arm in this process has no neighbour
-    codec = contract_of(settings, out)
+    codec = load_contract(settings)
     clock = make_clock(clock_name)
     embedded = EmbeddedBus(clock)
     bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
@@ -81,8 +86,13 @@ def run_embedded(
             progress=progress,
             live=live,
         )
-        with on_interrupt(session.interrupt):
-            summary = session.run()
+        session.on_started = on_started
+        try:
+            with on_interrupt(session.interrupt):
+                summary = session.run()
+        except BaseException:
+            truth.discard()
+            raise
     return summary, truth.path
 
 
@@ -92,24 +102,27 @@ def play(
     profile: str | None,
     seed: int | None,
     clock_name: str,
-    out: Path,
+    out: Path | None,
     live: LiveAddress | None = None,
 ) -> tuple[Report, ExitCode]:
-    """Play a scenario and report it. Raises ConfigError, CodecError, LogError, CommandError."""
+    """Play a scenario and report it; `out` None: in a new folder by date.
+
+    Raises ConfigError, CodecError, LogError, CommandError, OSError.
+    """
     cast = resolve(config, scenario_name, profile, seed)
     settings, scenario = cast
-    progress = Progress()
     what = "experiment" if scenario_name == SCENARIO else f"scenario {scenario.name}"
-    progress(f"{what} of configuration {settings.name}, profile {settings.arm.profile}, in {out}")
-    summary, truth_path = run_embedded(cast, clock_name, out, progress, live)
-    if summary.result is not None:
-        played_s = summary.result.cycles * settings.bus.period_s
-        pace = played_s / summary.elapsed_s
-        progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
-    progress("drawing the report")
-    report = write_report(summary.log.path, truth_path, out)
-    progress(f"report: {out / 'report.html'}")
-    progress.close()
+    with run_folder(out, (LOG_NAME, TRUTH_NAME), "demo") as folder, closing(Progress()) as progress:
+        progress(f"{what} of configuration {settings.name}, profile {settings.arm.profile}, in {folder.path}")
+        on_started = functools.partial(folder.link, progress)
+        summary, truth_path = run_embedded(cast, clock_name, folder.path, progress, live, on_started)
+        if summary.result is not None:
+            played_s = summary.result.cycles * settings.bus.period_s
+            pace = played_s / summary.elapsed_s
+            progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
+        progress("drawing the report")
+        report = write_report(summary.log.path, truth_path, folder.path)
+        progress(f"report: {folder.path / 'report.html'}")
     if summary.error:
         raise CommandError(summary.error, exit_code(summary))
     return report, exit_code(summary)

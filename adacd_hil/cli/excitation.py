@@ -11,6 +11,7 @@ from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.config import ExcitationSettings, builtin_names, load_settings, to_toml
+from adacd_hil.output_files import replace_file
 
 _LABELS = (
     ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),
@@ -49,7 +50,7 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
     if out is not None:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            out.write_text(as_toml(outcome), encoding="utf-8")
+            replace_file(out, as_toml(outcome))
         except OSError as error:
             raise CommandError(f"{out} can't be written: {error.strerror}") from None
     return outcome

@@ -8,6 +8,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.output_files import replace_file
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.foreign.recording_identification import Identified, Watched
@@ -75,10 +76,10 @@ def _write(found: "Identified", out: Path) -> None:
     from adacd_hil.analysis.foreign.recording_figure import draw_watched
 
     out.mkdir(parents=True, exist_ok=True)
-    (out / "identify.json").write_text(json.dumps(found.as_json(), indent=2), encoding="utf-8")
+    replace_file(out / "identify.json", json.dumps(found.as_json(), indent=2))
     names = ["test", *(f"watch{index + 1}" for index in range(len(found.watched)))]
     for name, watched in zip(names, (found.test, *found.watched), strict=True):
-        (out / f"{name}.png").write_bytes(draw_watched(found, watched, name).png())
+        replace_file(out / f"{name}.png", draw_watched(found, watched, name).png())
 
 
 def _as_text(found: "Identified") -> str:

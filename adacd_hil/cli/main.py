@@ -20,6 +20,7 @@ from adacd_hil.cli.options import (
     on_bus,
     on_bus_or_url,
     profile_option,
+    run_folder_option,
 )
 from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
@@ -46,7 +47,7 @@ def cli() -> None:
     metavar="NAME|FILE",
     help="What happens: one that `firmware-sim list` names, or a TOML file.",
 )
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/demo"), show_default=True)
+@run_folder_option("demo")
 @click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
 @clock_option(default="lockstep")
 @profile_option
@@ -56,7 +57,7 @@ def cli() -> None:
 def demo(
     config: str,
     scenario: str,
-    out: Path,
+    out: Path | None,
     seed: int | None,
     clock: str,
     profile: str | None,
@@ -78,12 +79,12 @@ def demo(
 @cli.command(epilog=EPILOG)
 @on_bus
 @click.option("--tare", type=click.Path(path_type=Path, dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("runs/run"), show_default=True)
+@run_folder_option("run")
 @clock_option(default="realtime")
 @json_option
 @live_options
 def run(
-    connection: "Connection", tare: Path | None, out: Path, clock: str, as_json: bool, live: "LiveAddress | None"
+    connection: "Connection", tare: Path | None, out: Path | None, clock: str, as_json: bool, live: "LiveAddress | None"
 ) -> ExitCode:
     """Run the scheme on an arm, real or emulated, that is on a bus.
 

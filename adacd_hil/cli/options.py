@@ -10,7 +10,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.config import ConfigError, builtin_names
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError
 
@@ -19,6 +19,7 @@ _CODES = (
     (CodecError, ExitCode.USAGE),
     (BusMissingError, ExitCode.BUS_MISSING),
     (BusError, ExitCode.SAFETY_STOP),
+    (LogExistsError, ExitCode.USAGE),
     (LogError, ExitCode.FAILURE),
     (OSError, ExitCode.FAILURE),
 )
@@ -58,6 +59,17 @@ config_option = click.option(
 profile_option = click.option(
     "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
 )
+
+
+def run_folder_option(name: str) -> Callable[..., Any]:
+    """Give a command the option for the folder of its run; where it isn't given, `runs/NAME` leads to the last one."""
+    return click.option(
+        "--out",
+        type=click.Path(path_type=Path, file_okay=False),
+        help=f"Folder, without a log so far; default: a new one by date, to which runs/latest and runs/{name} lead.",
+    )
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
 clock_option = functools.partial(
     click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."

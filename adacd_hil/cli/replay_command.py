@@ -8,6 +8,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
+from adacd_hil.log.run_folder import log_in
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.replay import Replay
@@ -107,15 +108,9 @@ def _replay_one(
     if not variants and base != own:
         variants = {", ".join(filter(None, [config or "", *changes])): base}
     progress(f"replaying {given}" + (f" with {len(variants)} other settings" if variants else ""))
-    truth = contacts_beside(_log_of(against or given))
+    truth = contacts_beside(log_in(against or given))
     settings: list[Settings] = [own, *variants.values()]
     return given, replay_source(source, settings, truth, progress, tolerance, ScriptedOperator, shown), list(variants)
-
-
-def _log_of(given: Path) -> Path:
-    from adacd_hil.control.session import LOG_NAME
-
-    return given / LOG_NAME if given.is_dir() else given
 
 
 def _open(
@@ -128,9 +123,9 @@ def _open(
     from adacd_hil.device.contract import load_contract
     from adacd_hil.wire.codec import load_codec
 
-    path = _log_of(given)
+    path = log_in(given)
     if against is not None:
-        return RecordingAgainstLog(path, _log_of(against)), False
+        return RecordingAgainstLog(path, log_in(against)), False
     if path.suffix.lower() == ".mcap":
         return LogSource(path), False
     config, profile, dbc = configured

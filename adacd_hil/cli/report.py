@@ -4,9 +4,7 @@ from pathlib import Path
 
 from adacd_hil.analysis.report.report import Report, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.control.session import LOG_NAME
-
-TRUTH_NAME = "truth.mcap"
+from adacd_hil.log.run_folder import TRUTH_NAME, log_in
 
 
 def report_logs(logs: tuple[Path, ...], out: Path | None) -> tuple[list[Report], ExitCode]:
@@ -15,7 +13,7 @@ def report_logs(logs: tuple[Path, ...], out: Path | None) -> tuple[list[Report],
     is_complete = True
     names: set[Path] = set()
     for given in logs:
-        path = given / LOG_NAME if given.is_dir() else given
+        path = log_in(given)
         folder = path.parent if out is None else out if len(logs) == 1 else out / path.parent.name
         if folder in names:
             raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)

@@ -1,17 +1,22 @@
 """Runs on a bus: opens it, lets a session run, says how it ended."""
 
+import functools
 import sys
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, check_clock, check_shared, contract_of, make_clock, on_interrupt
+from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, on_interrupt
 from adacd_hil.cli.exit_codes import ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
+from adacd_hil.cli.run_folder import run_folder
 from adacd_hil.clock import wall_ns
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
+from adacd_hil.device.contract import load_contract
+from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.wire.budget import check_budget
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.can_interface import CanInterface
@@ -42,13 +47,13 @@ def drop_old_frames(bus: Bus, interface: str) -> None:
 def run_on_bus(
     connection: Connection,
     clock_name: str,
-    out: Path,
+    out: Path | None,
     tare_path: Path | None = None,
     live: LiveAddress | None = None,
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Run the scheme on a bus, with the offsets of a tare when one is given.
+    """Run the scheme on a bus, with the offsets of a tare when one is given; `out` None: a new folder by date.
 
-    Raises ConfigError, CodecError, BusMissingError, LogError, CommandError.
+    Raises ConfigError, CodecError, BusMissingError, LogError, CommandError, OSError.
     """
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
@@ -58,25 +63,26 @@ def run_on_bus(
     if tare_path is not None:
         tare = use_tare(tare_path, settings, wall_ns())
         settings = tare.apply(settings)
-    codec = contract_of(settings, out)
+    codec = load_contract(settings)
     if clock_name == "realtime":
         check_budget_of(codec, settings)
     clock = make_clock(clock_name)
-    bus = connection.open(clock, codec, settings)
-    drop_old_frames(bus, interface)
-    operator: Operator = ScriptedOperator(settings.operator)
-    if sys.stdin is not None and sys.stdin.isatty():
-        operator = ConsoleOperator(ScriptedOperator(settings.operator))
-    progress = Progress()
-    session = Session(settings, codec, bus, clock, operator, out, interface, progress=progress, tare=tare, live=live)
-    for line in () if tare is None else tare.warnings:
-        progress(f"warning: {line}")
-    try:
+    with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack:
+        bus = connection.open(clock, codec, settings)
+        stack.callback(bus.close)
+        drop_old_frames(bus, interface)
+        operator: Operator = ScriptedOperator(settings.operator)
+        if sys.stdin is not None and sys.stdin.isatty():
+            operator = ConsoleOperator(ScriptedOperator(settings.operator))
+        progress = stack.enter_context(closing(Progress()))
+        session = Session(
+            settings, codec, bus, clock, operator, folder.path, interface, progress=progress, tare=tare, live=live
+        )
+        session.on_started = functools.partial(folder.link, progress)
+        for line in () if tare is None else tare.warnings:
+            progress(f"warning: {line}")
         with on_interrupt(session.interrupt):
             summary = session.run()
-    finally:
-        bus.close()
-        progress.close()
     return summarise(summary), exit_code(summary)
 
 

@@ -10,11 +10,10 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
+from adacd_hil.log.run_folder import LOG_NAME
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.plan import Plan
-
-_LOG_NAME = "run.mcap"
 
 
 @click.command(
@@ -112,9 +111,9 @@ def _files(logs: Sequence[Path]) -> list[Path]:
     """Find the logs; a folder stands for those below it."""
     found: list[Path] = []
     for given in logs:
-        below = sorted(given.rglob(_LOG_NAME)) if given.is_dir() else [given]
+        below = sorted(given.rglob(LOG_NAME)) if given.is_dir() else [given]
         if not below or not below[0].exists():
-            raise CommandError(f"no {_LOG_NAME} in {given}" if given.is_dir() else f"log {given} does not exist")
+            raise CommandError(f"no {LOG_NAME} in {given}" if given.is_dir() else f"log {given} does not exist")
         found += below
     return found
 

@@ -10,14 +10,15 @@ from adacd_hil.analysis.thresholds import Thresholds, thresholds_of_logs
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.table import format_table
 from adacd_hil.config import to_toml
-from adacd_hil.control.session import LOG_NAME
+from adacd_hil.log.run_folder import log_in
+from adacd_hil.output_files import replace_file
 
 
 def find(
     logs: tuple[Path, ...], rate_per_h: float, out: Path | None, report: Path | None
 ) -> tuple[Thresholds, Comparison | None]:
     """Find the thresholds, write them and the comparison where asked for. Raises LogError, CommandError."""
-    paths = [given / LOG_NAME if given.is_dir() else given for given in logs]
+    paths = [log_in(given) for given in logs]
     try:
         thresholds, statistics = thresholds_of_logs(paths, rate_per_h)
         comparison = None if report is None else compare_detectors(statistics, rate_per_h)
@@ -28,7 +29,7 @@ def find(
     if out is not None:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            out.write_text(to_toml(thresholds), encoding="utf-8")
+            replace_file(out, to_toml(thresholds))
         except OSError as error:
             raise CommandError(f"{out} can't be written: {error.strerror}", ExitCode.FAILURE) from None
     return thresholds, comparison

@@ -8,12 +8,12 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.log.run_folder import log_in
+from adacd_hil.output_files import replace_file
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.tune import Candidate, Tuning
     from adacd_hil.analysis.sweep.tune_roc import Found
-
-_LOG_NAME = "run.mcap"
 
 
 @click.command(
@@ -49,7 +49,7 @@ def tune(
     from adacd_hil.analysis.sweep.tune_config import base_of, suggested_toml
     from adacd_hil.cli.progress import Progress
 
-    paths = [given / _LOG_NAME if given.is_dir() else given for given in logs]
+    paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
         raise CommandError("a log is given twice: what is chosen on it can't be checked on it", ExitCode.USAGE)
     base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
@@ -73,7 +73,7 @@ def tune(
 def _write(out: Path, text: str) -> None:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text, encoding="utf-8")
+        replace_file(out, text)
     except OSError as error:
         raise CommandError(f"{out} can't be written: {error.strerror}", ExitCode.FAILURE) from None
 

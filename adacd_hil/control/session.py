@@ -16,19 +16,20 @@ from adacd_hil.control.recovery import Recovery
 from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.live.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.recorder import LogSummary, Recorder
+from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.log.setup import LiveSetup
+from adacd_hil.output_files import place_file
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.tap import Tap
-
-LOG_NAME = "run.mcap"
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,10 @@ class Ending(NamedTuple):
 
 @dataclass
 class Session:
-    """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time."""
+    """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
+
+    `on_started` is called when the devices are put into operation for the first time.
+    """
 
     settings: Settings
     codec: Codec
@@ -92,6 +96,7 @@ class Session:
     progress: Callable[[str], None] = lambda _: None
     tare: UsedTare | None = None
     live: LiveAddress | None = None
+    on_started: Callable[[], None] = lambda: None
     _cycle: Cycle | None = None
     _is_interrupted: bool = False
     _has_started: bool = False
@@ -110,7 +115,7 @@ class Session:
     def run(self) -> SessionSummary:
         """Run to the end. What ends the run early is in the summary; the log is closed and readable in any case.
 
-        Raises LogError when the log can't be created.
+        Raises LogExistsError when there is one already, LogError when it can't be created.
         """
         if self.is_lockstep:  # a simulated arm moves by whole periods, however late the modelled host sends SYNC
             realtime = replace(self.settings.realtime, sample_period="nominal")
@@ -194,7 +199,9 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
-        self._has_started = True
+        if not self._has_started:
+            self._has_started = True
+            self.on_started()
         with frozen_garbage():
             try:
                 master.start()
@@ -219,10 +226,8 @@ class Session:
         if self.tare is not None:
             attachments[TARE_NAME] = self.tare.text
         robot = robot_description(self.settings)
-        (self.out / ROBOT_NAME).write_text(robot)
-        (self.out / LAYOUT_NAME).write_bytes(viewer_layout(robot.encode()))
         with grant.unpinned():
-            return Recorder(
+            recorder = Recorder(
                 self.out / LOG_NAME,
                 messages=self.codec.messages.values(),
                 parameter_count=len(self.settings.estimator.parameter_names),
@@ -236,6 +241,21 @@ class Session:
                 robot=robot.encode(),
                 live=self._live_setup(robot),
             )
+        self._write_beside(robot.encode(), recorder)
+        return recorder
+
+    def _write_beside(self, robot: bytes, recorder: Recorder) -> None:
+        """Put beside the log what viewers want as files; all of it is in the log, too."""
+        for write in (
+            lambda: place_file(self.out / ROBOT_NAME, robot),
+            lambda: place_file(self.out / LAYOUT_NAME, viewer_layout(robot)),
+            lambda: write_contract(self.codec, self.out),
+        ):
+            try:
+                write()
+            except OSError as error:
+                self.progress(f"beside the log: {error}")
+                recorder.event(self.clock.now_ns(), Event("warning", "log", f"beside the log: {error}"))
 
     def _live_setup(self, robot: str) -> LiveSetup | None:
         if self.live is None:

@@ -5,9 +5,7 @@ sensors that it was measured with, by their serial numbers of 0x1018:4.
 """
 
 import dataclasses
-import os
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -16,6 +14,7 @@ from pathlib import Path
 from adacd_hil.config import ConfigError, Settings, parse, read_toml, setting, to_toml
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
+from adacd_hil.output_files import replacing
 from adacd_hil.records import JOINTS, Event
 
 TARE_NAME = "tare.toml"
@@ -124,17 +123,11 @@ def write_tare(tare: Tare, path: Path) -> Path | None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     backup = path.with_name(f"{path.name}.1") if path.exists() else None
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        new = Path(folder) / path.name
-        with new.open("w", encoding="utf-8") as file:
-            file.write(to_toml(tare))
-            file.flush()
-            os.fsync(file.fileno())
+    with replacing(path, is_durable=True) as new:
+        new.write_text(to_toml(tare), encoding="utf-8")
         if backup is not None:
-            copy = Path(folder) / backup.name
-            shutil.copy2(path, copy)
-            copy.replace(backup)
-        new.replace(path)
+            with replacing(backup) as copy:
+                shutil.copy2(path, copy)
     return backup
 
 

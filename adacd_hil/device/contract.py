@@ -13,6 +13,7 @@ from typing import NamedTuple
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.placement import Device, place_devices
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings
+from adacd_hil.output_files import place_file
 from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
 from adacd_hil.wire.node_offset import NODE_MASK, move_contract
 
@@ -80,17 +81,16 @@ def load_contract(settings: Settings) -> Codec:
     return codec
 
 
-def write_contract(codec: Codec, folder: Path) -> Codec:
-    """Return the codec with a file behind it: one that is composed or moved is written to `folder`.
+def write_contract(codec: Codec, folder: Path) -> Path:
+    """Return the file of the contract; one that is composed or moved has none and is written to `folder`.
 
-    Raises OSError, CodecError.
+    Raises OSError, also when another file of that name is there.
     """
     if codec.path.is_file() and codec.path.read_bytes() == codec.text:
-        return codec
-    folder.mkdir(parents=True, exist_ok=True)
+        return codec.path
     path = folder / codec.path.name
-    path.write_bytes(codec.text)
-    return load_codec(path)
+    place_file(path, codec.text)
+    return path
 
 
 def compose(settings: Settings, devices: list[Device]) -> Codec:

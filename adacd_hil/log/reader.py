@@ -28,6 +28,7 @@ from adacd_hil.log.ros_types import (
     LOG,
     unpack_log,
 )
+from adacd_hil.log.run_folder import log_in
 from adacd_hil.log.summary import LOST_KEY
 from adacd_hil.records import (
     PARAMETER_NAMES,
@@ -173,11 +174,12 @@ class RunLog:
         return self.topics["/truth"]
 
 
-def read_log(path: Path, topics: Collection[str] | None = None) -> RunLog:
+def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
     """Read the log whose first part is `path`, with all its parts, of the messages only those of `topics` when given.
 
-    Raises LogError when the file doesn't exist or isn't MCAP.
+    A folder stands for the run's log in it, `run.mcap`. Raises LogError when the file doesn't exist or isn't MCAP.
     """
+    path = log_in(path)
     walk, epoch_ns = open_log(path, topics)
     pieces = list(walk.pieces(_PIECE_CYCLES, epoch_ns, has_frame_records=True))
     rows = {}
@@ -203,10 +205,10 @@ def read_log(path: Path, topics: Collection[str] | None = None) -> RunLog:
     )
 
 
-def topic_bytes(path: Path, topic: str) -> bytes:
+def topic_bytes(path: str | Path, topic: str) -> bytes:
     """Return the payloads of a topic, one after the other: equal for two logs that hold the same, bit for bit.
 
-    Raises LogError when the file can't be read or lacks the topic.
+    path: as for `read_log`. Raises LogError when the file can't be read or lacks the topic.
     """
     walk, _ = open_log(path, (topic,))
     found = []
@@ -220,11 +222,11 @@ def topic_bytes(path: Path, topic: str) -> bytes:
     return b"".join(found)
 
 
-def open_log(path: Path, topics: Collection[str] | None) -> tuple["JoinedWalk", int]:
+def open_log(path: str | Path, topics: Collection[str] | None) -> tuple["JoinedWalk", int]:
     """Begin to read a log; return the walk over it and what was added to t_ns for its times. Raises LogError."""
     from adacd_hil.log.joined import JoinedWalk  # which loads numba
 
-    walk = JoinedWalk(path, _payload_layout, topics)
+    walk = JoinedWalk(log_in(path), _payload_layout, topics)
     return walk, _number(walk.metadata, EPOCH_KEY, 0)
 
 

@@ -9,7 +9,6 @@ import contextlib
 import json
 import os
 import socket
-import stat
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,12 +19,14 @@ from typing import NamedTuple
 from adacd_hil.config import LogSettings
 from adacd_hil.log import packet, words
 from adacd_hil.log.channels import MessageLike
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.live.robot_description import ROBOT_NAME
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.ring import Ring, room_of
+from adacd_hil.log.run_folder import check_free, make_room
 from adacd_hil.log.setup import LiveSetup, Setup, tell_messages
+from adacd_hil.output_files import create_file
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.wire.bus import Frame
 
@@ -73,11 +74,11 @@ class Recorder:
         robot: bytes = b"",
         live: LiveSetup | None = None,
     ) -> None:
-        """Create the file, replacing the log that is there with all its parts, and start the writer.
+        """Create the file, which must not be there (see run_folder.py), and start the writer.
 
         messages: of the DBC, default those of the one that comes with the package. epoch_ns: added to t_ns for the
         log's times; 0 in lockstep. is_truth: the emulator's own log, /truth and /events only. robot: the arm's URDF,
-        for viewers. live: serve what is logged. Raises LogError.
+        for viewers. live: serve what is logged. Raises LogExistsError, LogError.
         """
         settings = settings or LogSettings()
         own = {
@@ -95,7 +96,7 @@ class Recorder:
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
         self._unannounced = 0  # bytes in the ring that the writer was not woken for
-        file = _create(path)
+        file = _create(path, is_truth)
         setup = Setup(
             path=path.absolute(),
             is_truth=is_truth,
@@ -107,7 +108,6 @@ class Recorder:
             epoch_ns=epoch_ns,
             part_bytes=settings.part_MiB * _MIB,
             part_ns=round(settings.part_min * _MINUTE_NS),
-            may_rotate=stat.S_ISREG(os.fstat(file).st_mode),
             attachments={**(attachments or {}), **drawn, **layout},
             metadata={**(metadata or {}), **own},
             live=live,
@@ -148,8 +148,7 @@ class Recorder:
             self._process.wait()
             self._release()
             with contextlib.suppress(OSError):
-                if stat.S_ISREG(self.path.stat().st_mode):
-                    self.path.unlink()
+                self.path.unlink()
             raise LogError(f"log {self.path} can't be written: {error}")
         assert word is not None
         self.live_url = word["live_url"]
@@ -256,20 +255,18 @@ class Recorder:
         self.close()
 
 
-def _create(path: Path) -> int:
-    """Create the first part, and remove the others of the log that it replaces. Raises LogError."""
+def _create(path: Path, is_truth: bool) -> int:
+    """Create the first part. Raises LogExistsError, LogError."""
+    if is_truth:
+        check_free(path)
+    else:
+        make_room(path)
     try:
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        return create_file(path)
+    except FileExistsError:  # since it was looked at
+        raise LogExistsError(f"{path} is being written by another run; choose another folder with --out") from None
     except OSError as error:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None
-    try:
-        for number, part in find_parts(path).items():
-            if number:
-                part.unlink()
-    except OSError as error:
-        os.close(file)
-        raise LogError(f"log {path}: a part of the log before can't be removed: {error}") from None
-    return file
 
 
 def _own_messages() -> Iterable[MessageLike]:

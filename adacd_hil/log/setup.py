@@ -58,7 +58,7 @@ class Setup:
     """`messages`: of the DBC; `is_truth` makes the emulator's own log, which has none.
 
     `path`: absolute, of the first part. A part ends after `part_bytes` before compression or `part_ns` of log time,
-    never where these are 0. `may_rotate`: the log is a file, which others can follow. `live`: served, unless None.
+    never where these are 0. `live`: served, unless None.
     """
 
     path: Path
@@ -69,7 +69,6 @@ class Setup:
     epoch_ns: int
     part_bytes: int
     part_ns: int
-    may_rotate: bool
     attachments: dict[str, bytes]
     metadata: dict[str, str]
     further_count: int = 0

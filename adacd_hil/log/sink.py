@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from adacd_hil.output_files import create_file
+
 WAITING_BYTES = 32 * 1024 * 1024
 """What may wait for the disk: about 45 s of a run at 1 kHz, compressed."""
 
@@ -28,11 +30,12 @@ class Sink:
     def __init__(
         self,
         descriptor: int,
+        path: Path | None = None,
         waits: bool = True,
         most_waiting: int = WAITING_BYTES,
         on_written: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """Write to `descriptor`.
+        """Write to `descriptor`, which is of the file `path`.
 
         waits: `write` waits rather than let more than `most_waiting` bytes wait. on_written: is told, by the thread,
         how many packets each write has brought to the disk.
@@ -43,6 +46,8 @@ class Sink:
         """Why the first of all files that did ended early."""
         self.written = 0
         """Bytes of the file in progress that are on the disk."""
+        self.path = path
+        """The file in progress; None when it could not be created."""
         self._descriptor = descriptor
         self._name = ""  # of a later file
         self._waits = waits
@@ -70,7 +75,7 @@ class Sink:
         return len(data)
 
     def begin(self, path: Path) -> None:
-        """Go on with another file, replacing what is there, once everything before is written or has failed."""
+        """Go on with a new file, or with the one in progress from its start, once all before is written or failed."""
         self._position = 0
         with self._changed:
             self._tasks.append(path)
@@ -140,10 +145,18 @@ class Sink:
             self._lost += task.packets if self.error else 0
 
     def _open(self, path: Path) -> None:
-        self._close()
+        is_new = path != self.path or self._descriptor < 0
+        if is_new:
+            self._close()
+            self.path = None
         self.error, self.written, self._name = "", 0, f"{path.name}: "
         try:
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+            if is_new:
+                self._descriptor = create_file(path)
+                self.path = path
+            else:
+                os.lseek(self._descriptor, 0, os.SEEK_SET)
+                os.ftruncate(self._descriptor, 0)
         except OSError as error:
             self._fail(error)
 

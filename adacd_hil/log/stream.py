@@ -35,10 +35,10 @@ class LogStream:
     What is damaged or missing is left out; `problem` says so.
     """
 
-    def __init__(self, path: Path, topics: Collection[str] | None = None, cycles_per_piece: int = 20_000) -> None:
+    def __init__(self, path: str | Path, topics: Collection[str] | None = None, cycles_per_piece: int = 20_000) -> None:
         """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
 
-        Raises LogError when nothing of it can be read.
+        A folder stands for the run's log in it. Raises LogError when nothing of it can be read.
         """
         self._walk, self.epoch_ns = open_log(path, topics)
         self._topics = topics

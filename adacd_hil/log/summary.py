@@ -8,7 +8,9 @@ CUT = "cut"
 """The ending of a stretch of a log."""
 MERGED = "merged"
 """The ending of several logs in one."""
-PLANNED_ENDINGS = ("closed", "continued", RECOVERED, CUT, MERGED)
+COPY_ENDINGS = (RECOVERED, CUT, MERGED)
+"""The endings of logs that are made of others."""
+PLANNED_ENDINGS = ("closed", "continued", *COPY_ENDINGS)
 LOST_KEY = "lost"
 """Of the summary of a recovered log: what was lost, in words; missing when nothing was."""
 DROPPED_KEY = "dropped"

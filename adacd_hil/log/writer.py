@@ -31,6 +31,7 @@ from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, McapFile
 from adacd_hil.log.packet_writer import Numbers, PacketWriter, Rows
 from adacd_hil.log.parts import part_path
 from adacd_hil.log.ring import RingReader, split
+from adacd_hil.log.run_folder import is_there
 from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
 
@@ -107,9 +108,10 @@ class WriterProcess:
     def _end(self, summary: dict[str, str]) -> None:
         """Close the last file and say how it went."""
         self._sink.close()
-        if self._part and self._sink.error and not self._has_chunks:
+        path = part_path(self._setup.path, self._part)
+        if self._part and self._sink.error and self._sink.path == path and not self._has_chunks:
             with contextlib.suppress(OSError):
-                part_path(self._setup.path, self._part).unlink()
+                path.unlink()
         lost = self._lost + self._sink.take_lost()
         last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
         _send(self._connection, json.dumps({**summary, **last}).encode())
@@ -164,7 +166,7 @@ class WriterProcess:
             self._failed_ns = None
         elif self._failed_ns is None:
             self._failed_ns = now_ns
-        elif now_ns - self._failed_ns >= RETRY_PERIOD_NS and self._setup.may_rotate:
+        elif now_ns - self._failed_ns >= RETRY_PERIOD_NS:
             self._failed_ns = now_ns
             self._begin_part(is_next=self._has_chunks)
 
@@ -182,21 +184,23 @@ class WriterProcess:
             self._begin_part(is_next=True)
 
     def _is_part_full(self) -> bool:
-        if not self._setup.may_rotate or self._part_ns is None:
+        if self._part_ns is None:
             return False
         first_ns, last_ns = self._part_ns
         part_bytes, part_ns = self._setup.part_bytes, self._setup.part_ns
         return 0 < part_bytes <= self._file.record_bytes or 0 < part_ns <= last_ns - first_ns
 
     def _begin_part(self, is_next: bool) -> None:
-        """Begin the next part, or the present one again."""
+        """Begin the next part, or the present one again; names that somebody else has taken are passed over."""
         self._part += is_next
         self._parts += is_next
+        while self._sink.path != (path := part_path(self._setup.path, self._part)) and is_there(path):
+            self._part += 1
         self._frames += self._packets.frames
         self._messages += self._file.messages
         self._packets.frames = 0
         self._part_ns = None
-        self._sink.begin(part_path(self._setup.path, self._part))
+        self._sink.begin(path)
         self._file = self._begin_file()
         self._packets.begin(self._file)
 
@@ -291,7 +295,8 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
     try:
         setup = Setup.from_json(sys.stdin.buffer.read())
         ring = RingReader(ring_descriptor)
-        sink = Sink(file_descriptor, waits=setup.is_blocking, on_written=ring.count_written)
+        os.dup(file_descriptor)  # never closed: the lock of the first part lasts as long as this process
+        sink = Sink(file_descriptor, setup.path, waits=setup.is_blocking, on_written=ring.count_written)
         process = WriterProcess(connection, ring, sink, setup)
         sink.settle()
         error = sink.error

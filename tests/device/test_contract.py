@@ -92,10 +92,14 @@ def test_a_contract_moves_to_the_configured_node_ids_and_is_what_the_profiles_sa
 
 def test_a_moved_contract_gets_a_file_for_the_log_and_is_not_mistaken_for_another(tmp_path: Path) -> None:
     codec = load_contract(parse(Settings, {"devices": {"drive_node": [5, 6], "sensor_node": [7, 8]}}))
-    (tmp_path / "arm.dbc").write_bytes(load_codec().text)
     written = write_contract(codec, tmp_path)
-    assert written.path == tmp_path / "arm.dbc"
-    assert load_codec(written.path).layout_digest == codec.layout_digest
+    assert written == tmp_path / "arm.dbc"
+    assert load_codec(written).layout_digest == codec.layout_digest
+    assert write_contract(codec, tmp_path) == written
+    (tmp_path / "arm.dbc").write_bytes(load_codec().text)
+    with pytest.raises(FileExistsError, match="another one is there already"):
+        write_contract(codec, tmp_path)
+    assert written.read_bytes() == load_codec().text
 
 
 def test_the_host_has_a_node_id_of_its_own() -> None:
@@ -105,14 +109,14 @@ def test_the_host_has_a_node_id_of_its_own() -> None:
 
 def test_a_composed_contract_gets_a_file_for_the_log(tmp_path: Path) -> None:
     settings = parse(Settings, {"devices": {"contract": ""}})
-    codec = write_contract(load_contract(settings), tmp_path)
-    assert codec.path == tmp_path / "contract.dbc"
-    assert load_codec(codec.path).layout_digest == load_codec().layout_digest
+    written = write_contract(load_contract(settings), tmp_path)
+    assert written == tmp_path / "contract.dbc"
+    assert load_codec(written).layout_digest == load_codec().layout_digest
 
 
 def test_a_contract_with_a_file_is_not_written_again(tmp_path: Path) -> None:
     codec = load_codec()
-    assert write_contract(codec, tmp_path) is codec
+    assert write_contract(codec, tmp_path) == codec.path
     assert list(tmp_path.iterdir()) == []
 
 

@@ -40,11 +40,11 @@ class HastyClock:
 class Writer:
     """The writer in a thread of this process, fed through its ring as by a control process in real time."""
 
-    def __init__(self, path, descriptor, may_rotate=True, part_bytes=0):
+    def __init__(self, path, descriptor, part_bytes=0):
         self.ring = Ring(4 * 2**20)
         self.dropped = 0
         self.clock = HastyClock()
-        self.sink = Sink(descriptor, waits=False, most_waiting=MOST_WAITING)
+        self.sink = Sink(descriptor, path, waits=False, most_waiting=MOST_WAITING)
         self._reader = RingReader(self.ring.descriptor)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         setup = Setup(
@@ -56,7 +56,6 @@ class Writer:
             epoch_ns=0,
             part_bytes=part_bytes,
             part_ns=0,
-            may_rotate=may_rotate,
             attachments={},
             metadata={},
         )
@@ -120,7 +119,7 @@ def test_a_slow_disk_costs_packets_and_bounded_memory(tmp_path):
         while data := os.read(left, 65536):
             written.extend(data)
 
-    writer = Writer(tmp_path / "run.mcap", right, may_rotate=False)
+    writer = Writer(tmp_path / "run.mcap", right)
     for start in range(0, 1900, 190):
         writer.feed(run.cycles[start : start + 190])
         writer.wait_until_taken()
@@ -189,6 +188,25 @@ def test_a_full_disk_is_tried_again_with_another_part(tmp_path, monkeypatch):
     assert_accounts_for(log, run.cycles, int(word["lost"]))
 
 
+def test_a_part_without_data_is_begun_again_when_there_is_room(tmp_path, monkeypatch):
+    run = make_run(400)
+    disk = Disk(monkeypatch)
+    path = tmp_path / "run.mcap"
+    writer = Writer(path, create(path))
+    disk.room = 1000
+    writer.feed(run.cycles[:200])
+    writer.wait_until_taken()
+    disk.room = 2**40
+    failed = writer.clock.now
+    writer.wait(lambda: writer.clock.now > failed + 2 * RETRY_PERIOD_NS)
+    writer.feed(run.cycles[200:])
+    word = writer.end()
+    assert (word["lost"], word["parts"]) == (str(packets_of(run.cycles[:200])), "1")
+    log = read_log(path)
+    assert log.problem == ""
+    assert log.scheme.block.tobytes() == run.blocks[200:].tobytes()
+
+
 @pytest.mark.parametrize("has_chunk", [False, True])
 def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path, monkeypatch):
     run = make_run(400)
@@ -229,6 +247,6 @@ def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):
 
 def test_the_setup_arrives_as_it_was_sent(tmp_path):
     messages = tell_messages(CODEC.messages.values())
-    setup = Setup(tmp_path, True, False, messages, 7, 5, 1, 2, True, {"a": b"\xff"}, {"b": "c"})
+    setup = Setup(tmp_path, True, False, messages, 7, 5, 1, 2, {"a": b"\xff"}, {"b": "c"})
     assert Setup.from_json(setup.to_json()) == setup
     assert len(messages) == len(CODEC.messages)

@@ -18,6 +18,7 @@ from mcap.stream_reader import StreamReader
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
 from adacd_hil.config import LogSettings
+from adacd_hil.log import recorder as recorder_module
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
@@ -219,16 +220,24 @@ def test_a_full_disk_is_reported_and_stops_nobody(limit, least, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_disk_that_is_full_from_the_start_is_an_error_before_the_run():
-    with pytest.raises(LogError, match=r"^log /dev/full can't be written: No space left on device after 0 bytes$"):
-        Recorder(Path("/dev/full"))
+def test_a_disk_that_is_full_from_the_start_is_an_error_before_the_run(tmp_path, monkeypatch):
+    path = tmp_path / "run.mcap"
+
+    def create_full(path):
+        path.touch()
+        return os.open("/dev/full", os.O_WRONLY)
+
+    monkeypatch.setattr(recorder_module, "create_file", create_full)
+    with pytest.raises(LogError, match=f"^log {path} can't be written: No space left on device after 0 bytes$"):
+        Recorder(path)
+    assert not path.exists()
 
 
 @pytest.mark.parametrize(
-    ("name", "reason"), [("missing/run.mcap", "No such file or directory"), ("folder", "Is a directory")]
+    ("name", "reason"), [("missing/run.mcap", "No such file or directory"), ("file/run.mcap", "Not a directory")]
 )
 def test_a_path_that_can_not_be_created_is_an_error_before_the_run(name, reason, tmp_path):
-    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
     path = tmp_path / name
     with pytest.raises(LogError, match=f"^log {path} can't be created: {reason}$"):
         Recorder(path)

@@ -322,7 +322,6 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_outlives_the_l
         epoch_ns=EPOCH_NS,
         part_bytes=0,
         part_ns=0,
-        may_rotate=False,
         attachments={},
         metadata={},
         live=SETUP,

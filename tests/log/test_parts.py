@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
 from adacd_hil.config import LogSettings
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.errors import LogExistsError
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.reader import read_log, topic_bytes
 from adacd_hil.log.recorder import Recorder
@@ -131,19 +131,36 @@ def test_a_part_ends_in_real_time(run, whole, tmp_path):
     assert log.frames.tobytes() == whole.frames.tobytes()
 
 
-def test_the_parts_of_the_log_before_are_removed_and_nothing_else(tmp_path):
+@pytest.mark.parametrize("name", ["run_001.mcap", "run_1000.mcap"])
+def test_where_parts_of_another_log_are_no_log_begins(name, tmp_path):
+    (tmp_path / name).write_bytes(b"yesterday")
+    with pytest.raises(LogExistsError, match=f"{name} is there already; choose another folder"):
+        Recorder(tmp_path / "run.mcap")
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [(name, b"yesterday")]
+
+
+def test_what_is_no_part_of_a_log_is_left_alone_beside_it(tmp_path):
     keep = ["run_1.mcap", "run_abc.mcap", "walk_001.mcap", "run_001.txt", "run_001_001.mcap"]
-    for name in ("run_001.mcap", "run_002.mcap", "run_1000.mcap", *keep):
+    for name in keep:
         (tmp_path / name).touch()
     record(tmp_path / "run.mcap", make_run(3))
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(["run.mcap", *keep])
     assert read_log(tmp_path / "run.mcap").is_complete
 
 
-def test_a_part_of_before_that_can_not_be_removed_is_an_error_before_the_run(tmp_path):
-    (tmp_path / "run_001.mcap").mkdir()
-    with pytest.raises(LogError, match="a part of the log before can't be removed"):
-        Recorder(tmp_path / "run.mcap")
+def test_a_part_whose_name_is_taken_gets_the_next_one(run, whole, tmp_path):
+    path = tmp_path / "run.mcap"
+    recorder = start(path, run, settings=BY_SIZE)
+    part_path(path, 1).symlink_to(tmp_path / "target")
+    part_path(path, 3).write_bytes(b"somebody else's")
+    feed(recorder, run.cycles)
+    assert recorder.close().is_complete
+    assert not (tmp_path / "target").exists()
+    assert part_path(path, 3).read_bytes() == b"somebody else's"
+    part_path(path, 3).unlink()
+    log = read_log(path)
+    assert log.problem == "run_001.mcap is missing; run_003.mcap is missing"
+    assert log.scheme.payloads() == whole.scheme.payloads()
 
 
 def times_of(path):

@@ -27,6 +27,7 @@ from adacd_hil.analysis.replay.truth_contacts import TrueContact, read_contacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import LoggedContact
+from adacd_hil.log.run_folder import TRUTH_NAME
 from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.batch import SchemeBatch, arm_at
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
@@ -34,7 +35,6 @@ from adacd_hil.scheme.pipeline import Pipeline
 from adacd_hil.scheme.selection import pipeline_of
 from adacd_hil.wire.codec import Codec
 
-TRUTH_NAME: Final = "truth.mcap"
 SCRIPTED: Final = "script"
 """Of a log's metadata `operator`: nobody could type anything."""
 _PROGRESS_CYCLES: Final = 200_000

@@ -22,6 +22,7 @@ from adacd_hil.analysis.report.words import align_columns, contact_rows, paper_c
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.log.errors import LogError
+from adacd_hil.output_files import replace_file
 
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
@@ -102,7 +103,7 @@ def write_run_report(run: Run, out_dir: Path, source: Source, *, is_printed: boo
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
-            (out_dir / name).write_bytes(content)
+            replace_file(out_dir / name, content)
     except OSError as error:
         raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
     return report

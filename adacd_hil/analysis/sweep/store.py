@@ -11,6 +11,7 @@ from typing import Any
 
 from adacd_hil.analysis.sweep.rows import Values
 from adacd_hil.log.errors import LogError
+from adacd_hil.output_files import replace_file, replacing
 
 TABLE_NAME = "sweep.parquet"
 PLAN_NAME = "plan.json"
@@ -57,7 +58,7 @@ class SweepStore:
         metadata = {f"adacd_hil.{name}": text for name, text in about.items()}
         path = self.folder / TABLE_NAME
         _write(self._parquet, path, table.replace_schema_metadata(metadata))
-        (self.folder / PLAN_NAME).write_text(json.dumps(about, indent=2), encoding="utf-8")
+        replace_file(self.folder / PLAN_NAME, json.dumps(about, indent=2))
         return path
 
     def _paths(self) -> list[Path]:
@@ -86,6 +87,5 @@ def _table(rows: list[Values]) -> Any:
 
 
 def _write(parquet: Any, path: Path, table: Any) -> None:
-    beside = path.with_suffix(".writing")
-    parquet.write_table(table, beside, compression="zstd")
-    beside.replace(path)
+    with replacing(path) as beside:
+        parquet.write_table(table, beside, compression="zstd")

@@ -13,6 +13,7 @@ from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
 from adacd_hil.analysis.sweep.tune import Tuning
 from adacd_hil.analysis.sweep.tune_roc import Choice
 from adacd_hil.log.errors import LogError
+from adacd_hil.output_files import replace_file
 
 _LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "queue_log", "beside", "queue_receive", "muted")
 
@@ -110,7 +111,7 @@ def write_tuning(tuning: Tuning, out_dir: Path) -> tuple[Path, ...]:
     try:
         out_dir.mkdir(parents=True, exist_ok=True)
         for name, content in contents.items():
-            (out_dir / name).write_bytes(content)
+            replace_file(out_dir / name, content)
     except OSError as error:
         raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
     return tuple(out_dir / name for name in contents)

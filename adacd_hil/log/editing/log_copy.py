@@ -5,7 +5,6 @@ shared where they are equal.
 """
 
 import contextlib
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -17,8 +16,12 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.chunked_file import ChunkedFile
 from adacd_hil.log.editing.chunk_contents import Contents
+from adacd_hil.log.editing.file_end import read_end
+from adacd_hil.log.editing.info import read_info
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import LIBRARY, SUMMARY_METADATA
+from adacd_hil.log.summary import COPY_ENDINGS
+from adacd_hil.output_files import Replacement
 
 _CHANNEL_NUMBERS = 2**16
 _CHANNEL = 9
@@ -41,7 +44,7 @@ class Messages(NamedTuple):
 
 
 class LogCopy:
-    """The log in the making: `NAME.part` until `finish`."""
+    """The log in the making: a hidden file beside until `finish`, which replaces another copy, but no recording."""
 
     def __init__(self, path: Path) -> None:
         """Begin a log at `path`. Raises LogError."""
@@ -169,12 +172,12 @@ class _Target:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._part = path.with_name(path.name + ".part")
         self._position = 0
         try:
-            self._file = self._part.open("wb")
+            self._replacement = Replacement(path, is_log=_is_copy(path))
+            self._file = self._replacement.beside.open("wb")
         except OSError as error:
-            raise LogError(f"log {self._part} can't be created: {error.strerror}") from None
+            raise LogError(f"log {path} can't be created: {error.strerror}") from None
 
     def write(self, data: bytes, packets: int = 0) -> int:
         del packets
@@ -190,10 +193,8 @@ class _Target:
 
     def commit(self) -> None:
         try:
-            self._file.flush()
-            os.fsync(self._file.fileno())
             self._file.close()
-            self._part.replace(self._path)
+            self._replacement.commit(is_durable=True)
         except OSError as error:
             raise self._error(error) from None
 
@@ -201,7 +202,16 @@ class _Target:
         """Remove what was not committed."""
         with contextlib.suppress(OSError):
             self._file.close()
-        self._part.unlink(missing_ok=True)
+        self._replacement.discard()
 
     def _error(self, error: OSError) -> LogError:
-        return LogError(f"log {self._part} can't be written: {error.strerror}")
+        return LogError(f"log {self._path} can't be written: {error.strerror}")
+
+
+def _is_copy(path: Path) -> bool:
+    """Tell whether a file is a log that was made of others, so that it can be made again."""
+    try:
+        with path.open("rb") as file:
+            return read_end(file) is not None and read_info(path).ending in COPY_ENDINGS
+    except (OSError, LogError):
+        return False

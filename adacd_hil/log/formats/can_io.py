@@ -48,9 +48,11 @@ class McapWriter(BinaryIOMessageWriter):
     """Writes messages to an MCAP file with the topics and types of our logs."""
 
     def __init__(self, file: Any, append: bool = False, **_: Any) -> None:
-        """Create a file, or take an open binary one. Raises ValueError for `append`."""
+        """Create a file, or take an open binary one. Raises ValueError for `append`, FileExistsError for a log."""
         if append:
             raise ValueError("nothing can be appended to an MCAP file; log to another one")
+        if isinstance(file, str | os.PathLike) and Path(file).is_file() and Path(file).stat().st_size:
+            raise FileExistsError(f"{os.fspath(file)} is there already; log to another file")
         super().__init__(file, mode="wb")
         self._writer = FrameWriter(cast("IO[bytes]", self.file))
         self._is_stopped = False

@@ -69,8 +69,7 @@ def _export_topics(
     path: Path, out: Path, kind: str, topics: list[str], progress: Callable[[int], None]
 ) -> TableSummary:
     stream = LogStream(path, topics)
-    tables = Tables(out, kind, stream.metadata)
-    try:
+    with Tables(out, kind, stream.metadata) as tables:
         for piece in stream:
             for topic, series in piece.series.items():
                 if topic in topics:
@@ -78,8 +77,6 @@ def _export_topics(
             if payloads := piece.payloads.get(_EVENTS):
                 tables.write(_EVENTS, event_columns(payloads, stream.epoch_ns))
             progress(sum(tables.rows.values()))
-    finally:
-        tables.close()
     return TableSummary(tables.rows, stream.problem)
 
 
@@ -89,15 +86,12 @@ def _export_frames(
     chosen = choose_topics([DECODED + name for name in codec.messages], wanted)
     source = open_frames(path)
     pieces = iter(source)
-    tables = Tables(out, kind, {"contract": codec.path.name})
-    try:
+    with Tables(out, kind, {"contract": codec.path.name}) as tables:
         for frames in pieces:
             for name, columns in frame_columns(frames, codec):
                 if DECODED + name in chosen:
                     tables.write(DECODED + name, columns)
             progress(sum(tables.rows.values()))
-    finally:
-        tables.close()
     return TableSummary(tables.rows, source.problem)
 
 

@@ -6,6 +6,7 @@ before 1990, as of a run in lockstep, has no date in BLF and counts from 0.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -17,6 +18,7 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import FrameSource
+from adacd_hil.output_files import replacing
 
 _MS_NS = 1_000_000
 _US_NS = 1_000
@@ -61,15 +63,12 @@ def export_frames(
     losses: Counter[str] = Counter()
     count = 0
     try:
-        target = _TARGETS[kind](path)
-        try:
+        with replacing(path) as beside, closing(_TARGETS[kind](beside)) as target:
             for frames in pieces:
                 for what, is_lost in target.write(frames, source.channels, source.epoch_ns):
                     losses[what] += int(np.count_nonzero(is_lost))
                 count += len(frames)
                 progress(count)
-        finally:
-            target.close()
     except OSError as error:
         raise LogError(f"{path} can't be written: {error.strerror or error}") from None
     return ExportSummary(count, tuple(f"{number} {what}" for what, number in losses.items() if number))

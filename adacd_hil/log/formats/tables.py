@@ -8,7 +8,9 @@ and reasons are the numbers that the schemas name.
 import csv
 import struct
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
+from types import TracebackType
 from typing import IO, Any, Protocol
 
 import numpy as np
@@ -19,6 +21,7 @@ from adacd_hil.log.decoding import Decoder
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import Series
 from adacd_hil.log.ros_types import unpack_log
+from adacd_hil.output_files import replacing
 from adacd_hil.wire.codec import Codec
 
 _STAMP = struct.Struct("<II")
@@ -78,7 +81,7 @@ class _Table(Protocol):
 
 
 class Tables:
-    """Files of tables in one folder, each made when its first rows come."""
+    """Files of tables in one folder, each begun when its first rows come; they appear when all are whole."""
 
     def __init__(self, folder: Path, kind: str, metadata: Mapping[str, str]) -> None:
         """Make the folder. `metadata` goes into Parquet files. Raises LogError when nothing can be written."""
@@ -88,6 +91,7 @@ class Tables:
         self._kind = kind
         self._metadata = dict(metadata)
         self._tables: dict[str, _Table] = {}
+        self._files = ExitStack()
         if kind == "parquet":
             _import_pyarrow()
         try:
@@ -100,7 +104,9 @@ class Tables:
         path = self._folder / f"{topic.strip('/').replace('/', '_')}.{self._kind}"
         try:
             if topic not in self._tables:
-                self._tables[topic] = _Csv(path) if self._kind == "csv" else _Parquet(path, self._metadata)
+                beside = self._files.enter_context(replacing(path))
+                table = _Csv(beside) if self._kind == "csv" else _Parquet(beside, self._metadata)
+                self._tables[topic] = self._files.enter_context(closing(table))
                 self.rows[path] = 0
                 self._tables[topic].write(columns)
             elif len(columns["t_ns"]):
@@ -109,11 +115,15 @@ class Tables:
             raise LogError(f"{path} can't be written: {error.strerror or error}") from None
         self.rows[path] += len(columns["t_ns"])
 
-    def close(self) -> None:
-        """End all files. Raises LogError."""
+    def __enter__(self) -> "Tables":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End all files, or remove them after an error. Raises LogError."""
         try:
-            for table in self._tables.values():
-                table.close()
+            self._files.__exit__(kind, value, trace)
         except OSError as error:
             raise LogError(f"{self._folder} can't be written: {error.strerror or error}") from None
 

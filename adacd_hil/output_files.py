@@ -1,0 +1,169 @@
+"""Files that are written: new ones that replace nothing, and replacements in one step.
+
+Neither follows a link nor writes into a FIFO or a device, so that nothing is changed but what was named. A replacement
+is written beside and renamed: at no moment is there half a file, or none where there was one.
+"""
+
+import contextlib
+import errno
+import fcntl
+import itertools
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_LOG_MAGIC = b"\x89MCAP0\r\n"
+_LOCKS = Path("/proc/locks")
+
+
+class InUseError(Exception):
+    """A file that another process is writing; the message is one line."""
+
+
+def create_file(path: Path) -> int:
+    """Create a file and return its descriptor, locked for as long as that, or a copy of it, is open.
+
+    Raises FileExistsError for whatever is there, a dangling link included; OSError.
+    """
+    descriptor = os.open(path, _NEW, 0o666)
+    with contextlib.suppress(OSError):  # a file system without locks: then nobody is told who writes
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return descriptor
+
+
+def check_unused(path: Path) -> None:
+    """Raise InUseError when a process is writing a file that `create_file` made, with the process id where it's known.
+
+    A file that can't be opened passes.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InUseError(f"{path} is being written by {_owner(descriptor)}") from None
+    except OSError:
+        return
+    finally:
+        os.close(descriptor)
+
+
+def _owner(descriptor: int) -> str:
+    """Name the process that holds the lock of a file; proc(5), /proc/locks."""
+    status = os.fstat(descriptor)
+    place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    with contextlib.suppress(OSError):
+        for line in _LOCKS.read_text(encoding="ascii", errors="replace").splitlines():
+            words = line.split()
+            if len(words) >= 6 and words[1] == "FLOCK" and words[5] == place and words[4] != "0":
+                return f"process {words[4]}"
+    return "another process"
+
+
+class Replacement:
+    """A new file, `beside`, that takes the place of `path` when it is committed."""
+
+    def __init__(self, path: Path, is_log: bool = False) -> None:
+        """Create the file beside. A link is replaced, and its target left as it is.
+
+        is_log: a log may be replaced. Raises OSError, also when a FIFO, a device, a folder or, otherwise, a log is
+        there.
+        """
+        _check_replaceable(path, is_log)
+        self.path = path
+        self.beside = _create_beside(path)
+
+    def commit(self, is_durable: bool = False) -> None:
+        """Take the place of `path`; `is_durable`: not before the contents are on the disk. Raises OSError."""
+        try:
+            if is_durable:
+                with self.beside.open("rb") as file:
+                    os.fsync(file.fileno())
+            self.beside.replace(self.path)
+        except OSError:
+            self.discard()
+            raise
+
+    def discard(self) -> None:
+        """Remove the file beside."""
+        with contextlib.suppress(OSError):
+            self.beside.unlink()
+
+
+@contextmanager
+def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
+    """Yield the path of a new file that takes the place of `path` when the block ends without error.
+
+    See `Replacement`. Raises OSError.
+    """
+    replacement = Replacement(path)
+    try:
+        yield replacement.beside
+    except BaseException:
+        replacement.discard()
+        raise
+    replacement.commit(is_durable)
+
+
+def replace_file(path: Path, content: bytes | str) -> None:
+    """Write a whole file in one step, text as UTF-8; see `Replacement`. Raises OSError."""
+    with replacing(path) as beside:
+        beside.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def _check_replaceable(path: Path, is_log: bool) -> None:
+    """Raise OSError when what is there can't be replaced or shouldn't be."""
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder; give the name of a file", str(path))
+    if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+        raise OSError(errno.EINVAL, "it is a FIFO, a socket or a device; give the name of a file", str(path))
+    if stat.S_ISREG(mode) and not is_log:
+        with path.open("rb") as file:
+            if file.read(len(_LOG_MAGIC)) == _LOG_MAGIC:
+                raise FileExistsError(errno.EEXIST, "it is a log, which is not replaced; give another name", str(path))
+
+
+def _create_beside(path: Path) -> Path:
+    for number in itertools.count():
+        beside = path.with_name(f".{path.name}.{os.getpid()}-{number}.part")
+        with contextlib.suppress(FileExistsError):  # left by a process of this id that was killed
+            os.close(os.open(beside, _NEW, 0o666))
+            return beside
+    raise AssertionError
+
+
+def place_file(path: Path, content: bytes) -> None:
+    """Write a file that is new, or the same already. Raises FileExistsError for another one, OSError."""
+    try:
+        descriptor = os.open(path, _NEW, 0o666)
+    except FileExistsError:
+        if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
+            return
+        raise FileExistsError(errno.EEXIST, "another one is there already, which is left as it is", str(path)) from None
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+    except OSError:
+        path.unlink()
+        raise
+
+
+@contextmanager
+def tidied(path: Path) -> Iterator[None]:
+    """When the block ends, remove a folder and those above it, as far as they are empty and were not there before."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # not empty: it stays, and so do those above
+            for folder in made:
+                folder.rmdir()

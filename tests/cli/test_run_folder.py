@@ -1,0 +1,121 @@
+"""Where runs go: a new folder each, to which links lead; nothing of yesterday's is lost."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+from experiment_runs import BIN, PAPER, adacd_hil
+
+from adacd_hil.cli import run_folder as run_folder_module
+from adacd_hil.cli.run_folder import run_folder
+from adacd_hil.log.errors import LogExistsError
+from adacd_hil.log.reader import read_log
+from firmware_sim.truth import TruthLog
+
+USAGE, BUS_MISSING = 2, 5
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+@pytest.mark.slow
+def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text("lasts_s = 0.3\n")
+    command = [BIN / "adacd-hil", "demo", *PAPER, "--scenario", "short.toml"]
+    pair = [subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=tmp_path) for _ in range(2)]
+    assert [process.wait() for process in pair] == [0, 0]
+    folders = [file for file in (tmp_path / "runs").iterdir() if not file.is_symlink()]
+    assert len(folders) == 2
+    for folder in folders:
+        assert read_log(folder).is_complete
+        assert (folder / "report.html").is_file()
+    assert {(tmp_path / "runs" / link).resolve() for link in ("latest", "demo")} <= set(folders)
+    before = contents(tmp_path)
+    refused = adacd_hil(tmp_path, "demo", *PAPER, "--out", "runs/demo")
+    assert refused.status == USAGE
+    assert refused.stderr == (
+        "adacd-hil: runs/demo/run.mcap is there already; choose another folder with --out, or move it away\n"
+    )
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["run.mcap", "truth.mcap"])
+def test_a_run_into_the_folder_of_one_that_is_going_on_is_told_by_whom(name: str, tmp_path: Path) -> None:
+    with TruthLog(tmp_path / name, blocking=True) as log:
+        refused = adacd_hil(tmp_path, "demo", *PAPER, "--out", ".")
+        log.event(0, "info", "run", "going on")
+    assert (refused.status, refused.stdout) == (USAGE, "")
+    assert refused.stderr == (
+        f"adacd-hil: {name} is being written by process {os.getpid()}; choose another folder with --out\n"
+    )
+    assert [file.name for file in tmp_path.iterdir()] == [name]
+    assert len(read_log(tmp_path / name).events) == 1
+
+
+@pytest.mark.slow
+def test_a_start_that_fails_leaves_yesterday_alone_and_can_be_tried_again(tmp_path: Path) -> None:
+    yesterday = tmp_path / "runs" / "yesterday"
+    yesterday.mkdir(parents=True)
+    (yesterday / "run.mcap").write_bytes(b"yesterday")
+    (tmp_path / "runs" / "latest").symlink_to("yesterday")
+    (tmp_path / "wrong.toml").write_text("[filtr]\n")
+    for arguments, status in (
+        (("-c", "x", "--config", "wrong.toml"), USAGE),
+        (("-c", "x", "--dbc", "none.dbc"), USAGE),
+        (("-c", "x", "--tare", "none.toml"), USAGE),
+        (("-c", "x", "-b", "77777777", "--out", "runs/new/one"), BUS_MISSING),
+    ):
+        interface = "slcan" if status == BUS_MISSING else "virtual"
+        assert adacd_hil(tmp_path, "run", "-i", interface, *arguments).status == status
+        assert [file.name for file in sorted((tmp_path / "runs").iterdir())] == ["latest", "yesterday"]
+    for _ in range(2):  # nobody answers
+        assert adacd_hil(tmp_path, "run", "-i", "virtual", "-c", "x", *PAPER, "--out", "today").status == BUS_MISSING
+    assert {file.name for file in (tmp_path / "today").glob("*.mcap")} == {"run.mcap", "failed-start-1.mcap"}
+    assert contents(yesterday) == {"run.mcap": b"yesterday"}
+    assert (tmp_path / "runs" / "latest").resolve() == yesterday
+
+
+def test_runs_of_one_second_are_numbered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_folder_module, "wall_ns", lambda: 1_800_000_000_000_000_000)
+    made = []
+    for _ in range(3):
+        with run_folder(None, ("run.mcap",), "run") as folder:
+            (folder.path / "run.mcap").touch()
+            folder.link()
+        made.append(folder.path.name)
+    assert made == [made[0], f"{made[0]}_2", f"{made[0]}_3"]
+    assert (tmp_path / "runs" / "latest").readlink() == (tmp_path / "runs" / "run").readlink() == Path(made[2])
+
+
+def test_a_run_that_makes_nothing_leaves_no_folder_and_no_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for out in (None, Path("a/b")):
+        with run_folder(out, ("run.mcap",), "run") as folder:
+            folder.path.mkdir(parents=True, exist_ok=True)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_the_name_of_a_link_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "demo").mkdir(parents=True)
+    (tmp_path / "runs" / "demo" / "run.mcap").write_text("yesterday")
+    told: list[str] = []
+    with run_folder(None, ("run.mcap",), "demo") as folder:
+        (folder.path / "run.mcap").touch()
+        folder.link(told.append)
+    assert told == ["link runs/demo is not set: there is a folder of that name"]
+    assert (tmp_path / "runs" / "demo" / "run.mcap").read_text() == "yesterday"
+    assert (tmp_path / "runs" / "latest").resolve() == folder.path.resolve()
+
+
+def test_a_folder_with_a_log_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    (tmp_path / "truth.mcap").write_text("yesterday")
+    with (
+        pytest.raises(LogExistsError, match=r"truth\.mcap is there already"),
+        run_folder(tmp_path, ("run.mcap", "truth.mcap"), "demo"),
+    ):
+        pass

@@ -1,0 +1,114 @@
+"""A log takes the place of nothing; only a start that failed makes room for the next."""
+
+import os
+
+import pytest
+from recorded_run import feed, make_run, record, start, wait_until_taken
+
+from adacd_hil.config import LogSettings
+from adacd_hil.log.errors import LogError, LogExistsError
+from adacd_hil.log.parts import part_path
+from adacd_hil.log.reader import read_log
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.run_folder import check_free, log_in
+from adacd_hil.records import Event
+
+pytestmark = pytest.mark.slow  # each log starts a process
+
+
+def failed_start(path):
+    recorder = start(path, make_run(0))
+    recorder.event(0, Event("error", "run", "no boot-up from Drive1"))
+    return recorder.close()
+
+
+def test_a_second_run_leaves_the_log_of_the_first_as_it_is(tmp_path):
+    path = tmp_path / "run.mcap"
+    record(path, make_run(20))
+    before = path.read_bytes()
+    with pytest.raises(LogExistsError, match=f"^{path} is there already; choose another folder with --out"):
+        Recorder(path)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_a_run_beside_one_that_is_going_on_is_told_its_process(tmp_path):
+    path = tmp_path / "run.mcap"
+    run = make_run(40)
+    recorder = start(path, run)
+    feed(recorder, run.cycles[:20])
+    with pytest.raises(LogExistsError, match=f"^{path} is being written by process {os.getpid()}; choose another"):
+        Recorder(path)
+    feed(recorder, run.cycles[20:])
+    assert recorder.close().is_complete
+    assert read_log(path).scheme.block.tobytes() == run.blocks.tobytes()
+
+
+def test_a_run_is_going_on_after_its_first_part(tmp_path):
+    path = tmp_path / "run.mcap"
+    recorder = start(path, make_run(0), settings=LogSettings(part_MiB=1, part_min=0.0))
+    feed(recorder, make_run(900).cycles)
+    wait_until_taken(recorder)
+    while not part_path(path, 1).exists():  # the test's time limit ends it
+        os.sched_yield()
+    with pytest.raises(LogExistsError, match=f"^{path} is being written by process {os.getpid()}"):
+        Recorder(path)
+    assert recorder.close().is_complete
+
+
+def test_of_two_runs_that_begin_at_once_one_is_refused(tmp_path, monkeypatch):
+    path = tmp_path / "run.mcap"
+    first = start(path, make_run(0))
+    monkeypatch.setattr("adacd_hil.log.recorder.make_room", lambda path: None)  # it looked before there was one
+    with pytest.raises(LogExistsError, match="is being written by another run"):
+        Recorder(path)
+    assert first.close().is_complete
+
+
+def link(path):
+    path.symlink_to(path.with_name("target"))
+
+
+@pytest.mark.parametrize("make", [link, os.mkfifo, os.mkdir], ids=["link", "fifo", "folder"])
+def test_what_is_no_file_is_no_place_for_a_log(make, tmp_path):
+    path = tmp_path / "run.mcap"
+    make(path)
+    with pytest.raises(LogExistsError, match="is there already, which is no regular file"):
+        Recorder(path)
+    assert [file.name for file in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_the_log_of_a_start_that_failed_is_kept_aside(tmp_path):
+    path = tmp_path / "run.mcap"
+    failed = [failed_start(path).path.read_bytes()]
+    check_free(path)
+    failed.append(failed_start(path).path.read_bytes())
+    assert record(path, make_run(3)).is_complete
+    assert [(tmp_path / f"failed-start-{number}.mcap").read_bytes() for number in (1, 2)] == failed
+    assert len(read_log(path).scheme) == 3
+
+
+def test_a_log_without_cycles_whose_end_is_missing_is_not_taken_for_a_start_that_failed(tmp_path):
+    path = tmp_path / "run.mcap"
+    failed_start(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(LogExistsError):
+        Recorder(path)
+
+
+def test_a_log_that_is_none_is_not_moved(tmp_path):
+    (tmp_path / "run.mcap").write_text("notes")
+    with pytest.raises(LogExistsError):
+        Recorder(tmp_path / "run.mcap")
+    assert (tmp_path / "run.mcap").read_text() == "notes"
+
+
+def test_a_folder_stands_for_the_log_in_it(tmp_path):
+    run = make_run(3)
+    record(tmp_path / "run.mcap", run)
+    (tmp_path / "latest").symlink_to(tmp_path)
+    assert log_in(str(tmp_path)) == tmp_path / "run.mcap"
+    for given in (tmp_path, str(tmp_path), tmp_path / "latest", tmp_path / "run.mcap", str(tmp_path / "run.mcap")):
+        assert read_log(given).scheme.block.tobytes() == run.blocks.tobytes()
+    with pytest.raises(LogError):
+        read_log(tmp_path.parent)
