@@ -5,7 +5,6 @@ exist only here, in fields labelled `_deg`; the properties beside them give radi
 """
 
 import dataclasses
-import difflib
 import math
 import tomllib
 import types
@@ -19,12 +18,21 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Reaction, Vector
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
 
 
 class ConfigError(ValueError):
     """A setting that can't be used; the message is one line: key, value, bound, unit."""
+
+
+SUCCESSORS = {
+    "certified.collision_Nm": "`detector.collision_Nm`",
+    "certified.deviations": "`certified.noise_sigmas` and `certified.model_sigmas`",
+    "certified.sigmas": "`certified.noise_sigmas` and `certified.model_sigmas`",
+}
+"""Keys that are gone, and by what they are replaced, as an error says it."""
 
 
 def setting(
@@ -112,8 +120,10 @@ def _value_problems(hint: Any, value: Any, key: str, metadata: Any) -> list[str]
 
 def _unknown(key: str, known: Iterable[str], where: str) -> str:
     known = list(known)
-    nearest = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
-    hint = f"; did you mean `{where}{nearest[0]}`?" if nearest else f"; known: {', '.join(known)}"
+    if successor := SUCCESSORS.get(f"{where}{key}"):
+        return f"unknown key `{where}{key}`; its successor is {successor}"
+    nearest = nearest_name(key, known)
+    hint = f"; did you mean `{where}{nearest}`?" if nearest else f"; known: {', '.join(known)}"
     return f"unknown key `{where}{key}`{hint}"
 
 
@@ -138,8 +148,8 @@ def _parse_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
     if isinstance(value, int | float) and not isinstance(value, bool):
         _check_bounds(value, key, metadata)
     if metadata["choices"] and value not in metadata["choices"]:
-        nearest = difflib.get_close_matches(str(value), metadata["choices"], n=1)
-        hint_text = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        nearest = nearest_name(str(value), metadata["choices"])
+        hint_text = f"; did you mean {nearest!r}?" if nearest else ""
         raise ConfigError(f"`{key}` = {value!r} must be one of {', '.join(metadata['choices'])}{hint_text}")
     return value
 
@@ -865,9 +875,9 @@ def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
         return Path(str(folder / f"{name_or_file}.toml"))
     path = Path(name_or_file)
     if not path.suffix and not path.exists():
-        nearest = difflib.get_close_matches(name_or_file, names, n=1)
+        nearest = nearest_name(name_or_file, names)
         some = ", ".join(names) if len(names) <= _MOST_NAMES else f"{len(names)}, such as {', '.join(names[:3])}"
-        hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; built in: {some}"
+        hint = f"; did you mean {nearest!r}?" if nearest else f"; built in: {some}"
         raise ConfigError(f"{kind} {name_or_file!r} is neither built in nor a file{hint}")
     return path
 

@@ -1,9 +1,12 @@
 """The contracts that the emulator can play: a DBC and the EDS files of the devices behind it."""
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from adacd_hil.wire.codec import Codec, contract_folder
+from adacd_hil.config import ConfigError
+from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
+from adacd_hil.wire.node_offset import move_contract
 from firmware_sim.pdo_mapping import CLASSIC_BYTES, FD_BYTES
 
 
@@ -33,6 +36,23 @@ CONTRACTS = {
 def contract_of(codec: Codec) -> Contract:
     """Find the contract of a DBC by its file name; any other DBC is played by our own devices."""
     return CONTRACTS.get(codec.path.stem, CONTRACTS["arm_fd" if is_fd(codec) else "arm"])
+
+
+def playable_contract(codec: Codec) -> Contract:
+    """Find the contract with the layout of a DBC, wherever its nodes are. Raises ConfigError when there is none."""
+    for contract in CONTRACTS.values():
+        if codec.path == contract.path:
+            return contract
+    offset = codec.node_id("Drive1Heartbeat") - load_codec().node_id("Drive1Heartbeat")
+    for contract in CONTRACTS.values():
+        with contextlib.suppress(CodecError):  # a node id that this contract can't have
+            moved = move_contract(load_codec(contract.path), offset, codec.node_id("HostHeartbeat"))
+            if moved.layout_digest == codec.layout_digest:
+                return contract
+    raise ConfigError(
+        f"no emulated device has the frames of {codec.path.name}, layout digest 0x{codec.layout_digest:08X}; "
+        f"the emulator plays {', '.join(CONTRACTS)}; `adacd-hil run` runs on the arm itself"
+    )
 
 
 def is_fd(codec: Codec) -> bool:

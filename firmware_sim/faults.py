@@ -6,12 +6,12 @@ to frames, values and nodes is in `fault_plan`. A row without length, such as a 
 Nodes are named drive1, drive2, sensor1, sensor2; frames by what they carry, as in the contract's DBC.
 """
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple, TypeVar
 
 from adacd_hil.config import ConfigError, setting
+from adacd_hil.nearest_name import nearest_name
 
 DRIVES = ("drive1", "drive2")
 SENSORS = ("sensor1", "sensor2")
@@ -225,8 +225,8 @@ def _show(key: str, value: object) -> str:
 def _check_keys(name: str, kind: _Kind, given: Iterable[str]) -> None:
     for key in given:
         if key not in kind.keys:
-            nearest = difflib.get_close_matches(key, kind.keys, n=1, cutoff=0.5)
-            hint = f"did you mean `{nearest[0]}`?" if nearest else f"its keys: {', '.join(kind.keys[1:])}"
+            nearest = nearest_name(key, kind.keys)
+            hint = f"did you mean `{nearest}`?" if nearest else f"its keys: {', '.join(kind.keys[1:])}"
             raise ValueError(f"kind {name!r} has no key `{key}`; {hint}")
     for key in kind.required:
         if key not in given:
@@ -234,8 +234,8 @@ def _check_keys(name: str, kind: _Kind, given: Iterable[str]) -> None:
 
 
 def _refusal(key: str, value: str, allowed: Sequence[str], what: str) -> str:
-    nearest = difflib.get_close_matches(value, allowed, n=1)
-    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    nearest = nearest_name(value, allowed)
+    hint = f"; did you mean {nearest!r}?" if nearest else ""
     return f"{key} = {value!r} can't be with {what}, which takes {', '.join(allowed)}{hint}"
 
 

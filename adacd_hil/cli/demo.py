@@ -20,6 +20,7 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench import Bench
+from firmware_sim.contracts import playable_contract
 from firmware_sim.scenario import Scenario, load_scenario, named_profile
 from firmware_sim.truth import TruthLog
 
@@ -66,28 +67,31 @@ def run_embedded(
     settings, scenario = cast
     check_shared("lockstep", settings)  # an arm in this process has no neighbour
     codec = load_contract(settings)
+    contract = playable_contract(codec)
     clock = make_clock(clock_name)
     embedded = EmbeddedBus(clock)
     bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
     out.mkdir(parents=True, exist_ok=True)
     with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", scenario=scenario) as truth:
-        bench = Bench(scenario, codec, embedded.deliver, on_truth=truth.write, on_event=truth.event)
-        embedded.attach(bench.on_frame)
-        bench.boot()
-        session = Session(
-            settings,
-            codec,
-            bus,
-            clock,
-            ScriptedOperator(settings.operator),
-            out,
-            "embedded",
-            metadata={"scenario": scenario.name, "seed": str(scenario.seed)},
-            progress=progress,
-            live=live,
-        )
-        session.on_started = on_started
         try:
+            bench = Bench(
+                scenario, codec, embedded.deliver, contract=contract, on_truth=truth.write, on_event=truth.event
+            )
+            embedded.attach(bench.on_frame)
+            bench.boot()
+            session = Session(
+                settings,
+                codec,
+                bus,
+                clock,
+                ScriptedOperator(settings.operator),
+                out,
+                "embedded",
+                metadata={"scenario": scenario.name, "seed": str(scenario.seed)},
+                progress=progress,
+                live=live,
+                on_started=on_started,
+            )
             with on_interrupt(session.interrupt):
                 summary = session.run()
         except BaseException:

@@ -76,9 +76,18 @@ def run_on_bus(
             operator = ConsoleOperator(ScriptedOperator(settings.operator))
         progress = stack.enter_context(closing(Progress()))
         session = Session(
-            settings, codec, bus, clock, operator, folder.path, interface, progress=progress, tare=tare, live=live
+            settings,
+            codec,
+            bus,
+            clock,
+            operator,
+            folder.path,
+            interface,
+            progress=progress,
+            tare=tare,
+            live=live,
+            on_started=functools.partial(folder.link, progress),
         )
-        session.on_started = functools.partial(folder.link, progress)
         for line in () if tare is None else tare.warnings:
             progress(f"warning: {line}")
         with on_interrupt(session.interrupt):

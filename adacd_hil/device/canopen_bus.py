@@ -17,13 +17,24 @@ from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
 from adacd_hil.config import ConfigError
-from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.bus import Bus, BusError, Frame
 
 ANSWER_TIMEOUT_S = 0.5
 """Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
 NMT_ID = 0x000
 _SDO_ABORT = 0x80
+_UNFORESEEN = (
+    canopen.ObjectDictionaryError,
+    struct.error,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    AssertionError,
+)
+"""What canopen raises when an answer isn't what it expects: it trusts lengths, toggle bits and types."""
 _ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index: CiA 301, table 22
 
 # canopen reports what it also raises; the raised form is ours to print.
@@ -146,15 +157,17 @@ class CanopenBus:
 
 @contextmanager
 def explained(name: str, node_id: int, what: str) -> Iterator[None]:
-    """Turn canopen's SDO errors into a DeviceError of one line."""
+    """Turn whatever canopen raises into a DeviceError of one line; a BusError passes."""
     try:
         yield
+    except (BusError, DeviceError):
+        raise
     except SdoAbortedError as error:
         raise DeviceError(f"{name} (node {node_id}): {what} refused: {error}") from None
     except SdoCommunicationError:
         raise DeviceError(f"{name} (node {node_id}): no SDO answer within {ANSWER_TIMEOUT_S:g} s ({what})") from None
-    except (SdoError, KeyError) as error:
-        raise DeviceError(f"{name} (node {node_id}): {what}: {error}") from None
+    except (SdoError, *_UNFORESEEN) as error:
+        raise DeviceError(f"{name} (node {node_id}): {what}: {' '.join(str(error).split()) or repr(error)}") from None
 
 
 def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:

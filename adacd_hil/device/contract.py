@@ -4,7 +4,6 @@ What is composed has the layout of a DBC written by hand for the same devices, b
 Source: Vector DBC file format; CiA 301 clause 7.3.3 (predefined connection set).
 """
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import NamedTuple
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.placement import Device, place_devices
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.output_files import place_file
 from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
 from adacd_hil.wire.node_offset import NODE_MASK, move_contract
@@ -108,8 +108,8 @@ def find_contract(name: str) -> Path:
     if path.suffix or path.exists():
         return path
     known = sorted(path.stem for path in folder.glob("*.dbc"))
-    nearest = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}"
+    nearest = nearest_name(name, known)
+    hint = f"did you mean {nearest!r}?" if nearest else f"known: {', '.join(known)}"
     raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint}")
 
 

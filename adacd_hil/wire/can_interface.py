@@ -3,7 +3,6 @@
 Sources: Linux netdevice(7) for the flags, rtnetlink(7) for the queueing discipline, linux/can/raw.h.
 """
 
-import difflib
 import errno
 import fcntl
 import socket
@@ -11,6 +10,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.wire.bus import BusError, InterfaceDownError, can_interfaces, is_hardware
 
 CANFD_MTU = 72
@@ -58,8 +58,8 @@ class CanInterface:
         present = can_interfaces()
         if self.name not in present:
             known = f"present: {', '.join(present)}" if present else "no CAN interface is present"
-            nearest = difflib.get_close_matches(self.name, present, n=1)
-            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+            nearest = nearest_name(self.name, present)
+            hint = f"; did you mean {nearest!r}?" if nearest else ""
             return f"CAN interface {self.name} does not exist; {known}{hint}"
         if not self.is_up:
             return f"CAN interface {self.name} is down; bring it up: ip link set {self.name} up"

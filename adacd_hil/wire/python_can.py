@@ -1,12 +1,12 @@
 """Any interface that python-can offers, if it does not echo own frames."""
 
 import contextlib
-import difflib
 from typing import Any
 
 import can
 
 from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, MAX_STANDARD_ID, Bus, BusError, BusMissingError, Frame
 
 _ECHOING_INTERFACES = ("udp_multicast",)
@@ -22,9 +22,10 @@ class PythonCanBus(Bus):
         if interface in _ECHOING_INTERFACES:
             raise BusMissingError(f"interface {interface} echoes own frames and can't carry a cycle; use socketcan")
         if interface not in can.VALID_INTERFACES:
-            nearest = difflib.get_close_matches(interface, can.VALID_INTERFACES, n=1)
-            hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
-            raise BusMissingError(f"unknown interface {interface!r}{hint}")
+            known = sorted(can.VALID_INTERFACES)
+            nearest = nearest_name(interface, known)
+            hint = f"did you mean {nearest!r}?" if nearest else f"known: {', '.join(known)}"
+            raise BusMissingError(f"unknown interface {interface!r}; {hint}")
         self.channel = channel
         self._interface = interface
         self._clock = clock

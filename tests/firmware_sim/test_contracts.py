@@ -1,15 +1,19 @@
 """The contracts that the emulator plays: DBC and EDS describe the same frames, and the devices send them."""
 
 import configparser
+import dataclasses
 import math
 import struct
+from pathlib import Path
 
 import cantools
 import pytest
 from bench_host import ENABLE, SHUTDOWN, START, SWITCH_ON, BenchHost, quiet_scenario
 
-from adacd_hil.wire.codec import contract_folder, load_codec
-from firmware_sim.contracts import CONTRACTS, contract_of
+from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.device.contract import load_contract
+from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
+from firmware_sim.contracts import CONTRACTS, contract_of, playable_contract
 from firmware_sim.sensing import TORQUE_LSB_NM
 
 BY_DEFAULT = ("arm", "arm_fd")
@@ -225,3 +229,25 @@ def test_fd_devices_exchange_one_protected_frame_each_way():
     torque, gross, status, register, temperature = struct.unpack_from("<iiBBh", frames[0x184], 4)
     assert (torque, gross, status, register, temperature) == (gross, torque, 5, 0, 2500)
     assert frames[0x184][3] == 5
+
+
+@pytest.mark.parametrize("nodes", [{}, {"drive_node": (9, 10), "sensor_node": (11, 12)}], ids=["1 to 4", "9 to 12"])
+@pytest.mark.parametrize(("config", "name"), [("paper", "arm"), ("fd", "arm_fd"), ("stock", "arm_stock")])
+def test_a_composed_contract_is_played_by_the_devices_that_have_its_frames(config, name, nodes) -> None:
+    settings = load_settings(config)
+    devices = dataclasses.replace(settings.devices, contract="", **nodes)
+    composed = load_contract(dataclasses.replace(settings, devices=devices))
+    assert playable_contract(composed) == CONTRACTS[name]
+
+
+@pytest.mark.parametrize("name", PRESENT)
+def test_a_contract_of_the_package_is_played_by_its_own_devices(name: str) -> None:
+    assert playable_contract(load_codec(CONTRACTS[name].path)) == CONTRACTS[name]
+
+
+def test_frames_that_no_device_has_are_not_played_by_another() -> None:
+    codec = load_codec()
+    text = codec.text.replace(b"SG_ torque : 16|32@1- (1e-06,0)", b"SG_ torque : 16|32@1- (1e-05,0)")
+    other = parse_codec(text, Path("arm.dbc"))
+    with pytest.raises(ConfigError, match=r"no emulated device has the frames of arm\.dbc, layout digest 0x"):
+        playable_contract(other)

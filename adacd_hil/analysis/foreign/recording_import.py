@@ -5,7 +5,6 @@ the model is carried over, the filters begin anew. Values between two samples ar
 """
 
 import csv
-import difflib
 import warnings
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,6 +17,7 @@ from scipy.signal import savgol_filter
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
 from adacd_hil.scheme.offline import Record
 
@@ -172,8 +172,8 @@ def _place(name: str, heads: list[str], count: int, path: Path) -> int:
         return heads.index(name)
     if name.isdecimal() and 1 <= int(name) <= count:
         return int(name) - 1
-    nearest = difflib.get_close_matches(name, heads, n=1)
-    known = f"did you mean {nearest[0]!r}?" if nearest else f"there are {', '.join(heads) or f'1 to {count}'}"
+    nearest = nearest_name(name, heads)
+    known = f"did you mean {nearest!r}?" if nearest else f"there are {', '.join(heads) or f'1 to {count}'}"
     raise ConfigError(f"recording {path} has no column {name!r}; {known}")
 
 

@@ -5,7 +5,6 @@ list of such numbers.
 """
 
 import dataclasses
-import difflib
 import itertools
 import math
 import statistics
@@ -15,7 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from adacd_hil.analysis.replay.replay import Replay
-from adacd_hil.config import ConfigError, Settings, parse, to_toml
+from adacd_hil.config import SUCCESSORS, ConfigError, Settings, parse, to_toml
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
 
 NOTE: Final = (
@@ -63,11 +63,18 @@ def _unknown(key: str) -> str:
     below = [known for known in keys if known.startswith(f"{key}.")]
     if below:
         return f"`{key}` is a section; its keys are {', '.join(below)}"
-    last = key.rsplit(".", maxsplit=1)[-1]
-    by_name = {known.rsplit(".", maxsplit=1)[-1]: known for known in reversed(keys)}
-    alike = difflib.get_close_matches(last, by_name, n=1, cutoff=0.4)
-    found = difflib.get_close_matches(key, keys, n=1, cutoff=0.7) or [by_name[name] for name in alike]
-    return f"unknown key `{key}`" + (f"; did you mean `{found[0]}`?" if found else "")
+    if key in SUCCESSORS:
+        return f"unknown key `{key}`; its successor is {SUCCESSORS[key]}"
+    section, _, last = key.rpartition(".")
+    by_name = {known.rpartition(".")[2]: known for known in reversed(keys)}
+    found = nearest_name(key, keys) or by_name.get(nearest_name(last, by_name) or "")
+    if found:
+        return f"unknown key `{key}`; did you mean `{found}`?"
+    beside = [known.rpartition(".")[2] for known in keys if section and known.rpartition(".")[0] == section]
+    if beside:
+        return f"unknown key `{key}`; `{section}` has {', '.join(beside)}"
+    sections = dict.fromkeys(known.partition(".")[0] for known in keys)
+    return f"unknown key `{key}`; it begins with a section: {', '.join(sections)}"
 
 
 def _read_value(key: str, text: str) -> Any:

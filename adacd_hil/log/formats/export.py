@@ -1,6 +1,5 @@
 """Recordings to tables: topics of our logs as they are, and frames of any recording decoded by a contract."""
 
-import difflib
 import fnmatch
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.log.formats.tables import Tables, event_columns, frame_columns, series_columns
 from adacd_hil.log.stream import LogStream
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.wire.codec import Codec
 
 _EVENTS = "/events"
@@ -59,8 +59,9 @@ def choose_topics(topics: Collection[str], wanted: Collection[str]) -> list[str]
         slashed = "/" + pattern.strip("/")
         found = [t for t in topics if any(fnmatch.fnmatchcase(t, form) for form in (slashed, DECODED + pattern))]
         if not found:
-            near = difflib.get_close_matches(slashed, topics, 1, 0.0)
-            raise LogError(f"the log has no topic {pattern}{f', did you mean {near[0]}' if near else ''}")
+            near = nearest_name(slashed, topics)
+            hint = f"did you mean {near}" if near else f"there are {', '.join(topics)}"
+            raise LogError(f"the log has no topic {pattern}, {hint}")
         chosen += found
     return list(dict.fromkeys(chosen))
 

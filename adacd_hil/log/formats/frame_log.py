@@ -5,7 +5,6 @@ digits that they write, TRC and CSV to python-can's float (238 ns at today's dat
 the run; BLF, candump, TRC, CSV and MF4 from 1970; ASC from its beginning.
 """
 
-import difflib
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.mcap_frames import McapFrames
 from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE, FrameLog
+from adacd_hil.nearest_name import nearest_name
 
 PYTHON_CAN_SUFFIXES = (".blf", ".asc", ".mf4", ".trc", ".csv")
 SUFFIXES = (".mcap", ".log", *PYTHON_CAN_SUFFIXES)
@@ -46,10 +46,10 @@ def open_frames(path: Path) -> FrameSource:
     if suffix == ".log":
         return CandumpFrames(path)
     if suffix not in PYTHON_CAN_SUFFIXES:
-        near = difflib.get_close_matches(suffix, SUFFIXES, 1)
+        near = nearest_name(suffix, SUFFIXES)
         raise LogError(
             f"{path}: no frames are read from {suffix or 'a file without suffix'}"
-            f"{f', did you mean {near[0]}' if near else ''}; known: {' '.join(SUFFIXES)}"
+            f"{f', did you mean {near}' if near else ''}; known: {' '.join(SUFFIXES)}"
         )
     # python-can costs 0.1 s, and with asammdf beside it 0.3 s.
     from adacd_hil.log.formats.can_messages import PythonCanFrames

@@ -1,0 +1,70 @@
+"""The known name that somebody may have meant: a slip of the pen, never merely the least different one."""
+
+from collections.abc import Iterable, Iterator
+
+_LONGEST = 64
+_SLIPS = ((3, 0), (8, 1), (12, 2))
+"""Up to which length, exclusive, how many slips are one: a letter too many, too few, another, or two exchanged."""
+_MOST_SLIPS = 3
+
+
+def nearest_name(word: str, known: Iterable[str]) -> str | None:
+    """Return the name that differs from `word` by a few slips in each of its dotted parts, or by its ending.
+
+    Upper and lower case are the same. Units may be missing: `threshold` stands for `threshold_Nm`. Of several the
+    nearest is returned, of these the first; None when nothing is near.
+    """
+    if len(word) > _LONGEST:
+        return None
+    found = [(slips, name) for name in known if (slips := _slips_in_parts(word, name)) is not None]
+    return min(found, key=lambda pair: pair[0])[1] if found else None
+
+
+def _slips_in_parts(word: str, name: str) -> int | None:
+    parts = [part.split(".") for part in (word.casefold(), name.casefold())]
+    if len(parts[0]) != len(parts[1]):
+        return None
+    slips = [_slips(*pair) for pair in zip(*parts, strict=True)]
+    return sum(count for count in slips if count is not None) if None not in slips else None
+
+
+def _slips(word: str, name: str) -> int | None:
+    """Count the slips between a word and a name; None when they are too many. An ending too few or too many is one."""
+    pairs = [(word, name, 0)]
+    pairs += [(word, form, 1) for form in _without_ending(name)]
+    pairs += [(form, name, 1) for form in _without_ending(word)]
+    counts = [ending + slips for *pair, ending in pairs if (slips := _distance(*pair)) <= _allowed(*pair)]
+    shorter, longer = sorted((word, name), key=len)
+    if longer.startswith(shorter) and _SLIPS[0][0] <= len(shorter) and len(longer) <= 2 * len(shorter):
+        counts.append(1 + _MOST_SLIPS)
+    return min(counts, default=None)
+
+
+def _allowed(word: str, name: str) -> int:
+    shorter = min(len(word), len(name))
+    return next((slips for length, slips in _SLIPS if shorter < length), _MOST_SLIPS)
+
+
+def _without_ending(name: str) -> Iterator[str]:
+    """Give what is left of a name, at least half of it, without its last parts between underscores."""
+    while "_" in name:
+        shorter = name.rpartition("_")[0]
+        if 2 * len(shorter) < len(name):
+            return
+        name = shorter
+        yield name
+
+
+def _distance(word: str, name: str) -> int:
+    """Count the least letters to insert, delete, replace or exchange with the next (optimal string alignment)."""
+    before: list[int] = []
+    last = list(range(len(name) + 1))
+    for row, letter in enumerate(word, start=1):
+        this = [row]
+        for column, other in enumerate(name, start=1):
+            cost = min(last[column] + 1, this[-1] + 1, last[column - 1] + (letter != other))
+            if row > 1 and column > 1 and letter == name[column - 2] and word[row - 2] == other:
+                cost = min(cost, before[column - 2] + 1)
+            this.append(cost)
+        before, last = last, this
+    return last[-1]

@@ -1,0 +1,85 @@
+"""A slip of the pen is recognised, an unrelated name is not."""
+
+import tomllib
+
+import pytest
+
+from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.config import SUCCESSORS, ConfigError, Settings, load_settings, parse
+from adacd_hil.nearest_name import nearest_name
+
+KEYS = ("a_rad_s", "b_rad_s", "threshold_Nm", "torque_limit_Nm", "torque_rate_limit_Nm_s", "Kp", "Kd", "condition")
+DOTTED = ("filter.a_rad_s", "detector.threshold_Nm", "certified.condition", "certified.noise_sigmas")
+
+
+@pytest.mark.parametrize(
+    ("word", "known", "meant"),
+    [
+        ("a_rads", KEYS, "a_rad_s"),
+        ("threshold", KEYS, "threshold_Nm"),
+        ("treshold", KEYS, "threshold_Nm"),
+        ("treshold_nm", KEYS, "threshold_Nm"),
+        ("torque_limit", KEYS, "torque_limit_Nm"),
+        ("torque_limits_Nm", KEYS, "torque_limit_Nm"),
+        ("kp", KEYS, "Kp"),
+        ("amr", ("stock", "arm"), "arm"),
+        ("degree", ("rad", "deg"), "deg"),
+        ("sockecan", ("slcan", "socketcan", "socketcand"), "socketcan"),
+        ("detectr.threshold_Nm", DOTTED, "detector.threshold_Nm"),
+        ("detector.treshold", DOTTED, "detector.threshold_Nm"),
+        ("deviations", KEYS, None),
+        ("certified.deviations", DOTTED, None),
+        ("K", KEYS, None),
+        ("Kx", KEYS, None),
+        ("limit", KEYS, None),
+        ("detector", DOTTED, None),
+        ("", KEYS, None),
+        ("x" * 10**6, ("x" * 10**6,), None),
+        ("a", (), None),
+    ],
+)
+def test_the_nearest_name_is_one_that_may_have_been_meant(word: str, known: tuple[str, ...], meant: str | None) -> None:
+    assert nearest_name(word, known) == meant
+
+
+@pytest.mark.parametrize("key", sorted(SUCCESSORS))
+def test_a_key_that_is_gone_names_its_successor_and_nothing_else(key: str) -> None:
+    section, name = key.split(".")
+    line = f"unknown key `{key}`; its successor is {SUCCESSORS[key]}"
+    with pytest.raises(ConfigError) as of_file:
+        parse(Settings, {section: {name: 1.0}})
+    with pytest.raises(ConfigError) as of_option:
+        apply_settings(load_settings(), {key: "1.0"})
+    assert str(of_file.value) == str(of_option.value) == line
+    for successor in SUCCESSORS[key].replace("`", "").split(" and "):
+        section, name = successor.split(".")
+        assert hasattr(getattr(load_settings("certified"), section), name)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("[filter]\nreversal_share = 1", "unknown key `filter.reversal_share`; known: a_rad_s, b_rad_s"),
+        ("[certified]\nreversal_share = 1", "unknown key `certified.reversal_share`; known: cutoffs_rad_s, "),
+        ("flux = 1", "unknown key `flux`; known: name, scheme, arm, "),
+    ],
+)
+def test_an_unrelated_key_gets_the_known_ones(text: str, line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(Settings, tomllib.loads(text))
+    assert str(caught.value).startswith(line)
+
+
+@pytest.mark.parametrize(
+    ("key", "line"),
+    [
+        ("filter.flux", "unknown key `filter.flux`; `filter` has a_rad_s, b_rad_s"),
+        ("flux", "unknown key `flux`; it begins with a section: name, scheme, arm, "),
+        ("filter", "`filter` is a section; its keys are filter.a_rad_s, filter.b_rad_s"),
+        ("collision_Nm", "unknown key `collision_Nm`; did you mean `detector.collision_Nm`?"),
+    ],
+)
+def test_an_unrelated_option_gets_what_its_section_has(key: str, line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        apply_settings(load_settings(), {key: "1.0"})
+    assert str(caught.value).startswith(line)
