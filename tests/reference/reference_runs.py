@@ -25,11 +25,12 @@ import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.cli.connection import contract_of, model_time
+from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
+from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.wire.bus import EmbeddedBus
@@ -79,7 +80,7 @@ def play(name: str, folder: Path, cycles: int = 0) -> RunLog:
     """Play a reference run in lockstep and read its log. `cycles`: end after so many; 0: at its end."""
     settings = load_settings(str(RUNS / f"{name}.config.toml"))
     scenario = load_scenario(str(RUNS / f"{name}.scenario.toml"), settings.arm.profile)
-    codec = contract_of(settings, folder)
+    codec = load_contract(settings)
     clock = VirtualClock()
     embedded = EmbeddedBus(clock)
     bench = Bench(scenario, codec, embedded.deliver)
