@@ -330,6 +330,10 @@ class FilterSettings:
     )
 
 
+_GRAVITY_P0 = (50.0, 50.0)
+"""Gravity's torques are some ten times those of Coulomb friction, whose gain is 0.5; a gain goes by their square."""
+
+
 @dataclass(frozen=True)
 class EstimatorSettings:
     """Eq. (10)."""
@@ -338,7 +342,10 @@ class EstimatorSettings:
         "least_squares", choices=("least_squares", "gradient"), meaning="P from P(0) by least squares, or constant"
     )
     P0: tuple[float, ...] = setting(
-        (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5), low=0.0, high=1e6, meaning="diagonal of P(0), continuous-time gain, 1/s"
+        (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5),
+        low=0.0,
+        high=1e6,
+        meaning="diagonal of P(0), continuous-time gain, 1/s; with gravity those of a4 and a5 may be left out: 50",
     )
     gravity: bool = setting(False, meaning="add a4 and a5: joint axes that are not vertical")
 
@@ -348,8 +355,13 @@ class EstimatorSettings:
         return PARAMETER_NAMES + (GRAVITY_PARAMETER_NAMES if self.gravity else ())
 
     def __post_init__(self) -> None:
+        if self.gravity and len(self.P0) == len(PARAMETER_NAMES):
+            object.__setattr__(self, "P0", self.P0 + _GRAVITY_P0)
         if len(self.P0) != len(self.parameter_names):
-            raise ValueError(f"P0 has {len(self.P0)} values for {len(self.parameter_names)} parameters")
+            names = ", ".join(self.parameter_names)
+            raise ConfigError(
+                f"`estimator.P0` has {len(self.P0)} values, {len(self.parameter_names)} expected: {names}"
+            )
 
 
 @dataclass(frozen=True)
@@ -831,9 +843,13 @@ class Settings:
         return RealtimeRequest(wish.scheduler, wish.priority, wish.cpu, wish.lock_memory, self.bus.period_ns)
 
     def __post_init__(self) -> None:
-        count = len(self.estimator.parameter_names)
-        if len(self.arm.cad_theta) not in (0, count):
-            raise ValueError(f"arm.cad_theta has {len(self.arm.cad_theta)} values for {count} parameters")
+        names = self.estimator.parameter_names
+        if len(self.arm.cad_theta) not in (0, len(names)):
+            gravity = " (`estimator.gravity` adds a4 and a5, Nm)" if self.estimator.gravity else ""
+            raise ConfigError(
+                f"`arm.cad_theta` has {len(self.arm.cad_theta)} values, {len(names)} expected: "
+                f"{', '.join(names)}{gravity}; [] without CAD model"
+            )
         if self.bus.host_node in (*self.devices.drive_node, *self.devices.sensor_node):
             raise ConfigError(f"`bus.host_node` = {self.bus.host_node} is the node id of a device")
 

@@ -355,7 +355,7 @@ def _scripts(package: str) -> frozenset[str]:
 
 def _pip_complaints(words: list[str]) -> Complaints:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    named = [name for word in words for name in re.findall(r"adacd-hil\[([\w,]+)\]", word)]
+    named = [name for word in words for name in re.findall(r"(?:adacd-hil|\.)\[([\w,]+)\]", word)]
     return [f"there is no extra {name!r}" for names in named for name in names.split(",") if name not in extras]
 
 

@@ -1,5 +1,7 @@
 """What the certified scheme's settings refuse, what follows from them, and the block that carries its numbers."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -128,3 +130,31 @@ def test_the_certified_block_has_a_place_for_each_channel_and_parameter():
 def test_the_number_of_the_certifying_state_is_appended():
     """Older logs keep their meaning."""
     assert SchemeState.CERTIFY == max(SchemeState) == 9
+
+
+def test_gravity_brings_gains_of_its_own() -> None:
+    estimator = parse(Settings, {"estimator": {"gravity": True}}).estimator
+    assert estimator.P0 == (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5, 50.0, 50.0)
+    assert len(estimator.P0) == len(estimator.parameter_names)
+    given = (1.0,) * 9
+    assert given == parse(Settings, {"estimator": {"gravity": True, "P0": list(given)}}).estimator.P0
+
+
+@pytest.mark.parametrize(
+    ("table", "line"),
+    [
+        (
+            {"estimator": {"P0": [1.0] * 8}},
+            "`estimator.P0` has 8 values, 7 expected: a1, a2, a3, F_v1, F_v2, F_c1, F_c2",
+        ),
+        (
+            {"estimator": {"gravity": True}, "arm": {"cad_theta": [0.1] * 7}},
+            "`arm.cad_theta` has 7 values, 9 expected: a1, a2, a3, F_v1, F_v2, F_c1, F_c2, a4, a5 "
+            "(`estimator.gravity` adds a4 and a5, Nm); [] without CAD model",
+        ),
+    ],
+)
+def test_a_list_of_parameters_of_another_length_is_told_their_names(table: dict[str, Any], line: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(Settings, table)
+    assert line in str(caught.value)

@@ -5,7 +5,7 @@ from typing import Any
 
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.config import load_settings
-from adacd_hil.device.contract import find_contract
+from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, share_bus, us
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.response_time import Response
@@ -20,14 +20,20 @@ _LEGEND = (
 
 
 def judge(
-    dbc: str, config: str, period_us: int | None, bitrate: int | None, data_bitrate: int | None, arms: int | None = None
+    dbc: str | None,
+    config: str,
+    period_us: int | None,
+    bitrate: int | None,
+    data_bitrate: int | None,
+    arms: int | None = None,
 ) -> tuple[Budget, list[str], ExitCode]:
     """Find the budget of a contract, and what else there is to say of it. Raises CodecError, ConfigError.
 
-    The configuration's period counts where neither option nor DBC gives one, and how many arms share its bus.
+    Without `dbc` it is that of the configuration's devices, loaded or composed. The configuration's period counts where
+    neither option nor DBC gives one, and how many arms share its bus.
     """
     settings = load_settings(config)
-    codec = load_codec(find_contract(dbc))
+    codec = load_contract(settings) if dbc is None else load_codec(find_contract(dbc))
     contract = share_bus(read_contract(codec.text, codec.path.name), arms or settings.bus.arms)
     budget = find_budget(contract, period_us or contract.period_us or settings.bus.period_us, bitrate, data_bitrate)
     notes = list(budget.notes)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.extras import install_command
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import LiveAddress
@@ -30,7 +31,7 @@ def require_extra(asked_for: str, *modules: str) -> None:
     """Raise CommandError when a module of the extra `live` is missing."""
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
-        raise CommandError(f"{asked_for} needs the extra `live`: pip install 'adacd-hil[live]'", ExitCode.USAGE)
+        raise CommandError(f"{asked_for} needs the extra `live`: {install_command('live')}", ExitCode.USAGE)
 
 
 def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:

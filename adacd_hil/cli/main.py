@@ -205,7 +205,7 @@ def excitation(
 
 @cli.command(epilog="Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC.")
 @click.option(
-    "--dbc", default="arm", show_default=True, metavar="NAME|FILE", help="The contract: the package's, or a file."
+    "--dbc", metavar="NAME|FILE", help="The contract: the package's, or a file; default: the configuration's devices'."
 )
 @config_option
 @click.option(
@@ -223,7 +223,7 @@ def excitation(
 @json_option
 @explained
 def budget(
-    dbc: str,
+    dbc: str | None,
     config: str,
     period_us: int | None,
     bitrate: int | None,

@@ -92,7 +92,9 @@ def as_text(described: dict[str, Any]) -> str:
         rows = [_talk_row(owner, talk) for owner, talk in talks]
         parts.append(format_table(("node", "id", "message", "bytes", "frames", "Hz"), rows, right=(0, 3, 4, 5)))
     else:
-        parts.append(f"nothing was heard in {described['duration_s']:g} s")
+        has_answers = any(node["is_present"] for node in nodes)
+        what = "the nodes answered, and sent nothing by themselves" if has_answers else "nothing was heard"
+        parts.append(f"{what} in {described['duration_s']:g} s")
     return "\n\n".join([*parts, _summary(described)])
 
 

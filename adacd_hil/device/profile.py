@@ -62,6 +62,14 @@ def parse_object(text: str) -> ObjectName:
     return name
 
 
+_TOGETHER = {
+    "Feedback": ("position", "velocity"),
+    "Command": ("controlword", "target_torque"),
+    "Torque": ("torque",),
+}
+"""Signals that are one sample or one command, and so travel in one frame."""
+
+
 @dataclass(frozen=True)
 class SignalSettings:
     """One mapped object and the signal that it is in the contract."""
@@ -203,9 +211,18 @@ class ProfileSettings:
             "drive": ("position", "velocity", "statusword", "controlword", "target_torque"),
             "sensor": ("torque",),
         }
-        carried = {signal.signal for pdo in self.pdo for signal in pdo.signals}
+        carried = {signal.signal: pdo.message for pdo in self.pdo for signal in pdo.signals}
         if missing := [name for name in needed[self.kind] if name not in carried]:
             raise ValueError(f"pdo: no frame carries {', '.join(missing)}")
+        for message, signals in _TOGETHER.items():
+            for name in signals:
+                if carried.get(name, message) != message:
+                    others = " and ".join(other for other in signals if other != name)
+                    beside = f", in one PDO with {others}" if others else ""
+                    raise ValueError(f"pdo {carried[name]}: {name} must be in {message}{beside}")
+        for pdo in self.pdo:
+            if pdo.message in ("Feedback", "Torque") and pdo.transmission != 1:
+                raise ValueError(f"pdo {pdo.message}: transmission = {pdo.transmission} must be 1, on every SYNC")
 
     def _check_protection(self) -> None:
         headers = {"none": 0, "P02": 2, "P05": 3}

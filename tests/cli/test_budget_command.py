@@ -133,6 +133,30 @@ def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_pat
 
 
 @pytest.mark.parametrize(
+    ("devices", "name", "bits"),
+    [
+        ("", "arm", 795),
+        ('contract = ""', "contract", 795),
+        (
+            'drive = ["stock-drive", "stock-drive"]\nsensor = ["int32-sensor", "int32-sensor"]\ncontract = ""',
+            "contract",
+            0,
+        ),
+    ],
+)
+def test_without_a_dbc_it_is_the_contract_of_the_configured_devices(
+    tmp_path: Path, devices: str, name: str, bits: int
+) -> None:
+    config = tmp_path / "mine.toml"
+    config.write_text(f"[devices]\n{devices}\n")
+    found = json.loads(budget("--config", str(config), "--json").stdout)
+    stock = json.loads(budget("--config", "stock", "--json").stdout)
+    assert stock["worst_bits"] != 795
+    assert found["contract"].startswith(name)
+    assert found["worst_bits"] == (bits or stock["worst_bits"])
+
+
+@pytest.mark.parametrize(
     ("arguments", "line"),
     [
         (("--dbc", "arn"), "contract 'arn' is neither in dbc/ nor a file; did you mean 'arm'?"),

@@ -38,6 +38,18 @@ def test_the_table_names_who_is_missing() -> None:
     assert lines[-1] == "nodes: 3 as expected, 1 missing"
 
 
+def test_nodes_that_only_answer_are_not_taken_for_silence() -> None:
+    rig = BenchBus()
+    rig.forget()
+    text = as_text(scanned(rig))
+    assert "nothing was heard" not in text
+    assert text.splitlines()[-3:] == [
+        "the nodes answered, and sent nothing by themselves in 1.5 s",
+        "",
+        "nodes: 4 as expected",
+    ]
+
+
 def test_an_empty_bus_is_said_to_be() -> None:
     rig = BenchBus()
     rig.tamper = lambda can_id, data: None

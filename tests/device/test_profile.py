@@ -1,11 +1,13 @@
 """Device profiles: what is wrong with one is one line that names it."""
 
+import tomllib
+from importlib import resources
 from pathlib import Path
 
 import pytest
 
-from adacd_hil.config import ConfigError, load_settings
-from adacd_hil.device.profile import ObjectName, load_profile, parse_object, profile_names
+from adacd_hil.config import ConfigError, load_settings, parse
+from adacd_hil.device.profile import ObjectName, ProfileSettings, load_profile, parse_object, profile_names
 
 SENSOR = """
 kind = "sensor"
@@ -83,6 +85,42 @@ def test_a_profile_that_cant_be_used_is_one_line(tmp_path: Path, change: tuple[s
         load_profile(profile_file(tmp_path, SENSOR.replace(*change)), "sensor")
     assert line in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+DRIVE = resources.files("adacd_hil") / "device_profiles" / "stock-drive.toml"
+
+
+@pytest.mark.parametrize(
+    ("signal", "frame", "line"),
+    [
+        ("velocity", "Status", "pdo Status: velocity must be in Feedback, in one PDO with position"),
+        ("position", "Status", "pdo Status: position must be in Feedback, in one PDO with velocity"),
+        ("target_torque", "Feedback", "pdo Feedback: target_torque must be in Command, in one PDO with controlword"),
+        ("controlword", "Status", "pdo Status: controlword must be in Command, in one PDO with target_torque"),
+    ],
+)
+def test_what_is_one_sample_or_one_command_travels_in_one_frame(
+    tmp_path: Path, signal: str, frame: str, line: str
+) -> None:
+    table = tomllib.loads(DRIVE.read_text())
+    rows = {pdo["message"]: pdo["signals"] for pdo in table["pdo"]}
+    (moved,) = (row for signals in rows.values() for row in signals if row["signal"] == signal)
+    for signals in rows.values():
+        if moved in signals:
+            signals.remove(moved)
+    rows[frame].append(moved)
+    with pytest.raises(ConfigError) as caught:
+        parse(ProfileSettings, table)
+    assert line in str(caught.value)
+
+
+@pytest.mark.parametrize("transmission", [0, 2, 240, 254, 255])
+def test_a_sample_comes_on_every_sync(transmission: int) -> None:
+    table = tomllib.loads(DRIVE.read_text())
+    (feedback,) = (pdo for pdo in table["pdo"] if pdo["message"] == "Feedback")
+    feedback["transmission"] = transmission
+    with pytest.raises(ConfigError, match=f"transmission = {transmission} must be 1, on every SYNC"):
+        parse(ProfileSettings, table)
 
 
 def test_a_misspelt_name_is_told_the_nearest() -> None:

@@ -219,7 +219,7 @@ def test_a_topic_that_is_not_there_names_the_nearest():
 
 def test_without_pyarrow_one_line_says_what_to_install(log, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(LogError, match=r"pip install 'adacd-hil\[tables\]'"):
+    with pytest.raises(LogError, match=r"pip install -e '.*\[tables\]', or choose csv"):
         export_tables(log, tmp_path / "x", "parquet", (), CODEC)
     assert not (tmp_path / "x").exists()
 

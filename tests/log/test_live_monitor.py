@@ -13,6 +13,7 @@ from recorded_run import make_run
 
 from adacd_hil.cli.live_monitor import TOPICS, LiveMonitor, as_text
 from adacd_hil.cli.main import cli
+from adacd_hil.extras import install_command
 from adacd_hil.log.cdr import payload_dtype
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.live.client import LiveMessage, live_client
@@ -190,7 +191,7 @@ def test_without_the_extra_there_is_one_line_and_status_2(monkeypatch, tmp_path,
     monkeypatch.setitem(sys.modules, module, None)
     result = CliRunner().invoke(cli, words)
     assert result.exit_code == 2
-    assert result.stderr == f"adacd-hil: {asked_for} needs the extra `live`: pip install 'adacd-hil[live]'\n"
+    assert result.stderr == f"adacd-hil: {asked_for} needs the extra `live`: {install_command('live')}\n"
     assert list(tmp_path.iterdir()) == []
 
 

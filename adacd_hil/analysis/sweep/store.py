@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil.analysis.sweep.rows import Values
+from adacd_hil.extras import install_command
 from adacd_hil.log.errors import LogError
 from adacd_hil.output_files import replace_file, replacing
 
@@ -75,7 +76,7 @@ def _parquet() -> Any:
     try:
         from pyarrow import parquet
     except ImportError:
-        raise LogError("sweep needs pyarrow and dask: pip install adacd-hil[sweep]") from None
+        raise LogError(f"sweep needs pyarrow and dask: {install_command('sweep')}") from None
     return parquet
 
 

@@ -14,6 +14,7 @@ from adacd_hil.analysis.sweep.plan import Plan, Task
 from adacd_hil.analysis.sweep.rows import Values, failed
 from adacd_hil.analysis.sweep.store import SweepStore
 from adacd_hil.clock import MonotonicClock
+from adacd_hil.extras import install_command
 from adacd_hil.log.errors import LogError
 
 ROWS_PER_TASK = 20
@@ -111,7 +112,7 @@ def connect(scheduler: str, workers: int) -> Iterator[Any]:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise LogError("sweep needs pyarrow and dask: pip install adacd-hil[sweep]") from None
+        raise LogError(f"sweep needs pyarrow and dask: {install_command('sweep')}") from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers shows in the rows
     with contextlib.ExitStack() as stack:
         if scheduler:

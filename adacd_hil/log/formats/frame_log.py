@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.extras import install_command
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.mcap_frames import McapFrames
@@ -115,4 +116,4 @@ class CandumpFrames:
 
 def _need_asammdf(path: Path) -> None:
     if importlib.util.find_spec("asammdf") is None:
-        raise LogError(f"{path}: MF4 is read with asammdf; pip install 'python-can[mf4]'")
+        raise LogError(f"{path}: MF4 is read with asammdf: {install_command('mf4')}")

@@ -16,6 +16,7 @@ from typing import IO, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.extras import install_command
 from adacd_hil.log.cdr import ENCAPSULATION
 from adacd_hil.log.decoding import Decoder
 from adacd_hil.log.errors import LogError
@@ -25,7 +26,6 @@ from adacd_hil.output_files import replacing
 from adacd_hil.wire.codec import Codec
 
 _STAMP = struct.Struct("<II")
-_PARQUET_HINT = "Parquet is written with pyarrow; pip install 'adacd-hil[tables]', or choose csv"
 
 Columns = Mapping[str, Any]
 """Columns of a table by name, of equal length: arrays or lists."""
@@ -170,5 +170,6 @@ def _import_pyarrow() -> tuple[Any, Any]:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise LogError(_PARQUET_HINT) from None
+        hint = f"Parquet is written with pyarrow: {install_command('tables')}, or choose csv"
+        raise LogError(hint) from None
     return pyarrow, pyarrow.parquet
