@@ -16,7 +16,8 @@ host in lockstep says itself how much time passes (`firmware_sim.time_marks`), a
 come at once.
 
 The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
-0 for a master that begins at 1; from there the counter 1…240 is unwrapped.
+0 for a master that begins at 1; from there the counter 1…240 is unwrapped. SYNCs that come twice or out of order:
+`firmware_sim.sync_order`.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,18 +39,17 @@ from firmware_sim.object_dictionary import NEVER_NS, Abort, refuse
 from firmware_sim.outbox import Outbox
 from firmware_sim.scenario import Scenario
 from firmware_sim.sensor_node import SensorNode
+from firmware_sim.sync_listeners import SyncListeners
+from firmware_sim.sync_order import SyncKind, SyncOrder
 from firmware_sim.time_marks import HOST_MARK, MarkKind, unpack_mark
 from firmware_sim.torque_transducer import converter_ends
 
 ClockMode = Literal["sync", "wall"]
-SYNC_COUNTERS = 240
-
 _TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
 _PLANNED_PERIOD_NS = 1_000_000
 """How long a fault without length, such as a reboot, is active."""
-_ALL = (True,) * len(_NODES)
 
 _FAULTS = TRUTH_LAYOUT.slices["faults"]
 
@@ -134,9 +134,9 @@ class Bench:
         self.on_truth = on_truth
         self._on_answer = on_answer
         self._truth = np.zeros(TRUTH_LAYOUT.size)
-        self._counter = 0  # of the last SYNC, 0: none since boot-up
+        self._order = SyncOrder(is_timed=self._is_wall)
+        self._lost_syncs = 0  # before the last one
         self._has_moved = False
-        self._has_been_operational = False  # a node, since the arm is there
         self._is_started = False
         self._due_ns = NEVER_NS
         self._body_ns = 0
@@ -166,9 +166,10 @@ class Bench:
         self._injector.attach(self.devices, self.drives, self.sensors)
         self._period_ns = self.devices[0].value(0x1006) * 1000
         for device in self.devices:
-            device.watch(0x1006, 0, check=self._check_period)
+            device.watch(0x1006, 0, check=_check_period)
         self.devices[0].watch(0x1006, 0, self._set_period)
-        self._body = self._make_body()
+        self._listeners = SyncListeners(self.devices)
+        self._body = self._build_body()
         self._sync_id = codec.message("Sync").can_id
         self._host_id = codec.node_id("HostHeartbeat")
         self._commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
@@ -205,10 +206,6 @@ class Bench:
     def is_operational(self) -> bool:
         """Whether all nodes are in NMT state Operational."""
         return all(device.is_operational for device in self.devices)
-
-    @property
-    def _is_any_operational(self) -> bool:
-        return any(device.is_operational for device in self.devices)
 
     @property
     def is_scenario_started(self) -> bool:
@@ -272,8 +269,8 @@ class Bench:
         """Say by how much this SYNC moves the bench's time, if it is heard."""
         if self._is_wall or not self._has_moved:
             return 0
-        counter = data[0] if data else 0
-        periods = (counter - self._counter) % SYNC_COUNTERS if counter and self._counter else 1
+        counter, last = data[0] if data else 0, self._order.counter
+        periods = (counter - last) % self._listeners.overflow if counter and last else 1
         return periods * self._period_ns
 
     def release(self) -> None:
@@ -309,7 +306,8 @@ class Bench:
             self._injector.receive(place, 0x000, data, device.on_nmt, t_ns)
         is_reset = len(data) == 2 and data[0] in (RESET_NODE, RESET_COMMUNICATION)
         if is_reset and data[1] in (0, self.devices[0].node_id):
-            self._counter = 0
+            self._order.restart()
+            self._listeners.restart()
 
     def _on_host_heartbeat(self, data: bytes, t_ns: int) -> None:
         def take(_data: bytes, t_ns: int) -> None:
@@ -330,16 +328,14 @@ class Bench:
 
     def _on_sync(self, data: bytes, t_ns: int) -> None:
         """Run one cycle."""
-        counter = data[0] if data else 0
-        periods = self._count_periods(counter) if counter <= SYNC_COUNTERS else 0
-        if periods == 0:
+        takers = self._listeners.takers(data)
+        if not (any(takers) and self._judge(data, t_ns)):
+            self._ignore_sync(data, takers)
             return
         if self._is_wall:
             self._move_to(self.now_ns)
-        elif self._period_ns != self._body_period_ns:
-            self._body = self._make_body()
         elif self._has_moved:
-            self._live_through_lost_syncs(periods - 1)
+            self._live_through_lost_syncs(self._lost_syncs)
             self.now_ns += self._period_ns
         late_ns = self._injector.late_ns(self._period_ns)
         if late_ns and self._is_wall:
@@ -348,13 +344,32 @@ class Bench:
         else:
             self._answer(data, t_ns, late_ns)
 
+    def _judge(self, data: bytes, t_ns: int) -> bool:
+        """Place a SYNC among those before and count the cycles; tell whether devices take it."""
+        order = self._order
+        last = order.counter
+        order.judge(data[0] if data else 0, self._listeners.overflow if data else 0, t_ns, self._period_ns)
+        if not order.is_taken:
+            return False
+        self._lost_syncs = order.periods - 1
+        self.cycle = order.counter - 1 if last == 0 else self.cycle + order.periods
+        return True
+
+    def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
+        """Let the devices take note of a SYNC that none of them answers."""
+        listeners, is_quiet = self._listeners, self._injector.is_quiet
+        heard = listeners.everybody if is_quiet else self._injector.hear(self._sync_id, data)
+        listeners.ignore(heard, takers, self._order.kind, self.now_ns)
+        self._poll(self.now_ns)
+
     def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
         """Sample and answer a SYNC that reaches the devices now, or by SYNC `late_ns` after its time."""
         sync_ns = self.now_ns
         late_ticks = late_ns // _TICK_NS
         if late_ticks:
             self._advance_body(late_ticks)
-        if self._is_wall or self._is_plain:
+        is_for_all = self._listeners.takers(data) == self._listeners.everybody
+        if self._is_wall or (is_for_all and self._is_plain):
             self._sample_and_send(data)
             if self._is_wall:
                 self._outbox.release(self.now_ns)
@@ -367,7 +382,6 @@ class Bench:
         self._tell_truth(t_ns)
         if not self._is_wall:
             self._has_moved = True
-            self._has_been_operational = self._has_been_operational or self._is_any_operational
             self._advance_body(self._period_ns // _TICK_NS - late_ticks)
 
     def _advance_body(self, tick_count: int) -> None:
@@ -378,10 +392,10 @@ class Bench:
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
         """By SYNC, live through one that a fault keeps from all devices; what they send besides goes out."""
-        counter = data[0] if data else 0
-        periods = self._count_periods(counter) if self._counter and counter <= SYNC_COUNTERS else 0
-        if self._has_moved and self._period_ns == self._body_period_ns:
-            self._live_through_lost_syncs(periods)
+        is_counted = self._order.counter != 0 and any(self._listeners.takers(data)) and self._judge(data, t_ns)
+        if is_counted and self._has_moved:
+            self._listeners.miss(self._lost_syncs + 1)
+            self._live_through_lost_syncs(self._lost_syncs + 1)
         self._outbox.collect(self.now_ns)
         self._poll(self.now_ns)
         self._outbox.close(self.now_ns, self.now_ns + self._period_ns)
@@ -407,15 +421,22 @@ class Bench:
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
         measured = self._body.sample()
-        heard = _ALL
-        if self._injector.is_quiet:
+        listeners, order, lost = self._listeners, self._order, self._lost_syncs
+        takers = listeners.takers(data)
+        heard: Sequence[int] = listeners.everybody
+        if self._injector.is_quiet and takers == heard:
+            if listeners.is_remembering or lost or order.kind is not SyncKind.RIGHT:
+                listeners.tell(heard, takers, order.kind, lost, now_ns)
             (position1, position2), (velocity1, velocity2), (torque1, torque2) = measured
             drive1.on_sync(position1, velocity1, now_ns)
             drive2.on_sync(position2, velocity2, now_ns)
             sensor1.on_sync(torque1)
             sensor2.on_sync(torque2)
         else:
-            heard = self._injector.sync(self._sync_id, data, measured, now_ns)
+            heard = self._injector.hear(self._sync_id, data)
+            listeners.tell(heard, takers, order.kind, lost, now_ns)
+            heard = [times * is_taken for times, is_taken in zip(heard, takers, strict=True)]
+            self._injector.sync(heard, measured, now_ns)
             if not self._is_wall:  # by the clock, a drive that hears no SYNC has nothing to count
                 self._lose_sync(heard)
         if now_ns >= self._due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
@@ -428,27 +449,10 @@ class Bench:
             if heard[place]:
                 send()
 
-    def _lose_sync(self, heard: tuple[bool, ...]) -> None:
+    def _lose_sync(self, heard: Sequence[int]) -> None:
         for drive, has_heard in zip(self.drives, heard, strict=False):  # the drives come first
             if not has_heard:
                 drive.on_lost_sync(self.now_ns)
-
-    def _count_periods(self, counter: int) -> int:
-        """Unwrap the SYNC counter; return the periods since the SYNC before, 0 for a repeated one.
-
-        A SYNC without counter (0x1019 = 0) follows the one before.
-        """
-        last = self._counter
-        if last == 0:
-            self._counter = counter or 1
-            self.cycle = self._counter - 1
-            return 1
-        if counter == 0:
-            counter = last % SYNC_COUNTERS + 1
-        periods = (counter - last) % SYNC_COUNTERS
-        self._counter = counter
-        self.cycle += periods
-        return periods
 
     def _live_through_lost_syncs(self, count: int) -> None:
         drive1, drive2 = self.drives
@@ -468,7 +472,7 @@ class Bench:
         if not self._is_wall and not (drive1.is_left_alone or drive2.is_left_alone):
             self._body_ns = self.now_ns
             return
-        step_ns = self._body_period_ns
+        step_ns = _TICK_NS if self._is_wall else self._period_ns
         while self._body_ns + step_ns <= t_ns:
             self._body_ns += step_ns
             self._has_moved = True
@@ -509,26 +513,15 @@ class Bench:
             lambda: self._body.joint_temperature_C[joint],
         )
 
-    def _make_body(self) -> Movable:
-        """Make the arm as at power-on; by SYNC, one that moves by whole periods."""
-        self._body_period_ns = _TICK_NS if self._is_wall else self._period_ns
-        self._has_moved = self._has_been_operational = self._is_started = False
-        return self._build_body()
-
     def _build_body(self) -> Movable:
-        return Body(self._scenario, self._body_period_ns * 1e-9, self._seed)
-
-    def _check_period(self, period_us: int) -> None:
-        """Accept whole ticks; by SYNC, once the arm has moved, only the period that it has moved by.
-
-        Until a node has been operational it has not: SYNC may be that of another arm's host, which runs already.
-        A reset that restores another period's default makes a new arm at the next SYNC unless it is written again.
-        """
-        is_possible = 0 < period_us <= _LONGEST_PERIOD_US and period_us * 1000 % _TICK_NS == 0
-        if not is_possible:
-            refuse(Abort.VALUE_RANGE)
-        if not self._is_wall and self._has_been_operational and period_us * 1000 != self._body_period_ns:
-            refuse(Abort.DEVICE_STATE)
+        return Body(self._scenario, seed=self._seed)
 
     def _set_period(self, period_us: int) -> None:
-        self._period_ns = period_us * 1000
+        if period_us:  # 0 is written to change 0x1019; the period stays
+            self._period_ns = period_us * 1000
+
+
+def _check_period(period_us: int) -> None:
+    """Accept whole ticks, and 0."""
+    if not 0 <= period_us <= _LONGEST_PERIOD_US or period_us * 1000 % _TICK_NS:
+        refuse(Abort.VALUE_RANGE)

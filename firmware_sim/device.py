@@ -14,13 +14,16 @@ from adacd_hil.wire.codec import MessageCodec
 from firmware_sim.emergency import ErrorReporter
 from firmware_sim.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from firmware_sim.node_clock import NodeClock
-from firmware_sim.object_dictionary import ObjectDictionary, Send
+from firmware_sim.object_dictionary import Abort, ObjectDictionary, Send, refuse
 from firmware_sim.pdo import Pdos, PdoUser
 from firmware_sim.pdo_mapping import CLASSIC_BYTES
+from firmware_sim.sync_order import SyncCounts, SyncKind
 from firmware_sim.watchdogs import Watchdog, Watchdogs
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
 _RECOVERED_FROM_BUS_OFF = 0x8140
+_CLEAR_HISTORY = (0x1003, 0)
+_LONGEST_OVERFLOW = 240
 
 
 class NmtState(IntEnum):
@@ -35,6 +38,7 @@ class NmtState(IntEnum):
 _COMMANDED_STATES = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
 _EMCY_STATES = (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL)
 RESET_NODE, RESET_COMMUNICATION = 129, 130
+_OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
 
 
 class Application(PdoUser, Protocol):
@@ -51,6 +55,13 @@ class Application(PdoUser, Protocol):
 
     def find_heartbeat(self, t_ns: int) -> None:
         """Act on the return of the master's heartbeat."""
+
+    def distrust_sync(self, t_ns: int) -> None:
+        """Act on SYNCs that are no time base."""
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether the device does what its objects must not be changed under."""
 
     def restart(self, is_node_reset: bool) -> None:
         """Begin anew: communication only, or all of the device."""
@@ -95,6 +106,14 @@ class Device(ObjectDictionary):
         self._consumer = HeartbeatConsumer(self, self)
         self._errors = ErrorReporter(self, self._send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
         self.watchdogs = Watchdogs(self)
+        self.sync_counts = SyncCounts(self)
+        self.is_locked = self._is_locked_at_work
+        self.watch(0x1006, 0, check=self._check_period)
+        self.sync_overflow = self.value(0x1019) if self.has(0x1019) else None
+        """0x1019: the last SYNC counter before 1, 0 for SYNCs without counter; None where the EDS lacks it."""
+        self.watch(0x1019, 0, self._set_overflow, self._check_overflow)
+        self.open_at_work = frozenset({_CLEAR_HISTORY})
+        """Objects that SDO may write while the device is at work."""
         self.pdos = Pdos(self, send, messages or {}, longest_pdo, self._announce_pdos)
         self.pdos.own_ns = self.clock.own_ns
 
@@ -103,6 +122,11 @@ class Device(ObjectDictionary):
         """0x1001."""
         register = _GENERIC | _COMMUNICATION if self.watchdogs.tripped else 0
         return register | (_GENERIC | self.fault_bits if self.is_faulty else 0)
+
+    @property
+    def is_sync_odd(self) -> bool:
+        """Whether an odd SYNC is remembered, so that right ones count."""
+        return bool(_OF_SYNC & self.watchdogs.tripped)
 
     def attach(self, application: Application) -> None:
         """Connect what the device does."""
@@ -187,6 +211,24 @@ class Device(ObjectDictionary):
         if self._application is not None:
             self._application.find_heartbeat(t_ns)
 
+    def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
+        """Take note of a SYNC in Operational, be it taken or not, and of those that were lost before it."""
+        if not (self.is_operational and self.is_on_bus):
+            return
+        t_ns = self.clock.own_ns(t_ns)
+        counts = self.sync_counts
+        counts.note(kind, lost)
+        if kind is SyncKind.WRONG_LENGTH:
+            self.trip(Watchdog.SYNC_LENGTH, t_ns)
+        elif kind is SyncKind.RIGHT:
+            self.clear(Watchdog.SYNC_LENGTH, t_ns)
+            if counts.is_in_order:
+                self.clear(Watchdog.SYNC_ORDER, t_ns)
+        else:
+            self.trip(Watchdog.SYNC_ORDER, t_ns)
+            if not counts.is_time_base and self._application is not None:
+                self._application.distrust_sync(t_ns)
+
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
         """Report a watchdog that trips; once, until it has cleared."""
         self.watchdogs.trip(watchdog, self._errors, t_ns, self._time_ms(t_ns))
@@ -206,6 +248,26 @@ class Device(ObjectDictionary):
     def poll(self, t_ns: int) -> int:
         """Do what is due by its own clock; return when something is due next."""
         return min(self._producer.poll(t_ns), self._consumer.poll(t_ns), self._errors.poll(t_ns))
+
+    def _is_locked_at_work(self, index: int, subindex: int) -> bool:
+        """Whether SDO may not write an object now: while the device is at work, none but what changes nothing."""
+        is_at_work = self._application is not None and self._application.is_at_work
+        return is_at_work and (index, subindex) not in self.open_at_work
+
+    def _check_period(self, period_us: int) -> None:
+        """Keep the SYNC period as long as SYNCs are obeyed."""
+        if self.is_operational and period_us != self.value(0x1006):
+            refuse(Abort.DEVICE_STATE)
+
+    def _check_overflow(self, overflow: int) -> None:
+        """Accept 0 and 2 to 240, and a change at period 0 only: CiA 301, 7.5.2.22."""
+        if overflow == 1 or overflow > _LONGEST_OVERFLOW:
+            refuse(Abort.VALUE_RANGE)
+        if overflow != self.value(0x1019) and self.value(0x1006) != 0:
+            refuse(Abort.DEVICE_STATE)
+
+    def _set_overflow(self, overflow: int) -> None:
+        self.sync_overflow = overflow
 
     def _announce_pdos(self) -> None:
         self.on_pdo_change()
@@ -233,5 +295,6 @@ class Device(ObjectDictionary):
         self.pdos.restart()
         if is_node_reset:
             self.watchdogs.reset()
+            self.sync_counts.reset()
         if self._application is not None:
             self._application.restart(is_node_reset)

@@ -5,7 +5,12 @@ SYNC. The motor has torque only in Operation enabled with mode 10; Quick stop ac
 brake, and so do shutdown and disable operation where 0x605B and 0x605C say so; everywhere else the arm coasts.
 
 Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
-0x6076, rated torque in mNm. Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
+0x6076, rated torque in mNm.
+
+While the motor is powered, SDO writes nothing but the controlword and clears the error history. While an RPDO brings
+the controlword, SDO writes only those that take the power away: Disable voltage and Quick stop.
+
+Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
 """
 
 from collections.abc import Callable
@@ -19,7 +24,7 @@ from firmware_sim.drive_stops import DISABLE, FAULT_REACTIONS, QUICK_STOPS, RAMP
 from firmware_sim.object_dictionary import NEVER_NS, Abort, one_of, refuse
 from firmware_sim.sensing import VELOCITY_LSB_RAD_S
 from firmware_sim.torque_limits import TorqueLimits
-from firmware_sim.watchdogs import ERROR_CODES, Watchdog
+from firmware_sim.watchdogs import ERROR_CODES, WARNINGS, Watchdog
 
 CYCLIC_SYNCHRONOUS_TORQUE = 10
 _NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
@@ -28,7 +33,9 @@ _TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
 _BRAKE_WATCH_NS = 1_000_000  # how often a drive without SYNC looks whether it stands still
 
 _ENABLE_OPERATION_WORD = 0x0F
-_REMOTE, _INTERNAL_LIMIT, _FOLLOWS_TARGET = 1 << 9, 1 << 11, 1 << 12
+_CONTROLWORD = (0x6040, 0)
+_WARNING, _REMOTE, _INTERNAL_LIMIT, _FOLLOWS_TARGET = 1 << 7, 1 << 9, 1 << 11, 1 << 12
+_DISARMING = (DriveEvent.DISABLE_VOLTAGE, DriveEvent.QUICK_STOP)
 _ENABLED = DriveState.OPERATION_ENABLED
 _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _KIND_BITS = {2: 1 << 1, 4: 1 << 3}  # of 0x1001 by first digit of the error code: current, temperature
@@ -103,6 +110,7 @@ class DriveNode:
         serve(0x2000, 1, lambda: codec.wire_version)
         serve(0x2000, 2, lambda: codec.layout_digest)
         serve(0x2202, 0, lambda: self._acted_commands & 0xFFFF)
+        serve(0x2212, 0, lambda: self._obstacle)
         serve(0x603F, 0, lambda: self._error_code)
         serve(0x6040, 0, lambda: self._controlword)
         serve(0x6041, 0, lambda: self.statusword)
@@ -116,15 +124,15 @@ class DriveNode:
     def _configure(self) -> None:
         """Act on what is written, by SDO or PDO."""
         device = self.device
+        device.open_at_work |= {_CONTROLWORD}
         self._pdos.events = _EVENTS
-        self._pdos.accept(0x6040, 0, self._receive_word)
-        device.watch(0x6040, 0, check=self._obey_by_sdo)
+        self._pdos.accept(*_CONTROLWORD, self._receive_word)
+        device.watch(*_CONTROLWORD, check=self._obey_by_sdo)
         device.watch(0x605A, 0, check=one_of(*QUICK_STOPS))
         device.watch(0x605B, 0, check=one_of(*RAMPS))
         device.watch(0x605C, 0, check=one_of(*RAMPS))
         device.watch(0x605E, 0, check=one_of(*FAULT_REACTIONS))
         device.watch(0x6060, 0, self._want_mode, one_of(0, CYCLIC_SYNCHRONOUS_TORQUE))
-        device.watch(0x6076, 0, check=self._check_rated_torque)
         device.watch(0x1006, 0, self._set_period)
         device.watch(0x2200, 0, self._set_patience)
         device.watch(0x2201, 0, self._set_tolerance)
@@ -133,6 +141,11 @@ class DriveNode:
     def is_enabled(self) -> bool:
         """Whether the drive is in Operation enabled."""
         return self.state is DriveState.OPERATION_ENABLED
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether the motor has power by command, so that neither watchdogs nor limits may change."""
+        return self.state in _POWERED
 
     @property
     def is_left_alone(self) -> bool:
@@ -147,8 +160,10 @@ class DriveNode:
 
     @property
     def statusword(self) -> int:
-        """0x6041. Target reached (bit 10) has no meaning in mode 10 and stays 0."""
+        """0x6041. Target reached (bit 10) has no meaning in mode 10 and stays 0; so does all of set-point and halt."""
         word = STATE_BITS[self.state] | _REMOTE
+        if Watchdog.COMMAND_PDO in self._tripped:
+            word |= _WARNING
         if self.is_enabled and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None:
             word |= _FOLLOWS_TARGET
             if self._limits.is_limiting or self._is_motor_limited:
@@ -253,6 +268,7 @@ class DriveNode:
     def enter_operational(self, t_ns: int) -> None:
         """Clear the watchdog; a fault stays latched."""
         self.device.clear(Watchdog.OPERATIONAL, t_ns)
+        self._find_command_pdo(t_ns)
 
     def lose_heartbeat(self, t_ns: int) -> None:
         """Fault when powered."""
@@ -264,6 +280,11 @@ class DriveNode:
     def find_heartbeat(self, t_ns: int) -> None:
         """Clear the watchdog; a fault stays latched."""
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
+
+    def distrust_sync(self, t_ns: int) -> None:
+        """Fault when enabled: torque that acts at SYNC has no time."""
+        if self.is_enabled:
+            self._fault(Watchdog.SYNC, t_ns)
 
     def restart(self, is_node_reset: bool) -> None:
         """Forget the last command; a node reset also runs the state machine from its start (0, 1)."""
@@ -297,6 +318,8 @@ class DriveNode:
         self._controlword = controlword
 
     def _obey_by_sdo(self, controlword: int) -> None:
+        if self._pdos.brings(*_CONTROLWORD) and decode_command(controlword, self._controlword) not in _DISARMING:
+            refuse(Abort.DEVICE_STATE)
         self._obey(controlword, self.device.now_ns)
         self._controlword = controlword
         self._drive_motor()
@@ -306,12 +329,16 @@ class DriveNode:
         event = decode_command(controlword, self._controlword)
         if event is None:
             return
+        if event is not DriveEvent.ENABLE_OPERATION:
+            self.device.clear(Watchdog.COMMAND_PDO, t_ns)
         if event is DriveEvent.FAULT_RESET:
             self._reset_fault(t_ns)
             return
         if event is DriveEvent.ENABLE_OPERATION:
-            if self.state is DriveState.SWITCHED_ON and not self._pdos.is_commandable:
-                return  # no torque without a way to command it
+            if self.state is DriveState.SWITCHED_ON and self._obstacle:
+                self.has_news |= Watchdog.COMMAND_PDO not in self._tripped
+                self.device.trip(Watchdog.COMMAND_PDO, t_ns)
+                return
             if self.state is DriveState.QUICK_STOP_ACTIVE and not self._stop.stays:
                 return
         if self.is_enabled and event in _RAMPED:
@@ -399,15 +426,21 @@ class DriveNode:
 
     def _is_cause_present(self, t_ns: int) -> bool:
         """Whether the drive fails, the motor is too hot, or a watchdog that stops it is tripped or would be at once."""
-        if self._failure or self._tripped - {Watchdog.LENGTH} or self._motor.error_code():
+        if self._failure or self._tripped - WARNINGS or self._motor.error_code():
             return True
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
 
     def _clear_watchdogs(self, t_ns: int) -> None:
         """At a SYNC: it has come, and maybe a command with it."""
-        self.device.clear(Watchdog.SYNC, t_ns)
+        if self.device.sync_counts.is_in_order:
+            self.device.clear(Watchdog.SYNC, t_ns)
         if not self._is_command_missing(t_ns):
             self.device.clear(Watchdog.COMMAND, t_ns)
+        self._find_command_pdo(t_ns)
+
+    def _find_command_pdo(self, t_ns: int) -> None:
+        if not self._obstacle:
+            self.device.clear(Watchdog.COMMAND_PDO, t_ns)
 
     def _miss_command(self, t_ns: int) -> None:
         self._silent_syncs += 1
@@ -425,6 +458,13 @@ class DriveNode:
         if self._pdos.find_late(t_ns):
             self._fault(Watchdog.COMMAND, t_ns, is_found_by_time=True)
         return min(due_ns, self._pdos.deadline_ns) if self.is_enabled else t_ns
+
+    @property
+    def _obstacle(self) -> int:
+        """0x2212, why there is no Operation enabled: 0 nothing, 1 no PDO is exchanged, 2 none brings commands."""
+        if self._pdos.is_commandable:
+            return 0
+        return 2 if self.device.is_operational else 1
 
     def _is_command_missing(self, t_ns: int) -> bool:
         return self._silent_syncs >= self._patience_syncs or self._pdos.find_late(t_ns)
@@ -465,13 +505,9 @@ class DriveNode:
         self._mode = self._wanted_mode
         self._drive_motor()
 
-    def _check_rated_torque(self, rated_mNm: int) -> None:
-        """Accept the motor's rating only: it can't be changed."""
-        if rated_mNm != self._rated_mNm:
-            refuse(Abort.VALUE_RANGE)
-
     def _set_period(self, period_us: int) -> None:
-        self._period_us = period_us
+        if period_us:  # 0 is written to change 0x1019; SYNC is watched all the same
+            self._period_us = period_us
 
     def _set_tolerance(self, tenth_periods: int) -> None:
         self._tenth_periods = tenth_periods

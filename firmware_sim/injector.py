@@ -124,13 +124,16 @@ class Injector:
             for offset_ns, can_id, data in self.plan.babble(period_ns):
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
-    def sync(self, sync_id: int, data: bytes, measured: Measurement, now_ns: int) -> tuple[bool, ...]:
-        """Give a SYNC to the nodes that hear it, with what they take for measured; tell which do."""
+    def hear(self, sync_id: int, data: bytes) -> tuple[int, ...]:
+        """Tell how often each node hears a SYNC that is on the bus once."""
         plan = self.plan
-        position, velocity, torque = plan.distort(*measured)
-        heard = tuple(
-            device.is_on_bus and bool(plan.receive(place, sync_id, data)) for place, device in enumerate(self._devices)
+        return tuple(
+            len(plan.receive(place, sync_id, data)) * device.is_on_bus for place, device in enumerate(self._devices)
         )
+
+    def sync(self, heard: Sequence[int], measured: Measurement, now_ns: int) -> None:
+        """Give a SYNC to the nodes that hear it, with what they take for measured."""
+        position, velocity, torque = self.plan.distort(*measured)
         for joint, drive in enumerate(self._drives):
             if heard[joint]:
                 is_distorted = velocity[joint] != measured.velocity_counts[joint]
@@ -138,7 +141,6 @@ class Injector:
         for joint, sensor in enumerate(self._sensors):
             if heard[JOINTS + joint]:
                 sensor.on_sync(torque[joint])
-        return heard
 
     def _do(self, action: NodeAction, t_ns: int) -> None:
         kind, place, value = action

@@ -225,6 +225,9 @@ class ObjectDictionary:
         self._readers: dict[tuple[int, int], Callable[[], int]] = {}
         self._checks: dict[tuple[int, int], list[Callable[[int], None]]] = {}
         self._appliers: dict[tuple[int, int], list[Callable[[int], None]]] = {}
+        self.is_locked: Callable[[int, int], bool] = lambda _index, _subindex: False
+        """Whether the state of the device forbids SDO to write an object now."""
+        self._is_requested = False  # an SDO request is in progress
         self._node = _Node(node_id, eds_path)
         self._node.associate_network(_Network(send))
         self._node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
@@ -314,7 +317,11 @@ class ObjectDictionary:
 
     def on_request(self, data: bytes, t_ns: int) -> None:
         """Answer an SDO request of 8 bytes."""
-        self._node.sdo.on_request(0x600 + self.node_id, data, t_ns)  # type: ignore[no-untyped-call]
+        self._is_requested = True
+        try:
+            self._node.sdo.on_request(0x600 + self.node_id, data, t_ns)  # type: ignore[no-untyped-call]
+        finally:
+            self._is_requested = False
 
     def restore(self, last: int) -> None:
         """Forget what was written to the objects up to the index `last`; those who watch get the defaults."""
@@ -329,6 +336,8 @@ class ObjectDictionary:
         return None if read is None else read()
 
     def _write(self, index: int, subindex: int, od: ODVariable, data: bytes) -> None:
+        if self._is_requested and self.is_locked(index, subindex):
+            refuse(Abort.DEVICE_STATE)
         if od.data_type not in datatypes.NUMBER_TYPES:
             return
         value = int(od.decode_raw(bytes(data)))

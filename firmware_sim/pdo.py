@@ -253,6 +253,10 @@ class Pdos:
         """Whether a PDO is exchanged that brings commands."""
         return any(pdo.is_command for pdo in self._receiving)
 
+    def brings(self, index: int, subindex: int) -> bool:
+        """Whether a PDO is exchanged that brings values of an object."""
+        return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
+
     def accept(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
         """Give received values of an object to a function instead of writing the object as SDO does."""
         self._writers[index, subindex] = write

@@ -1,7 +1,12 @@
 """An emulated joint torque sensor: a CiA 404 analogue input whose process value is the torque in the contract's LSB.
 
 On every SYNC it sends the value. Where the frame has an end-to-end header, the header's status carries the low bits of
-0x6150, so that an overload is seen in the very frame that it spoils. Source: CiA 404, objects 0x6125, 0x6150, 0x9130.
+0x6150, so that an overload is seen in the very frame that it spoils.
+
+In Operational the sensor measures for somebody: SDO writes nothing but clears the error history. Autozero is asked for
+in Pre-operational; its samples are those of the SYNCs that follow, in whichever state.
+
+Source: CiA 404, objects 0x6125, 0x6150, 0x9130.
 """
 
 from collections.abc import Callable
@@ -119,6 +124,14 @@ class SensorNode:
         """Clear the error."""
         self.has_news = True
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
+
+    def distrust_sync(self, t_ns: int) -> None:
+        """Do nothing: who measures by SYNC has been told."""
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether somebody relies on what it measures."""
+        return self.device.is_operational
 
     def restart(self, is_node_reset: bool) -> None:
         """Forget the zero at a node reset."""

@@ -2,7 +2,8 @@
 
 An EMCY's byte 3 is the number of the watchdog, its bytes 4 to 7 the device's time in ms at which that happened. 0x2210
 keeps the last one and counts them. A fault that a watchdog caused is the drive's business and stays latched.
-Source: CiA 301 (4.2), table 27 (0x8100 … 0x8250); CiA 402-1, error code 0x8700 "sync controller".
+Source: CiA 301 (4.2), table 27 (0x8100 … 0x8250); CiA 402-1, error codes 0x6320 "parameter error" and 0x8700 "sync
+controller".
 """
 
 from enum import IntEnum
@@ -21,6 +22,9 @@ class Watchdog(IntEnum):
     HEARTBEAT = 3  # the master's heartbeat comes, or is no longer monitored
     OPERATIONAL = 4  # NMT start
     LENGTH = 5  # a command frame of the right length comes
+    SYNC_ORDER = 6  # 100 SYNCs in a row are right
+    SYNC_LENGTH = 7  # a SYNC of the right length comes
+    COMMAND_PDO = 8  # Enable operation is no longer asked for, or can be obeyed
 
 
 ERROR_CODES = {
@@ -30,8 +34,14 @@ ERROR_CODES = {
     Watchdog.HEARTBEAT: 0x8130,
     Watchdog.OPERATIONAL: 0x8100,
     Watchdog.LENGTH: 0x8210,
+    Watchdog.SYNC_ORDER: 0x8200,
+    Watchdog.SYNC_LENGTH: 0x8240,
+    Watchdog.COMMAND_PDO: 0x6320,
 }
 """EMCY error code and 0x603F by watchdog."""
+
+WARNINGS = frozenset({Watchdog.LENGTH, Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH, Watchdog.COMMAND_PDO})
+"""Those that never cause a fault."""
 
 
 class Watchdogs:

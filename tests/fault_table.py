@@ -189,6 +189,21 @@ FRAMES = [
         Expected(("DRIVE",), 2, 1, says="Drive1: FAULT_REACTION_ACTIVE, error code 0x8700"),
     ),
     Case(
+        "SYNC comes twice",
+        'kind = "duplicate", frame = "sync"',
+        Expected(("DRIVE",), 5, 3, says="error code 0x8700: sync controller"),
+        Expected(("DRIVE",), 4, 3, says="error code 0x8700: sync controller"),
+        (Wire(0x181, 3, 3), Wire(0x081, 1, 1)),
+        note="the fourth that is odd before 100 were right faults the drives; "
+        "on the modelled bus four EMCY delay feedback and status by a cycle",
+    ),
+    Case(
+        "three SYNCs come twice",
+        'kind = "duplicate", frame = "sync", count = 3',
+        *both(TOLERATED),
+        (Wire(0x181, 20, 20), Wire(0x081, 20, 1)),
+    ),
+    Case(
         "the reset of a sensor is lost at power-on",
         'kind = "lose", node = "sensor1", frame = "nmt", since = "power_on", count = 1',
         *both(Expected(error="no boot-up from Sensor1 (node 3)")),

@@ -28,7 +28,7 @@ from adacd_hil.control.session import git_commit
 from adacd_hil.control.tare_file import FORMAT, PoseRecord, SensorRecord, Tare, format_date, sensor_identities
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
-from adacd_hil.device.network import Identity, Master
+from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master
 from adacd_hil.records import JOINT_NAMES, ArmState, Vector
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec
@@ -231,8 +231,11 @@ class TareSession:
         before = self._measure()
         solve_tare([before], self.settings)  # an arm that somebody pushes on isn't zeroed
         for node, sensor in zip(nodes, sensors, strict=True):
+            # Sensors of our own kind refuse it in Operational, where somebody relies on what they measure.
+            self._canopen.command(ENTER_PRE_OPERATIONAL, sensor.node_id)
             with explained(sensor.name, sensor.node_id, "auto-zero"):
                 node.sdo.download(*AUTO_ZERO, AUTO_ZERO_SIGNATURE)
+            self._canopen.command(START, sensor.node_id)
         for _ in range(_AUTO_ZERO_WAIT_CYCLES):
             self._step()
         after = self._measure()

@@ -145,7 +145,16 @@ _CODES = {
     0xF004: "control",
 }
 
-WATCHDOGS = {1: "SYNC", 2: "command", 3: "host heartbeat", 4: "left Operational", 5: "PDO length"}
+WATCHDOGS = {
+    1: "SYNC",
+    2: "command",
+    3: "host heartbeat",
+    4: "left Operational",
+    5: "PDO length",
+    6: "SYNC order",
+    7: "SYNC length",
+    8: "no RPDO brings commands",
+}
 """Byte 3 of an EMCY of devices with the feature `watchdog_in_emcy`; bytes 4 to 7 are the device's time in ms."""
 
 

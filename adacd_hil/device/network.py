@@ -22,8 +22,8 @@ from adacd_hil.records import Event
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 
-START, RESET_COMMUNICATION = 0x01, 0x82
-_ENTER_PRE_OPERATIONAL = 0x80
+START, ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION = 0x01, 0x80, 0x82
+"""NMT commands."""
 _SYNC_ID = 0x080
 _IDENTIFIER_MASK = 0x7FF
 _PROFILE_NUMBER_MASK = 0xFFFF  # of 0x1000
@@ -221,7 +221,7 @@ class Master:
     def stop(self) -> None:
         """Put all nodes back to pre-operational; drives drop out if they are still enabled. Raises BusError."""
         self._heartbeats.stop()
-        self._command(_ENTER_PRE_OPERATIONAL)
+        self._command(ENTER_PRE_OPERATIONAL)
 
     def _command(self, nmt_command: int) -> None:
         """Send an NMT command to the arm: to all nodes at once, or to each of its own where other arms listen too."""

@@ -21,6 +21,8 @@ PERIOD_NS = 1_000_000
 START, STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128, 129, 130
 SHUTDOWN, SWITCH_ON, ENABLE = 0x06, 0x07, 0x0F
 DISABLE_VOLTAGE, QUICK_STOP, FAULT_RESET = 0x00, 0x02, 0x80
+INVALID = 1 << 31
+"""Bit of a COB-ID."""
 
 
 def quiet_scenario(**changes: Any) -> Scenario:
@@ -161,3 +163,27 @@ class BenchHost:
         """Send SYNCs until a braking drive has surely finished."""
         for _ in range(1100):
             self.step(controlword)
+
+
+def remap(
+    host: BenchHost, node: int, record: int, entries: tuple[int, ...], *, can_id: int, kind: int = 1, timer_ms: int = 0
+) -> None:
+    """Write a PDO's records in the order that CiA 301 asks for."""
+    host.write(node, record, 1, INVALID | can_id)
+    host.write(node, record, 2, kind)
+    host.write(node, record, 5, timer_ms)
+    host.write(node, record + 0x200, 0, 0)
+    for sub, value in enumerate(entries, start=1):
+        host.write(node, record + 0x200, sub, value)
+    host.write(node, record + 0x200, 0, len(entries))
+    host.write(node, record, 1, can_id)
+
+
+def remap_mode(host: BenchHost) -> None:
+    """Let RPDO2 of drive 1 bring the mode of operation, at once; `set_mode` sends it."""
+    remap(host, 1, 0x1401, (0x60600008,), can_id=0x301, kind=255)
+
+
+def set_mode(host: BenchHost, mode: int) -> None:
+    """Send the mode of operation to drive 1."""
+    host.put(0x301, bytes([mode]))

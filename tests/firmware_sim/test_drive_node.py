@@ -18,6 +18,9 @@ from bench_host import (
     SWITCH_ON,
     BenchHost,
     quiet_scenario,
+    remap,
+    remap_mode,
+    set_mode,
 )
 
 from firmware_sim.drive_states import TRANSITIONS, DriveEvent, DriveState, decode_command, find_transition
@@ -118,9 +121,11 @@ def host() -> BenchHost:
     return BenchHost()
 
 
-def pushed_host() -> BenchHost:
-    """An enabled arm that moves fast enough to need more than one period to brake."""
+def pushed_host(objects: dict[tuple[int, int], int] | None = None) -> BenchHost:
+    """An enabled arm that moves fast enough to need more than one period to brake. objects: value by node and index."""
     host = BenchHost()
+    for (node, index), value in (objects or {}).items():
+        host.write(node, index, 0, value)
     host.enable()
     for _ in range(30):
         host.step(ENABLE, 300)
@@ -221,11 +226,12 @@ def test_operation_enabled_without_mode_10_has_no_torque():
 
 
 def test_leaving_mode_10_while_enabled_ends_the_torque(host):
+    remap_mode(host)
     host.enable()
     for _ in range(10):
         host.step(ENABLE, 500)
     assert host.true("tau_J")[0] > 5.0
-    host.write(1, 0x6060, 0, 0)
+    set_mode(host, 0)
     for _ in range(10):
         host.step(ENABLE, 500)
     assert abs(host.true("tau_J")[0]) < 1e-9
@@ -361,12 +367,24 @@ def test_bit_7_that_was_set_already_when_the_fault_came_resets_nothing(host):
 
 
 def test_fault_reset_is_refused_while_commands_are_still_missing():
-    host = in_state(FAULT_BITS)
-    host.write(1, 0x6040, 0, FAULT_RESET)
+    host = BenchHost()
+    remap(host, 1, 0x1400, (0x60400010,), can_id=0x201, kind=255)
+    remap(host, 1, 0x1401, (0x60710010,), can_id=0x301)
+    host.start()
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        host.put(0x301, bytes(2))
+        host.sync()
+        host.put(0x201, bytes([word, 0]))
+    for _ in range(20):
+        host.sync()
     assert host.state_bits() == FAULT_BITS
-    host.step(ENABLE)
-    host.write(1, 0x6040, 0, 0)
-    host.write(1, 0x6040, 0, FAULT_RESET)
+    host.put(0x201, bytes([FAULT_RESET, 0]))  # the word alone is no command
+    host.sync()
+    assert host.state_bits() == FAULT_BITS
+    host.put(0x201, bytes(2))
+    host.put(0x301, bytes(2))
+    host.sync()
+    host.put(0x201, bytes([FAULT_RESET, 0]))
     assert host.state_bits() == DISABLED_BITS
 
 
@@ -395,8 +413,7 @@ def test_a_fault_brakes_the_moving_arm_to_rest_and_then_lets_it_go():
 
 
 def test_fault_reaction_option_0_lets_the_arm_coast_at_once():
-    host = pushed_host()
-    host.write(1, 0x605E, 0, 0)
+    host = pushed_host({(1, 0x605E): 0})
     for _ in range(3):
         host.sync()
     assert host.state_bits(1) == FAULT_BITS
@@ -428,9 +445,7 @@ def test_quick_stop_brakes_until_standstill_and_then_disables():
 
 
 def test_quick_stop_option_6_stays_and_lets_operation_resume():
-    host = pushed_host()
-    for joint in (1, 2):
-        host.write(joint, 0x605A, 0, 6)
+    host = pushed_host({(1, 0x605A): 6, (2, 0x605A): 6})
     host.wait_until_at_rest(QUICK_STOP)
     assert host.state_bits() == QUICK_STOP_BITS
     host.step(ENABLE)
@@ -524,7 +539,7 @@ def test_by_wall_clock_the_fault_can_be_reset_once_sync_is_back():
     host = wall_host()
     host.t_ns += 1_000_000_000
     host.bench.advance_to(host.t_ns)
-    host.write(1, 0x6040, 0, FAULT_RESET)
+    host.command(FAULT_RESET)
     assert host.state_bits() == FAULT_BITS
     host.step(ENABLE)
     host.step(FAULT_RESET)

@@ -1,7 +1,7 @@
 """How the emulated drive stops, by each option code, and which torque it is limited to; seen in state and motion."""
 
 import pytest
-from bench_host import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, BenchHost
+from bench_host import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, BenchHost, remap_mode, set_mode
 
 from firmware_sim.body import DriveMode
 
@@ -146,9 +146,10 @@ def test_a_fault_brakes_by_its_reaction_code(code, mode):
 
 
 def demand_with(host: BenchHost, target: int, **objects: int) -> tuple[int, bool]:
-    """Return 0x6074 and the internal limit's bit for a target, with objects written before."""
+    """Return 0x6074 and the internal limit's bit for a target, with objects written before the drive is enabled."""
     for name, value in objects.items():
         host.write(1, int(name[1:], 16), 0, value)
+    host.enable()
     host.step(ENABLE, target)
     return host.read(1, 0x6074), bool(host.statusword() & 0x0800)
 
@@ -177,7 +178,6 @@ def demand_with(host: BenchHost, target: int, **objects: int) -> tuple[int, bool
 )
 def test_of_all_limits_the_smallest_counts_and_shows(target, objects, demand, is_limited):
     host = BenchHost()
-    host.enable()
     assert demand_with(host, target, **objects) == (demand, is_limited)
     assert host.bench.drives[0].torque_Nm == pytest.approx(demand * 12e-3)
 
@@ -193,9 +193,10 @@ def test_another_mode_takes_effect_at_the_next_sync_while_enabled_and_at_once_el
     host = BenchHost()
     host.write(1, 0x6060, 0, 10)
     assert host.read(1, 0x6061) == 10
+    remap_mode(host)
     host.enable()
     host.step(ENABLE, 100)
-    host.write(1, 0x6060, 0, 0)
+    set_mode(host, 0)
     assert host.read(1, 0x6061) == 10
     assert host.bench.drives[0].torque_Nm == pytest.approx(1.2)
     host.step(ENABLE, 100)

@@ -15,10 +15,13 @@ FAULT_BITS, DISABLED_BITS, REACTION_BITS, ENABLED_BITS = 0x08, 0x40, 0x0F, 0x27
 ERROR = 0x2310
 
 
-def enabled_host() -> BenchHost:
+def enabled_host(objects: dict[tuple[int, int, int], int] | None = None) -> BenchHost:
+    """An arm in motion. objects: value by node, index and sub-index."""
     host = BenchHost()
     for node in (1, 2, 3, 4):
         host.write(node, 0x1017, 0, 10)
+    for (node, index, sub), value in (objects or {}).items():
+        host.write(node, index, sub, value)
     host.enable()
     for _ in range(5):
         host.step(ENABLE, 100)
@@ -64,8 +67,7 @@ def test_a_drive_without_power_has_no_torque_and_does_not_brake():
 
 @pytest.mark.parametrize("node", [1, 3])
 def test_power_brings_a_device_back_as_it_was_delivered(node):
-    host = enabled_host()
-    host.write(node, 0x1016, 1, 127 << 16 | 50)
+    host = enabled_host({(node, 0x1016, 1): 127 << 16 | 50})
     device = host.bench.devices[node - 1]
     device.power_off(host.bench.now_ns)
     device.power_on(host.bench.now_ns)
@@ -88,8 +90,7 @@ def test_a_drives_state_machine_begins_anew_with_power():
 
 
 def test_emergencies_that_waited_are_gone_with_the_power():
-    host = enabled_host()
-    host.write(1, 0x1015, 0, 1000)
+    host = enabled_host({(1, 0x1015, 0): 1000})
     host.put(0x201, b"\0")  # wrong length, right length: two messages, of which the second must wait
     host.command(ENABLE)
     assert errors(host, 1) == [0x8210]
@@ -195,8 +196,7 @@ def test_a_drive_that_fails_faults_with_its_code_and_says_so():
 
 
 def test_a_drive_whose_host_has_died_ends_its_braking_without_any_sync():
-    host = enabled_host()
-    host.write(1, 0x1016, 1, 127 << 16 | 50)
+    host = enabled_host({(1, 0x1016, 1): 127 << 16 | 50})
     host.put(0x77F, b"\x05")
     pass_ms(host, 500)
     assert host.state_bits(1) == FAULT_BITS
@@ -214,8 +214,7 @@ def test_a_drive_says_by_its_own_clock_when_it_failed():
 
 
 def test_a_drive_says_by_its_own_clock_when_it_lost_its_commands_with_sync():
-    host = enabled_host()
-    host.write(1, 0x2200, 0, 10)
+    host = enabled_host({(1, 0x2200, 0): 10})
     start_ns = host.bench.now_ns
     host.bench.devices[0].clock.set_drift(500_000.0, start_ns)
     host.cycle += 20
@@ -293,8 +292,7 @@ def test_an_overload_is_added_to_the_error_of_a_sensor(bits, counts):
 
 
 def test_a_device_out_of_control_sends_emergencies_whatever_their_inhibit_time():
-    host = enabled_host()
-    host.write(1, 0x1015, 0, 10_000)
+    host = enabled_host({(1, 0x1015, 0): 10_000})
     for _ in range(5):
         host.bench.devices[0].cry(0x1000, host.bench.now_ns)
     assert errors(host, 1) == [0x1000] * 5

@@ -23,13 +23,15 @@ from firmware_sim.watchdogs import Watchdog
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
 WRONG_LENGTH, VALUE_RANGE, NO_DATA = 0x06070010, 0x06090030, 0x08000024
-TOO_HIGH, TOO_LOW, CANNOT_STORE = 0x06090031, 0x06090032, 0x08000020
+TOO_HIGH, TOO_LOW, CANNOT_STORE, DEVICE_STATE = 0x06090031, 0x06090032, 0x08000020, 0x08000022
 
 # What differs from the EDS default right after boot-up: live values.
 LIVE = {
     (1, 0x2000, 1): CODEC.wire_version,
     (1, 0x2000, 2): CODEC.layout_digest,
+    (1, 0x2212, 0): 1,
     (1, 0x6041, 0): 0x0250,
+    (1, 0x6076, 0): 12_000,
     (3, 0x2000, 1): CODEC.wire_version,
     (3, 0x2000, 2): CODEC.layout_digest,
     (3, 0x6150, 1): 1,
@@ -46,7 +48,7 @@ def eds_rows(node: int) -> list[tuple[int, int, str, str]]:
         index, _, sub = section.partition("sub")
         if len(index) == 4 and "DataType" in parser[section]:
             row = parser[section]
-            rows.append((int(index, 16), int(sub or "0", 16), row["AccessType"], row["DefaultValue"]))
+            rows.append((int(index, 16), int(sub or "0", 16), row["AccessType"], row.get("DefaultValue", "0")))
     return rows
 
 
@@ -113,10 +115,12 @@ def test_reading_what_is_not_there_is_aborted(host, node, index, sub, code):
         (1, 0x1000, 0, b"\0\0\0\0", READ_ONLY),
         (1, 0x6041, 0, b"\0\0", READ_ONLY),
         (1, 0x6040, 0, b"\0", WRONG_LENGTH),
-        (1, 0x1006, 0, b"\0\0\0\0", VALUE_RANGE),
         (1, 0x1006, 0, struct.pack("<I", 1050), VALUE_RANGE),
         (1, 0x6060, 0, b"\x08", VALUE_RANGE),
-        (1, 0x6076, 0, struct.pack("<I", 11999), VALUE_RANGE),
+        (1, 0x6076, 0, struct.pack("<I", 12000), READ_ONLY),
+        (1, 0x1019, 0, b"\1", VALUE_RANGE),
+        (1, 0x1019, 0, b"\0", DEVICE_STATE),
+        (1, 0x1019, 0, b"\xf1", TOO_HIGH),
         (1, 0x605A, 0, struct.pack("<h", 4), VALUE_RANGE),
         (1, 0x2200, 0, b"\0", TOO_LOW),
         (1, 0x2201, 0, struct.pack("<H", 10_001), TOO_HIGH),

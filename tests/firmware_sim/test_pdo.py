@@ -3,11 +3,10 @@
 import struct
 
 import pytest
-from bench_host import ENABLE, RESET_COMMUNICATION, SHUTDOWN, START, SWITCH_ON, BenchHost
+from bench_host import ENABLE, INVALID, RESET_COMMUNICATION, SHUTDOWN, START, SWITCH_ON, BenchHost, remap
 
 NO_OBJECT, NO_SUBINDEX, NOT_MAPPABLE, TOO_LONG = 0x06020000, 0x06090011, 0x06040041, 0x06040042
 INCOMPATIBLE, VALUE_RANGE, DEVICE_STATE, READ_ONLY = 0x06040043, 0x06090030, 0x08000022, 0x06010002
-INVALID = 1 << 31
 COMMAND = (0x60400010, 0x60710010)
 
 
@@ -18,20 +17,6 @@ def host() -> BenchHost:
 
 def entry(index: int, bits: int, sub: int = 0) -> int:
     return index << 16 | sub << 8 | bits
-
-
-def remap(
-    host: BenchHost, node: int, record: int, entries: tuple[int, ...], *, can_id: int, kind: int = 1, timer_ms: int = 0
-) -> None:
-    """Write a PDO's records in the order that CiA 301 asks for."""
-    host.write(node, record, 1, INVALID | can_id)
-    host.write(node, record, 2, kind)
-    host.write(node, record, 5, timer_ms)
-    host.write(node, record + 0x200, 0, 0)
-    for sub, value in enumerate(entries, start=1):
-        host.write(node, record + 0x200, sub, value)
-    host.write(node, record + 0x200, 0, len(entries))
-    host.write(node, record, 1, can_id)
 
 
 def abort_of(host: BenchHost, index: int, sub: int, value: int, node: int = 1) -> int:

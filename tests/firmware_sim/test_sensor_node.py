@@ -120,7 +120,9 @@ def test_autozero_takes_the_mean_of_64_samples_for_zero():
     host.nmt(START)
     before = torque_frames(host, 200)
     assert np.mean([torque_uNm(frame) for frame in before]) == pytest.approx(3e6, abs=10e3)
+    host.nmt(PRE_OPERATIONAL, 3)
     host.write(3, 0x6125, 1, ZERO)
+    host.nmt(START, 3)
     torque_frames(host, 64)
     after = torque_frames(host, 1000)
     assert np.mean([torque_uNm(frame) for frame in after]) == pytest.approx(0.0, abs=4 * 20e3 / 64**0.5)
@@ -128,6 +130,6 @@ def test_autozero_takes_the_mean_of_64_samples_for_zero():
 
 def test_a_zeroed_sensor_still_reports_the_overload_of_its_converter():
     host = BenchHost(quiet_scenario(torque_offset_Nm=[50.0, 0.0]))
-    host.nmt(START)
     host.write(3, 0x6125, 1, ZERO)
+    host.nmt(START)
     assert torque_frames(host, 65)[-1][1] >> 4 == 0x03

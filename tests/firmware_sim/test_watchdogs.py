@@ -14,6 +14,7 @@ from bench_host import (
     START,
     BenchHost,
     quiet_scenario,
+    remap,
 )
 from test_main import ScriptedBus, enabling_script
 
@@ -37,6 +38,7 @@ class Watched:
         self.watchdog = watchdog
         if watchdog == HEARTBEAT:
             self.host.write(1, 0x1016, 1, 127 << 16 | 50)
+        remap(self.host, 1, 0x1402, (0x60400010,), can_id=0x401, kind=255)
         self.host.enable()
         self.host.step(ENABLE)
         if watchdog == HEARTBEAT:
@@ -67,6 +69,13 @@ class Watched:
             host.nmt(START, 1)
         for _ in range(8):  # the first are out of sequence where the drive hasn't listened for a while
             host.step(ENABLE)
+
+    def say(self, word: int) -> None:
+        """Send drive 1 a controlword that acts at once: by PDO, where none is exchanged by SDO."""
+        if self.host.bench.devices[0].is_operational:
+            self.host.put(0x401, bytes([word, 0]))
+        else:
+            self.host.write(1, 0x6040, 0, word)
 
     def emergencies(self) -> list[tuple[int, int, int, int]]:
         """Take the EMCYs of drive 1: code, register, watchdog, ms."""
@@ -124,11 +133,11 @@ def test_fault_reset_is_refused_while_the_cause_lasts_and_works_by_its_edge_afte
         else:
             host.step(ENABLE)
     assert host.state_bits(1) == FAULT_BITS
-    host.write(1, 0x6040, 0, 0)
-    host.write(1, 0x6040, 0, FAULT_RESET)
+    watched.say(0)
+    watched.say(FAULT_RESET)
     assert host.state_bits(1) == FAULT_BITS
     watched.find()
-    host.write(1, 0x6040, 0, FAULT_RESET)
+    watched.say(FAULT_RESET)
     assert host.state_bits(1) == DISABLED_BITS
     host.take()
     assert host.read(1, 0x1001) == 0

@@ -1,0 +1,259 @@
+"""What SDO may not write while a drive is powered or a sensor measures, and what it may make of a commanded drive."""
+
+import struct
+
+import pytest
+from bench_host import (
+    DISABLE_VOLTAGE,
+    ENABLE,
+    FAULT_RESET,
+    INVALID,
+    PRE_OPERATIONAL,
+    QUICK_STOP,
+    RESET_COMMUNICATION,
+    SHUTDOWN,
+    START,
+    SWITCH_ON,
+    BenchHost,
+    remap,
+)
+from test_object_dictionary import default_of, eds_rows
+
+DEVICE_STATE = 0x08000022
+CLEAR_HISTORY, CONTROLWORD = (0x1003, 0), (0x6040, 0)
+DISABLED, READY, SWITCHED_ON, ENABLED, STOPPING, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
+ZERO = int.from_bytes(b"zero", "little")
+
+
+def writable(node: int) -> list[tuple[int, int, int]]:
+    """List index, sub-index and default of what the EDS lets be written, but the controlword."""
+    return [
+        (index, sub, ZERO if index == 0x6125 else int(default_of(default, node)))
+        for index, sub, access, default in eds_rows(node)
+        if access in ("rw", "rww", "wo") and (index, sub) != CONTROLWORD
+    ]
+
+
+def refusals(host: BenchHost, node: int) -> dict[tuple[int, int], int]:
+    """Write every writable object of a node with its default; give the abort codes, 0 for none."""
+    codes = {}
+    for index, sub, value in writable(node):
+        try:
+            host.write(node, index, sub, value)
+        except Exception as error:
+            codes[index, sub] = error.code
+        else:
+            codes[index, sub] = 0
+    return codes
+
+
+def in_state(bits: int) -> BenchHost:
+    """Bring both drives of a host that exchanges PDOs to a state."""
+    host = BenchHost()
+    for node in (1, 2):
+        host.write(node, 0x605A, 0, 6)  # Quick stop active stays
+        host.write(node, 0x1016, 1, 127 << 16 | 250)
+        host.write(node, 0x1017, 0, 100)
+    host.start()
+    words = {
+        DISABLED: (),
+        READY: (SHUTDOWN,),
+        SWITCHED_ON: (SHUTDOWN, SWITCH_ON),
+        ENABLED: (SHUTDOWN, SWITCH_ON, ENABLE),
+        STOPPING: (SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP),
+        FAULT: (SHUTDOWN, SWITCH_ON, ENABLE),
+    }[bits]
+    for word in words:
+        host.step(word)
+    if bits == FAULT:
+        for _ in range(20):
+            host.sync()
+    assert host.state_bits() == bits
+    return host
+
+
+@pytest.mark.parametrize("bits", [ENABLED, STOPPING])
+def test_a_powered_drive_refuses_everything_but_to_forget_its_errors(bits):
+    codes = refusals(in_state(bits), 1)
+    assert len(codes) > 60
+    assert {key for key, code in codes.items() if code != DEVICE_STATE} == {CLEAR_HISTORY}
+
+
+@pytest.mark.parametrize("bits", [DISABLED, READY, SWITCHED_ON, FAULT])
+def test_a_drive_without_power_refuses_nothing_for_being_at_work(bits):
+    assert set(refusals(in_state(bits), 1).values()) == {0}
+
+
+@pytest.mark.parametrize(
+    ("index", "sub", "value"),
+    [
+        (0x1006, 0, 2000),
+        (0x1014, 0, 0x80000081),
+        (0x1016, 1, 0),
+        (0x1017, 0, 0),
+        (0x1400, 5, 10_000),
+        (0x2200, 0, 255),
+        (0x2201, 0, 10_000),
+        (0x605A, 0, 0),
+        (0x605E, 0, 0),
+        (0x6060, 0, 0),
+        (0x6071, 0, 500),
+        (0x6072, 0, 2000),
+        (0x60B2, 0, 500),
+    ],
+)
+def test_what_was_refused_stays_as_it_was(index, sub, value):
+    host = in_state(ENABLED)
+    before = host.read(1, index, sub)
+    assert before != value
+    assert host.abort_code(lambda: host.write(1, index, sub, value)) == DEVICE_STATE
+    host.step(ENABLE)
+    assert host.read(1, index, sub) == before
+    assert (host.state_bits(), host.bench.drives[0].torque_Nm) == (ENABLED, 0.0)
+
+
+def test_a_download_in_segments_is_refused_as_well():
+    host = in_state(ENABLED)
+    host.take()
+    host.put(0x601, struct.pack("<BHBI", 0x21, 0x6072, 0, 2))
+    host.put(0x601, bytes([0x0B, 0xD0, 0x07, 0, 0, 0, 0, 0]))
+    assert host.taken(0x581)[-1] == struct.pack("<BHBI", 0x80, 0x6072, 0, DEVICE_STATE)
+    assert host.read(1, 0x6072) == 1000
+
+
+def test_a_limit_that_an_rpdo_brings_is_obeyed_in_operation():
+    host = BenchHost()
+    remap(host, 1, 0x1401, (0x60720010,), can_id=0x301, kind=255)
+    host.enable()
+    host.put(0x301, struct.pack("<H", 200))
+    host.step(ENABLE, 500)
+    assert host.bench.drives[0].torque_Nm == pytest.approx(2.4)
+
+
+@pytest.mark.parametrize("command", [PRE_OPERATIONAL, RESET_COMMUNICATION])
+def test_a_drive_that_was_taken_out_of_operation_by_nmt_can_be_set_up_at_once(command):
+    host = in_state(ENABLED)
+    host.nmt(command)
+    assert set(refusals(host, 1).values()) == {0}
+
+
+@pytest.mark.parametrize("node", [3, 4])
+def test_a_sensor_that_measures_refuses_everything_but_to_forget_its_errors(node):
+    host = BenchHost()
+    host.nmt(START)
+    codes = refusals(host, node)
+    assert (0x6125, 1) in codes
+    assert {key for key, code in codes.items() if code != DEVICE_STATE} == {CLEAR_HISTORY}
+    host.nmt(PRE_OPERATIONAL, node)
+    assert set(refusals(host, node).values()) == {0}
+
+
+WORDS = (SHUTDOWN, SWITCH_ON, ENABLE, ENABLE | 0x100, FAULT_RESET, FAULT_RESET | ENABLE, DISABLE_VOLTAGE, QUICK_STOP)
+
+
+@pytest.mark.parametrize("bits", [DISABLED, READY, SWITCHED_ON, ENABLED, STOPPING, FAULT])
+@pytest.mark.parametrize("word", WORDS)
+def test_while_an_rpdo_commands_sdo_only_takes_power_away(bits, word):
+    host = in_state(bits)
+    if word in (DISABLE_VOLTAGE, QUICK_STOP):
+        host.write(1, 0x6040, 0, word)
+    else:
+        assert host.abort_code(lambda: host.write(1, 0x6040, 0, word)) == DEVICE_STATE
+    ends = {bits: bits} | (
+        {READY: DISABLED, SWITCHED_ON: DISABLED, ENABLED: DISABLED, STOPPING: DISABLED}
+        if word == DISABLE_VOLTAGE
+        else {READY: DISABLED, SWITCHED_ON: DISABLED, ENABLED: STOPPING}
+        if word == QUICK_STOP
+        else {}
+    )
+    assert host.state_bits() == ends[bits]
+
+
+@pytest.mark.parametrize("word", [DISABLE_VOLTAGE, QUICK_STOP])
+def test_what_sdo_took_away_the_rpdos_next_word_does_not_bring_back(word):
+    host = BenchHost()
+    host.enable()
+    host.step(ENABLE, 100)
+    host.write(1, 0x6040, 0, word)
+    for _ in range(1200):
+        host.step(ENABLE, 100)
+    assert host.state_bits(1) == DISABLED
+    assert host.bench.drives[0].torque_Nm == 0.0
+    assert host.state_bits(2) == ENABLED
+
+
+def test_without_an_rpdo_that_brings_it_the_controlword_goes_by_sdo():
+    host = BenchHost()
+    remap(host, 1, 0x1400, (0x60710010,), can_id=0x201)
+    host.start()
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        host.put(0x201, struct.pack("<h", 100))
+        host.sync()
+        host.write(1, 0x6040, 0, word)
+    assert host.state_bits() == ENABLED
+    host.write(1, 0x6040, 0, SHUTDOWN)
+    assert host.state_bits() == READY
+
+
+def without_command_pdo(is_operational: bool = True) -> BenchHost:
+    """A drive in Switched on that no PDO commands."""
+    host = BenchHost()
+    host.write(1, 0x1400, 1, INVALID | 0x201)
+    host.write(1, 0x6060, 0, 10)
+    if is_operational:
+        host.nmt(START)
+    for word in (SHUTDOWN, SWITCH_ON):
+        host.write(1, 0x6040, 0, word)
+    host.take()
+    return host
+
+
+WARNING = 0x80
+
+
+@pytest.mark.parametrize(("is_operational", "reason"), [(True, 2), (False, 1)])
+def test_a_drive_that_nobody_can_command_says_why_it_stays_in_switched_on(is_operational, reason):
+    host = without_command_pdo(is_operational)
+    assert host.read(1, 0x2212) == reason
+    assert host.statusword() & WARNING == 0
+    host.write(1, 0x6040, 0, ENABLE)
+    assert host.state_bits() == SWITCHED_ON
+    assert host.statusword() & WARNING == WARNING
+    host.write(1, 0x6040, 0, ENABLE)
+    sent = host.take()
+    (emergency,) = [data for can_id, data in sent if can_id == 0x081]
+    assert struct.unpack_from("<HBB", emergency) == (0x6320, 0x11, 8)
+    statuses = [data[0] & WARNING for can_id, data in sent if can_id == 0x281]
+    assert statuses == ([WARNING] if is_operational else [])
+    assert (host.read(1, 0x2210, 1), host.read(1, 0x2210, 10)) == (8, 1)
+
+
+@pytest.mark.parametrize("word", [DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, QUICK_STOP])
+def test_the_warning_ends_when_operation_is_no_longer_asked_for(word):
+    host = without_command_pdo()
+    host.write(1, 0x6040, 0, ENABLE)
+    host.take()
+    host.write(1, 0x6040, 0, word)
+    assert struct.unpack_from("<HBB", host.taken(0x081)[0]) == (0, 0, 8)
+    assert host.statusword() & WARNING == 0
+
+
+def test_the_warning_ends_when_a_command_pdo_is_there_and_operation_is_enabled_by_it():
+    host = without_command_pdo()
+    host.write(1, 0x6040, 0, ENABLE)
+    host.write(1, 0x1400, 1, 0x201)
+    host.step(ENABLE)
+    assert host.state_bits() == ENABLED
+    assert (host.statusword() & WARNING, host.read(1, 0x2212), host.read(1, 0x1001)) == (0, 0, 0)
+
+
+def test_a_fault_of_another_kind_can_be_reset_beside_the_warning():
+    host = without_command_pdo()
+    host.write(1, 0x6040, 0, ENABLE)
+    host.bench.drives[0].fail(0x2310, host.bench.now_ns)
+    host.bench.drives[0].mend()
+    for _ in range(1100):
+        host.sync()
+    assert host.state_bits() == FAULT
+    host.write(1, 0x6040, 0, FAULT_RESET)
+    assert host.state_bits() == DISABLED

@@ -1,0 +1,356 @@
+"""SYNCs that come twice, out of order, too early or with the wrong length: what devices take, count, say and do."""
+
+import struct
+
+import pytest
+from bench_host import ENABLE, PERIOD_NS, RESET_COMMUNICATION, RESET_NODE, SHUTDOWN, START, BenchHost, quiet_scenario
+
+from firmware_sim.sync_order import SyncKind, SyncOrder
+
+NODES = (1, 2, 3, 4)
+TOLERATED, CLEAN_SYNCS = 3, 100  # as docs/protocol.md says
+ENABLED, REACTION, FAULT = 0x27, 0x0F, 0x08
+ORDER, LENGTH = 6, 7
+REPEATED, SEQUENCE, EARLY, WRONG_LENGTH, LOST = 1, 2, 3, 4, 5
+
+
+def running(clock_mode: str = "sync") -> BenchHost:
+    """Both drives enabled, more than one overflow of the counter ago."""
+    host = BenchHost(clock_mode=clock_mode)
+    host.enable()
+    for _ in range(250):
+        host.step(ENABLE)
+    host.take()
+    return host
+
+
+def again(host: BenchHost) -> None:
+    """Send the last SYNC once more."""
+    host.put(0x080, bytes([1 + (host.cycle - 1) % 240]))
+
+
+def emergencies(host: BenchHost, node: int = 1) -> list[tuple[int, int, int]]:
+    """Take everything; return code, register and watchdog of one node's EMCYs."""
+    return [struct.unpack_from("<HBB", data) for data in host.taken(0x080 + node)]
+
+
+def counts(host: BenchHost, node: int = 1) -> list[int]:
+    """Read how often each kind of odd SYNC was heard."""
+    return [host.read(node, 0x2211, sub) for sub in range(1, 6)]
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_one_doubled_sync_is_ignored_counted_and_reported_by_every_node(clock_mode):
+    host = running(clock_mode)
+    cycle, truths, now_ns = host.bench.cycle, len(host.truths), host.bench.now_ns
+    again(host)
+    assert (host.bench.cycle, len(host.truths), host.bench.now_ns) == (cycle, truths, now_ns)
+    frames = host.take()
+    assert [can_id for can_id, _ in frames] == [0x081, 0x082, 0x083, 0x084]
+    assert {struct.unpack_from("<HBB", data) for _, data in frames} == {(0x8200, 0x11, ORDER)}
+    assert [counts(host, node) for node in NODES] == [[1, 0, 0, 0, 0]] * 4
+    assert host.read(1, 0x2210, 2 + ORDER) == 1
+    host.step(ENABLE)
+    assert [host.state_bits(1), host.state_bits(2)] == [ENABLED] * 2
+
+
+def test_the_command_of_a_doubled_sync_waits_for_the_next():
+    host = running()
+    host.command(ENABLE, 100)
+    again(host)
+    assert host.bench.drives[0].torque_Nm == 0.0
+    host.sync()
+    assert host.bench.drives[0].torque_Nm == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_a_sync_that_is_doubled_every_time_faults_the_drives_within_4_periods(clock_mode):
+    host = running(clock_mode)
+    for period in range(1, 5):
+        host.step(ENABLE, 50)
+        again(host)
+        assert host.state_bits(1) == (REACTION if period > TOLERATED else ENABLED)
+    assert [host.bench.drives[joint].torque_Nm for joint in (0, 1)] == [0.0, 0.0]
+    assert [error[::2] for error in emergencies(host)] == [(0x8200, ORDER), (0x8700, 1)]
+    assert host.read(1, 0x603F) == 0x8700
+
+
+def test_odd_syncs_are_tolerated_for_ever_if_100_right_ones_lie_between_them():
+    host = running()
+    for _ in range(2 * (TOLERATED + 1)):
+        again(host)
+        for _ in range(CLEAN_SYNCS):
+            host.step(ENABLE)
+    assert [host.state_bits(1), host.state_bits(2)] == [ENABLED] * 2
+    assert [error[::2] for error in emergencies(host)] == [(0x8200, ORDER), (0, ORDER)] * 8
+    assert host.read(1, 0x1001) == 0
+
+
+def test_odd_syncs_with_99_right_ones_between_them_fault_at_the_fourth():
+    host = running()
+    for _ in range(TOLERATED):
+        again(host)
+        for _ in range(CLEAN_SYNCS - 1):
+            host.step(ENABLE)
+    assert host.state_bits(1) == ENABLED
+    again(host)
+    assert host.state_bits(1) == REACTION
+
+
+def test_fault_reset_is_refused_until_100_syncs_were_right():
+    host = running()
+    for _ in range(TOLERATED + 1):
+        again(host)
+    for _ in range(CLEAN_SYNCS - 1):
+        host.step(ENABLE)
+    assert host.state_bits(1) == FAULT
+    host.command(0x80)
+    again(host)
+    host.sync()
+    assert host.state_bits(1) == FAULT
+    for _ in range(CLEAN_SYNCS):
+        host.step(ENABLE)
+    host.step(0x80)
+    assert host.state_bits(1) == 0x40
+
+
+def test_a_warning_about_sync_does_not_keep_another_fault_from_being_reset():
+    host = running()
+    again(host)
+    host.bench.drives[0].fail(0x2310, host.bench.now_ns)
+    host.bench.drives[0].mend()
+    for _ in range(CLEAN_SYNCS - 10):
+        host.step(ENABLE)
+    assert (host.state_bits(1), host.bench.devices[0].is_sync_odd) == (FAULT, True)
+    host.step(0x80)
+    assert host.state_bits(1) == 0x40
+
+
+@pytest.mark.parametrize("back", [1, 2, 100, 119])
+def test_a_counter_that_runs_backwards_is_odd_and_one_period(back):
+    host = running()
+    now_ns, cycle = host.bench.now_ns, host.bench.cycle
+    host.cycle -= 1 + back
+    host.step(ENABLE)
+    assert (host.bench.now_ns, host.bench.cycle) == (now_ns + PERIOD_NS, cycle + 1)
+    assert emergencies(host) == [(0x8200, 0x11, ORDER)]
+    assert counts(host) == [0, 1, 0, 0, 0]
+    host.step(ENABLE)
+    assert (host.state_bits(1), counts(host)) == (ENABLED, [0, 1, 0, 0, 0])
+
+
+@pytest.mark.parametrize("lost", [1, 2, 119])
+def test_a_counter_that_runs_forward_by_sync_is_lost_syncs(lost):
+    host = running()
+    now_ns = host.bench.now_ns
+    host.cycle += lost
+    host.step(ENABLE)
+    assert host.bench.now_ns == now_ns + (lost + 1) * PERIOD_NS
+    assert counts(host) == [0, 0, 0, 0, lost]
+    assert emergencies(host, 3) == []
+
+
+def test_syncs_that_a_fault_keeps_from_a_node_are_its_own_loss():
+    rows = [{"kind": "lose", "node": "sensor1", "frame": "sync", "at_s": 0.01, "count": 5}]
+    host = BenchHost(quiet_scenario(faults=rows))
+    host.enable()
+    for _ in range(30):
+        host.step(ENABLE)
+    assert [counts(host, node) for node in NODES] == [[0] * 5, [0] * 5, [0, 0, 0, 0, 5], [0] * 5]
+
+
+@pytest.mark.parametrize("node", ["all", "sensor2"])
+def test_a_fault_that_doubles_sync_is_noticed_by_those_who_hear_it(node):
+    rows = [{"kind": "duplicate", "node": node, "frame": "sync", "at_s": 0.01, "count": 2}]
+    host = BenchHost(quiet_scenario(faults=rows))
+    host.enable()
+    for _ in range(30):
+        host.step(ENABLE)
+    repeated = [counts(host, number)[0] for number in NODES]
+    assert repeated == ([2] * 4 if node == "all" else [0, 0, 0, 2])
+    assert host.bench.cycle == 32
+
+
+@pytest.mark.parametrize("data", [b"\x00", b"\xf1", b"\xff"])
+def test_a_counter_that_there_is_not_is_ignored(data):
+    host = running()
+    cycle = host.bench.cycle
+    host.put(0x080, data)
+    assert host.bench.cycle == cycle
+    assert emergencies(host) == [(0x8200, 0x11, ORDER)]
+    assert counts(host) == [0, 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize("data", [b"", b"\x01\x02", bytes(8)])
+def test_a_sync_of_the_wrong_length_is_ignored_and_never_a_fault(data):
+    host = running()
+    cycle = host.bench.cycle
+    for _ in range(20):
+        host.put(0x080, data)
+    assert host.bench.cycle == cycle
+    assert emergencies(host) == [(0x8240, 0x11, LENGTH)]
+    assert counts(host) == [0, 0, 0, 20, 0]
+    host.step(ENABLE)
+    assert emergencies(host) == [(0, 0, LENGTH)]
+    assert host.state_bits(1) == ENABLED
+
+
+def test_a_node_takes_syncs_by_its_own_overflow():
+    host = BenchHost()
+    for value in (0, 1000):
+        host.write(3, 0x1006, 0, value)
+        if value == 0:
+            host.write(3, 0x1019, 0, 0)
+    host.nmt(START)
+    host.sync()
+    host.take()
+    host.sync()
+    host.put(0x080, b"")
+    sent = [can_id for can_id, _ in host.take()]
+    assert [can_id for can_id in sent if can_id in (0x181, 0x182, 0x183, 0x184)] == [0x181, 0x182, 0x184, 0x183]
+    assert {can_id for can_id in sent if can_id < 0x100} == {0x081, 0x082, 0x083, 0x084}  # 0x083: it's over
+    assert [counts(host, node)[WRONG_LENGTH - 1] for node in NODES] == [1, 1, 2, 1]
+
+
+@pytest.mark.parametrize("overflow", [2, 10, 100])
+def test_another_overflow_is_counted_round(overflow):
+    host = BenchHost()
+    for node in NODES:
+        host.write(node, 0x1006, 0, 0)
+        host.write(node, 0x1019, 0, overflow)
+        host.write(node, 0x1006, 0, 1000)
+    host.nmt(START)
+    for cycle in range(250):
+        host.t_ns += PERIOD_NS
+        host.put(0x080, bytes([1 + cycle % overflow]))
+    assert host.bench.now_ns == 249 * PERIOD_NS
+    assert counts(host) == [0] * 5
+
+
+def test_only_in_operational_do_nodes_judge_sync():
+    host = BenchHost()
+    for _ in range(3):
+        host.sync()
+        again(host)
+    host.put(0x080, b"")
+    assert [can_id for can_id, _ in host.take() if can_id < 0x700] == []
+    assert counts(host) == [0] * 5
+
+
+def test_the_first_sync_after_a_reset_may_have_any_counter():
+    host = running()
+    host.nmt(RESET_COMMUNICATION)
+    host.start()
+    host.cycle = 7
+    host.step(SHUTDOWN)
+    host.take()
+    host.step(SHUTDOWN)
+    assert counts(host) == [0] * 5
+
+
+def test_the_counts_outlive_a_reset_of_communication_and_not_one_of_the_node():
+    host = running()
+    again(host)
+    host.nmt(RESET_COMMUNICATION)
+    assert counts(host) == [1, 0, 0, 0, 0]
+    host.nmt(RESET_NODE)
+    assert counts(host) == [0] * 5
+
+
+def wall_sync(host: BenchHost, periods: float, steps: int = 1) -> None:
+    """Send commands and a SYNC so long after the last, its counter so many steps further."""
+    host.command(ENABLE)
+    host.t_ns += round(periods * PERIOD_NS)
+    host.bench.advance_to(host.t_ns)
+    host.cycle += steps
+    host.put(0x080, bytes([1 + (host.cycle - 1) % 240]))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.7, 0.9])
+def test_by_the_clock_a_second_sync_within_a_period_is_early_once(share):
+    host = running("wall")
+    wall_sync(host, share)
+    wall_sync(host, 1.0 - share)
+    for _ in range(5):
+        wall_sync(host, 1.0)
+    count = counts(host)[EARLY - 1]
+    assert count == 2 if share == 0.5 else count == 1
+    assert counts(host)[SEQUENCE - 1] == 0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.7, 0.9])
+def test_by_the_clock_two_masters_that_take_turns_stop_the_drives_within_4_periods(share):
+    host = running("wall")
+    for _ in range(4):
+        wall_sync(host, share)
+        wall_sync(host, 1.0 - share)
+    assert host.read(1, 0x603F) == 0x8700
+
+
+@pytest.mark.parametrize("late", [0.05, 0.2, 0.39, 0.45])
+def test_by_the_clock_a_late_sync_does_not_make_the_next_one_early(late):
+    host = running("wall")
+    for _ in range(20):
+        wall_sync(host, 1.0 + late)
+        wall_sync(host, 1.0 - late)
+        wall_sync(host, 1.0)
+    assert counts(host) == [0] * 5
+
+
+def test_by_the_clock_syncs_may_jitter_by_a_tenth_for_ever():
+    host = running("wall")
+    for place in range(300):
+        wall_sync(host, 1.0 + 0.2 * ((place * 7) % 5 - 2) / 4)
+    assert counts(host) == [0] * 5
+
+
+@pytest.mark.parametrize(
+    ("steps", "periods", "is_odd"), [(2, 1.0, True), (2, 1.4, True), (3, 1.0, True), (50, 1.0, True)]
+)
+def test_by_the_clock_a_counter_that_is_ahead_of_time_is_odd(steps, periods, is_odd):
+    host = running("wall")
+    cycle = host.bench.cycle
+    wall_sync(host, periods, steps)
+    assert counts(host)[SEQUENCE - 1] == is_odd
+    assert host.bench.cycle == cycle + 1
+
+
+def test_by_the_clock_a_gap_that_took_its_time_is_lost_syncs():
+    host = BenchHost(clock_mode="wall")
+    for node in (1, 2):
+        host.write(node, 0x2200, 0, 255)
+        host.write(node, 0x2201, 0, 10_000)
+    host.enable()
+    for _ in range(5):
+        wall_sync(host, 3.0, 3)
+    assert counts(host) == [0, 0, 0, 0, 10]
+    assert host.state_bits(1) == ENABLED
+
+
+def judged(is_timed: bool, *syncs: tuple[int, float]) -> list[SyncKind]:
+    """Judge SYNCs given by counter and time in periods."""
+    order = SyncOrder(is_timed)
+    kinds = []
+    for counter, at in syncs:
+        order.judge(counter, 240, round(at * PERIOD_NS), PERIOD_NS)
+        kinds.append(order.kind)
+    return kinds
+
+
+def test_after_a_long_pause_any_counter_is_in_order_by_the_clock():
+    assert judged(True, (1, 0.0), (2, 1.0), (200, 1000.0), (201, 1001.0)) == [SyncKind.RIGHT] * 4
+
+
+def test_a_host_whose_clock_is_slow_gathers_no_lateness_that_a_second_sync_could_use():
+    syncs = [(1 + place % 240, place * 1.002) for place in range(2000)]
+    assert judged(True, *syncs, (syncs[-1][0] % 240 + 1, syncs[-1][1] + 0.3))[-2:] == [SyncKind.RIGHT, SyncKind.EARLY]
+
+
+def test_syncs_that_waited_for_a_busy_receiver_and_come_in_a_row_are_in_order():
+    waited = [(12 + place, 15.0 + 0.01 * place) for place in range(5)]
+    syncs = [*((1 + place, float(place)) for place in range(11)), *waited, (17, 16.0), (18, 17.0)]
+    assert judged(True, *syncs) == [SyncKind.RIGHT] * len(syncs)
+
+
+def test_a_host_that_resumes_its_grid_after_a_stall_is_in_order():
+    assert judged(True, (1, 0.0), (2, 1.0), (3, 4.9), (4, 5.0), (5, 6.0)) == [SyncKind.RIGHT] * 5
