@@ -1,9 +1,12 @@
 """The live view in a terminal: state, residuals against their thresholds, parameters, contacts, events."""
 
+import contextlib
 import json
 import math
+import struct
 import sys
 from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,7 @@ from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.monitor import Screen
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
+from adacd_hil.log.errors import LogError
 from adacd_hil.log.live.client import LiveClient, LiveMessage, live_client
 from adacd_hil.log.ros_types import unpack_log
 from adacd_hil.records import (
@@ -146,15 +150,32 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
             due_ns = drawn_ns + round(screen.redraw_s * 1e9)
             wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
             if (message := client.receive(max(0.0, (wake_ns - now_ns) * 1e-9))) is not None:
-                monitor.accept(message)
+                with _understood():
+                    monitor.accept(message)
             now_ns = clock.now_ns()
             if now_ns >= due_ns:
                 drawn_ns = now_ns
                 if is_live and not as_json:
-                    screen.draw(as_text(monitor.describe()))
-    described = {"url": url} | monitor.describe()
+                    with _understood():
+                        screen.draw(as_text(monitor.describe()))
+        with _understood():
+            described = {"url": url} | monitor.describe()
     screen.end(json.dumps(described, indent=2) if as_json else as_text(described))
     return ExitCode.OK
+
+
+@contextlib.contextmanager
+def _understood() -> Iterator[None]:
+    """Turn what a message holds that ours never do into a LogError."""
+    try:
+        yield
+    except (ValueError, LookupError, OverflowError, struct.error):
+        raise LogError("it does not serve a log of adacd-hil") from None
+
+
+def _plain(text: str) -> str:
+    """Return text without what a terminal would obey."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _write(text: str) -> None:
@@ -180,7 +201,8 @@ def as_text(described: dict[str, Any]) -> str:
         parts.append(format_table(table_head, list(map(_contact_row, described["contacts"])), right=(0, 2, 4, 5)))
     if described["events"]:
         rows = [
-            (f"{event['t_s']:.3f}", event["level"], event["name"], event["message"]) for event in described["events"]
+            (f"{event['t_s']:.3f}", event["level"], _plain(event["name"]), _plain(event["message"]))
+            for event in described["events"]
         ]
         parts.append(format_table(("s", "level", "event", ""), rows, right=(0,)))
     return "\n\n".join(parts)

@@ -23,7 +23,7 @@ from adacd_hil.log.live.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.recorder import LogSummary, Recorder
 from adacd_hil.log.run_folder import LOG_NAME
-from adacd_hil.log.setup import LiveSetup
+from adacd_hil.log.setup import MOST_VIEWERS, LiveSetup
 from adacd_hil.output_files import place_file
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
@@ -51,10 +51,13 @@ class SessionSummary:
 
 
 class LiveAddress(NamedTuple):
-    """Where the live view is served; port 0: any that is free."""
+    """Where the live view is served, and to whom; port 0: any that is free. The rest as in LiveSetup."""
 
     host: str
     port: int
+    origins: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    most_viewers: int = MOST_VIEWERS
 
 
 class Attempt(NamedTuple):
@@ -261,7 +264,8 @@ class Session:
         if self.live is None:
             return None
         arm, is_upright = self.settings.arm, self.settings.estimator.gravity
-        return LiveSetup(self.live.host, self.live.port, robot, arm.link_length_m, is_upright)
+        host, port, origins, names, most_viewers = self.live
+        return LiveSetup(host, port, robot, arm.link_length_m, is_upright, origins, names, most_viewers)
 
     def _metadata(self, grant: RealtimeGrant) -> dict[str, str]:
         settings = self.settings

@@ -10,7 +10,6 @@ import json
 import os
 import socket
 import subprocess
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -22,6 +21,7 @@ from adacd_hil.log.channels import MessageLike
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.live.robot_description import ROBOT_NAME
+from adacd_hil.log.own_process import start_module
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.ring import Ring, room_of
 from adacd_hil.log.run_folder import check_free, make_room
@@ -115,7 +115,9 @@ class Recorder:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._ring = Ring(settings.buffer_MiB * _MIB)
-            self._process = self._start((theirs.fileno(), file, self._ring.descriptor), setup)
+            self._process = start_module(
+                "adacd_hil.log.writer", (theirs.fileno(), file, self._ring.descriptor), setup.to_json()
+            )
         except OSError as error:
             self._socket.close()
             raise LogError(f"log {path}: no writer with a buffer of {settings.buffer_MiB} MiB: {error}") from None
@@ -124,21 +126,6 @@ class Recorder:
             os.close(file)
         self._wait_until_ready()
         self._socket.setblocking(True)
-
-    def _start(self, descriptors: tuple[int, ...], setup: Setup) -> "subprocess.Popen[bytes]":
-        # A session of its own: Ctrl-C is for the control process. No folder but ours is searched for modules.
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "adacd_hil.log.writer", *map(str, descriptors)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            pass_fds=descriptors,
-            start_new_session=True,
-            env={**os.environ, "PYTHONPATH": _module_path()},
-        )
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError), process.stdin:  # a writer that died says so below
-            process.stdin.write(setup.to_json())
-        return process
 
     def _wait_until_ready(self) -> None:
         word = self._hear(START_TIMEOUT_S)
@@ -274,9 +261,3 @@ def _own_messages() -> Iterable[MessageLike]:
     from adacd_hil.wire.codec import load_codec
 
     return load_codec().messages.values()
-
-
-def _module_path() -> str:
-    """Name the folder that this package was imported from, before what the environment names."""
-    own = str(Path(__file__).resolve().parents[2])
-    return os.pathsep.join(filter(None, (own, os.environ.get("PYTHONPATH", ""))))

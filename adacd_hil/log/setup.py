@@ -13,6 +13,9 @@ from typing import Any
 
 from adacd_hil.log.channels import MessageLike
 
+MOST_VIEWERS = 8
+"""Viewers of a live view at a time, unless --live-viewers says otherwise."""
+
 
 @dataclass(frozen=True)
 class ToldSignal:
@@ -43,7 +46,8 @@ class ToldMessage:
 class LiveSetup:
     """Where the live view is served (port 0: any that is free), and the arm that it draws.
 
-    robot_description: a URDF. is_upright: gravity acts on the joints.
+    robot_description: a URDF. is_upright: gravity acts on the joints. origins, names: of web pages that may watch, and
+    of this machine, beside those of log/live/admission.py. most_viewers: at a time.
     """
 
     host: str
@@ -51,6 +55,9 @@ class LiveSetup:
     robot_description: str
     link_length_m: tuple[float, float]
     is_upright: bool = False
+    origins: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    most_viewers: int = MOST_VIEWERS
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,8 @@ class Setup:
         )
         table["attachments"] = {name: base64.b64decode(data) for name, data in table["attachments"].items()}
         if live := table["live"]:
-            table["live"] = LiveSetup(**{**live, "link_length_m": tuple(live["link_length_m"])})
+            tuples = {name: tuple(live[name]) for name in ("link_length_m", "origins", "names")}
+            table["live"] = LiveSetup(**{**live, **tuples})
         return Setup(**table)
 
 

@@ -19,7 +19,6 @@ import os
 import socket
 import struct
 import sys
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.log import packet, words
 from adacd_hil.log.channels import run_channels, truth_channels
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.live.feed import LiveFeed
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, McapFile
 from adacd_hil.log.packet_writer import Numbers, PacketWriter, Rows
 from adacd_hil.log.parts import part_path
@@ -34,9 +34,6 @@ from adacd_hil.log.ring import RingReader, split
 from adacd_hil.log.run_folder import is_there
 from adacd_hil.log.setup import Setup
 from adacd_hil.log.sink import Sink
-
-if TYPE_CHECKING:
-    from adacd_hil.log.live.server import LiveView
 
 FLUSH_PERIOD_NS = 250_000_000
 POLL_PERIOD_US = 25_000
@@ -47,8 +44,6 @@ RETRY_PERIOD_NS = 5_000_000_000
 SHOW_PERIOD_NS = 45_000_000
 """How often packets are written while somebody watches in real time: at every second look into the ring. At every one
 the writer would take 10 % of a processor instead of 6 %."""
-LINGER_NS = 200_000_000
-"""How long the live view outlives the log: what its server still has to send would be lost with it."""
 BATCH_BYTES = 256 * 1024
 """Packets that are gathered at most, about 400 cycles: more would be no cheaper, each."""
 
@@ -85,12 +80,9 @@ class WriterProcess:
         if not setup.is_blocking:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
 
-    def _open_live(self) -> "LiveView":
-        from adacd_hil.log.live.server import LiveView  # with an SDK that nothing else needs
-
-        assert self._setup.live is not None
+    def _open_live(self) -> LiveFeed:
         start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())
-        return LiveView(self._setup.live, self._channels, self._file.ids, start_ns)
+        return LiveFeed(self._setup, self._file.ids, start_ns)
 
     def run(self) -> None:
         """Write until the end, then answer with the last word."""
@@ -116,8 +108,6 @@ class WriterProcess:
         last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
         _send(self._connection, json.dumps({**summary, **last}).encode())
         if self.live is not None:
-            if self._is_watched:
-                self._clock.sleep_until_ns(self._clock.now_ns() + LINGER_NS)
             self.live.close()
 
     def _hear(self) -> bytes | None:

@@ -1,6 +1,7 @@
-"""A live view in this process, fed with the packets of a run; what it sends is compared with what the file holds."""
+"""A live view, fed with the packets of a run; what it sends is compared with what the file holds."""
 
 import io
+from pathlib import Path
 
 import numpy as np
 from mcap.reader import make_reader
@@ -9,11 +10,11 @@ from reference_writer import MemorySink
 
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.live.client import LiveClient, LiveMessage
-from adacd_hil.log.live.server import LiveView
+from adacd_hil.log.live.feed import LiveFeed
 from adacd_hil.log.mcap_file import McapFile
 from adacd_hil.log.packet import ROOM, pack_cycle, pack_event
 from adacd_hil.log.packet_writer import PacketWriter
-from adacd_hil.log.setup import LiveSetup
+from adacd_hil.log.setup import LiveSetup, Setup, tell_messages
 from adacd_hil.records import Event
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -21,6 +22,23 @@ URDF = '<robot name="a"/>'
 LINK_LENGTH_M = (0.35, 0.30)
 SETUP = LiveSetup("127.0.0.1", 0, URDF, LINK_LENGTH_M)
 LAST = Event("info", "test", "last")
+
+
+def setup_of(live: LiveSetup | None, path: Path = Path("run.mcap"), parameter_count: int = 7) -> Setup:
+    """What a writer is told of a log in real time."""
+    return Setup(
+        path=path,
+        is_truth=False,
+        is_blocking=False,
+        messages=tell_messages(CODEC.messages.values()),
+        parameter_count=parameter_count,
+        epoch_ns=EPOCH_NS,
+        part_bytes=0,
+        part_ns=0,
+        attachments={},
+        metadata={},
+        live=live,
+    )
 
 
 class Feed:
@@ -31,7 +49,8 @@ class Feed:
         channels = run_channels(parameter_count, messages)
         self.sink = MemorySink()
         self._file = McapFile(self.sink, channels, {}, {})
-        self.live = None if setup is None else LiveView(setup, channels, self._file.ids, EPOCH_NS)
+        told = setup_of(setup, parameter_count=parameter_count)
+        self.live = None if setup is None else LiveFeed(told, self._file.ids, EPOCH_NS)
         show = self.live.show if self.live else None
         self._writer = PacketWriter(self._file, messages, EPOCH_NS, parameter_count, show)
         self._packets: list[bytes] = []
@@ -63,6 +82,7 @@ class Feed:
     def close(self) -> None:
         if self.live is not None:
             self.live.close()
+            self.live.process.wait(30.0)
 
 
 def receive_until_last(client: LiveClient) -> list[LiveMessage]:

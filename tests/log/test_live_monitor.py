@@ -1,10 +1,11 @@
 """`monitor --url`: what a terminal shows of a live view, and how the commands say that they can't."""
 
+import contextlib
 import json
-import os
 import sys
 import threading
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -12,7 +13,9 @@ from live_rig import Feed, receive_until_last
 from recorded_run import make_run
 
 from adacd_hil.cli.live_monitor import TOPICS, LiveMonitor, as_text
+from adacd_hil.cli.live_options import live_options
 from adacd_hil.cli.main import cli
+from adacd_hil.control.session import LiveAddress
 from adacd_hil.extras import install_command
 from adacd_hil.log.cdr import payload_dtype
 from adacd_hil.log.channels import run_channels
@@ -151,14 +154,20 @@ def test_of_the_certified_scheme_the_filter_nearest_to_its_threshold_counts():
 
 
 @pytest.mark.parametrize("words", [(), ("--json",)])
-def test_the_monitor_ends_with_the_run(words):
+def test_the_monitor_ends_with_the_run(words, monkeypatch):
     fed = Feed()
+    is_subscribed = threading.Event()
+
+    class Seen(LiveMonitor):
+        def __init__(self, client) -> None:
+            super().__init__(client)
+            is_subscribed.set()
 
     def end() -> None:
-        while len(fed.live._subscriptions) < len(TOPICS) + 1:
-            os.sched_yield()
+        is_subscribed.wait(60.0)
         fed.close()
 
+    monkeypatch.setattr("adacd_hil.cli.live_monitor.LiveMonitor", Seen)
     thread = threading.Thread(target=end)
     thread.start()
     result = CliRunner().invoke(cli, ["monitor", "--url", fed.live.url, "--seconds", "600", *words])
@@ -181,8 +190,8 @@ def test_the_monitor_listens_for_as_long_as_it_is_asked_to():
 @pytest.mark.parametrize(
     ("module", "words", "asked_for"),
     [
-        ("foxglove", ("demo", "--live"), "--live"),
-        ("foxglove", ("run", "-i", "virtual", "-c", "x", "--live"), "--live"),
+        ("websockets", ("demo", "--live"), "--live"),
+        ("websockets", ("run", "-i", "virtual", "-c", "x", "--live"), "--live"),
         ("websockets", ("monitor", "--url", "ws://127.0.0.1:1"), "--url"),
     ],
 )
@@ -205,3 +214,69 @@ def test_where_nothing_is_served_there_is_one_line_and_status_1():
     assert result.exit_code == 1
     assert result.stderr.startswith("adacd-hil: live view ws://127.0.0.1:1: ")
     assert result.stderr.count("\n") == 1
+
+
+def test_no_escape_sequence_of_an_event_reaches_the_terminal():
+    fed = Feed()
+    with live_client(fed.live.url, TOPICS) as client:
+        run = two_cycles()
+        run.cycles[1].event = Event("warning", "\x1b[2Jname", "\x1b]0;owned\x07text\r\n")
+        fed.cycles(run, 1)
+        monitor = LiveMonitor(client)
+        for message in receive_until_last(client):
+            monitor.accept(message)
+    fed.close()
+    text = as_text(monitor.describe())
+    assert "?[2Jname" in text
+    assert {letter for letter in text if not letter.isprintable()} <= {"\n"}
+
+
+class StrangeClient:
+    """Has messages that no log of ours has."""
+
+    is_open = True
+
+    def __init__(self, message):
+        self._messages = [message]
+
+    def receive(self, timeout_s):
+        return self._messages.pop() if self._messages else None
+
+    def decode(self, message):
+        return np.zeros(1, [("state", np.uint8)])[0]
+
+
+@pytest.mark.parametrize(
+    "message", [LiveMessage("/events", 0, b"short"), LiveMessage("/scheme", 0, b""), LiveMessage("/contact", 0, b"")]
+)
+def test_a_server_of_something_else_is_one_line_and_status_1(monkeypatch, message):
+    @contextlib.contextmanager
+    def strange(url, topics):
+        yield StrangeClient(message)
+
+    monkeypatch.setattr("adacd_hil.cli.live_monitor.live_client", strange)
+    result = CliRunner().invoke(cli, ["monitor", "--url", "ws://x:1", "--seconds", "0.1"])
+    assert (result.exit_code, result.stderr) == (1, "adacd-hil: it does not serve a log of adacd-hil\n")
+
+
+def test_the_options_say_where_and_who():
+    @click.command()
+    @live_options
+    def command(live):
+        print(live)
+
+    given = ["--live", "--live-port", "0", "--live-host", "::1", "--live-viewers", "3", "--live-name", "arm.example"]
+    origins = ["--live-origin", "https://View.example:8443/", "--live-origin", "viewer-app://"]
+    found = CliRunner().invoke(command, [*given, *origins]).stdout
+    assert found == f"{LiveAddress('::1', 0, ('https://view.example:8443', 'viewer-app://'), ('arm.example',), 3)}\n"
+    assert CliRunner().invoke(command, []).stdout == "None\n"
+    assert CliRunner().invoke(command, ["--live"]).stdout == f"{LiveAddress('127.0.0.1', 8765, (), (), 8)}\n"
+
+
+@pytest.mark.parametrize("origin", ["view.example", "*", "https://view.example/page", "https://a b", "", "null"])
+def test_what_is_no_origin_is_refused(origin, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(cli, ["demo", "--live", "--live-origin", origin])
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"adacd-hil: --live-origin: {origin!r} is no origin")
+    assert list(tmp_path.iterdir()) == []

@@ -19,9 +19,11 @@ from websockets.typing import Subprotocol
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.cdr import payload_dtype
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.live.admission import SUBPROTOCOLS
 from adacd_hil.log.live.rates import DESCRIPTION_TOPIC
 
-SUBPROTOCOL = Subprotocol("foxglove.sdk.v1")
+MOST_MESSAGE_BYTES = 16 * 1024 * 1024
+"""A longer message is nothing that we serve."""
 OPEN_TIMEOUT_S = 5.0
 _MESSAGE_HEAD = struct.Struct("<BIQ")
 _MESSAGE_DATA = 1
@@ -82,11 +84,14 @@ class LiveClient:
             except ConnectionClosed:
                 self.is_open = False
                 break
-            if isinstance(data, str):
-                self._obey(json.loads(data))
-            elif len(data) >= _MESSAGE_HEAD.size and data[0] == _MESSAGE_DATA:
-                _, number, log_ns = _MESSAGE_HEAD.unpack_from(data)
-                return LiveMessage(self._names[number], log_ns, data[_MESSAGE_HEAD.size :])
+            try:
+                if isinstance(data, str):
+                    self._obey(json.loads(data))
+                elif len(data) >= _MESSAGE_HEAD.size and data[0] == _MESSAGE_DATA:
+                    _, number, log_ns = _MESSAGE_HEAD.unpack_from(data)
+                    return LiveMessage(self._names[number], log_ns, data[_MESSAGE_HEAD.size :])
+            except (ValueError, KeyError, TypeError, RecursionError):
+                raise LogError("it does not serve a log of adacd-hil") from None
         return None
 
     def _obey(self, word: dict[str, Any]) -> None:
@@ -111,7 +116,10 @@ class LiveClient:
         """Return a message of numbers as a numpy record, its fields named as in the schema. Raises LogError."""
         if message.topic not in self._dtypes:
             self._dtypes[message.topic] = payload_dtype(self.topics[message.topic].text)
-        return np.frombuffer(message.payload, self._dtypes[message.topic])[0]
+        try:
+            return np.frombuffer(message.payload, self._dtypes[message.topic])[0]
+        except (ValueError, IndexError):
+            raise LogError(f"a message of {message.topic} does not fit its schema") from None
 
 
 @contextmanager
@@ -120,9 +128,9 @@ def live_client(url: str, topics: Collection[str] | None = None) -> Iterator[Liv
     try:
         connection = connect(
             url,
-            subprotocols=[SUBPROTOCOL],
+            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
             compression=None,
-            max_size=None,
+            max_size=MOST_MESSAGE_BYTES,
             max_queue=None,  # a full queue would keep the server's goodbye from being heard when the block ends
             open_timeout=OPEN_TIMEOUT_S,
             proxy=None,

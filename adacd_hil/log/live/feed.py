@@ -1,0 +1,117 @@
+"""The writer's side of the live view: records go into a ring that a process of its own looks into.
+
+Nothing here waits for that process. Records that find the ring full are not shown; one that is stopped, dead or busy
+with five hundred viewers costs the log nothing. Only the writer's start waits until it listens, or says why it can't.
+"""
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.log import words
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.live.told import Batch, Told, pack_batch
+from adacd_hil.log.own_process import start_module
+from adacd_hil.log.ring import Ring
+from adacd_hil.log.setup import Setup
+
+START_TIMEOUT_S = 30.0
+RING_BYTES = 8 * 1024 * 1024
+"""5 s of a run at 1 kHz: longer than any viewer's request keeps the other process busy."""
+
+
+class LiveFeed:
+    """Records for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
+
+    def __init__(self, setup: Setup, ids: dict[int, int], start_ns: int) -> None:
+        """Start the process, and wait until it listens where `setup.live` says. Raises LogError.
+
+        ids: the file's number of each channel, by ours. start_ns: log time before the first record.
+        """
+        self.hidden = 0
+        self._is_watched = False
+        assert setup.live is not None
+        place = f"{setup.live.host}:{setup.live.port}"
+        told = Told(replace(setup, attachments={}, metadata={}), ids, start_ns)
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._ring = Ring(RING_BYTES)
+            descriptors = (theirs.fileno(), self._ring.descriptor)
+            # Whatever its libraries might say of what a viewer sent stays away from the run's terminal.
+            notices = os.dup(2)
+            try:
+                self.process = start_module(
+                    "adacd_hil.log.live.server", (*descriptors, notices), told.to_json(), subprocess.DEVNULL
+                )
+            finally:
+                os.close(notices)
+        except OSError as error:
+            self._socket.close()
+            raise LogError(f"the live view can't start: {error}") from None
+        finally:
+            theirs.close()
+        word = self._hear()
+        if word["error"]:
+            self.process.kill()
+            self.process.wait()
+            self._release()
+            raise LogError(f"the live view can't listen on {place}: {word['error']}")
+        self.url = word["url"]
+        self._socket.setblocking(False)
+
+    def _hear(self) -> dict[str, str]:
+        self._socket.settimeout(START_TIMEOUT_S)
+        try:
+            received = self._socket.recv(words.MOST_BYTES)
+        except OSError:
+            received = b""
+        word: dict[str, str] = json.loads(received) if received else {"error": "it did not start"}
+        return word
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody is there to see what is shown."""
+        with contextlib.suppress(BlockingIOError, ConnectionResetError):
+            while word := self._socket.recv(words.MOST_BYTES):
+                self._is_watched = word == words.WATCHED
+            self._is_watched = False  # nobody is left
+        return self._is_watched
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that the other side has not taken yet."""
+        return self._ring.waiting
+
+    def show(
+        self,
+        records: NDArray[np.uint8],
+        channels: NDArray[np.uint16],
+        log_ns: NDArray[np.int64],
+        ends: NDArray[np.int64],
+    ) -> None:
+        """Hand over message records that follow each other, of which the other side shows some; see Batch."""
+        if not len(ends) or not self.is_watched:
+            return
+        if not self._ring.put(pack_batch(Batch(records, channels, log_ns, ends))):
+            self.hidden += 1
+            return
+        self._say(words.WAKE)
+
+    def _say(self, word: bytes) -> None:
+        with contextlib.suppress(OSError):  # it has words that it hasn't heard yet, or is dead
+            self._socket.send(word)
+
+    def close(self) -> None:
+        """Let it send what it has, and end, in its own time."""
+        self._say(words.END)
+        self._release()
+
+    def _release(self) -> None:
+        self._socket.close()
+        self._ring.close()

@@ -1,0 +1,502 @@
+"""The live view's server: whom it refuses, what it says, and that whatever viewers do, the log is whole."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from live_rig import EPOCH_NS, LINK_LENGTH_M, SETUP, URDF, Feed, receive_until_last, setup_of
+from recorded_run import CODEC, feed, make_run, start
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from adacd_hil.log import words
+from adacd_hil.log.channels import run_channels
+from adacd_hil.log.live import server as server_module
+from adacd_hil.log.live.admission import FULL, NOTICES, Admission
+from adacd_hil.log.live.client import live_client
+from adacd_hil.log.live.server import listen, make_server, url_of
+from adacd_hil.log.live.told import Told
+from adacd_hil.log.ring import Ring, RingReader
+from adacd_hil.log.setup import LiveSetup
+
+SDK = "foxglove.sdk.v1"
+OLD = "foxglove.websocket.v1"
+LONGEST_S = 60.0
+CHANNEL_IDS = {channel.id: channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))}
+
+
+def live_setup(**changes) -> LiveSetup:
+    return LiveSetup(**{**vars(SETUP), **changes})
+
+
+@pytest.fixture
+def fed():
+    one = Feed()
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope="module")
+def served():
+    """One that nothing is written to."""
+    one = Feed()
+    yield one.live.url
+    one.close()
+
+
+def opened(url, *, protocols=(SDK,), origin=None, host=None, **options):
+    headers = {} if host is None else {"Host": host}
+    return connect(
+        url,
+        subprotocols=list(protocols),
+        origin=origin,
+        additional_headers=headers,
+        compression=None,
+        proxy=None,
+        max_queue=None,
+        **options,
+    )
+
+
+def words_until_advertised(viewer):
+    info = json.loads(viewer.recv(timeout=LONGEST_S))
+    return info, json.loads(viewer.recv(timeout=LONGEST_S))
+
+
+def ask(viewer, *topics):
+    """Subscribe to topics, all or none named, and return their channels."""
+    _, advertised = words_until_advertised(viewer)
+    channels = [channel for channel in advertised["channels"] if not topics or channel["topic"] in topics]
+    rows = [{"id": channel["id"] + 100, "channelId": channel["id"]} for channel in channels]
+    viewer.send(json.dumps({"op": "subscribe", "subscriptions": rows}))
+    return channels
+
+
+def status_of(viewer):
+    while True:
+        data = viewer.recv(timeout=LONGEST_S)
+        if isinstance(data, str) and (word := json.loads(data))["op"] == "status":
+            return word
+
+
+def code_at_the_end(viewer):
+    """Read until the server closes the connection; return its reason."""
+    try:
+        while True:
+            viewer.recv(timeout=LONGEST_S)
+    except ConnectionClosed as closed:
+        return closed.rcvd.code
+
+
+# -- who may watch ---------------------------------------------------------------------------------------------------
+
+OWN = socket.gethostname().lower()
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "status"),
+    [
+        (None, "127.0.0.1:8765", None),
+        (None, "10.1.2.3:8765", None),
+        (None, "[::1]:8765", None),
+        (None, "localhost", None),
+        (None, "LOCALHOST.:8765", None),
+        (None, OWN, None),
+        (None, f"{OWN.partition('.')[0]}.local:8765", None),
+        (None, "arm.lab.example:8765", None),  # --live-name
+        (None, "stranger.example:8765", 403),
+        (None, "127.0.0.1.stranger.example", 403),
+        (None, "localhost.stranger.example", 403),
+        (None, "", 403),
+        (None, "127.0.0.1:x", 403),
+        (None, "user@127.0.0.1", 403),
+        ("https://app.foxglove.dev", "127.0.0.1:8765", None),
+        ("https://studio.foxglove.dev", "127.0.0.1:8765", None),
+        ("file://", "127.0.0.1:8765", None),
+        ("http://localhost:8080", "127.0.0.1:8765", None),
+        ("http://127.0.0.1:3000", "127.0.0.1:8765", None),
+        ("https://[::1]:3000", "127.0.0.1:8765", None),
+        ("https://view.lab.example", "127.0.0.1:8765", None),  # --live-origin
+        ("viewer-app://", "127.0.0.1:8765", None),
+        ("viewer-app://x", "127.0.0.1:8765", 403),
+        ("https://View.Lab.Example", "127.0.0.1:8765", None),
+        ("http://view.lab.example", "127.0.0.1:8765", 403),
+        ("https://view.lab.example:444", "127.0.0.1:8765", 403),
+        ("https://stranger.example", "127.0.0.1:8765", 403),
+        ("null", "127.0.0.1:8765", 403),  # a sandboxed frame of anybody's
+        ("", "127.0.0.1:8765", 403),
+        ("https://app.foxglove.dev.stranger.example", "127.0.0.1:8765", 403),
+        ("https://app.foxglove.dev@stranger.example", "127.0.0.1:8765", 403),
+        ("http://app.foxglove.dev", "127.0.0.1:8765", 403),
+        ("http://localhost.stranger.example", "127.0.0.1:8765", 403),
+        ("http://localhost:8080/x", "127.0.0.1:8765", 403),
+        ("http://127.0.0.1.stranger.example", "127.0.0.1:8765", 403),
+        ("http://stranger.example:8765", "stranger.example:8765", 403),  # a name that was bound to this machine
+    ],
+)
+def test_pages_of_viewers_and_names_of_this_machine_are_admitted(origin, host, status):
+    admission = Admission(
+        live_setup(origins=("https://view.lab.example/", "viewer-app://"), names=("arm.lab.example",))
+    )
+    refusal = admission.refuse([] if origin is None else [origin], [host], [SDK])
+    assert (None if refusal is None else refusal.status) == status
+
+
+@pytest.mark.parametrize(
+    ("origins", "hosts", "protocols", "status"),
+    [
+        ([], [], [SDK], 403),
+        ([], ["127.0.0.1", "127.0.0.1"], [SDK], 403),
+        (["file://", "https://stranger.example"], ["127.0.0.1"], [SDK], 403),
+        ([], ["127.0.0.1"], [], 400),
+        ([], ["127.0.0.1"], ["foxglove.sdk.v2"], 400),
+        ([], ["127.0.0.1"], ["foxglove.sdk.v2, foxglove.websocket.v1"], None),
+        ([], ["127.0.0.1"], ["x", SDK], None),
+    ],
+)
+def test_what_a_request_has_twice_or_not_at_all(origins, hosts, protocols, status):
+    refusal = Admission(SETUP).refuse(origins, hosts, protocols)
+    assert (None if refusal is None else refusal.status) == status
+
+
+@pytest.mark.parametrize(
+    ("request_options", "status", "word"),
+    [
+        ({"origin": "https://stranger.example"}, 403, "--live-origin"),
+        ({"origin": "null"}, 403, "--live-origin"),
+        ({"protocols": ("graphql-ws",)}, 400, "foxglove.websocket.v1"),
+    ],
+)
+def test_who_is_refused_gets_the_reason_and_nothing_else(served, request_options, status, word):
+    with pytest.raises(InvalidStatus) as refused:
+        opened(served, **request_options)
+    response = refused.value.response
+    assert (response.status_code, word in response.body.decode()) == (status, True)
+    assert "scheme" not in response.body.decode()
+
+
+def test_a_name_that_is_not_ours_is_refused_on_the_wire(served):
+    port = int(served.rsplit(":", 1)[1])
+    request = raw_request("stranger.example:8765")
+    with socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall(request)
+        answer = client.makefile("rb").read()
+    assert answer.startswith(b"HTTP/1.1 403")
+    assert b"--live-name" in answer
+
+
+def raw_request(host, *more, key="AAAAAAAAAAAAAAAAAAAAAA==", protocol=SDK, path="/"):
+    lines = [
+        f"GET {path} HTTP/1.1",
+        f"Host: {host}",
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        f"Sec-WebSocket-Key: {key}",
+        "Sec-WebSocket-Version: 13",
+        f"Sec-WebSocket-Protocol: {protocol}",
+        *more,
+    ]
+    return "\r\n".join([*lines, "", ""]).encode("latin-1")
+
+
+def test_one_viewer_too_many_is_refused_until_one_has_left():
+    fed = Feed(live_setup(most_viewers=2))
+    with contextlib.ExitStack() as stack:
+        first, _ = (stack.enter_context(opened(fed.live.url)) for _ in range(2))
+        with pytest.raises(InvalidStatus) as refused:
+            opened(fed.live.url)
+        assert refused.value.response.status_code == FULL.status
+        assert "--live-viewers" in refused.value.response.body.decode()
+        first.close()
+        stack.enter_context(opened(fed.live.url))  # its place is free
+    fed.close()
+
+
+# -- what is said ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("offered", [(SDK,), (OLD,), (OLD, SDK), ("x", OLD)])
+def test_viewers_of_either_name_of_the_protocol_are_served_alike(fed, offered):
+    run = make_run(40)
+    with opened(fed.live.url, protocols=offered) as viewer:
+        assert viewer.subprotocol in offered
+        channels = ask(viewer, "/events", "/robot_description")
+        events = next(channel for channel in channels if channel["topic"] == "/events")
+        assert (events["encoding"], events["schemaEncoding"]) == ("cdr", "ros2msg")
+        await_description(viewer, channels)
+        fed.cycles(run, 1)
+        message = next_message(viewer)
+    assert struct.unpack_from("<BI", message) == (1, events["id"] + 100)
+    assert b"name10" in message
+
+
+def await_description(viewer, channels):
+    number = next(channel["id"] for channel in channels if channel["topic"] == "/robot_description") + 100
+    while struct.unpack_from("<BI", next_message(viewer)) != (1, number):
+        pass
+
+
+def next_message(viewer):
+    while True:
+        data = viewer.recv(timeout=LONGEST_S)
+        if isinstance(data, bytes) and data[0] == 1:
+            return data
+
+
+def test_the_servers_time_is_offered_and_is_that_of_the_log(fed):
+    run = make_run(200, start_ns=7_000_000_000)
+    with opened(fed.live.url) as viewer:
+        info, _ = words_until_advertised(viewer)
+    assert info["capabilities"] == ["time"]
+    times_ns, stamps_ns = [], []
+    with opened(fed.live.url) as viewer:
+        channels = ask(viewer, "/cycle", "/robot_description", "/events")
+        await_description(viewer, channels)
+        fed.cycles(run, 60)
+        while True:
+            data = viewer.recv(timeout=LONGEST_S)
+            if data[0] == 2:
+                times_ns.append(struct.unpack("<BQ", data)[1])
+            else:
+                stamps_ns.append((struct.unpack_from("<BIQ", data)[2], times_ns[-1] if times_ns else 0))
+            if b"last\0" in data:
+                break
+    assert times_ns == sorted(times_ns)
+    assert EPOCH_NS + 7_000_000_000 <= times_ns[0] < times_ns[-1] <= EPOCH_NS + 7_200_000_000
+    assert len(times_ns) >= 8  # more often than the four times that something came
+    assert all(abs(stamp_ns - time_ns) < 20_000_000 for stamp_ns, time_ns in stamps_ns[1:])
+
+
+def test_a_viewer_can_end_a_subscription_and_begin_it_again(fed):
+    with opened(fed.live.url) as viewer:
+        channels = ask(viewer, "/events", "/robot_description")
+        await_description(viewer, channels)
+        rows = [{"id": 7, "channelId": channel["id"]} for channel in channels if channel["topic"] == "/events"]
+        viewer.send(json.dumps({"op": "unsubscribe", "subscriptionIds": [row["channelId"] + 100 for row in rows]}))
+        viewer.send(json.dumps({"op": "subscribe", "subscriptions": rows}))
+        viewer.send(json.dumps({"op": "subscribe", "subscriptions": rows}))  # the number is taken
+        assert status_of(viewer)["level"] == 2
+        fed.cycles(make_run(20), 1)
+        assert struct.unpack_from("<BI", next_message(viewer)) == (1, 7)
+
+
+NONSENSE = [
+    "",
+    "{",
+    "[]",
+    "7",
+    '"subscribe"',
+    '{"op": "subscribe"}',
+    '{"op": "subscribe", "subscriptions": 3}',
+    '{"op": "subscribe", "subscriptions": [3]}',
+    '{"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]}',
+    '{"op": "subscribe", "subscriptions": [{"id": 1e999, "channelId": 1}]}',
+    '{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 4711}]}',
+    '{"op": "subscribe", "subscriptions": [{"id": ' + 4400 * "9" + ', "channelId": 1}]}',
+    '{"op": "unsubscribe", "subscriptionIds": ["x"]}',
+    '{"op": "unsubscribe", "subscriptionIds": [99]}',
+    30_000 * "[",
+    '{"op": "advertise", "channels": [{"id": 1, "topic": "/to_can_bus", "encoding": "cdr", "schemaName": "x"}]}',
+    '{"op": "setParameters", "parameters": [{"name": "arm.torque_limit_Nm", "value": 99}]}',
+    b"",
+    b"\x01\x00\x00\x00\x00payload",
+    b"\xff",
+    "\x1b]0;owned\x07",
+]
+
+
+def test_what_a_viewer_says_changes_nothing(fed):
+    run = make_run(200, seed=3)
+    alone = Feed(None)
+    with opened(fed.live.url) as rude, live_client(fed.live.url) as client:
+        for data in NONSENSE:
+            rude.send(data)
+        assert status_of(rude)["op"] == "status"
+        fed.cycles(run, 10)
+        alone.cycles(run, 10)
+        assert len(receive_until_last(client)) > 50
+    assert fed.file() == alone.file()
+
+
+@pytest.mark.parametrize(
+    ("data", "code"),
+    [
+        (70_000 * "x", 1009),
+        (json.dumps({"op": "subscribe", "subscriptions": [{"id": n, "channelId": 1} for n in range(500)]}), 1008),
+    ],
+)
+def test_a_viewer_that_asks_for_too_much_is_closed(served, data, code):
+    with opened(served) as viewer:
+        viewer.send(data)
+        assert code_at_the_end(viewer) == code
+
+
+def test_nothing_that_a_peer_sends_reaches_the_runs_terminal():
+    escape = "\x1b]0;owned\x07\x1b[2J"
+    script = (
+        "import sys; sys.path[:0] = sys.argv[1:]\n"
+        "from live_rig import Feed\n"
+        "if __name__ == '__main__':\n"
+        "    fed = Feed(); print(fed.live.url, flush=True); sys.stdin.read(); fed.close()\n"
+    )
+    folder = Path(__file__).parent
+    run = subprocess.Popen(
+        [sys.executable, "-c", script, str(folder), str(folder.parent)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    url = run.stdout.readline().decode().strip()
+    port = int(url.rsplit(":", 1)[1])
+    hostile = [
+        raw_request("127.0.0.1", f"Origin: https://{escape}"),
+        raw_request("127.0.0.1", f"Origin: https://{escape}"),
+        raw_request("127.0.0.1", "Origin: https://owned.example"),
+        raw_request("127.0.0.1", "Origin: https://owned.example"),
+        raw_request(escape),
+        raw_request("owned.example"),
+        raw_request("127.0.0.1", protocol=escape),
+        raw_request("127.0.0.1", key=escape),
+        raw_request("127.0.0.1", path=f"/{escape}"),
+        raw_request("127.0.0.1", f"X: {'y' * 100_000}"),
+        f"{escape}\r\n\r\n".encode(),
+        b"\x16\x03\x01\x02\x00" + os.urandom(500),  # TLS
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    ]
+    for request in hostile:
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            client.sendall(request)
+            if not request.endswith(b"\r\n\r\n"):  # the server would wait for the rest
+                client.shutdown(socket.SHUT_WR)
+            with contextlib.suppress(ConnectionResetError):
+                client.recv(4096)
+    with opened(url) as viewer:
+        for data in NONSENSE:
+            viewer.send(data)
+        status_of(viewer)
+    out, complaints = run.communicate(timeout=LONGEST_S)
+    lines = complaints.decode().splitlines()
+    assert run.returncode == 0
+    assert out == b""
+    assert set(lines) <= set(NOTICES)
+    assert len(lines) == len(set(lines)) == 3  # of origin, name and protocol, once each
+
+
+# -- the log ---------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def crowd(url, count):
+    """Clients that behave badly, see live_crowd.py."""
+    words = [sys.executable, Path(__file__).parent / "live_crowd.py", url.rsplit(":", 1)[1], str(count)]
+    clients = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        assert clients.stdout.readline() == b"ready\n"
+        yield
+        clients.stdin.close()
+        assert clients.wait(LONGEST_S) == 0
+    finally:
+        clients.kill()
+        clients.wait()
+        clients.stdout.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blocking", [True, False])
+def test_five_hundred_clients_that_behave_badly_cost_the_log_nothing(tmp_path, blocking):
+    run = make_run(1500, seed=8)
+    for name, live in (("crowded", live_setup(most_viewers=500)), ("alone", None)):
+        recorder = start(tmp_path / f"{name}.mcap", run, live=live, blocking=blocking)
+        with crowd(recorder.live_url, 500) if live else contextlib.nullcontext():
+            feed(recorder, run.cycles)
+            summary = recorder.close()
+        assert (summary.is_complete, summary.dropped) == (True, 0)
+        assert summary.messages > 10_000
+    if blocking:
+        assert (tmp_path / "crowded.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+
+
+def live_process_of(writer_pid):
+    """Find the process of the live view among the writer's children."""
+    (child,) = Path(f"/proc/{writer_pid}/task/{writer_pid}/children").read_text().split()
+    return int(child)
+
+
+def is_running(pid):
+    """Whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes() != b""
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_live_view_that_is_stopped_or_killed_costs_the_log_nothing(tmp_path, number):
+    run = make_run(1500, seed=9)
+    recorder = start(tmp_path / "run.mcap", run, live=SETUP)
+    other = start(tmp_path / "alone.mcap", run)
+    pid = live_process_of(recorder.pid)
+    with opened(recorder.live_url) as viewer:
+        channels = ask(viewer)
+        await_description(viewer, channels)
+        os.kill(pid, number)
+        for each in (recorder, other):
+            feed(each, run.cycles)
+            assert each.close().is_complete
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    assert (tmp_path / "run.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
+
+
+def test_the_live_view_ends_when_the_writer_dies(tmp_path):
+    recorder = start(tmp_path / "run.mcap", make_run(1), live=SETUP)
+    pid = live_process_of(recorder.pid)
+    with opened(recorder.live_url) as viewer:
+        words_until_advertised(viewer)
+        os.kill(recorder.pid, signal.SIGKILL)
+        assert code_at_the_end(viewer) == 1001
+    assert not recorder.close().is_complete
+    while is_running(pid):
+        os.sched_yield()
+
+
+def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch):
+    monkeypatch.setattr(server_module, "LINGER_S", LONGEST_S)
+    ring = Ring(2**16)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listening = listen(SETUP)
+    address = listening.getsockname()
+    reader = RingReader(ring.descriptor)
+    server = make_server(Told(setup_of(SETUP), CHANNEL_IDS, EPOCH_NS), reader, theirs)
+    serving = threading.Thread(target=lambda: asyncio.run(server.run(listening)))
+    serving.start()
+    with socket.create_connection(address) as deaf:  # for whose goodbye the server waits
+        deaf.sendall(raw_request("127.0.0.1"))
+        assert deaf.recv(12) == b"HTTP/1.1 101"
+        ours.send(words.END)
+        with contextlib.suppress(ConnectionRefusedError):
+            while True:
+                socket.create_connection(address).close()
+        assert serving.is_alive()
+    serving.join()
+    for end in (ours, theirs, reader, ring):
+        end.close()
+
+
+def test_an_address_of_version_6_is_written_so_that_it_can_be_opened():
+    setup = LiveSetup("::1", 0, URDF, LINK_LENGTH_M)
+    with socket.socket(socket.AF_INET6) as listening:
+        try:
+            listening.bind(("::1", 0))
+        except OSError as error:
+            pytest.skip(f"no IPv6 here: {error}")
+        assert url_of(setup, listening) == f"ws://[::1]:{listening.getsockname()[1]}"
