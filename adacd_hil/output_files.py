@@ -16,6 +16,7 @@ from pathlib import Path
 
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LOG_MAGIC = b"\x89MCAP0\r\n"
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCKS = Path("/proc/locks")
 
 
@@ -63,6 +64,22 @@ def _owner(descriptor: int) -> str:
             if len(words) >= 6 and words[1] == "FLOCK" and words[5] == place and words[4] != "0":
                 return f"process {words[4]}"
     return "another process"
+
+
+def is_disk_full(error: BaseException | None) -> bool:
+    """Tell whether an error, or one that it was made of, says that there is no room for what is written."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def in_words(error: BaseException) -> str:
+    """Describe an error: of the system's by the file and its reason, without its number."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return str(error)
 
 
 class Replacement:

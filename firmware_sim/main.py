@@ -15,9 +15,10 @@ from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.run_folder import TRUTH_NAME, check_free
-from adacd_hil.output_files import tidied
+from adacd_hil.output_files import in_words, tidied
 from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.terminal import one_line, open_terminals
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError, load_codec
 from adacd_hil.wire.node_offset import move_contract
@@ -233,11 +234,13 @@ def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: Trut
 
 
 def _complain(line: str) -> None:
-    print(f"firmware-sim: {' '.join(line.split())}", file=sys.stderr)
+    print(f"firmware-sim: {one_line(line)}", file=sys.stderr)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line and exit with a documented status."""
+    """Run the command line, by default that of this process, and exit with a documented status."""
+    if arguments is None:
+        open_terminals()
     logging.getLogger("canopen").addHandler(logging.NullHandler())
     try:
         code = cli.main(arguments, prog_name="firmware-sim", standalone_mode=False)
@@ -247,7 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except (click.Abort, KeyboardInterrupt):
         code = ExitCode.OK
     except tuple(kind for kind, _ in _CODES) as error:
-        _complain(error.format_message() if isinstance(error, click.ClickException) else str(error))
+        _complain(error.format_message() if isinstance(error, click.ClickException) else in_words(error))
         code = next(code for kind, code in _CODES if isinstance(error, kind))
     sys.exit(code)
 

@@ -11,6 +11,7 @@ from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.editing.attached import run_metadata
 from adacd_hil.log.errors import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.terminal import one_line
 from adacd_hil.wire.codec import Codec, load_codec
 from adacd_hil.wire.node_offset import move_contract
 from firmware_sim.bench import ClockMode
@@ -97,7 +98,7 @@ def _check_contract(log: Path, codec: Codec) -> None:
 def _report(bench: RecordedBench, cycles: RecordedCycles | None, as_json: bool) -> int:
     problem = "" if cycles is None else cycles.problem
     if problem:
-        print(f"firmware-sim: {problem}", file=sys.stderr)
+        print(f"firmware-sim: {one_line(problem)}", file=sys.stderr)
     if as_json:
         described = {
             "cycles": bench.cycle + 1,

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from adacd_hil.clock import Clock
+from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench import Bench, ClockMode
@@ -28,6 +29,7 @@ class StopRequest:
     def make(self, *_signal: object) -> None:
         """Ask for the end; callable as a signal handler."""
         self.is_made = True
+        hurry()
 
 
 class Service:

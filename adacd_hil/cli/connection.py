@@ -13,6 +13,7 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.device.contract import load_contract
+from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, is_hardware, open_bus
 from adacd_hil.wire.codec import Codec
 
@@ -116,9 +117,14 @@ def on_interrupt(interrupt: Callable[[], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+
+    def handle(*_: object) -> None:
+        hurry()
+        interrupt()
+
     previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number in previous:
-        signal.signal(number, lambda *_: interrupt())
+        signal.signal(number, handle)
     try:
         yield
     finally:

@@ -23,7 +23,8 @@ class ExitCode(IntEnum):
 
 EPILOG = (
     "Exit status: 0 done; 1 failure (a tare: refused); 2 wrong usage or configuration; 3 partial result (the log lost "
-    "something); 4 safety stop (the run faulted or the arm fell silent); 5 bus or devices missing; 130 interrupted."
+    "something, or a disk is full); 4 safety stop (the run faulted or the arm fell silent); 5 bus or devices missing; "
+    "130 interrupted."
 )
 
 

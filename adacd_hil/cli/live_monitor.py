@@ -30,6 +30,7 @@ from adacd_hil.records import (
     Location,
     SchemeState,
 )
+from adacd_hil.terminal import one_line, write_screen
 
 TOPICS = ("/scheme", "/cycle", "/contact", "/events")
 _BAR_WIDTH = 40
@@ -134,7 +135,7 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
     Raises LogError.
     """
     clock = MonotonicClock()
-    screen = Screen(sys.stdout.isatty() and is_live and not as_json, _write)
+    screen = Screen(sys.stdout.isatty() and is_live and not as_json, write_screen)
     is_stopped = False
 
     def stop() -> None:
@@ -173,16 +174,6 @@ def _understood() -> Iterator[None]:
         raise LogError("it does not serve a log of adacd-hil") from None
 
 
-def _plain(text: str) -> str:
-    """Return text without what a terminal would obey."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
-
-
-def _write(text: str) -> None:
-    sys.stdout.write(text)
-    sys.stdout.flush()
-
-
 def as_text(described: dict[str, Any]) -> str:
     """Write the view for people."""
     if "state" not in described:
@@ -201,7 +192,7 @@ def as_text(described: dict[str, Any]) -> str:
         parts.append(format_table(table_head, list(map(_contact_row, described["contacts"])), right=(0, 2, 4, 5)))
     if described["events"]:
         rows = [
-            (f"{event['t_s']:.3f}", event["level"], _plain(event["name"]), _plain(event["message"]))
+            (f"{event['t_s']:.3f}", event["level"], one_line(event["name"]), one_line(event["message"]))
             for event in described["events"]
         ]
         parts.append(format_table(("s", "level", "event", ""), rows, right=(0,)))

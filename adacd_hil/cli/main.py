@@ -1,8 +1,9 @@
 """`adacd-hil`: the commands. Each parses, calls one function, prints."""
 
 import json
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
@@ -14,6 +15,7 @@ from adacd_hil.cli.live_options import live_options, require_extra
 from adacd_hil.cli.log_command import log
 from adacd_hil.cli.options import (
     clock_option,
+    complain,
     config_option,
     explained,
     json_option,
@@ -26,6 +28,7 @@ from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
 from adacd_hil.cli.sweep_command import sweep
 from adacd_hil.cli.tune_command import tune
+from adacd_hil.terminal import open_terminals
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -331,6 +334,16 @@ cli.add_command(sweep)
 cli.add_command(tune)
 
 
-def main() -> None:
-    """Enter here from the console script."""
-    cli.main(prog_name="adacd-hil")
+def main() -> NoReturn:
+    """Enter here from the console script: run the command line and exit with a documented status."""
+    open_terminals()
+    try:
+        code = cli.main(prog_name="adacd-hil", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        code = ExitCode.INTERRUPTED
+    except OSError as error:  # help that can't be written
+        code = complain(error)
+    sys.exit(code)

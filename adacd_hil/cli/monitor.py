@@ -12,6 +12,7 @@ from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.device.bus_view import BusView, MessageView, Snapshot
+from adacd_hil.terminal import plain, write_screen
 from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.link import carried_frames, read_link
@@ -39,16 +40,17 @@ class Screen:
 
     def draw(self, text: str) -> None:
         """Show a table, cut to the terminal; a full one comes at the end."""
+        text = plain(text)
         if not self._is_terminal:
             self._write(text + "\n\n")
             return
         columns, rows = shutil.get_terminal_size()
-        lines = [line[: columns - 1] + _CLEAR_LINE for line in text.splitlines()[: rows - 1]]
+        lines = [line[: columns - 1] + _CLEAR_LINE for line in text.split("\n")[: rows - 1]]
         self._write(_HOME + "\n".join(lines) + "\n" + _CLEAR_BELOW)
 
     def end(self, text: str) -> None:
         """Show the last table."""
-        self._write((_HOME + _CLEAR_BELOW if self._is_terminal else "") + text + "\n")
+        self._write((_HOME + _CLEAR_BELOW if self._is_terminal else "") + plain(text) + "\n")
 
 
 class Monitor:
@@ -106,7 +108,7 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
     """
     clock = MonotonicClock()
     _, codec = connection.load()  # what is wrong with the configuration comes before what is wrong with the bus
-    screen = Screen(sys.stdout.isatty() and is_live and not as_json, _write)
+    screen = Screen(sys.stdout.isatty() and is_live and not as_json, write_screen)
     with connection.bus(clock, codec.is_fd) as bus:
         monitor = Monitor(connection, bus, clock, node_id)
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
@@ -125,11 +127,6 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
                 described = monitor.describe()
                 screen.end(json.dumps(described, indent=2) if as_json else as_text(described))
     return ExitCode.OK
-
-
-def _write(text: str) -> None:
-    sys.stdout.write(text)
-    sys.stdout.flush()
 
 
 def _describe(snapshot: Snapshot) -> dict[str, Any]:

@@ -11,6 +11,8 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.config import ConfigError, builtin_names
 from adacd_hil.log.errors import LogError, LogExistsError
+from adacd_hil.output_files import in_words, is_disk_full
+from adacd_hil.terminal import one_line
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError
 
@@ -22,7 +24,9 @@ _CODES = (
     (LogExistsError, ExitCode.USAGE),
     (LogError, ExitCode.FAILURE),
     (OSError, ExitCode.FAILURE),
+    (MemoryError, ExitCode.FAILURE),
 )
+_EXPECTED = (KeyboardInterrupt, CommandError, *(kind for kind, _ in _CODES))
 
 
 def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
@@ -32,21 +36,25 @@ def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
     def run(*args: Any, **kwargs: Any) -> None:
         try:
             code = command(*args, **kwargs)
-        except KeyboardInterrupt:
-            _fail("interrupted", ExitCode.INTERRUPTED)
-        except CommandError as error:
-            _fail(str(error), error.code)
-        except tuple(kind for kind, _ in _CODES) as error:
-            _fail(str(error), next(code for kind, code in _CODES if isinstance(error, kind)))
-        else:
-            sys.exit(code)
+        except _EXPECTED as error:
+            code = complain(error)
+        sys.exit(code)
 
     return run
 
 
-def _fail(line: str, code: ExitCode) -> None:
-    print(f"adacd-hil: {line}", file=sys.stderr)
-    sys.exit(code)
+def complain(error: BaseException) -> ExitCode:
+    """Say in one line what ended a command; return its exit code."""
+    is_interrupted = isinstance(error, KeyboardInterrupt)
+    line = "interrupted" if is_interrupted else in_words(error) or type(error).__name__
+    print(f"adacd-hil: {one_line(line)}", file=sys.stderr)
+    if is_interrupted:
+        return ExitCode.INTERRUPTED
+    if is_disk_full(error):
+        return ExitCode.PARTIAL
+    if isinstance(error, CommandError):
+        return error.code
+    return next(code for kind, code in _CODES if isinstance(error, kind))
 
 
 config_option = click.option(

@@ -227,7 +227,7 @@ def test_no_escape_sequence_of_an_event_reaches_the_terminal():
             monitor.accept(message)
     fed.close()
     text = as_text(monitor.describe())
-    assert "?[2Jname" in text
+    assert "\\u001b[2Jname" in text
     assert {letter for letter in text if not letter.isprintable()} <= {"\n"}
 
 

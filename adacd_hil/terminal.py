@@ -1,0 +1,172 @@
+"""Standard output and error of both programs: the one door through which text reaches a terminal, a pipe or a file.
+
+Nothing that a file or the bus says controls a terminal: control characters are escaped as in JSON, which reads them
+back. A reader that goes away, as `head` does, is no error. An output that blocks holds nobody up once the user has
+asked for the end.
+"""
+
+import contextlib
+import errno
+import io
+import os
+import re
+import select
+import signal
+import stat
+import sys
+import threading
+from types import FrameType
+
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 but for tab and newline, DEL, C1
+    "\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"  # what turns the order of letters, or ends lines unseen
+)
+_MOST_LETTERS = 2000
+_POLL_MS = 100
+_PATIENCE_POLLS = 5
+"""How long a blocked output is waited for after the user has asked for the end: 0.5 s."""
+_NOBODY_READS = (errno.EPIPE, errno.EIO)
+"""The other end of the pipe is closed, the terminal has hung up."""
+_PIECE = 1024
+"""Bytes that a pipe or a terminal takes without blocking when it is ready: POSIX has PIPE_BUF of at least 512."""
+
+
+def plain(text: str) -> str:
+    """Escape control characters of a text, but for tabs and newlines, by `u` and four hexadecimal digits."""
+    return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def one_line(text: object) -> str:
+    """Put a text into one line, free of control characters and not longer than anybody reads."""
+    line = plain(" ".join(str(text).split()))
+    return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"
+
+
+class Terminal(io.TextIOBase):
+    """A standard stream. What is written goes out at once."""
+
+    def __init__(self, descriptor: int, name: str, is_needed: bool) -> None:
+        """Write to `descriptor`. is_needed: a full disk behind it is an error; otherwise nobody is told."""
+        self.name = name
+        self._descriptor = descriptor
+        self._is_needed = is_needed
+        self._is_gone = False  # nobody reads, or nobody would wait
+        self._patience = -1  # polls to wait for an output that blocks; negative: for ever
+        self._lock = threading.Lock()
+        try:
+            self._is_ready = stat.S_ISREG(os.fstat(descriptor).st_mode)  # a file never blocks
+        except OSError:
+            self._is_gone = True
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """UTF-8, whatever the locale."""
+        return "utf-8"
+
+    @property
+    def errors(self) -> str:  # type: ignore[override]
+        """What isn't a character, as in names of files, is written in hexadecimal."""
+        return "backslashreplace"
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        """Whether a terminal is behind it."""
+        return not self._is_gone and os.isatty(self._descriptor)
+
+    def writable(self) -> bool:
+        """Tell that it can be written."""
+        return True
+
+    def write(self, text: str) -> int:
+        """Write a text, free of control characters. Raises OSError where the stream is needed."""
+        if not isinstance(text, str):
+            raise TypeError(f"{self.name} takes text, not {type(text).__name__}")
+        self.write_raw(plain(text))
+        return len(text)
+
+    def write_raw(self, text: str) -> None:
+        """Write a text as it is: of our own making, with what moves a cursor. Raises OSError."""
+        data = text.encode(self.encoding, self.errors)
+        if not data or self._is_gone or not self._acquire():
+            return
+        try:
+            self._put(memoryview(data))
+        except OSError as error:
+            self._leave()
+            if self._is_needed and error.errno not in _NOBODY_READS:
+                raise OSError(error.errno, f"{self.name} can't be written: {error.strerror}") from None
+        finally:
+            self._lock.release()
+
+    def hurry(self) -> None:
+        """From now on, wait for an output that blocks for half a second only. Safe in a signal handler."""
+        self._patience = _PATIENCE_POLLS
+
+    def _acquire(self) -> bool:
+        """Wait for whoever writes at present; False when patience ends."""
+        polls = 0
+        while not self._lock.acquire(timeout=_POLL_MS / 1000):
+            polls += 1
+            if 0 <= self._patience < polls:
+                return False
+        return True
+
+    def _put(self, view: memoryview) -> None:
+        poll = select.poll()
+        poll.register(self._descriptor, select.POLLOUT)
+        polls = 0
+        while view and not self._is_gone:
+            if not self._is_ready and not poll.poll(_POLL_MS):
+                polls += 1
+                self._is_gone = 0 <= self._patience < polls
+                continue
+            with contextlib.suppress(BlockingIOError):  # whoever shares the other end has made it so
+                view = view[os.write(self._descriptor, view if self._is_ready else view[:_PIECE]) :]
+
+    def _leave(self) -> None:
+        """Write nothing more; what others write to this descriptor goes nowhere."""
+        self._is_gone = True
+        with contextlib.suppress(OSError):
+            nowhere = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
+            os.dup2(nowhere, self._descriptor)
+            os.close(nowhere)
+
+
+def hurry() -> None:
+    """Let no output hold up the end any more. Safe in a signal handler."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, Terminal):
+            stream.hurry()
+
+
+def write_screen(text: str) -> None:
+    """Write to standard output what moves the cursor of a terminal: own escape sequences around plain text."""
+    if isinstance(sys.stdout, Terminal):
+        sys.stdout.write_raw(text)
+    else:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+
+def open_terminals() -> None:
+    """Put the door before both streams of this process, for good; Ctrl-C ends a wait for one that blocks.
+
+    Where a standard descriptor is closed it is opened to nowhere, so that no file of ours takes its place.
+    """
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number, which is this one
+    sys.stdout = Terminal(1, "standard output", is_needed=True)
+    sys.stderr = Terminal(2, "standard error", is_needed=False)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as in the background
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    hurry()
+    signal.default_int_handler(number, frame)

@@ -1,0 +1,198 @@
+"""What reaches a terminal, a pipe or a full disk, and who may leave, block or fail without harm."""
+
+import fcntl
+import os
+import select
+import signal
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from experiment_runs import BIN, PAPER
+
+from adacd_hil.cli.monitor import Screen
+from adacd_hil.log.reader import read_log
+from adacd_hil.terminal import one_line, plain
+from firmware_sim.truth import TruthLog
+
+OK, USAGE, PARTIAL, INTERRUPTED = 0, 2, 3, 130
+LONG = ([BIN / "adacd-hil", "budget", "--json"], [BIN / "firmware-sim", "list", "--json"])
+"""They print more than a small pipe takes, and need no bus."""
+EVIL = "x\x1b]0;owned\x07\udc80"
+WRITE_AND_EXIT = """
+import sys
+from adacd_hil.terminal import open_terminals
+open_terminals()
+for number in range(3000):
+    print("line", number)
+    print("progress", number, file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("plain text, ünïcödé θ̂ ±0.1 Nm\tok\n", "plain text, ünïcödé θ̂ ±0.1 Nm\tok\n"),
+        ("\x1b]0;title\x07\x1b[2J", "\\u001b]0;title\\u0007\\u001b[2J"),
+        ("done\rFAILED", "done\\u000dFAILED"),
+        ("\x9b31m\x7f\x00\x08", "\\u009b31m\\u007f\\u0000\\u0008"),
+        ("left\u202eright\u2066\u2028", "left\\u202eright\\u2066\\u2028"),
+    ],
+)
+def test_control_characters_are_escaped_and_nothing_else(text: str, shown: str) -> None:
+    assert plain(text) == shown
+
+
+def test_an_error_is_one_line_that_can_be_read() -> None:
+    assert one_line("a\n  b\x1b\r\n") == "a b\\u001b"
+    assert one_line("9" * 10**6) == "9" * 2000 + " …"
+
+
+def test_a_table_that_is_redrawn_moves_the_cursor_by_its_own_sequences_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    written: list[str] = []
+    screen = Screen(True, written.append)
+    screen.draw("name\x1b[2J\nother\x0c")
+    screen.end("name\x1b[2J")
+    assert "".join(written) == "\x1b[Hname\\u001b[2J\x1b[K\nother\\u000c\x1b[K\n\x1b[J\x1b[H\x1b[Jname\\u001b[2J\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "status", "line"),
+    [
+        (("adacd-hil", "log", "info", "EVIL.mcap"), 1, "SHOWN.mcap can't be read: No such file"),
+        (("adacd-hil", "log", "info", "EVIL/truth.mcap"), 0, "SHOWN/truth.mcap: "),
+        (("firmware-sim", "show", "EVIL.toml"), 2, "SHOWN.toml does not exist"),
+        (("firmware-sim", "check", "EVIL.toml"), 2, "SHOWN.toml"),
+    ],
+)
+def test_a_name_reaches_a_terminal_as_plain_text(
+    words: tuple[str, ...], status: int, line: str, tmp_path: Path
+) -> None:
+    (tmp_path / EVIL).mkdir()
+    with TruthLog(tmp_path / EVIL / "truth.mcap", blocking=True) as log:
+        log.event(0, "info", "run", "begun")
+    ours, theirs = os.openpty()
+    program, *rest = (word.replace("EVIL", EVIL) for word in words)
+    done = subprocess.run([BIN / program, *rest], stdout=theirs, stderr=theirs, check=False, cwd=tmp_path)
+    os.close(theirs)
+    shown = os.read(ours, 65536).decode()
+    os.close(ours)
+    assert done.returncode == status
+    assert line.replace("SHOWN", "x\\u001b]0;owned\\u0007\\udc80") in shown
+    assert "\x1b" not in shown
+    assert "\x07" not in shown
+
+
+@pytest.fixture
+def small_pipe() -> Iterator[tuple[int, int]]:
+    """Both ends of a pipe that takes a page."""
+    left, right = os.pipe()
+    fcntl.fcntl(right, fcntl.F_SETPIPE_SZ, 4096)
+    yield left, right
+    for descriptor in (left, right):
+        os.close(descriptor)
+
+
+def wait_until_full(pipe: int, process: "subprocess.Popen[bytes]") -> None:
+    """Wait until a pipe takes nothing more; the test's time limit ends it."""
+    poll = select.poll()
+    poll.register(pipe, select.POLLOUT)
+    while poll.poll(0):
+        assert process.poll() is None
+        os.sched_yield()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_both", [False, True], ids=["stdout", "both"])
+@pytest.mark.parametrize("command", LONG, ids=lambda command: command[0].name)
+def test_an_output_that_blocks_ends_with_ctrl_c(command: list[str], is_both: bool, small_pipe: tuple[int, int]) -> None:
+    _, right = small_pipe
+    said = right if is_both else subprocess.PIPE
+    with subprocess.Popen(command, stdout=right, stderr=said) as process:
+        wait_until_full(right, process)
+        process.send_signal(signal.SIGINT)
+        complaint = process.communicate(timeout=60)[1]
+    expected = {"adacd-hil": (INTERRUPTED, b"adacd-hil: interrupted\n"), "firmware-sim": (OK, b"")}[command[0].name]
+    assert process.returncode == expected[0]
+    assert is_both or complaint.lstrip() == expected[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [*LONG, *([BIN / name, *words] for name in ("adacd-hil", "firmware-sim") for words in (("--help",), ("x",)))],
+    ids=lambda command: " ".join(map(str, command[1:])),
+)
+def test_a_reader_that_goes_away_is_no_error(command: list[str], small_pipe: tuple[int, int]) -> None:
+    usual = subprocess.run(command, capture_output=True, check=False)
+    left, right = os.pipe()
+    os.close(left)
+    assert subprocess.run(command, stdout=right, stderr=right, check=False).returncode == usual.returncode
+    gone = subprocess.run(command, stdout=right, stderr=subprocess.PIPE, check=False)
+    os.close(right)
+    assert (gone.returncode, gone.stderr) == (usual.returncode, usual.stderr)
+
+
+def test_nothing_is_written_twice_or_lost_before_the_reader_goes() -> None:
+    done = subprocess.run([sys.executable, "-c", WRITE_AND_EXIT], capture_output=True, check=True)
+    assert done.stdout == b"".join(b"line %d\n" % number for number in range(3000))
+    assert done.stderr == b"".join(b"progress %d\n" % number for number in range(3000))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [("budget",), ("--help",), ("log", "--help")])
+def test_results_on_a_full_disk_are_partial(words: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run([BIN / "adacd-hil", *words], stdout=full, stderr=subprocess.PIPE, check=False)
+    assert done.returncode == PARTIAL
+    assert done.stderr == b"adacd-hil: standard output can't be written: No space left on device\n"
+
+
+@pytest.mark.slow
+def test_words_on_a_full_disk_or_to_nobody_cost_a_run_nothing(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text("lasts_s = 0.3\n")
+    command = [BIN / "adacd-hil", "demo", *PAPER, "--scenario", "short.toml", "--out", "run", "--json"]
+    left, right = os.pipe()
+    os.close(left)
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(command, stdout=right, stderr=full, check=False, cwd=tmp_path)
+    os.close(right)
+    assert done.returncode == OK
+    assert read_log(tmp_path / "run").is_complete
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+WRITE_BESIDE = """
+import sys
+from adacd_hil.terminal import open_terminals
+open_terminals()
+file = open(sys.argv[1], "w")
+print("not for that file")
+sys.exit(file.fileno() < 3)
+"""
+
+
+@pytest.mark.slow
+def test_closed_streams_lend_their_numbers_to_no_file(tmp_path: Path) -> None:
+    checked = ["sh", "-c", '"$0" check "$1" <&- >&- 2>&-', BIN / "firmware-sim", tmp_path / "none.toml"]
+    assert subprocess.run(checked, check=False).returncode == USAGE
+    written = ["sh", "-c", '"$0" -c "$1" "$2" >&-', sys.executable, WRITE_BESIDE, tmp_path / "x"]
+    assert subprocess.run(written, check=False).returncode == OK
+    assert (tmp_path / "x").read_text() == ""
+
+
+def test_a_stopped_terminal_ends_with_ctrl_c() -> None:
+    ours, theirs = os.openpty()
+    termios.tcflow(theirs, termios.TCOOFF)
+    command = [sys.executable, "-c", WRITE_AND_EXIT]
+    with subprocess.Popen(command, stdout=theirs, stderr=subprocess.DEVNULL) as process:
+        wait_until_full(theirs, process)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) in (-signal.SIGINT, 1, INTERRUPTED)
+    os.close(theirs)
+    os.close(ours)
