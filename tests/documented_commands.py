@@ -37,7 +37,7 @@ from firmware_sim.scenario_list import check as check_scenario
 Complaints = list[str]
 
 PROGRAMS = {"adacd-hil": host_cli, "firmware-sim": emulator_cli}
-OTHERS = {"apt-get", "candump", "canbusload", "canplayer", "duckdb", "ip", "sleep", "ssh"}
+OTHERS = {"apt-get", "candump", "canbusload", "canplayer", "dask", "duckdb", "ip", "openssl", "sleep", "ssh"}
 """Programs that aren't ours: known to be meant, their arguments are not looked at."""
 PREFIXES = {"chrt": 3, "nice": 3}
 """Programs that run another one, with the words before it."""

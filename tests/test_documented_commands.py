@@ -60,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, documents: dict[str, Docume
         shutil.copy(ROOT / "docs/examples/foreign" / source, folder / name)
     for name, block in named_toml(documents).items():
         (folder / name).write_text(block.text)
-    for name in ("recording.csv", "cyclic.log", "host.toml", "tare.toml"):
+    for name in ("recording.csv", "cyclic.log", "host.toml", "tare.toml", "ca.pem", "me.pem", "me-key.pem"):
         (folder / name).touch()
     with contextlib.chdir(folder):
         export = ["log", "export", "run.mcap", "--format"]

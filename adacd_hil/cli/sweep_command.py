@@ -15,6 +15,8 @@ from adacd_hil.log.run_folder import LOG_NAME
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.plan import Plan
 
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
 
 @click.command(
     epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` says why; 1 the cluster is "
@@ -27,7 +29,15 @@ if TYPE_CHECKING:
 @click.option("--config", default="", metavar="NAME|FILE", help="Configuration; default: each log's own, or certified.")
 @profile_option
 @click.option("--workers", type=click.IntRange(1, 1024), help="Processes on this machine; default: its processors.")
-@click.option("--scheduler", default="", metavar="ADDRESS", help="Dask scheduler to use instead: tcp://host:8786.")
+@click.option(
+    "--scheduler",
+    default="",
+    metavar="ADDRESS",
+    help="Dask scheduler to use instead: tls://host:8786. One at tcp:// runs what anybody sends who reaches it.",
+)
+@click.option("--tls-ca-file", type=_FILE, help="Of tls://: who signs the cluster's certificates; PEM.")
+@click.option("--tls-cert", type=_FILE, help="Of tls://: the certificate to show; PEM.")
+@click.option("--tls-key", type=_FILE, help="Of tls://: its key, where the certificate's file lacks it; PEM.")
 @click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the results.")
 @json_option
 @explained
@@ -40,6 +50,9 @@ def sweep(
     profile: str | None,
     workers: int | None,
     scheduler: str,
+    tls_ca_file: Path | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
     out: Path,
     as_json: bool,
 ) -> ExitCode:
@@ -47,9 +60,10 @@ def sweep(
 
     A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
     """
+    from adacd_hil.analysis.sweep.cluster import TLS, TlsFiles, connect
     from adacd_hil.analysis.sweep.rows import replay_task
     from adacd_hil.analysis.sweep.store import SweepStore
-    from adacd_hil.analysis.sweep.sweep import connect, run_sweep
+    from adacd_hil.analysis.sweep.sweep import run_sweep
     from adacd_hil.cli.progress import Progress
 
     if bool(logs) == bool(scenarios):
@@ -64,8 +78,10 @@ def sweep(
     store = SweepStore(out)
     progress = Progress()
     progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
+    if scheduler and not scheduler.startswith(TLS):
+        progress(f"{scheduler} is open: it runs whatever anybody sends who reaches it (docs/sweep.md)")
     try:
-        with connect(scheduler, workers or os.cpu_count() or 1) as client:
+        with connect(scheduler, workers or os.cpu_count() or 1, TlsFiles(tls_ca_file, tls_cert, tls_key)) as client:
             outcome = run_sweep(plan, work, store, client, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)

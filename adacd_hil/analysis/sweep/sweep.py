@@ -5,16 +5,13 @@ grow with the plan. A worker that dies costs its tasks, which go to another; a t
 that its rows say what it raised. Workers need the package and, of replays, the logs at the same paths.
 """
 
-import contextlib
-import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from adacd_hil.analysis.sweep.plan import Plan, Task
 from adacd_hil.analysis.sweep.rows import Values, failed
 from adacd_hil.analysis.sweep.store import SweepStore
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.extras import install_command
 from adacd_hil.log.errors import LogError
 
 ROWS_PER_TASK = 20
@@ -104,31 +101,3 @@ def _describe(computed: int, wanted: int, failures: int, elapsed_s: float) -> st
     left_s = (wanted - computed) / rate if computed else 0.0
     text = f"{computed} of {wanted} rows, {rate:.1f} rows/s, {left_s:.0f} s left"
     return text + (f", {failures} failed" if failures else "")
-
-
-@contextlib.contextmanager
-def connect(scheduler: str, workers: int) -> Iterator[Any]:
-    """Give a client: of the scheduler at an address, or of processes of this machine. Raises LogError."""
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError:
-        raise LogError(f"sweep needs pyarrow and dask: {install_command('sweep')}") from None
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers shows in the rows
-    with contextlib.ExitStack() as stack:
-        if scheduler:
-            try:
-                client = stack.enter_context(Client(scheduler, timeout=10, set_as_default=False))
-            except (OSError, TimeoutError, ValueError) as error:
-                raise LogError(f"no Dask scheduler at {scheduler}: {error}") from None
-        else:
-            cluster = stack.enter_context(
-                LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.CRITICAL,
-                )
-            )
-            client = stack.enter_context(Client(cluster, set_as_default=False))
-        yield client

@@ -1,0 +1,142 @@
+"""A sweep's connections: by certificates to a cluster, by its own to the processes of this machine; what is refused."""
+
+import subprocess
+import sys
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from made_certificates import Authority
+
+from adacd_hil.analysis.sweep.cluster import NO_FILES, TlsFiles, connect
+from adacd_hil.cli.main import cli
+from adacd_hil.log.errors import LogError
+
+distributed = pytest.importorskip("distributed")
+parquet = pytest.importorskip("pyarrow.parquet")
+
+LIMIT_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    return Authority(tmp_path_factory.mktemp("tls") / "lab")
+
+
+@pytest.fixture(scope="module")
+def cluster(authority: Authority):
+    """A scheduler and a worker at tls://, that trust what the lab has signed."""
+    certificate, key = map(str, authority.sign("cluster"))
+    of_all = {
+        f"tls_{who}_{what}": value
+        for who in ("client", "scheduler", "worker")
+        for what, value in (("cert", certificate), ("key", key))
+    }
+    security = distributed.Security(require_encryption=True, tls_ca_file=str(authority.ca_file), **of_all)
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tls",
+        dashboard_address=None,
+        silence_logs=50,
+        security=security,
+    ) as cluster:
+        yield cluster
+
+
+def sweep(folder: Path, log: Path, *more: object) -> "subprocess.CompletedProcess[str]":
+    """Run the command in a process of its own, so that nothing that Dask might print is missed."""
+    words = ["sweep", log, "--vary", "detector.threshold_Nm=0.1,0.4", "--out", folder / "out", *more]
+    command = [sys.executable, "-c", "from adacd_hil.cli.main import main; main()", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=folder)
+
+
+def files(authority: Authority, who: str, **changes: timedelta) -> list[object]:
+    certificate, key = authority.sign(who, **changes)
+    return ["--tls-ca-file", authority.ca_file, "--tls-cert", certificate, "--tls-key", key]
+
+
+def test_a_small_sweep_over_tls(tmp_path: Path, log: Path, cluster, authority: Authority) -> None:
+    played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(authority, "engineer"))
+    assert (played.returncode, "is open" in played.stderr) == (0, False)
+    rows = parquet.read_table(tmp_path / "out/sweep.parquet").to_pylist()
+    assert [(row["set.detector.threshold_Nm"], row["status"]) for row in rows] == [("0.1", "ok"), ("0.4", "ok")]
+
+
+def test_certificates_can_stand_in_dasks_configuration(
+    tmp_path: Path, log: Path, cluster, authority: Authority, monkeypatch
+) -> None:
+    certificate, key = authority.sign("configured")
+    tls = f"{{ca-file: {authority.ca_file}, client: {{cert: {certificate}, key: {key}}}}}"
+    (tmp_path / "dask.yaml").write_text(f"distributed: {{comm: {{tls: {tls}}}}}\n")
+    monkeypatch.setenv("DASK_CONFIG", str(tmp_path / "dask.yaml"))
+    assert sweep(tmp_path, log, "--scheduler", cluster.scheduler_address).returncode == 0
+
+
+def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(
+    tmp_path: Path, log: Path, cluster, authority: Authority
+) -> None:
+    stranger = Authority(tmp_path / "stranger")
+    mixed = files(stranger, "mixed")
+    mixed[1] = authority.ca_file  # trusts the cluster, but is not trusted
+    for words in (files(stranger, "stranger"), mixed, files(authority, "late", lasts=-timedelta(days=1))):
+        refused = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *words)
+        complaints = [line for line in refused.stderr.splitlines() if not line.startswith("2 rows")]
+        assert (refused.returncode, len(complaints)) == (1, 1), refused.stderr
+        assert complaints[0].startswith(f"adacd-hil: no Dask scheduler at {cluster.scheduler_address}: ")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"--tls-ca-file": None}, "needs --tls-ca-file"),
+        ({"--tls-cert": None, "--tls-key": None}, "needs --tls-cert"),
+        ({"--tls-cert": None}, "--tls-key needs --tls-cert"),
+        ({"--tls-ca-file": "missing.pem"}, "No such file"),
+        ({"--tls-ca-file": "text.pem"}, "CA file text.pem"),
+        ({"--tls-cert": "text.pem"}, "certificate text.pem"),
+        ({"--tls-key": "other.pem"}, "KEY_VALUES_MISMATCH"),
+        ({"--scheduler": "tcp://127.0.0.1:1"}, "are for tls:// addresses, not tcp://127.0.0.1:1"),
+    ],
+)
+def test_certificates_that_cant_be_used_are_one_line_and_status_2(
+    tmp_path: Path, log: Path, authority: Authority, monkeypatch, changes: dict[str, str | None], reason: str
+) -> None:
+    (tmp_path / "text.pem").write_text("no certificate\n")
+    (tmp_path / "other.pem").write_bytes(authority.sign("other")[1].read_bytes())
+    given = files(authority, "user")
+    words: dict[object, object] = {
+        "--scheduler": "tls://127.0.0.1:1",
+        **dict(zip(given[::2], given[1::2], strict=True)),
+    }
+    words |= changes
+    more = [str(word) for pair in words.items() if pair[1] is not None for word in pair]
+    monkeypatch.chdir(tmp_path)
+    refused = CliRunner().invoke(cli, ["sweep", str(log), "--out", str(tmp_path / "out"), *more])
+    complaints = [line for line in refused.stderr.splitlines() if not line.startswith("1 rows")]
+    assert (refused.exit_code, len(complaints)) == (2, 1), refused.stderr
+    assert reason in complaints[0]
+
+
+def test_the_scheduler_of_a_sweep_on_this_machine_takes_nothing_from_others(tmp_path: Path) -> None:
+    stranger = Authority(tmp_path / "stranger")
+    certificate, key = stranger.sign("other-user")
+    with connect("", 1) as client:
+        address = client.scheduler_info()["address"]
+        assert address.startswith("tls://127.0.0.1:")
+        assert client.submit(sum, [1, 2]).result() == 3
+        for other in (address, address.replace("tls://", "tcp://")):
+            tls = TlsFiles(stranger.ca_file, certificate, key) if other == address else NO_FILES
+            with pytest.raises(LogError, match="no Dask scheduler"), connect(other, 1, tls):
+                pass
+
+
+def test_an_open_scheduler_is_called_open(tmp_path: Path, log: Path, monkeypatch) -> None:
+    monkeypatch.setattr("adacd_hil.analysis.sweep.cluster._TIMEOUT_S", 0.1)
+    words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
+    refused = CliRunner().invoke(cli, words)
+    assert refused.exit_code == 1
+    assert "tcp://127.0.0.1:1 is open: it runs whatever anybody sends who reaches it" in refused.stderr
+    assert refused.stderr.splitlines()[-1].startswith("adacd-hil: no Dask scheduler at tcp://127.0.0.1:1: ")
