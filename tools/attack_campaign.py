@@ -1,0 +1,113 @@
+"""Attacks a running arm in every way of tools/attacks.py and says what was noticed, and how the arm came to rest.
+
+    python tools/attack_campaign.py -j 2                  virtual time: the table on stdout
+    python tools/attack_campaign.py command sync          attacks whose names have one of these words
+    python tools/attack_campaign.py --vcan --out runs/attacks     real processes on a real vcan, by tools/with-vcan
+    python tools/attack_campaign.py --json
+
+In virtual time host and devices run by the clock at 1 kHz, and the figures are exact (tools/attacked_run.py). With
+`--vcan` emulator, host and attacker are processes on one interface, at `--period-us`, and a second host, the commands
+that look at an arm, and a host that is killed come on top; figures are then of the host's rules and of this machine.
+
+Columns: ms from the first forged frame to the first line of the log that says that something is wrong; from there to
+rest; degrees that the joint that went furthest went until then; deg/s at most. A row is bad when nothing was noticed,
+when the line names something else, or when the arm was not at rest 100 ms after it was noticed.
+
+Exit status: 0 no bad row, 1 a bad one, 2 wrong usage, 5 no vcan can be had.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+
+from attacked_run import Finding, play_attack  # noqa: E402
+from attacks import ATTACKS, find_attack  # noqa: E402
+
+from adacd_hil.cli.table import format_table  # noqa: E402
+
+NOTHING = "nothing"
+"""The run without an attacker, for comparison."""
+HEAD = ("attack", "forged", "noticed ms", "rest after ms", "deg", "deg/s", "verdict", "end", "first line")
+
+
+def virtual_names(words: Sequence[str]) -> list[str]:
+    """Return the attacks that virtual time can play, and whose names have one of the words."""
+    names = [NOTHING, *(case.name for case in ATTACKS if case.only != "vcan")]
+    return [name for name in names if not words or any(word in name for word in words)]
+
+
+def _run(job: tuple[str, Path | None]) -> Finding:
+    name, keep = job
+    case = None if name == NOTHING else find_attack(name)
+    with tempfile.TemporaryDirectory() as folder:
+        return play_attack(case, Path(folder) if keep is None else keep / name)[0]
+
+
+def play_virtual(names: Sequence[str], jobs: int, keep: Path | None) -> Iterator[Finding]:
+    """Play attacks in virtual time, in order."""
+    work = [(name, keep) for name in names]
+    if jobs == 1:
+        yield from map(_run, work)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(_run, work)
+
+
+def as_table(findings: Sequence[Finding]) -> str:
+    """Lay out what came of each attack."""
+    rows = [
+        [
+            found.name, str(found.forged), _ms(found.noticed_ms), _ms(found.rest_after_notice_ms),
+            f"{found.travelled_deg:.1f}", f"{found.fastest_deg_s:.0f}", found.verdict, found.end[:40],
+            found.noticed_by[:70],
+        ]
+        for found in findings
+    ]  # fmt: skip
+    return format_table(list(HEAD), rows, right=range(1, 6))
+
+
+def _ms(value: float | None) -> str:
+    return "never" if value is None else f"{value:.0f}"
+
+
+def is_bad(found: Finding) -> bool:
+    """Whether a row is not as it must be."""
+    return not found.verdict.startswith("ok")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status."""
+    parser = argparse.ArgumentParser(prog="attack_campaign", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("words", nargs="*", help="play only attacks whose names have one of these words")
+    parser.add_argument("-j", "--jobs", type=int, default=2, help="processes, in virtual time; default %(default)s")
+    parser.add_argument("--keep", type=Path, help="folder that keeps the logs")
+    parser.add_argument("--json", action="store_true", help="print all findings")
+    chosen = parser.parse_args(argv)
+    names = virtual_names(chosen.words)
+    if not names or chosen.jobs < 1:
+        parser.error("no attack has such a name" if not names else f"--jobs {chosen.jobs} is below 1")
+    findings = []
+    for found in play_virtual(names, chosen.jobs, chosen.keep):
+        findings.append(found)
+        print(f"{len(findings)} of {len(names)}: {found.name}: {found.verdict}", file=sys.stderr)
+    if chosen.json:
+        print(json.dumps([asdict(found) for found in findings], indent=1))
+    else:
+        print(as_table(findings))
+        verdicts = Counter(found.verdict for found in findings)
+        print("\n".join(f"{count} {verdict}" for verdict, count in verdicts.most_common()))
+    return 1 if any(map(is_bad, findings)) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
