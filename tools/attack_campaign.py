@@ -2,8 +2,8 @@
 
     python tools/attack_campaign.py -j 2                  virtual time: the table on stdout
     python tools/attack_campaign.py command sync          attacks whose names have one of these words
-    python tools/attack_campaign.py --vcan --out runs/attacks     real processes on a real vcan, by tools/with-vcan
     python tools/attack_campaign.py --json
+    tools/with-vcan -- .venv/bin/python tools/attack_campaign.py --vcan --keep runs/attacks     processes on a vcan
 
 In virtual time host and devices run by the clock at 1 kHz, and the figures are exact (tools/attacked_run.py). With
 `--vcan` emulator, host and attacker are processes on one interface, at `--period-us`, and a second host, the commands
@@ -30,6 +30,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
+import attack_vcan  # noqa: E402
 from attacked_run import Finding, play_attack  # noqa: E402
 from attacks import ATTACKS, find_attack  # noqa: E402
 
@@ -37,13 +38,13 @@ from adacd_hil.cli.table import format_table  # noqa: E402
 
 NOTHING = "nothing"
 """The run without an attacker, for comparison."""
+BUS_MISSING = 5
 HEAD = ("attack", "forged", "noticed ms", "rest after ms", "deg", "deg/s", "verdict", "end", "first line")
 
 
-def virtual_names(words: Sequence[str]) -> list[str]:
-    """Return the attacks that virtual time can play, and whose names have one of the words."""
-    names = [NOTHING, *(case.name for case in ATTACKS if case.only != "vcan")]
-    return [name for name in names if not words or any(word in name for word in words)]
+def virtual_names() -> list[str]:
+    """Return the attacks that virtual time can play."""
+    return [NOTHING, *(case.name for case in ATTACKS if case.only != "vcan")]
 
 
 def _run(job: tuple[str, Path | None]) -> Finding:
@@ -61,6 +62,13 @@ def play_virtual(names: Sequence[str], jobs: int, keep: Path | None) -> Iterator
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         yield from pool.map(_run, work)
+
+
+def play_vcan(names: Sequence[str], channel: str, period_us: int, keep: Path | None) -> Iterator[Finding]:
+    """Play attacks on an interface, one after the other."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            yield attack_vcan.play_on_vcan(name, channel, period_us, Path(folder) if keep is None else keep)
 
 
 def as_table(findings: Sequence[Finding]) -> str:
@@ -91,13 +99,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("words", nargs="*", help="play only attacks whose names have one of these words")
     parser.add_argument("-j", "--jobs", type=int, default=2, help="processes, in virtual time; default %(default)s")
     parser.add_argument("--keep", type=Path, help="folder that keeps the logs")
+    parser.add_argument("--vcan", metavar="NAME", nargs="?", const="vcan0", help="on this interface; default vcan0")
+    parser.add_argument("--period-us", type=int, default=2000, help="cycle with --vcan; default %(default)s")
     parser.add_argument("--json", action="store_true", help="print all findings")
     chosen = parser.parse_args(argv)
-    names = virtual_names(chosen.words)
+    everything = attack_vcan.names() if chosen.vcan else virtual_names()
+    names = [name for name in everything if not chosen.words or any(word in name for word in chosen.words)]
     if not names or chosen.jobs < 1:
         parser.error("no attack has such a name" if not names else f"--jobs {chosen.jobs} is below 1")
+    if chosen.vcan and not Path("/sys/class/net", chosen.vcan).exists():
+        print(f"attack_campaign: there is no interface {chosen.vcan}; run it by tools/with-vcan", file=sys.stderr)
+        return BUS_MISSING
     findings = []
-    for found in play_virtual(names, chosen.jobs, chosen.keep):
+    played = (
+        play_vcan(names, chosen.vcan, chosen.period_us, chosen.keep)
+        if chosen.vcan
+        else play_virtual(names, chosen.jobs, chosen.keep)
+    )
+    for found in played:
         findings.append(found)
         print(f"{len(findings)} of {len(names)}: {found.name}: {found.verdict}", file=sys.stderr)
     if chosen.json:

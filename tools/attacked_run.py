@@ -9,7 +9,7 @@ import dataclasses
 import heapq
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from adacd_hil.cli.connection import contract_of
 from adacd_hil.config import OperatorSettings, RequestSettings, Settings, load_settings, parse
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
-from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
 from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench import Bench
@@ -34,6 +34,7 @@ AFTER_S = 1.5
 REST_RAD_S = 0.02
 REST_HOLD_S = 0.1
 """At rest is an arm that is this slow for so long."""
+STOPS = (SchemeState.FAULT, SchemeState.REACT)
 REST_BOUND_S = 0.1
 """At rest so soon after it was noticed: what the issue asks."""
 
@@ -259,11 +260,14 @@ def judge(case: AttackCase | None, wire: Wire, bench: Bench, log: RunLog, summar
     begin_ns = wire.begin_ns or 0
     times_ns = np.array([t_ns for t_ns, _ in wire.looks], np.int64)
     blocks = np.array([block for _, block in wire.looks])
-    noticed_ns, line = first_notice(log, begin_ns, () if case is None else expected_lines(case))
+    noticed_ns, line = first_notice(log.events, begin_ns, () if case is None else expected_lines(case))
+    stops_ns = log.scheme.t_ns[np.isin(log.scheme["state"], STOPS)]
     result = summary.result
     end = summary.error or ("" if result is None else f"{result.state.name} {result.fault.name}")
     states = ", ".join(drive.state.value for drive in bench.drives)
-    return finding(case, wire.forged, begin_ns, noticed_ns, line, times_ns, blocks, log, f"{end}; drives: {states}")
+    return finding(
+        case, wire.forged, begin_ns, noticed_ns, line, times_ns, blocks, stops_ns, f"{end}; drives: {states}"
+    )
 
 
 def expected_lines(case: AttackCase) -> tuple[str, ...]:
@@ -271,11 +275,11 @@ def expected_lines(case: AttackCase) -> tuple[str, ...]:
     return ("0x2310", "-> FAULT: DRIVE") if case.name == "enable-after-fault" else ()
 
 
-def first_notice(log: RunLog, begin_ns: int, ignored: tuple[str, ...]) -> tuple[int | None, str]:
+def first_notice(events: Sequence[LoggedEvent], begin_ns: int, ignored: tuple[str, ...]) -> tuple[int | None, str]:
     """Return when the log first says that something is wrong, and how; with a line that names more, if one is near."""
     found = [
         (entry.t_ns, f"{entry.event.name}: {entry.event.message}")
-        for entry in log.events
+        for entry in events
         if entry.t_ns >= begin_ns
         and (entry.event.level in ("warning", "error") or "-> REACT" in entry.event.message)
         and not any(text in entry.event.message for text in ignored)
@@ -294,18 +298,20 @@ def finding(
     line: str,
     times_ns: NDArray[np.int64],
     blocks: NDArray[np.float64],
-    log: RunLog,
+    stops_ns: NDArray[np.int64],
     end: str,
 ) -> Finding:
-    """Put together what came of an attack. times_ns (n,), blocks (n, TRUTH_LAYOUT.size): the arm's truth over time."""
+    """Put together what came of an attack.
+
+    times_ns (n,), blocks (n, TRUTH_LAYOUT.size): the arm's truth over time. stops_ns: when the host stopped the arm.
+    """
     q = np.degrees(blocks[:, TRUTH_LAYOUT.slices["q"]])
     dq = np.degrees(blocks[:, TRUTH_LAYOUT.slices["dq"]])
     since = times_ns >= begin_ns
     rest_ns = rest_from(times_ns, np.abs(dq).max(axis=1), noticed_ns if noticed_ns is not None else begin_ns)
     until = since & (times_ns <= rest_ns) if rest_ns is not None else since
     path = np.abs(np.diff(q[until], axis=0)).sum(axis=0).max(initial=0.0)
-    stops = log.scheme.t_ns[np.isin(log.scheme["state"], (SchemeState.FAULT, SchemeState.REACT))]
-    stops = stops[stops >= begin_ns]
+    stops = stops_ns[stops_ns >= begin_ns]
     after = None if rest_ns is None or noticed_ns is None else (rest_ns - noticed_ns) / MS
     is_named = bool(case is not None and line and re.search(case.named_by, line, re.IGNORECASE))
     found = Finding(

@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from crccheck.crc import Crc8Autosar
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import attack_campaign
+import attack_vcan
 import attacked_run
 import attacks
 from attacked_run import Finding
@@ -117,8 +117,9 @@ def test_a_silent_sensor_is_played_on() -> None:
 def test_every_attack_has_a_name_of_its_own_and_sends_something() -> None:
     names = [case.name for case in ATTACKS]
     assert len(names) == len(set(names))
-    heard = [(0x080, b"\1"), (0x181, bytes(8)), (0x182, bytes(8)), (0x183, TORQUE), (0x184, TORQUE), (0x281, bytes(7)),
-             (0x201, COMMAND), (0x202, COMMAND), (0x201, COMMAND[:2] + b"\2\0\0\0"), (0x080, b"\2"), (0x080, b"\3")]  # fmt: skip
+    cyclic = [(can_id, bytes(8)) for can_id in (0x181, 0x182)] + [(0x183, TORQUE), (0x184, TORQUE), (0x281, bytes(7))]
+    commands = [(0x201, COMMAND), (0x202, COMMAND), (0x201, COMMAND[:2] + b"\2\0\0\0")]
+    heard = [(0x080, b"\1"), *cyclic, *commands, (0x080, b"\2"), (0x080, b"\3")]
     for case in ATTACKS:
         attack = case.make(FORGER)
         sent = [forged for can_id, data in heard for forged in attack.hears(can_id, data, 0)]
@@ -179,10 +180,9 @@ def test_the_first_notice_is_a_warning_or_a_reaction_since_the_attack() -> None:
         LoggedEvent(60 * MS, Event("info", "supervisor", "MONITOR -> REACT")),
         LoggedEvent(62 * MS, Event("error", "bus", "somebody else sends SYNC")),
     ]
-    log: Any = SimpleNamespace(events=events)
     line = "supervisor: MONITOR -> REACT | bus: somebody else sends SYNC"
-    assert attacked_run.first_notice(log, 10 * MS, ()) == (60 * MS, line)
-    assert attacked_run.first_notice(log, 10 * MS, ("REACT", "SYNC")) == (None, "")
+    assert attacked_run.first_notice(events, 10 * MS, ()) == (60 * MS, line)
+    assert attacked_run.first_notice(events, 10 * MS, ("REACT", "SYNC")) == (None, "")
 
 
 def test_travel_counts_from_the_attack_to_rest() -> None:
@@ -191,20 +191,13 @@ def test_travel_counts_from_the_attack_to_rest() -> None:
     angle_deg = np.concatenate((np.zeros(100), np.linspace(0.0, 10.0, 100), np.full(800, 10.0)))
     blocks[:, TRUTH_LAYOUT.slices["q"]] = np.radians(angle_deg)[:, None]
     blocks[100:200, TRUTH_LAYOUT.slices["dq"]] = np.radians(100.0)
-    series = SimpleNamespace(t_ns=times_ns)
-    rows = {"state": np.where(np.arange(1000) < 120, 4, 8)}
-    log: Any = SimpleNamespace(scheme=_Series(series.t_ns, rows))
     case = find_attack("command-both")
-    found = attacked_run.finding(case, 7, 110 * MS, 120 * MS, "somebody else", times_ns, blocks, log, "FAULT")
+    found = attacked_run.finding(
+        case, 7, 110 * MS, 120 * MS, "somebody else", times_ns, blocks, times_ns[120:], "FAULT"
+    )
     assert (found.noticed_ms, found.stopped_ms, found.rest_after_notice_ms) == (10.0, 10.0, 80.0)
     assert found.travelled_deg == pytest.approx(9.0, abs=0.15)
     assert (found.fastest_deg_s, found.furthest_deg, found.verdict) == (100.0, 10.0, "ok")
-
-
-class _Series(dict[str, Any]):
-    def __init__(self, t_ns: Any, rows: dict[str, Any]) -> None:
-        super().__init__(rows)
-        self.t_ns = t_ns
 
 
 def test_the_table_and_the_status_tell_bad_rows() -> None:
@@ -216,12 +209,32 @@ def test_the_table_and_the_status_tell_bad_rows() -> None:
     assert "UNNOTICED" in table
 
 
-def test_words_choose_attacks() -> None:
-    names = attack_campaign.virtual_names(["sync"])
-    assert {"sync-doubled", "sdo-sync-tolerance"} <= set(names)
-    assert "command-both" not in names
-    assert "remote" not in attack_campaign.virtual_names([])
-    assert attack_campaign.NOTHING in attack_campaign.virtual_names([])
+def test_virtual_time_plays_what_it_can_and_a_vcan_everything() -> None:
+    virtual, everything = set(attack_campaign.virtual_names()), set(attack_vcan.names())
+    assert {attack_campaign.NOTHING, "sync-doubled", "command-both"} <= virtual
+    assert virtual < everything
+    assert {"remote", "second-run", attack_vcan.KILLED} <= everything - virtual
+
+
+def test_an_interface_that_is_not_there_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert attack_campaign.main(["--vcan", "nocan7", "command-both"]) == 5
+    assert "no interface nocan7" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "said", "stopped_ms", "expected"),
+    [
+        ("second-run", 5, "another host drives this arm", None, "ok"),
+        ("second-run", 0, "", None, "NOT REFUSED"),
+        ("second-run", 5, "no boot-up", None, "NOT NAMED"),
+        ("second-doctor", 1, "another master is present", 3.0, "RUN DISTURBED"),
+        ("second-scan", 0, "nodes: 4", None, "ok"),
+    ],
+)
+def test_a_second_user_is_refused_by_name_and_disturbs_nobody(
+    name: str, status: int, said: str, stopped_ms: float | None, expected: str
+) -> None:
+    assert attack_vcan.second_verdict(name, status, said, finding(stopped_ms=stopped_ms)) == expected
 
 
 @pytest.mark.slow
