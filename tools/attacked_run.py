@@ -27,8 +27,8 @@ from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench import Bench
 from firmware_sim.scenario import Scenario
 
-ATTACK_S = 3.0
-"""When an attack begins, since the drives were enabled: detection has been armed for 0.7 s."""
+ATTACK_S = 4.45
+"""When an attack begins, since the drives were enabled: both joints move, joint 1 at its fastest, 95 deg/s."""
 AFTER_S = 1.5
 """How long the arm is watched after the host has gone; the attack goes on until its own end."""
 REST_RAD_S = 0.02
@@ -87,6 +87,8 @@ class Wire(Bus):
         self._held: list[tuple[int, int, Forged]] = []
         self._order = 0
         self.forged = 0
+        self.first_ns: int | None = None
+        """When the first frame was forged."""
         self.looks: list[tuple[int, NDArray[np.float64]]] = []
         self._is_open = True
         clock.world = self._live
@@ -146,6 +148,8 @@ class Wire(Bus):
             heapq.heappush(self._held, (self._clock.now_ns() + forged.after_ns, self._order, forged))
             return
         self.forged += 1
+        if self.first_ns is None:
+            self.first_ns = self._clock.now_ns()
         self._to_host(forged.can_id, forged.data)
         self._to_devices(forged.can_id, forged.data)
 
@@ -258,6 +262,8 @@ def play_attack(case: AttackCase | None, folder: Path) -> tuple[Finding, RunLog]
 def judge(case: AttackCase | None, wire: Wire, bench: Bench, log: RunLog, summary: SessionSummary) -> Finding:
     """Say what came of an attack in virtual time."""
     begin_ns = wire.begin_ns or 0
+    if case is not None and not case.faults and wire.first_ns is not None:
+        begin_ns = wire.first_ns  # where a fault is part of the attack, it is what begins
     times_ns = np.array([t_ns for t_ns, _ in wire.looks], np.int64)
     blocks = np.array([block for _, block in wire.looks])
     noticed_ns, line = first_notice(log.events, begin_ns, () if case is None else expected_lines(case))
@@ -352,10 +358,10 @@ def verdict(case: AttackCase | None, found: Finding) -> str:
     """Say in a word whether it is as it must be: ok, UNNOTICED, NOT NAMED, NOT AT REST."""
     if case is None:
         return "ok" if found.noticed_ms is None else "FALSE ALARM"
-    if found.noticed_ms is None:
+    if found.noticed_ms is None or found.noticed_ms > case.lasts_s * 1e3:
         return "ok, no effect" if case.is_harmless and found.stopped_ms is None else "UNNOTICED"
     late = found.rest_after_notice_ms is None or found.rest_after_notice_ms > REST_BOUND_S * 1e3
-    is_stopped = case.must_stop or found.stopped_ms is not None
+    is_stopped = (case.must_stop or found.stopped_ms is not None) and not case.may_coast
     problems = [
         word for word, holds in (("NOT AT REST", late and is_stopped), ("NOT NAMED", not found.is_named)) if holds
     ]

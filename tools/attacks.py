@@ -334,7 +334,7 @@ class AttackCase:
 
     must_stop: the arm has to come to rest. named_by: a pattern of which the log's line must have something. faults: of
     the scenario, their times from the beginning of the attack. is_harmless: it may pass unnoticed if it changes
-    nothing. only: "vcan" where virtual time can't play it, or "".
+    nothing. may_coast: it takes the power off a drive, and then nobody can brake. only: "vcan" where virtual time can't play it, or "".
     """
 
     name: str
@@ -344,6 +344,7 @@ class AttackCase:
     named_by: str = "somebody else|another host|another master|foreign|forged"
     faults: tuple[dict[str, Any], ...] = ()
     is_harmless: bool = False
+    may_coast: bool = False
     only: str = ""
     lasts_s: float = field(default=1.5)
 
@@ -365,6 +366,7 @@ def _writes() -> Iterator[AttackCase]:
             f"sdo-{name}",
             f"0x{index:04X}:{sub} = {value} is written to both drives",
             lambda forger, args=(index, sub, value, size): Written(forger, *args, _BOTH),
+            may_coast=index == 0x6040,
         )
     yield AttackCase(
         "sdo-sensor-zero", "0x6125:1, autozero, is written to both sensors",
@@ -379,6 +381,7 @@ def _nmt() -> Iterator[AttackCase]:
                 f"nmt-{name}-{whom}",
                 f"one NMT {name} to {'all nodes' if node == 0 else f'node {node}'}",
                 lambda forger, frame=(NMT, bytes([command, node])): Repeated(forger, (frame,), MS, 1),
+                may_coast=command == 0x81 and whom != "sensor",
             )
     yield AttackCase("nmt-start", "NMT start to all, every 100 ms", lambda f: Repeated(f, ((NMT, b"\1\0"),), 100 * MS))
 
@@ -498,7 +501,7 @@ ATTACKS: tuple[AttackCase, ...] = (
         KeptAlive,
         False,
         _DATA,
-        faults=({"kind": "silence", "node": "sensor1", "at_s": 0.0},),
+        faults=({"kind": "silence", "node": "sensor1", "at_s": 0.2},),
     ),
     AttackCase(
         "emcy",

@@ -3,17 +3,20 @@
     python tools/damage_campaign.py                      1000 damaged logs, 20 killed runs
     python tools/damage_campaign.py --logs 1000 --kills 0
     python tools/damage_campaign.py --kills 200 --logs 0 --seed 7 --json
+    python tools/damage_campaign.py --kills 0 --logs 0 --vcan-kills 200     host, logger, emulated arm, or two of them
 
 A log of random numbers is cut, has bits flipped or stretches zeroed, at places that the seed chooses: check must find
 it, and recover must save every intact chunk and no message that the log never had. A run of the experiment in real time
 loses its writer, its control process or both by SIGKILL at moments that the seed chooses: recover must save all but the
-last 0.3 s, cycle for cycle.
+last 0.3 s, cycle for cycle. With `--vcan-kills` host, logger and emulated arm are processes on a vcan, by tools/with-vcan
+where there is none, and whoever is left must come to the end that is documented, the arm to rest (tools/vcan_kills.py).
 
 Exit status: 0 all as it must be, 1 something isn't, 2 wrong usage.
 """
 
 import argparse
 import json
+import subprocess
 import sys
 import tempfile
 from collections import Counter
@@ -24,10 +27,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-sys.path[:0] = [str(Path(__file__).resolve().parent.parent), str(Path(__file__).resolve().parent)]
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 from damage_trials import DamageResult, Undamaged, make_undamaged, run_trial  # noqa: E402
 from kill_trials import LOSS_BOUND_S, KillResult, kill_trial  # noqa: E402
+from side_by_side import CHANNEL  # noqa: E402
+from vcan_kills import VcanKill, kill_on_vcan  # noqa: E402
 
 REPORT_EVERY = 100
 
@@ -69,7 +75,19 @@ def _tell_violations(seed: int, violations: Sequence[str]) -> None:
         print(f"seed {seed}: {violation}", file=sys.stderr)
 
 
-def summary(logs: Sequence[DamageResult], kills: Sequence[KillResult]) -> dict[str, Any]:
+def killed_on_vcan(count: int, seed: int) -> list[VcanKill]:
+    """Kill somebody in `count` runs on a vcan."""
+    results = []
+    for index in range(count):
+        result = kill_on_vcan(seed + index)
+        results.append(result)
+        _tell_violations(result.seed, result.violations)
+        line = f"{result.victim} killed, {result.cycles} cycles saved, host's status {result.status}"
+        print(f"{index + 1} of {count} on vcan: {line}", file=sys.stderr)
+    return results
+
+
+def summary(logs: Sequence[DamageResult], kills: Sequence[KillResult], vcan: Sequence[VcanKill]) -> dict[str, Any]:
     """Sum up."""
     statuses = Counter(str(result.exit_status) for result in logs)
     return {
@@ -81,7 +99,9 @@ def summary(logs: Sequence[DamageResult], kills: Sequence[KillResult]) -> dict[s
         "by_victim": dict(Counter(result.victim for result in kills)),
         "most_lost_s": max((result.lost_s for result in kills), default=0.0),
         "bound_s": LOSS_BOUND_S,
-        "violations": sum(bool(result.violations) for result in (*logs, *kills)),
+        "killed_on_vcan": len(vcan),
+        "by_victim_on_vcan": dict(Counter(result.victim for result in vcan)),
+        "violations": sum(bool(result.violations) for result in (*logs, *kills, *vcan)),
     }
 
 
@@ -90,18 +110,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--logs", type=int, default=1000, help="logs to damage")
     parser.add_argument("--kills", type=int, default=20, help="runs to kill, one at a time")
+    parser.add_argument("--vcan-kills", type=int, default=0, help="the same with processes on a vcan")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("-j", "--jobs", type=int, default=2, help="processes that damage logs")
     parser.add_argument("--json", action="store_true", help="print every trial")
     arguments = parser.parse_args()
-    if min(arguments.logs, arguments.kills, arguments.seed) < 0 or arguments.jobs < 1:
+    if min(arguments.logs, arguments.kills, arguments.vcan_kills, arguments.seed) < 0 or arguments.jobs < 1:
         parser.error("counts and seed are 0 or more, jobs 1 or more")
+    if arguments.vcan_kills and not Path("/sys/class/net", CHANNEL).exists():
+        launcher = [ROOT / "tools" / "with-vcan", "--can", CHANNEL, "--", sys.executable, __file__, *sys.argv[1:]]
+        return subprocess.run(launcher, check=False).returncode
     with tempfile.TemporaryDirectory() as name:
         logs = damaged_logs(arguments.logs, arguments.seed, arguments.jobs, Path(name))
         kills = killed_runs(arguments.kills, arguments.seed, Path(name))
-    totals = summary(logs, kills)
+    vcan = killed_on_vcan(arguments.vcan_kills, arguments.seed)
+    totals = summary(logs, kills, vcan)
     if arguments.json:
-        trials = {"logs": [asdict(result) for result in logs], "kills": [asdict(result) for result in kills]}
+        found = (("logs", logs), ("kills", kills), ("vcan", vcan))
+        trials = {name: [asdict(result) for result in results] for name, results in found}
         print(json.dumps({**totals, **trials}, indent=1))
     else:
         print("\n".join(f"{key}: {value}" for key, value in totals.items()))

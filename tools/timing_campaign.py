@@ -4,6 +4,8 @@
     python tools/timing_campaign.py rates --minutes 2        2 kHz: classic frames, and CAN FD
     python tools/timing_campaign.py hour --minutes 60        contacts, memory, every part of the log
     python tools/timing_campaign.py disk --seconds 20        slow disk, full disk, logger killed, logger stopped
+    python tools/timing_campaign.py hogs --minutes 10        beside processes that take processor and disk
+    python tools/timing_campaign.py clock --seconds 10       the wall clock is set forward and back
 
 All run through tools/with-vcan: emulator and host are two processes on one vcan interface. `--settings` adds TOML to
 the configuration of the host, such as its [log] and [realtime] sections. docs/timing.md says how to read the results.
@@ -35,7 +37,9 @@ from side_by_side import (
     summarise,
     yardstick_run,
 )
-from timing_disk import DISK_CASES, run_disk, show_disk
+from timing_clock import run_clock, show_clock
+from timing_disk import DISK_CASES, STOPPED_S, run_disk, show_disk
+from timing_hogs import run_hogs, show_hogs
 from timing_hour import CONTACT_S, finish_hour, run_hour, show_hour
 
 from adacd_hil.wire.codec import contract_folder
@@ -103,6 +107,8 @@ COMMANDS: dict[str, tuple[Measurement, Callable[[dict[str, Any]], str]]] = {
     "rates": (run_rates, show_sides),
     "hour": (run_hour, show_hour),
     "disk": (run_disk, show_disk),
+    "hogs": (run_hogs, show_hogs),
+    "clock": (run_clock, show_clock),
 }
 
 
@@ -110,15 +116,23 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     """Read the command line; exits with 2 on a usage error."""
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Long measurements of the cycle over vcan.")
     commands = parser.add_subparsers(dest="command", required=True)
-    for name, minutes in (("cycle", 10.0), ("rates", 2.0), ("hour", 60.0)):
+    for name, minutes in (("cycle", 10.0), ("rates", 2.0), ("hour", 60.0), ("hogs", 10.0)):
         command = commands.add_parser(name)
         command.add_argument("--minutes", type=float, default=minutes, help="of each side; default %(default)s")
     period = "SYNC period in µs; default %(default)s"
-    hour = commands.choices["hour"]
-    hour.add_argument("--period-us", type=int, default=1000, help=period)
-    hour.add_argument("--every", type=float, default=3.0, help="seconds from contact to contact; default %(default)s")
+    for name in ("hour", "hogs"):
+        commands.choices[name].add_argument("--period-us", type=int, default=1000, help=period)
+        every = "seconds from contact to contact; default %(default)s"
+        commands.choices[name].add_argument("--every", type=float, default=3.0, help=every)
+    hogs = commands.choices["hogs"]
+    hogs.add_argument("--processors", type=int, default=2, help="processes that burn time; default %(default)s")
+    hogs.add_argument("--disks", type=int, default=1, help="processes that write and sync; default %(default)s")
+    hogs.add_argument("--base", default="certified", help="configuration; default %(default)s")
     disk = commands.add_parser("disk")
     disk.add_argument("--seconds", type=float, default=20.0, help="before and during each case; default %(default)s")
+    disk.add_argument("--stopped", type=float, default=STOPPED_S, help="seconds of SIGSTOP; default %(default)s")
+    clock = commands.add_parser("clock")
+    clock.add_argument("--seconds", type=float, default=10.0, help="before and after each step; default %(default)s")
     disk.add_argument("--case", action="append", choices=DISK_CASES, help="only this one; may be repeated")
     for command in commands.choices.values():
         command.add_argument("--out", type=Path, metavar="FOLDER", help="default runs/timing-COMMAND")
@@ -129,7 +143,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
         command.add_argument("--inside", action="store_true", help=f"on an interface {CHANNEL} that is up")
         command.add_argument("--mem", default="2G", help="of the guest, where there is one; default %(default)s")
     chosen = parser.parse_args(argv)
-    if chosen.command == "hour" and not chosen.every > CONTACT_S:
+    if chosen.command in ("hour", "hogs") and not chosen.every > CONTACT_S:
         parser.error(f"--every = {chosen.every:g} s must be above the {CONTACT_S:g} s that a contact takes")
     if chosen.out is None:
         chosen.out = Path("runs") / f"timing-{chosen.command}"

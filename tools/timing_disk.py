@@ -37,7 +37,7 @@ SYNC_ID, FEEDBACK_ID, LAST_COMMAND_ID, STATUS_ID = 0x080, 0x181, 0x202, 0x281
 POSITION_RAD = 2.0 * np.pi / 2**20
 DISK_CASES = ("undisturbed", "slow", "full", "killed", "stopped")
 SLOW_BYTES_S = 64 * 1024
-STOPPED_S = 5.0
+STOPPED_S = 10.0
 TMPFS_BYTES = 256 * 1024 * 1024
 HOST_WITH_PIPE = """
 import os, sys
@@ -157,7 +157,7 @@ def run_disk_case(case: str, chosen: argparse.Namespace, folder: Path) -> dict[s
         time.sleep(chosen.seconds)
         marks_ns.append(time.time_ns())
         begin()
-        time.sleep(STOPPED_S if case == "stopped" else chosen.seconds)
+        time.sleep(chosen.stopped if case == "stopped" else chosen.seconds)
         end()
         marks_ns.append(time.time_ns())
         status = begun.end()

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,13 +123,11 @@ class _WatchedPerson:
 class Truth:
     """What was true at each SYNC that the devices were to hear, column arrays of the same length n.
 
-    sync: number of the host's SYNC from 0, over the whole run. `drive_state` (n, 2): names of CiA 402 states.
+    sync: number of the host's SYNC from 0, over the whole run.
     """
 
     sync: NDArray[np.int64]
     block: NDArray[np.float64]  # (n, TRUTH_LAYOUT.size)
-    drive_state: NDArray[Any]
-    is_operational: NDArray[np.bool_]  # (n, 4) NMT state of drive 1, 2, sensor 1, 2
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """Return a field of TRUTH_LAYOUT, (n, size)."""
@@ -160,7 +157,6 @@ class Played:
     finish_ns: int | None
     end_ns: int
     enabled_at_end: tuple[bool, bool]
-    edges: tuple[tuple[int, str], ...]  # SYNC number and text of faults that begin and end
 
 
 class HungError(BaseException):
@@ -207,20 +203,12 @@ def play_witnessed(settings: Settings, scenario: Scenario, folder: Path, user: U
     bus.limit_ns = round(allowed_s(settings) * 1e9)
     syncs: list[int] = []
     blocks: list[NDArray[np.float64]] = []
-    states: list[tuple[str, str]] = []
-    operational: list[tuple[bool, ...]] = []
-    edges: list[tuple[int, str]] = []
 
     def on_truth(_cycle: int, _t_ns: int, block: NDArray[np.float64]) -> None:
         syncs.append(bus.syncs - 1)
         blocks.append(block.copy())
-        states.append((bench.drives[0].state.name, bench.drives[1].state.name))
-        operational.append(tuple(device.is_operational for device in bench.devices))
 
-    def on_event(_t_ns: int, _level: str, _name: str, text: str) -> None:
-        edges.append((bus.syncs - 1, text))
-
-    bench = Bench(scenario, codec, embedded.deliver, on_truth=on_truth, on_event=on_event)
+    bench = Bench(scenario, codec, embedded.deliver, on_truth=on_truth)
 
     def is_enabled() -> tuple[bool, bool]:
         first, second = (drive.state.name == "OPERATION_ENABLED" for drive in bench.drives)
@@ -252,12 +240,7 @@ def play_witnessed(settings: Settings, scenario: Scenario, folder: Path, user: U
         settings=dataclasses.replace(settings),
         scenario=scenario,
         wire=WireRecord(codec.text, bus.passed),
-        truth=Truth(
-            np.array(syncs, np.int64),
-            np.array(blocks).reshape(len(blocks), TRUTH_LAYOUT.size),
-            np.array(states, dtype=object).reshape(len(states), 2),
-            np.array(operational, np.bool_).reshape(len(operational), 4),
-        ),
+        truth=Truth(np.array(syncs, np.int64), np.array(blocks).reshape(len(blocks), TRUTH_LAYOUT.size)),
         log=read_log(path, ("/scheme", "/control", "/contact", "/events", "/cycle")) if path.exists() else None,
         summary=summary,
         crash=crash,
@@ -265,5 +248,4 @@ def play_witnessed(settings: Settings, scenario: Scenario, folder: Path, user: U
         finish_ns=notes.finish_ns,
         end_ns=clock.now_ns(),
         enabled_at_end=is_enabled(),
-        edges=tuple(edges),
     )

@@ -116,12 +116,7 @@ class Made:
             block[:, TRUTH_LAYOUT.slices[name]] = np.array([[value(cycle)] for cycle in cycles])
         block[:, TRUTH_LAYOUT.slices["tau_J"]] = 1e-3 * cycles[:, None]
         block[:, TRUTH_LAYOUT.slices["faults"]] = np.array([[self.faults(cycle)] for cycle in cycles])
-        truth = Truth(
-            cycles,
-            block,
-            np.full((self.cycles, 2), "OPERATION_ENABLED", dtype=object),
-            np.ones((self.cycles, 4), np.bool_),
-        )
+        truth = Truth(cycles, block)
         log: Any = SimpleNamespace(
             scheme=_Rows(
                 t_ns=(cycles + 1) * PERIOD_NS,
@@ -155,7 +150,6 @@ class Made:
             "finish_ns": None,
             "end_ns": self.cycles * PERIOD_NS,
             "enabled_at_end": (False, False),
-            "edges": (),
         }
         # The end of a real run: drives disabled, without torque.
         return Played(**played | self.changes)

@@ -152,6 +152,8 @@ def finding(**changes: Any) -> Finding:
         ("sensor-jump", {"rest_after_notice_ms": 400.0}, "NOT AT REST"),
         ("flood", {"noticed_ms": None, "stopped_ms": None}, "ok, no effect"),
         ("sdo-answers", {"noticed_ms": None, "stopped_ms": 3.0}, "UNNOTICED"),
+        ("sensor-jump", {"noticed_ms": 1502.0}, "UNNOTICED"),
+        ("nmt-reset-node-drive", {"rest_after_notice_ms": 1900.0}, "ok"),
     ],
 )
 def test_a_verdict_follows_from_notice_name_and_rest(name: str, changes: dict[str, Any], expected: str) -> None:
