@@ -17,10 +17,10 @@ import numpy as np
 from attacks import MS, Attack, AttackCase, Forged, Forger
 from numpy.typing import NDArray
 
-from adacd_hil.cli.connection import contract_of
 from adacd_hil.config import OperatorSettings, RequestSettings, Settings, load_settings, parse
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
 from adacd_hil.wire.bus import Bus, Frame
@@ -236,7 +236,7 @@ def play_attack(case: AttackCase | None, folder: Path) -> tuple[Finding, RunLog]
     folder.mkdir(parents=True, exist_ok=True)
     lasts_s = 1.5 if case is None else case.lasts_s
     settings = settings_of(lasts_s)
-    codec = contract_of(settings, folder)
+    codec = load_contract(settings)
     clock = VirtualClock()
     wire = Wire(clock)
     scenario = parse(Scenario, {"profile": "P", "start_deg": [-30.0, -60.0]}) if case is None else scenario_of(case)

@@ -8,8 +8,9 @@
 A log of random numbers is cut, has bits flipped or stretches zeroed, at places that the seed chooses: check must find
 it, and recover must save every intact chunk and no message that the log never had. A run of the experiment in real time
 loses its writer, its control process or both by SIGKILL at moments that the seed chooses: recover must save all but the
-last 0.3 s, cycle for cycle. With `--vcan-kills` host, logger and emulated arm are processes on a vcan, by tools/with-vcan
-where there is none, and whoever is left must come to the end that is documented, the arm to rest (tools/vcan_kills.py).
+last 0.3 s, cycle for cycle. With `--vcan-kills` host, logger and emulated arm are processes on a vcan, made by
+tools/with-vcan where there is none: whoever is left must come to its documented end, the arm to rest
+(tools/vcan_kills.py).
 
 Exit status: 0 all as it must be, 1 something isn't, 2 wrong usage.
 """

@@ -31,11 +31,10 @@ from side_by_side import (
 from timing_hour import write_contacts
 
 from adacd_hil.config import load_settings
-from adacd_hil.control.session import LOG_NAME
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 from adacd_hil.records import SchemeState
 from firmware_sim.scenario import load_scenario
-from firmware_sim.truth import TRUTH_NAME
 
 BURN = "while True: pass"
 SCRUB = """

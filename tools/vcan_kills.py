@@ -21,14 +21,13 @@ from typing import Any
 
 import numpy as np
 from kill_trials import LOSS_BOUND_S
-from side_by_side import CHANNEL, BIN, TimingError, host_run, patient_config, running, wait_for
+from side_by_side import BIN, CHANNEL, TimingError, host_run, patient_config, running, wait_for
 
 from adacd_hil.log.check.check import check_log
 from adacd_hil.log.editing.recover import recover
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.run_folder import LOG_NAME
-from firmware_sim.truth import TRUTH_NAME
+from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 
 VICTIMS = ("host", "logger", "emulator", "host and logger", "host and emulator")
 EARLIEST_S, LATEST_S = 1.5, 6.0
@@ -45,7 +44,7 @@ ATTEMPTS = 3
 
 @dataclass
 class VcanKill:
-    """One kill. cycles: in the log. end: exit status of the host; None: it was the victim. drives: their last states."""
+    """One kill. cycles: in the log. status: the host's, None where it was the victim. drives: their last states."""
 
     seed: int
     victim: str

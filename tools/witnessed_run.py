@@ -16,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from wire_record import OverdueError, WireRecord, WitnessBus
 
-from adacd_hil.cli.connection import contract_of, model_time
+from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import Settings
 from adacd_hil.control.operator import FaultAnswer, Operator, ScriptedOperator
-from adacd_hil.control.session import LOG_NAME, Session, SessionSummary
+from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.records import TRUTH_LAYOUT, Request, SchemeState
 from adacd_hil.wire.bus import EmbeddedBus
 from firmware_sim.bench import Bench
@@ -196,7 +198,7 @@ def allowed_s(settings: Settings) -> float:
 def play_witnessed(settings: Settings, scenario: Scenario, folder: Path, user: User | None = None) -> Played:
     """Play a run to its end, or until it is overdue. Raises ConfigError, CodecError for what can't be played."""
     folder.mkdir(parents=True, exist_ok=True)
-    codec = contract_of(settings, folder)
+    codec = load_contract(settings)
     clock = VirtualClock()
     embedded = EmbeddedBus(clock)
     bus = WitnessBus(model_time(embedded, clock, codec, settings), clock)
