@@ -37,7 +37,7 @@ from side_by_side import (
     summarise,
     yardstick_run,
 )
-from timing_clock import run_clock, show_clock
+from timing_clock import STEPS_S, run_clock, show_clock
 from timing_disk import DISK_CASES, STOPPED_S, run_disk, show_disk
 from timing_hogs import run_hogs, show_hogs
 from timing_hour import CONTACT_S, finish_hour, run_hour, show_hour
@@ -133,6 +133,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     disk.add_argument("--stopped", type=float, default=STOPPED_S, help="seconds of SIGSTOP; default %(default)s")
     clock = commands.add_parser("clock")
     clock.add_argument("--seconds", type=float, default=10.0, help="before and after each step; default %(default)s")
+    clock.add_argument("--step", action="append", choices=list(STEPS_S), help="only this one; may be repeated")
     disk.add_argument("--case", action="append", choices=DISK_CASES, help="only this one; may be repeated")
     for command in commands.choices.values():
         command.add_argument("--out", type=Path, metavar="FOLDER", help="default runs/timing-COMMAND")

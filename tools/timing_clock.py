@@ -40,7 +40,8 @@ def set_clock(step_s: float) -> None:
 def run_clock(chosen: argparse.Namespace) -> dict[str, Any]:
     """Play every step: undisturbed for some seconds, then the clock is set, then on for as long."""
     result: dict[str, Any] = {}
-    for name, step_s in STEPS_S.items():
+    for name in chosen.step or STEPS_S:
+        step_s = STEPS_S[name]
         print(name, file=sys.stderr, flush=True)
         before_s, began_s = time.time(), time.monotonic()
         with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
@@ -83,6 +84,7 @@ def run_step(step_s: float, chosen: argparse.Namespace, folder: Path) -> dict[st
         "incomplete": int((cycle["frames_missing"] > 0).sum()),
         "cycles_back_in_time": int((np.diff(cycle.t_ns) <= 0).sum()),
         "frames_off_s": float(np.abs(frames_ns - log.frames["cycle_t_ns"]).max(initial=0)) * 1e-9,
+        "faults": [entry.event.message for entry in log.events if "-> FAULT" in entry.event.message],
         "violations": violations_of(status, said, log.problem, cycle.t_ns),
     }
 
@@ -114,4 +116,5 @@ def show_clock(result: dict[str, Any]) -> str:
             f"{each['overruns']}, incomplete {each['incomplete']}, frames at most {each['frames_off_s']:.3f} s from "
             f"their cycle; {'; '.join(each['violations']) or 'nothing noticed'}"
         )
+        lines += [f"  {text}" for text in each["faults"]]
     return "\n".join(lines)

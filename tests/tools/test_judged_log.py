@@ -1,0 +1,79 @@
+"""tools/judged_log.py, and the long runs on a vcan: kills, a clock that is set, hogs."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import damage_campaign
+import run_rules
+import timing_clock
+import timing_hogs
+import vcan_kills
+from judged_log import judged_log
+from vcan_kills import VcanKill
+
+from adacd_hil.cli.demo import Cast, run_embedded
+from adacd_hil.config import OperatorSettings, RequestSettings, load_settings, parse
+from adacd_hil.records import TRUTH_LAYOUT
+from firmware_sim.scenario import Scenario
+
+
+@pytest.mark.slow
+def test_a_log_and_its_truth_are_judged_as_the_wire_is(tmp_path: Path) -> None:
+    push = {"at_s": 2.7, "link": 1, "point_m": 0.3, "force_N": 8.0, "duration_s": 0.3}
+    scenario = parse(Scenario, {"profile": "P", "start_deg": [-30.0, -60.0], "contacts": [push]})
+    operator = OperatorSettings(script=(RequestSettings(at_s=3.2, request="finish"),))
+    settings = dataclasses.replace(load_settings("certified", "P"), operator=operator)
+    summary, truth_path = run_embedded(Cast(settings, scenario), "lockstep", tmp_path)
+    played = judged_log(summary.log.path, truth_path, settings, scenario)
+    assert run_rules.judge(played) == []
+    case = run_rules.Case(played)
+    assert len(played.wire.sync_place) == len(played.truth.sync) == len(case.state) + 20
+    assert len(run_rules.clear_contacts(case)) == 1
+    played.truth.block[:, TRUTH_LAYOUT.slices["tau_ext"]] = 0.0
+    assert {violation.rule for violation in run_rules.judge(played)} == {"reaction-to-nothing"}
+
+
+def test_a_host_that_outlives_its_arm_or_its_logger_ends_as_documented() -> None:
+    said = ["MONITOR -> FAULT: DATA_AGE; Drive1: position, velocity 4 cycles old, 3 allowed"]
+    assert vcan_kills.status_violations("emulator", 4, said) == []
+    assert "status 0" in vcan_kills.status_violations("emulator", 0, said)[0]
+    assert vcan_kills.status_violations("emulator", 4, ["nothing"]) == ["nobody says what has gone"]
+    assert vcan_kills.status_violations("logger", 3, []) == []
+    assert "status 0" in vcan_kills.status_violations("logger", 0, [])[0]
+    assert vcan_kills.status_violations("host", None, []) == []
+
+
+def test_a_drive_left_enabled_is_named() -> None:
+    assert vcan_kills.drive_violations(["fault", "operation enabled"]) == ["drive 2 ends in operation enabled"]
+
+
+def test_rest_after_a_kill_is_read_off_the_truth() -> None:
+    times_ns = np.arange(100) * 10_000_000
+    speed = np.where(np.arange(100) < 50, 1.0, 0.0)[:, None] * np.ones((1, 2))
+    assert vcan_kills.rest_s(times_ns, speed, 300_000_000) == pytest.approx(0.2)
+    assert vcan_kills.rest_s(times_ns[:45], speed[:45], 300_000_000) is None
+    assert vcan_kills.rest_s(times_ns, speed, 2_000_000_000) is None
+
+
+def test_kills_on_vcan_count_among_the_violations() -> None:
+    kills = [VcanKill(1, "host"), VcanKill(2, "logger", violations=["nothing saved"])]
+    totals = damage_campaign.summary([], [], kills)
+    assert (totals["killed_on_vcan"], totals["violations"]) == (2, 1)
+
+
+def test_a_set_clock_that_changes_a_run_is_told() -> None:
+    forward = np.arange(5)
+    assert timing_clock.violations_of(130, {"fault": "NONE"}, "", forward) == []
+    told = timing_clock.violations_of(4, {"fault": "DATA_AGE"}, "cut", forward[::-1])
+    assert told == ["exit status 4", "fault DATA_AGE", "cut", "the log's cycles go back in time"]
+
+
+def test_hogs_are_gone_when_the_block_ends(tmp_path: Path) -> None:
+    with timing_hogs.hogs(2, 1, tmp_path) as processes:
+        assert [process.poll() for process in processes] == [None] * 3
+    assert [process.returncode for process in processes] == [-9] * 3
