@@ -5,6 +5,9 @@ Unless the arguments name another configuration it is `paper`, whose numbers tak
 
 import contextlib
 import json
+import re
+import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,7 +19,6 @@ from typing import Any
 BIN = Path(sys.executable).parent
 LIMIT_S = 280
 PAPER = ("--config", "paper")
-MARK = "1ADACD0"  # how lockstep keeps time: 29-bit identifiers, none of CANopen
 
 
 @dataclass(frozen=True)
@@ -72,21 +74,67 @@ def emulator(folder: Path, *arguments: str) -> Iterator["subprocess.Popen[str]"]
             process.communicate(timeout=30)
 
 
+STANDARD_FRAMES = "vcan0,0:80000000"
+"""candump's filter for 11-bit identifiers: how lockstep keeps time is not CANopen."""
+WITNESS_BYTES = 512 * 1024 * 1024
+"""Room for all frames of a run, of which a frame takes some 1 kB; the kernel takes it as the run needs it."""
+TOKEN_ID = 0x7E3
+"""Of a frame that only the witness's own side sends: what candump has written of it, it has written of all before."""
+
+
+@dataclass(frozen=True)
+class Witness:
+    """What candump wrote down. `dropped`: frames for which the kernel had no room, by its own count."""
+
+    path: Path
+
+    @property
+    def lines(self) -> list[str]:
+        """The frames, but for the tokens."""
+        token = f" {TOKEN_ID:03X}#"
+        return [line for line in self.path.read_text().splitlines() if line.startswith("(") and token not in line]
+
+    @property
+    def dropped(self) -> int:
+        """How many frames are not in `lines` though they were on the bus."""
+        totals = re.findall(r"total drops (\d+)", self.path.read_text())
+        return int(totals[-1]) if totals else 0
+
+
 @contextlib.contextmanager
-def candump(dump: Path) -> Iterator[None]:
-    """Write down what is on vcan0 while the block lasts."""
-    command = ["candump", "-L", "-r", "16777216", "vcan0"]  # room for what it can't write down at once
-    with dump.open("w") as sink, subprocess.Popen(command, stdout=sink) as listener:
+def candump(path: Path) -> Iterator[Witness]:
+    """Write down what is on vcan0 from the beginning of the block to its end, however busy the machine is.
+
+    The block begins once candump listens, and ends once it has written what waited for it.
+    """
+    command = ["candump", "-L", "-d", "-r", str(WITNESS_BYTES), STANDARD_FRAMES]
+    witness = Witness(path)
+    with path.open("w") as sink, subprocess.Popen(command, stdout=sink, stderr=subprocess.DEVNULL) as listener:
         try:
-            yield
+            _await_token(listener, path, 1)
+            yield witness
+            _await_token(listener, path, 2)
         finally:
             listener.terminate()
-            listener.wait(10)
+            listener.wait(LIMIT_S)
 
 
-def frames_of(dump: Path) -> str:
-    """Return what candump saw of CANopen."""
-    return "".join(line for line in dump.read_text().splitlines(keepends=True) if MARK not in line)
+def _await_token(listener: "subprocess.Popen[bytes]", path: Path, number: int) -> None:
+    """Send a token until candump has written it: one may find no room, or nobody who listens yet."""
+    token = f"{TOKEN_ID:03X}#{number:02X}"
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
+        can.bind(("vcan0",))
+        while token not in _end_of(path):
+            can.send(struct.pack("=IB3x8s", TOKEN_ID, 1, bytes([number])))
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                raise RuntimeError(f"candump ended with {listener.wait(0.05)}")
+
+
+def _end_of(path: Path) -> str:
+    """Return the last lines, as far as they are written."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 65536))
+        return file.read().decode()
 
 
 def run_on_vcan(folder: Path, *arguments: str) -> Played:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiment_runs import BIN, LIMIT_S, Played, adacd_hil
+from experiment_runs import BIN, LIMIT_S, Played, Witness, adacd_hil, candump
 from test_on_vcan import longest_stall_cycles
 
 from adacd_hil.clock import MonotonicClock
@@ -88,10 +88,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> TwoArms:
         configs[arm].write_text(PATIENT + text)
     with contextlib.ExitStack() as stack:
         if shutil.which("candump"):
-            dump = stack.enter_context((folder / "candump.log").open("w"))
-            listener = subprocess.Popen(["candump", "-L", "-r", "16777216", "vcan0"], stdout=dump)
-            stack.callback(listener.wait, 10)
-            stack.callback(listener.terminate)
+            stack.enter_context(candump(folder / "candump.log"))
         stack.enter_context(emulators(("-c", "vcan0"), ("-c", "vcan0", "--node-offset", "4", "--host-node", "126")))
         on_bus = ("run", "-i", "socketcan", "-c", "vcan0", "--json", "--config")
         command = [BIN / "adacd-hil", *on_bus, configs[FIRST], "--out", folder / "first"]
@@ -106,7 +103,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> TwoArms:
     hosts = (Played(folder / "first", first.returncode, stdout, stderr), second)
     logs = (read_log(folder / "first" / "run.mcap"), read_log(folder / "second" / "run.mcap"))
     path = folder / "candump.log"
-    return TwoArms(hosts, logs, path.read_text().splitlines() if path.exists() else [])
+    return TwoArms(hosts, logs, Witness(path).lines if path.exists() else [])
 
 
 def test_both_arms_end_as_asked(shared: TwoArms) -> None:
