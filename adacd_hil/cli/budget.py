@@ -1,7 +1,7 @@
 """The bit budget of a contract, as text and as JSON."""
 
 import textwrap
-from typing import Any
+from typing import Any, NamedTuple
 
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.config import load_settings
@@ -19,6 +19,16 @@ _LEGEND = (
 )
 
 
+class Judgement(NamedTuple):
+    """A contract's budget, what else there is to say of it, the exit status, and what its devices must tell."""
+
+    budget: Budget
+    notes: list[str]
+    code: ExitCode
+    wire_version: int
+    layout_digest: int
+
+
 def judge(
     dbc: str | None,
     config: str,
@@ -26,7 +36,7 @@ def judge(
     bitrate: int | None,
     data_bitrate: int | None,
     arms: int | None = None,
-) -> tuple[Budget, list[str], ExitCode]:
+) -> Judgement:
     """Find the budget of a contract, and what else there is to say of it. Raises CodecError, ConfigError.
 
     Without `dbc` it is that of the configuration's devices, loaded or composed. The configuration's period counts where
@@ -41,11 +51,13 @@ def judge(
         notes.append(
             f"configuration {settings.name} has bus.period_us = {settings.bus.period_us}, the DBC {budget.period_us}"
         )
-    return budget, notes, ExitCode.OK if budget.is_fit else ExitCode.FAILURE
+    code = ExitCode.OK if budget.is_fit else ExitCode.FAILURE
+    return Judgement(budget, notes, code, codec.wire_version, codec.layout_digest)
 
 
-def as_text(budget: Budget, notes: list[str]) -> str:
+def as_text(judgement: Judgement) -> str:
     """Write a budget for people, at most 120 characters wide."""
+    budget = judgement.budget
     rates = f"{budget.bitrate} bit/s" + (f", data {budget.data_bitrate} bit/s" if budget.data_bitrate else "")
     findings = [
         (
@@ -58,7 +70,8 @@ def as_text(budget: Budget, notes: list[str]) -> str:
             f"feedback in after {us(budget.feedback_ns)} µs, commands need {us(budget.command_ns)} µs, "
             f"left for the host {us(budget.host_ns)} µs",
         ),
-        *(("note", note) for note in notes),
+        ("0x2000", f"wire version {judgement.wire_version}, layout digest 0x{judgement.layout_digest:08X}"),
+        *(("note", note) for note in judgement.notes),
         ("verdict", budget.line),
     ]
     lines = [f"{budget.contract.name}, {budget.period_us} µs, {rates}", "", *_table(budget), "", *_LEGEND, ""]
@@ -99,17 +112,20 @@ def _response(response: Response) -> str:
     return ("" if response.is_bounded else "> ") + us(response.time_ns)
 
 
-def as_json(budget: Budget, notes: list[str]) -> dict[str, Any]:
+def as_json(judgement: Judgement) -> dict[str, Any]:
     """Describe a budget for machines."""
+    budget = judgement.budget
     return {
         "contract": budget.contract.name,
+        "wire_version": judgement.wire_version,
+        "layout_digest": f"0x{judgement.layout_digest:08X}",
         "arms": budget.contract.arms,
         "period_us": budget.period_us,
         "bitrate": budget.bitrate,
         "data_bitrate": budget.data_bitrate,
         "is_fit": budget.is_fit,
         "verdict": budget.line,
-        "notes": notes,
+        "notes": judgement.notes,
         "unstuffed_bits": budget.unstuffed_bits,
         "worst_bits": budget.worst_bits,
         "cyclic_us": budget.cyclic_ns / 1000,

@@ -56,6 +56,12 @@ dbc_option = click.option(
 @click.option(
     "--topic", "topics", multiple=True, metavar="TOPIC", help="For tables: a topic, or a pattern such as 'decoded/*'."
 )
+@click.option(
+    "--direction",
+    "has_direction",
+    is_flag=True,
+    help="candump: T or R behind each frame, sent or received. Wireshark opens no file that has them.",
+)
 @only_option
 @id_option
 @dbc_option
@@ -66,6 +72,7 @@ def export(
     kind: str,
     out: Path | None,
     topics: tuple[str, ...],
+    has_direction: bool,
     only: str,
     can_ids: tuple[int, ...],
     dbc: Path | None,
@@ -80,12 +87,14 @@ def export(
         raise CommandError(f"--only and --id choose frames, {kind} holds tables; use --topic", ExitCode.USAGE)
     if kind in FRAMES and topics:
         raise CommandError(f"--topic chooses tables, {kind} holds frames; use --only or --id", ExitCode.USAGE)
+    if has_direction and kind != "candump":
+        raise CommandError(f"--direction is candump's; {kind} needs none", ExitCode.USAGE)
     codec = contract_of(log, dbc)
     if kind in TABLES:
         described, problem = _export_tables(log, out or log.with_name(f"{log.stem}-tables"), kind, topics, codec)
     else:
         out = out or log.with_suffix(_SUFFIXES.get(kind, f".{kind}"))
-        described, problem = _export_frames(log, out, kind, only, can_ids, codec)
+        described, problem = _export_frames(log, out, kind, only, can_ids, codec, has_direction)
     if problem:
         print(f"warning: {problem}", file=sys.stderr)
     print(json.dumps(described | {"problem": problem}, indent=2) if as_json else described["text"])
@@ -118,7 +127,7 @@ def _export_tables(
 
 
 def _export_frames(
-    log: Path, out: Path, kind: str, only: Any, can_ids: tuple[int, ...], codec: "Codec"
+    log: Path, out: Path, kind: str, only: Any, can_ids: tuple[int, ...], codec: "Codec", has_direction: bool
 ) -> tuple[dict[str, Any], str]:
     from adacd_hil.log.formats.frame_choice import FrameChoice, sides
     from adacd_hil.log.formats.frame_export import export_frames
@@ -129,7 +138,7 @@ def _export_frames(
     host_ids, device_ids = sides(codec)
     choice = FrameChoice(only, host_ids, device_ids, frozenset(can_ids))
     source = open_frames(log)
-    summary = export_frames(source, choice.pieces(source), out, kind, _Teller("frames"))
+    summary = export_frames(source, choice.pieces(source), out, kind, _Teller("frames"), has_direction)
     for loss in summary.losses:
         print(f"{kind}: {loss}", file=sys.stderr)
     described = {

@@ -237,9 +237,9 @@ def budget(
     """Say whether the frames of a contract get through in time: bits, response times, what is left for the host."""
     from adacd_hil.cli import budget as budgets
 
-    found, notes, code = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
-    print(json.dumps(budgets.as_json(found, notes), indent=2) if as_json else budgets.as_text(found, notes))
-    return code
+    found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
+    print(json.dumps(budgets.as_json(found), indent=2) if as_json else budgets.as_text(found))
+    return found.code
 
 
 @cli.command(epilog=EPILOG)

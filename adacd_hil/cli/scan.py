@@ -21,8 +21,9 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
     settings, codec = connection.load()
     clock = MonotonicClock()
     with connection.bus(clock, codec.is_fd) as bus:
-        expected = expected_nodes(Master(settings, codec, bus).slaves)
-        found = survey(bus, clock, listen_s, lambda line: print(line, file=sys.stderr, flush=True))
+        expected = expected_nodes(Master(settings, codec, bus).slaves, codec)
+        told = {node.node_id for node in expected if node.layout_digest is not None}
+        found = survey(bus, clock, listen_s, lambda line: print(line, file=sys.stderr, flush=True), told)
     described = describe(found, compare(found, expected), codec)
     is_right = not any(row["verdict"] not in ("", "unexpected") for row in described["nodes"])
     return described, ExitCode.OK if is_right else ExitCode.BUS_MISSING
@@ -34,6 +35,11 @@ def describe(found: Survey, verdicts: dict[int, str], codec: Codec) -> dict[str,
     return {
         "duration_s": round(found.duration_s, 3),
         "error_frames": found.error_frames,
+        "contract": {
+            "name": codec.path.name,
+            "wire_version": codec.wire_version,
+            "layout_digest": _hex(codec.layout_digest),
+        },
         "nodes": [_describe_node(node_id, nodes.get(node_id), verdict, codec) for node_id, verdict in verdicts.items()],
         "others": [_describe_talk(talk, codec) for talk in found.others],
     }
@@ -54,9 +60,15 @@ def _describe_node(node_id: int, node: Node | None, verdict: str, codec: Codec) 
         "state": node.state_text,
         "error_register": node.error_register,
         "answers_sdo": node.answers,
+        "wire_version": node.wire_version,
+        "layout_digest": _hex(node.layout_digest),
         "emergencies": [{"code": code, "error_register": register} for code, register in node.emergencies],
         "produces": [_describe_talk(talk, codec) for talk in node.produces],
     }
+
+
+def _hex(number: int | None) -> str | None:
+    return None if number is None else f"0x{number:08X}"
 
 
 def _describe_talk(talk: Talk, codec: Codec) -> dict[str, Any]:
@@ -95,7 +107,7 @@ def as_text(described: dict[str, Any]) -> str:
         has_answers = any(node["is_present"] for node in nodes)
         what = "the nodes answered, and sent nothing by themselves" if has_answers else "nothing was heard"
         parts.append(f"{what} in {described['duration_s']:g} s")
-    return "\n\n".join([*parts, _summary(described)])
+    return "\n\n".join([*parts, f"{_contract(described)}\n{_summary(described)}"])
 
 
 def _node_row(node: dict[str, Any]) -> tuple[str, ...]:
@@ -118,6 +130,17 @@ def _node_row(node: dict[str, Any]) -> tuple[str, ...]:
 def _talk_row(owner: str, talk: dict[str, Any]) -> tuple[str, ...]:
     rate = "-" if talk["rate_Hz"] is None else f"{talk['rate_Hz']:.1f}"
     return owner, f"0x{talk['id']:03X}", talk["message"], talk["length"], str(talk["count"]), rate
+
+
+def _contract(described: dict[str, Any]) -> str:
+    """Say which contract is expected, and which nodes tell that it is theirs."""
+    contract = described["contract"]
+    told = [node for node in described["nodes"] if node.get("layout_digest") is not None]
+    same = [node["node"] for node in told if node["layout_digest"] == contract["layout_digest"]]
+    other = [f"node {node['node']}: {node['layout_digest']}" for node in told if node["node"] not in same]
+    what = f"{contract['name']}: wire version {contract['wire_version']}, layout digest {contract['layout_digest']}"
+    says = [f"same in node {', '.join(map(str, same))}"] * bool(same) + other
+    return f"{what}; {'; '.join(says) or 'no node tells its own'}"
 
 
 def _summary(described: dict[str, Any]) -> str:

@@ -2,10 +2,11 @@
 
 Sends SDO uploads only and changes no node's state, so it works beside a running master. Source: CiA 301 (4.2), clauses
 7.2.4 (SDO), 7.2.8 (NMT, boot-up, heartbeat), 7.3.3 (predefined connection set), objects 0x1000, 0x1001, 0x1008, 0x1018.
+Of nodes whose profile says that they have it, 0x2000 is read as well: wire version and layout digest.
 """
 
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from adacd_hil.clock import Clock
@@ -24,6 +25,7 @@ _BETWEEN_REQUESTS_S = 0.002
 _ANSWER_S = 0.1
 _UPLOAD_DEVICE_TYPE = bytes.fromhex("4000100000000000")
 _IDENTITY = ("vendor", "product", "revision", "serial")
+_CONTRACT = ("wire_version", "layout_digest")
 
 NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
 _PROFILES = {401: "I/O", 402: "drive", 404: "measuring device", 405: "PLC", 406: "encoder", 408: "hydraulic drive"}
@@ -72,6 +74,8 @@ class Node:
     nmt_state: int | None = None
     has_pdos: bool = False
     answers: bool = False
+    wire_version: int | None = None
+    layout_digest: int | None = None
     emergencies: list[tuple[int, int]] = field(default_factory=list)
     produces: list[Talk] = field(default_factory=list)
 
@@ -103,6 +107,8 @@ class Expected:
     node_id: int
     vendor: int | None
     product: int | None
+    wire_version: int | None = None
+    layout_digest: int | None = None
 
 
 @dataclass(frozen=True)
@@ -116,11 +122,15 @@ class Survey:
 
 
 def survey(
-    bus: Bus, clock: Clock, duration_s: float = LISTEN_S, progress: Callable[[str], None] = lambda _: None
+    bus: Bus,
+    clock: Clock,
+    duration_s: float = LISTEN_S,
+    progress: Callable[[str], None] = lambda _: None,
+    contract_ids: Container[int] = (),
 ) -> Survey:
     """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of whoever is there.
 
-    Raises BusError.
+    `contract_ids`: nodes whose 0x2000 is the contract's. Raises BusError.
     """
     tap = Tap(bus, clock)
     traffic = Traffic()
@@ -136,7 +146,7 @@ def survey(
     for node in nodes.values():
         if node.answers:
             progress(f"reading node {node.node_id}")
-            _identify(canopen, node)
+            _identify(canopen, node, node.node_id in contract_ids)
     others = _assign(nodes, traffic)
     return Survey(list(nodes.values()), others, traffic.error_frames, elapsed_s)
 
@@ -165,7 +175,7 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
     return dict(sorted(found.items()))
 
 
-def _identify(canopen: CanopenBus, node: Node) -> None:
+def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
     """Read what a node says of itself; what it doesn't tell stays None."""
     remote = canopen.add_node(node.node_id, None)
     try:
@@ -175,6 +185,9 @@ def _identify(canopen: CanopenBus, node: Node) -> None:
         node.error_register = None if register is None else int.from_bytes(register, "little")
         for subindex, what in enumerate(_IDENTITY, start=1):
             value = read_object(remote, 0x1018, subindex)
+            setattr(node, what, None if value is None else int.from_bytes(value, "little"))
+        for subindex, what in enumerate(_CONTRACT, start=1):
+            value = read_object(remote, 0x2000, subindex) if has_contract else None
             setattr(node, what, None if value is None else int.from_bytes(value, "little"))
     except DeviceError:
         node.answers = False  # it fell silent or refuses: what was read stands
@@ -193,15 +206,21 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
     return others
 
 
-def expected_nodes(slaves: Iterable[Slave]) -> list[Expected]:
-    """List what the master of an arm expects: vendor and product of the EDS, None where any will do."""
+def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[Expected]:
+    """List what the master of an arm expects: vendor and product of the EDS, None where any will do.
+
+    With a codec also its wire version and layout digest, of nodes that tell them.
+    """
     expected = []
     for slave in slaves:
         is_checked = slave.device.settings.identity == "eds"
         vendor, product = (
             slave.default(0x1018, sub) if is_checked and slave.has(0x1018, sub) else None for sub in (1, 2)
         )
-        expected.append(Expected(slave.name, slave.node_id, vendor, product))
+        version, digest = None, None
+        if codec is not None and slave.device.settings.contract_object:
+            version, digest = codec.wire_version, codec.layout_digest
+        expected.append(Expected(slave.name, slave.node_id, vendor, product, version, digest))
     return expected
 
 
@@ -233,6 +252,13 @@ def _difference(node: Node, wanted: Expected) -> str:
             return f"{wanted.name} expected; tells no {what}"
         if found != value:
             return f"{wanted.name} expected; {what} is not 0x{value:X}"
+    for what, found, value in (
+        ("wire version", node.wire_version, wanted.wire_version),
+        ("layout digest", node.layout_digest, wanted.layout_digest),
+    ):
+        if value is not None and found != value:
+            told = f"tells no {what}" if found is None else f"{what} 0x{found:08X}, the contract has 0x{value:08X}"
+            return f"{wanted.name} expected; {told}"
     return ""
 
 

@@ -14,7 +14,8 @@ from adacd_hil.log.channels import Channel
 from adacd_hil.log.chunked_file import ChunkedFile
 from adacd_hil.log.sink import Sink
 
-LIBRARY = f"adacd-hil {__version__}; {LIBRARY_IDENTIFIER}"
+PRODUCT = "adacd-hil"
+LIBRARY = f"{PRODUCT} {__version__}; {LIBRARY_IDENTIFIER}"
 RUN_METADATA = "run"
 SUMMARY_METADATA = "summary"
 PART_KEY = "part"
@@ -23,6 +24,10 @@ ENDING_KEY = "ending"
 """Of the summary: why the part ended."""
 CONTINUED = "continued"
 """The ending of a part that another follows."""
+ROS_PROFILE = "ros2"
+"""Of the header: every channel is CDR with a schema of ROS 2, so rosbags and rosbag2 take the file."""
+QOS_KEY = "offered_qos_profiles"
+"""Channel metadata that the profile asks for; nobody offered one."""
 FIELDS_KEY = "fields"
 """Channel metadata: our names of the fields, which ROS would have in lower case."""
 _MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
@@ -34,7 +39,7 @@ class McapFile(ChunkedFile):
     def __init__(
         self, sink: Sink, channels: tuple[Channel, ...], attachments: dict[str, bytes], metadata: dict[str, str]
     ) -> None:
-        super().__init__(sink, LIBRARY)
+        super().__init__(sink, LIBRARY, ROS_PROFILE)
         self.ids: dict[int, int] = {}
         """The file's number of each channel, by ours."""
         for name, data in attachments.items():
@@ -58,7 +63,7 @@ class McapFile(ChunkedFile):
                 topic=channel.topic,
                 message_encoding="cdr",
                 schema_id=schema_ids[name],
-                metadata={FIELDS_KEY: " ".join(channel.type.fields)} if channel.type.fields else {},
+                metadata={QOS_KEY: "", **({FIELDS_KEY: " ".join(channel.type.fields)} if channel.type.fields else {})},
             )
             self.define_channel(record)
             self.ids[channel.id] = number

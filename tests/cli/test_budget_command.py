@@ -81,6 +81,7 @@ def test_the_text_has_table_phases_and_verdict_within_120_columns() -> None:
     assert command.split() == ["0x202", "Drive2Command", "6", "command", "1", "115", "115", "920", "2830", "1000"]
     assert len(command) == len(table[0])
     assert "phases        feedback in after 565 µs, commands need 230 µs, left for the host 205 µs" in lines
+    assert "0x2000        wire version 1, layout digest 0xF80FDAE0" in lines
     assert lines[-1] == "verdict       arm.dbc at 1000 µs fits: 795 µs of cyclic frames, 205 µs left for the host"
 
 
@@ -91,7 +92,9 @@ def test_a_contract_that_does_not_fit_says_who_is_late_and_by_how_much() -> None
 
 
 def test_json_has_every_message_with_its_response_times() -> None:
-    messages = json.loads(budget("--json").stdout)["messages"]
+    found = json.loads(budget("--json").stdout)
+    assert (found["wire_version"], found["layout_digest"]) == (1, "0xF80FDAE0")
+    messages = found["messages"]
     (command,) = [message for message in messages if message["name"] == "Drive1Command"]
     assert command == {
         "name": "Drive1Command",

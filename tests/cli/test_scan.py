@@ -6,11 +6,12 @@ from bench_bus import CODEC, BenchBus
 
 from adacd_hil.cli.scan import as_text, describe
 from adacd_hil.device.survey import compare, expected_nodes, survey
+from adacd_hil.wire.codec import Codec, parse_codec
 
 
-def scanned(rig: BenchBus) -> dict:
-    found = survey(rig.bus, rig.clock)
-    return describe(found, compare(found, expected_nodes(rig.master.slaves)), CODEC)
+def scanned(rig: BenchBus, codec: Codec = CODEC) -> dict:
+    found = survey(rig.bus, rig.clock, contract_ids={1, 2, 3, 4})
+    return describe(found, compare(found, expected_nodes(rig.master.slaves, codec)), codec)
 
 
 def test_the_table_shows_nodes_what_they_send_and_whether_they_fit() -> None:
@@ -43,9 +44,10 @@ def test_nodes_that_only_answer_are_not_taken_for_silence() -> None:
     rig.forget()
     text = as_text(scanned(rig))
     assert "nothing was heard" not in text
-    assert text.splitlines()[-3:] == [
+    assert text.splitlines()[-4:] == [
         "the nodes answered, and sent nothing by themselves in 1.5 s",
         "",
+        "arm.dbc: wire version 1, layout digest 0xF80FDAE0; same in node 1, 2, 3, 4",
         "nodes: 4 as expected",
     ]
 
@@ -62,3 +64,30 @@ def test_an_empty_bus_is_said_to_be() -> None:
 def test_the_result_is_json() -> None:
     described = scanned(BenchBus())
     assert json.loads(json.dumps(described)) == described
+    assert described["contract"] == {"name": "arm.dbc", "wire_version": 1, "layout_digest": "0xF80FDAE0"}
+    assert {node["layout_digest"] for node in described["nodes"]} == {"0xF80FDAE0"}
+
+
+def test_nodes_with_another_layout_are_told_apart() -> None:
+    """The nodes have arm.dbc; the host has it with another scale of the torque."""
+    text = CODEC.text.replace(b"@1- (1e-06,0)", b"@1- (2e-06,0)")
+    other = parse_codec(text, CODEC.path)
+    assert other.layout_digest != CODEC.layout_digest
+    described = scanned(BenchBus(), other)
+    digest = f"0x{other.layout_digest:08X}"
+    assert [node["verdict"] for node in described["nodes"]] == [
+        f"{name} expected; layout digest 0xF80FDAE0, the contract has {digest}"
+        for name in ("Drive1", "Drive2", "Sensor1", "Sensor2")
+    ]
+    lines = as_text(described).splitlines()
+    assert lines[-2].startswith(f"arm.dbc: wire version 1, layout digest {digest}; node 1: 0xF80FDAE0; node 2: ")
+    assert lines[-1] == "nodes: 0 as expected, 4 different"
+
+
+def test_a_node_that_tells_no_digest_is_different() -> None:
+    rig = BenchBus()
+    rig.tamper = lambda can_id, data: None if can_id == 0x583 and data[1:4] == bytes.fromhex("002002") else data
+    described = scanned(rig)
+    verdicts = {node["node"]: node["verdict"] for node in described["nodes"]}
+    assert verdicts[3] == "Sensor1 expected; does not answer SDO"
+    assert (verdicts[1], verdicts[4]) == ("", "")

@@ -34,7 +34,7 @@ class ReferenceWriter:
         self._joints = [slices[name] for name in ("q", "dq", "tau_J")]
         self._dropped = 0
         self._writer = mcap.writer.Writer(sink, chunk_size=240 * 1024, enable_crcs=True, enable_data_crcs=True)
-        self._writer.start("", f"adacd-hil {__version__}; {mcap.writer.LIBRARY_IDENTIFIER}")
+        self._writer.start("ros2", f"adacd-hil {__version__}; {mcap.writer.LIBRARY_IDENTIFIER}")
         for name, data in attachments.items():
             kind = "application/toml" if name.endswith(".toml") else "text/plain"
             self._writer.add_attachment(0, 0, name, kind, data)
@@ -44,7 +44,9 @@ class ReferenceWriter:
             kind = channel.type
             if kind.name not in schema_ids:
                 schema_ids[kind.name] = self._writer.register_schema(kind.name, "ros2msg", kind.text.encode())
-            fields = {FIELDS_KEY: " ".join(kind.fields)} if kind.fields else {}
+            fields = {"offered_qos_profiles": ""}
+            if kind.fields:
+                fields[FIELDS_KEY] = " ".join(kind.fields)
             self._ids[channel.id] = self._writer.register_channel(channel.topic, "cdr", schema_ids[kind.name], fields)
         self._latest_ns = dict.fromkeys(self._ids, 0)
 

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import re
+import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -49,9 +52,9 @@ def log(run, tmp_path_factory):
     return path
 
 
-def rewrite(source, target, kind):
+def rewrite(source, target, kind, **options):
     frames = open_frames(source)
-    return export_frames(frames, FrameChoice().pieces(frames), target, kind)
+    return export_frames(frames, FrameChoice().pieces(frames), target, kind, **options)
 
 
 def read_messages(path):
@@ -68,7 +71,7 @@ def test_blf_holds_every_frame_to_the_nanosecond(messages, bus, tmp_path):
 
 
 def test_candump_holds_every_frame_to_the_microsecond(messages, bus, tmp_path):
-    summary = rewrite(bus, tmp_path / "x.log", "candump")
+    summary = rewrite(bus, tmp_path / "x.log", "candump", has_direction=True)
     read = read_messages(tmp_path / "x.log")
     lost = [message for message in read if message.is_error_frame]
     assert [content(message)[2:] for message in read] == [
@@ -77,6 +80,44 @@ def test_candump_holds_every_frame_to_the_microsecond(messages, bus, tmp_path):
     assert [message.t_ns for message in read] == [message.t_ns // 1000 * 1000 for message in messages]
     assert summary.losses == (f"{len(messages)} frames lose what their times have below 1 µs",)
     assert len(lost) == 3
+
+
+# What can-utils' canplayer and Wireshark's wiretap/candump_scanner.l take for a line; nothing may follow.
+CANDUMP_LINE = re.compile(
+    r"\(\d+\.\d{6}\) \S+ ([0-9A-F]{3}|[0-9A-F]{8})#(R[0-8]?|([0-9A-F]{2}){0,8}|#[0-9A-F]([0-9A-F]{2}){0,64})"
+)
+
+
+def test_candump_says_nothing_of_direction_unless_it_is_asked_to(bus, tmp_path):
+    summary = rewrite(bus, tmp_path / "x.log", "candump")
+    lines = (tmp_path / "x.log").read_text().splitlines()
+    assert [line for line in lines if not CANDUMP_LINE.fullmatch(line)] == []
+    rewrite(bus, tmp_path / "y.log", "candump", has_direction=True)
+    marked = (tmp_path / "y.log").read_text().splitlines()
+    assert [line[:-2] for line in marked] == lines
+    sent = sum(line.endswith(" T") for line in marked)
+    assert 0 < sent < len(lines)
+    assert f"{sent} frames lose that they were sent" in summary.losses
+    bare, full = (read_frames(tmp_path / name).frames for name in ("x.log", "y.log"))
+    assert not bare["is_tx"].any()
+    full["is_tx"] = False
+    assert bare.tobytes() == full.tobytes()
+
+
+@pytest.mark.skipif(shutil.which("tshark") is None, reason="Wireshark's tshark is not installed")
+def test_wireshark_opens_a_candump_log_with_all_its_frames(bus, tmp_path):
+    rewrite(bus, tmp_path / "x.log", "candump")
+    fields = ["-T", "fields", "-e", "can.id", "-e", "frame.protocols"]
+    done = subprocess.run(
+        ["tshark", "-r", str(tmp_path / "x.log"), *fields], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    rows = [line.split("\t") for line in done.stdout.splitlines()]
+    frames = read_frames(tmp_path / "x.log").frames
+    assert len(rows) == len(frames)
+    for (can_id, protocols), frame in zip(rows, frames, strict=True):
+        if not frame["is_error"]:
+            assert (int(can_id, 0), "canfd" in protocols) == (frame["can_id"], frame["is_fd"])
 
 
 def test_asc_says_what_it_loses(messages, bus, tmp_path):
@@ -123,6 +164,7 @@ def test_frames_out_of_order_and_names_are_counted(tmp_path):
     assert rewrite(tmp_path / "x.mcap", tmp_path / "x.log", "candump").losses == (
         "1 frames lose what their times have below 1 µs",
         "1 error frames lose that they were FD",
+        "2 frames lose that they were sent",
     )
     assert read_frames(tmp_path / "x.blf").frames["t_ns"].tolist() == [times_ns[0], times_ns[0], times_ns[2]]
     assert read_frames(tmp_path / "x.asc").frames["t_ns"].tolist() == [0, 0, 1_000_000]
@@ -249,6 +291,7 @@ def test_a_damaged_recording_is_a_partial_result(log, tmp_path):
     [
         (("--format", "blf", "--topic", "scheme"), "--topic chooses tables"),
         (("--format", "csv", "--id", "181"), "--only and --id choose frames"),
+        (("--format", "blf", "--direction"), "--direction is candump's"),
         (("--format", "csv", "--id", "1XX"), "not a hexadecimal"),
         (("--format", "csv", "--id", "20000000"), "more than 29 bits"),
     ],

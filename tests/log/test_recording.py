@@ -215,10 +215,10 @@ def test_publish_time_is_the_cycle_and_log_time_never_runs_backwards(run, by_oth
         assert {message.publish_time for message, _ in messages} <= cycle_times, topic
 
 
-def test_the_header_names_us_and_no_profile(recorded):
+def test_the_header_names_us_and_the_profile_of_ros_2(recorded):
     header = records_of(recorded[0])[0]
     assert isinstance(header, Header)
-    assert header.profile == ""
+    assert header.profile == "ros2"
     assert header.library.startswith(f"adacd-hil {__version__}")
 
 

@@ -83,7 +83,7 @@ def cut(
     if out.exists() and path.exists() and out.samefile(path):
         raise LogError(f"{out} is the log itself; --out names another file")
     log = IntactLog(path)
-    with LogCopy(out) as copy:
+    with LogCopy(out, [path]) as copy:
         source = copy.source(topics=frozenset(topics) or None)
         start_ns: int | None = None
         progress(f"reading {path.name}")

@@ -5,21 +5,22 @@ shared where they are equal.
 """
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
-from mcap.records import Attachment, Channel, Schema
+from mcap.records import Attachment, Channel, Header, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.log.chunked_file import ChunkedFile
 from adacd_hil.log.editing.chunk_contents import Contents
 from adacd_hil.log.editing.file_end import read_end
 from adacd_hil.log.editing.info import read_info
+from adacd_hil.log.editing.record_scan import read_header
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_file import LIBRARY, SUMMARY_METADATA
+from adacd_hil.log.mcap_file import LIBRARY, PRODUCT, ROS_PROFILE, SUMMARY_METADATA
 from adacd_hil.log.summary import COPY_ENDINGS
 from adacd_hil.output_files import Replacement
 
@@ -46,11 +47,11 @@ class Messages(NamedTuple):
 class LogCopy:
     """The log in the making: a hidden file beside until `finish`, which replaces another copy, but no recording."""
 
-    def __init__(self, path: Path) -> None:
-        """Begin a log at `path`. Raises LogError."""
+    def __init__(self, path: Path, sources: Iterable[Path]) -> None:
+        """Begin a log at `path` that is copied from others. Raises LogError."""
         self.path = path
         self._target = _Target(path)
-        self.file = ChunkedFile(self._target, LIBRARY)
+        self.file = ChunkedFile(self._target, LIBRARY, _common_profile(sources))
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels = 0
         self._metadata: set[str] = set()
@@ -114,6 +115,16 @@ class LogCopy:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._target.discard()
+
+
+def _common_profile(sources: Iterable[Path]) -> str:
+    """Return the profile that all logs fit; earlier ones of ours fit the one of ROS 2, but don't say so."""
+    headers = [read_header(path) for path in sources]
+    return ROS_PROFILE if headers and all(header is not None and _is_ros(header) for header in headers) else ""
+
+
+def _is_ros(header: Header) -> bool:
+    return header.profile == ROS_PROFILE or (header.profile == "" and header.library.startswith(f"{PRODUCT} "))
 
 
 class Source:

@@ -54,7 +54,7 @@ def merge(
     if any(out.exists() and path.exists() and out.samefile(path) for path in paths):
         raise LogError(f"{out} is one of the logs; --out names another file")
     names = log_names(paths)
-    with LogCopy(out) as copy:
+    with LogCopy(out, paths) as copy:
         attached: dict[str, bytes] = {}
         logs = [
             _Log(copy, path, name, f"/{name}" if has_prefix else "", number == 0, attached)

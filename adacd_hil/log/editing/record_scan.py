@@ -9,6 +9,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import zstandard
@@ -109,6 +110,19 @@ def parse(opcode: int, body: bytes) -> Any:
 def scan(file: IO[bytes]) -> Iterator[RawRecord | Gap | Trailer]:
     """List the records of a file, and the gaps between them."""
     return _Scan(file).items()
+
+
+def read_header(path: Path) -> Header | None:
+    """Read the header of a file; None where it has none that can be trusted."""
+    try:
+        with path.open("rb") as file:
+            first = next(scan(file), None)
+        if not isinstance(first, RawRecord) or first.opcode != Opcode.HEADER:
+            return None
+        header: Header = parse(first.opcode, first.body)
+    except (OSError, LogError):
+        return None
+    return header
 
 
 class _Scan:

@@ -75,7 +75,7 @@ def recover(path: Path, out: Path | None = None, progress: Callable[[str], None]
         parts = {0: path}
     if out.exists() and any(part.exists() and out.samefile(part) for part in parts.values()):
         raise LogError(f"{out} is the log itself; --out names another file")
-    with LogCopy(out) as copy:
+    with LogCopy(out, parts.values()) as copy:
         work = _Work(copy, path)
         for part in parts.values():
             progress(f"reading {part.name}")

@@ -8,7 +8,8 @@
 | _9 behind the data | a raw DLC beyond 8, which has no meaning for us |
 
 An identifier of 8 digits is a 29-bit one; with bit 0x20000000 it is an error frame and the rest its class. ` T` and
-` R` at the end say sent and received, as python-can writes them. Source: can-utils, lib.h.
+` R` at the end say sent and received, as python-can and `candump -x` write them; they are read, and written if asked
+for, because Wireshark takes no file that has them. Source: can-utils, lib.h.
 """
 
 import re
@@ -66,7 +67,7 @@ def channel_name(name: str) -> str:
     return f"can{spelled}" if spelled.isdecimal() or not spelled else spelled
 
 
-def line(row: Any, channel: str, epoch_ns: int = 0) -> str:
+def line(row: Any, channel: str, epoch_ns: int = 0, has_direction: bool = False) -> str:
     """Write a row of RECORDED_FRAME_DTYPE, its time cut to the µs that canplayer reads."""
     seconds, rest_ns = divmod(int(row["t_ns"]) + epoch_ns, 1_000_000_000)
     can_id, length = int(row["can_id"]), int(row["length"])
@@ -81,5 +82,5 @@ def line(row: Any, channel: str, epoch_ns: int = 0) -> str:
         if row["is_fd"] and not row["is_error"]:
             flags = _RATE_SWITCH * bool(row["has_rate_switch"]) | _ERROR_STATE * bool(row["has_error_state"])
             content = f"#{flags:X}{content}"
-    way = "T" if row["is_tx"] else "R"
-    return f"({seconds}.{rest_ns // 1000:06d}) {channel} {identifier}#{content} {way}\n"
+    way = (" T" if row["is_tx"] else " R") if has_direction else ""
+    return f"({seconds}.{rest_ns // 1000:06d}) {channel} {identifier}#{content}{way}\n"

@@ -5,7 +5,7 @@ before 1990, as of a run in lockstep, has no date in BLF and counts from 0.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -55,15 +55,18 @@ def export_frames(
     path: Path,
     kind: str,
     progress: Callable[[int], None] = lambda _: None,
+    has_direction: bool = False,
 ) -> ExportSummary:
     """Write the chosen pieces of a recording; `progress` is told the frames so far.
+
+    `has_direction`: candump says of each frame whether it was sent; BLF and ASC always do.
 
     Raises LogError when the recording can't be read or the file not be written.
     """
     losses: Counter[str] = Counter()
     count = 0
     try:
-        with replacing(path) as beside, closing(_TARGETS[kind](beside)) as target:
+        with replacing(path) as beside, closing(_open(kind, beside, has_direction)) as target:
             for frames in pieces:
                 for what, is_lost in target.write(frames, source.channels, source.epoch_ns):
                     losses[what] += int(np.count_nonzero(is_lost))
@@ -148,24 +151,24 @@ class _Asc:
 
 
 class _Candump:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, has_direction: bool) -> None:
         self._file = path.open("w", encoding="ascii", errors="replace", newline="\n")
+        self._has_direction = has_direction
 
     def write(self, frames: NDArray[Any], channels: list[str], epoch_ns: int) -> list[_Loss]:
-        self._file.writelines(_lines(frames, channels, epoch_ns))
-        return [_nanoseconds(frames, epoch_ns), _fd_errors(frames)]
+        names = [candump.channel_name(name) for name in channels]
+        self._file.writelines(candump.line(row, names[row["channel"]], epoch_ns, self._has_direction) for row in frames)
+        is_sent = frames["is_tx"] & (not self._has_direction)
+        return [_nanoseconds(frames, epoch_ns), _fd_errors(frames), ("frames lose that they were sent", is_sent)]
 
     def close(self) -> None:
         self._file.close()
 
 
-def _lines(frames: NDArray[Any], channels: list[str], epoch_ns: int) -> Iterator[str]:
-    names = [candump.channel_name(name) for name in channels]
-    for row in frames:
-        yield candump.line(row, names[row["channel"]], epoch_ns)
-
-
-_TARGETS: dict[str, Callable[[Path], _Target]] = {"blf": _Blf, "asc": _Asc, "candump": _Candump}
+def _open(kind: str, path: Path, has_direction: bool) -> _Target:
+    if kind == "candump":
+        return _Candump(path, has_direction)
+    return _Blf(path) if kind == "blf" else _Asc(path)
 
 
 def _losses_of_both(frames: NDArray[Any], channels: list[str], is_early: NDArray[np.bool_]) -> list[_Loss]:

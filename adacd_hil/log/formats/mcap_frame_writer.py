@@ -8,11 +8,10 @@ import re
 import struct
 from typing import IO, NamedTuple
 
-from mcap.writer import LIBRARY_IDENTIFIER, Writer
+from mcap.writer import Writer
 
-from adacd_hil import __version__
 from adacd_hil.log.formats.mcap_frames import CHANNEL_KEY, ERROR_STATE_KEY, RATE_SWITCH_KEY
-from adacd_hil.log.mcap_file import ENDING_KEY, RUN_METADATA, SUMMARY_METADATA
+from adacd_hil.log.mcap_file import ENDING_KEY, LIBRARY, QOS_KEY, ROS_PROFILE, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.reader import EPOCH_KEY
 from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, pack_can_frame, pack_fd_frame
 
@@ -48,7 +47,7 @@ class FrameWriter:
         self._frames = 0  # of the first CAN channel, which has the topics of our logs
         self._stream = stream
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
-        self._writer.start("", f"adacd-hil {__version__}; {LIBRARY_IDENTIFIER}")
+        self._writer.start(ROS_PROFILE, LIBRARY)
         self._writer.add_metadata(RUN_METADATA, {EPOCH_KEY: "0"})
         self._schemas: dict[bool, int] = {}
         self._ids: dict[tuple[str, bool, bool, bool, bool], int] = {}
@@ -87,7 +86,7 @@ class FrameWriter:
         kind = FD_FRAME if frame.is_fd else CAN_FRAME
         if frame.is_fd not in self._schemas:
             self._schemas[frame.is_fd] = self._writer.register_schema(kind.name, "ros2msg", kind.text.encode())
-        metadata = {CHANNEL_KEY: frame.channel} if frame.channel else {}
+        metadata = {QOS_KEY: "", **({CHANNEL_KEY: frame.channel} if frame.channel else {})}
         if frame.is_fd:
             metadata[RATE_SWITCH_KEY] = str(int(frame.has_rate_switch))
             metadata[ERROR_STATE_KEY] = str(int(frame.has_error_state))

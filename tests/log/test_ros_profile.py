@@ -1,0 +1,143 @@
+"""Our logs in the hands of a ROS 2 user: rosbags opens them and reads what mcap's own decoder reads."""
+
+import collections
+import dataclasses
+
+import numpy as np
+import pytest
+from made_log import kinds, make_log, new, put_together, take_apart
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Header
+from mcap_ros2.decoder import DecoderFactory
+from recorded_run import fd_contract, make_run, record
+from rosbags.highlevel import AnyReader, AnyReaderError
+
+from adacd_hil.log.check.check import check_log
+from adacd_hil.log.editing.cut import Stretch, cut
+from adacd_hil.log.editing.merge import merge
+from adacd_hil.log.editing.recover import recover
+from adacd_hil.log.formats.mcap_frame_writer import FrameWriter, RecordedFrame
+from adacd_hil.log.reader import read_log
+from adacd_hil.wire.codec import load_codec
+
+CYCLES = 120
+
+
+@pytest.fixture(scope="module")
+def log_path(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("log")
+    record(
+        folder / "run.mcap", make_run(CYCLES, has_fd=True), messages=load_codec(fd_contract(folder)).messages.values()
+    )
+    return folder / "run.mcap"
+
+
+def header_of(path):
+    return kinds(take_apart(path.read_bytes()), Opcode.HEADER)[0].read(Header)
+
+
+def without_profile(path, out, **changes):
+    """Write a log as earlier versions did: its header names no profile. changes: of the header besides."""
+    parts = take_apart(path.read_bytes())
+    header = dataclasses.replace(parts[0].read(Header), **{"profile": "", **changes})
+    parts[0].body = new(header).body
+    out.write_bytes(put_together(parts))
+    return out
+
+
+def plain(value):
+    """Make a message of either library a comparable tree; of rosbags' names of types nothing stays."""
+    if hasattr(value, "__slots__"):
+        return {name: plain(getattr(value, name)) for name in value.__slots__}
+    if dataclasses.is_dataclass(value):
+        return {
+            row.name: plain(getattr(value, row.name))
+            for row in dataclasses.fields(value)
+            if not (row.name.startswith("__") or row.name.isupper())  # the type, and its constants
+        }
+    if isinstance(value, (np.ndarray, bytes, list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return repr(float(value))  # NaN is NaN
+    return int(value) if isinstance(value, (int, np.integer)) else value
+
+
+def by_rosbags(path):
+    messages = collections.defaultdict(list)
+    with AnyReader([path]) as reader:
+        assert all(c.msgtype and c.msgdef.data for c in reader.connections)
+        for connection, log_time, data in reader.messages():
+            messages[connection.topic].append((log_time, plain(reader.deserialize(data, connection.msgtype))))
+        counts = {connection.topic: connection.msgcount for connection in reader.connections if connection.msgcount}
+    assert counts == {topic: len(rows) for topic, rows in messages.items()}
+    return messages
+
+
+def by_mcap(path):
+    messages = collections.defaultdict(list)
+    with path.open("rb") as file:
+        for _, channel, message, decoded in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            messages[channel.topic].append((message.log_time, plain(decoded)))
+    return messages
+
+
+@pytest.mark.slow
+def test_rosbags_reads_every_message_of_every_topic(log_path):
+    theirs = by_rosbags(log_path)
+    assert {"/scheme", "/joint_states", "/from_can_bus_fd", "/to_can_bus", "/events", "/contact"} <= set(theirs)
+    assert len(theirs["/scheme"]) == CYCLES
+    assert theirs == by_mcap(log_path)
+
+
+@pytest.mark.slow
+def test_every_channel_has_the_metadata_that_the_profile_asks_for(log_path):
+    with log_path.open("rb") as file:
+        channels = make_reader(file).get_summary().channels.values()
+    assert len(channels) > 10
+    assert {channel.metadata.get("offered_qos_profiles") for channel in channels} == {""}
+    assert {channel.message_encoding for channel in channels} == {"cdr"}
+
+
+@pytest.mark.slow
+def test_a_log_of_before_the_profile_is_read_as_ever_and_a_copy_of_it_opens_in_rosbags(log_path, tmp_path):
+    old = without_profile(log_path, tmp_path / "run.mcap")
+    with pytest.raises(AnyReaderError, match="Profile is not ros2"), AnyReader([old]):
+        pass
+    before, now = read_log(old), read_log(log_path)
+    assert before.frames.tobytes() == now.frames.tobytes()
+    assert before.contacts == now.contacts
+    assert [finding for finding in check_log(old).findings if finding.rule == "profile"] == []
+    copies = [tmp_path / name for name in ("cut.mcap", "merged.mcap", "recovered.mcap")]
+    cut(old, copies[0], Stretch(0.02, 0.05))
+    merge([old, log_path], copies[1], has_prefix=True)
+    recover(old, copies[2])
+    assert [header_of(copy).profile for copy in copies] == ["ros2"] * 3
+    assert len(by_rosbags(copies[0])["/scheme"]) == 30
+    assert by_rosbags(copies[2]) == by_mcap(log_path)
+
+
+def test_a_copy_of_somebody_elses_log_does_not_claim_the_profile(tmp_path):
+    theirs = tmp_path / "theirs.mcap"
+    theirs.write_bytes(make_log(library="somebody 1.0"))
+    ours = tmp_path / "ours.mcap"
+    ours.write_bytes(make_log())
+    cut(theirs, tmp_path / "cut.mcap", Stretch(0.0, 1.0))
+    merge([ours, theirs], tmp_path / "merged.mcap", has_prefix=True)
+    cut(ours, tmp_path / "own.mcap", Stretch(0.0, 1.0))
+    profiles = [header_of(tmp_path / f"{name}.mcap").profile for name in ("cut", "merged", "own")]
+    assert profiles == ["", "", "ros2"]
+
+
+def test_frames_that_python_can_records_open_in_rosbags(tmp_path):
+    path = tmp_path / "frames.mcap"
+    with path.open("wb") as file:
+        writer = FrameWriter(file)
+        writer.write(RecordedFrame(1_000_000, 0x123, b"\x01\x02", 2, channel="can0"))
+        writer.write(RecordedFrame(2_000_000, 0x124, bytes(12), 12, channel="can0", is_fd=True))
+        writer.finish()
+    read = by_rosbags(path)
+    assert read == by_mcap(path)
+    assert [row["id"] for _, row in read["/from_can_bus"]] == [0x123]

@@ -1,0 +1,132 @@
+"""The EDS files as tools that are not ours see them, and what CiA 306 and CiA 301 ask of them."""
+
+import configparser
+import re
+from pathlib import Path
+
+import pytest
+from eds_utils.eds_validate import eds_validate
+
+from adacd_hil.wire.codec import contract_folder
+
+FILES = sorted(contract_folder().glob("*.eds"))
+EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+LISTS = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
+MANDATORY = {0x1000, 0x1001, 0x1018}
+BITS = {0x1: 1, 0x2: 8, 0x3: 16, 0x4: 32, 0x5: 8, 0x6: 16, 0x7: 32, 0x15: 64, 0x1B: 64}  # by DataType
+SIGNED = {0x2, 0x3, 0x4, 0x15}
+ACCESS = {"ro", "wo", "rw", "rwr", "rww", "const"}
+DRIVES = [path for path in FILES if "drive" in path.stem]
+
+
+def sections_of(path: Path) -> configparser.ConfigParser:
+    parser = configparser.ConfigParser(strict=True, interpolation=None)  # strict: nothing twice
+    parser.optionxform = str  # type: ignore[method-assign, assignment]
+    parser.read_string(path.read_text(encoding="ascii"))
+    return parser
+
+
+def number(text: str, node_id: int = 1) -> int:
+    """Read a value; `$NODEID+x` stands for the node's."""
+    return node_id + int(text.removeprefix("$NODEID+"), 0) if text.startswith("$NODEID+") else int(text, 0)
+
+
+def variables(path: Path) -> dict[tuple[int, int], configparser.SectionProxy]:
+    """List what has a DataType, by index and sub-index."""
+    found = {}
+    parser = sections_of(path)
+    for name in parser.sections():
+        match = re.fullmatch(r"([0-9A-F]{4})(?:sub([0-9A-F]{1,2}))?", name)
+        if match and "DataType" in parser[name]:
+            found[int(match[1], 16), int(match[2] or "0", 16)] = parser[name]
+    return found
+
+
+def test_there_are_files() -> None:
+    assert {path.stem for path in FILES} >= {"drive", "drive_fd", "stock_drive", "torque_sensor", "int32_sensor"}
+
+
+@EVERY_FILE
+def test_eds_validate_is_content(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    eds_validate([str(path)])  # exits when it isn't
+    assert capsys.readouterr().err == ""
+
+
+@EVERY_FILE
+def test_the_three_lists_name_every_object_once_and_nothing_else(path: Path) -> None:
+    parser = sections_of(path)
+    listed: dict[int, str] = {}
+    for name in LISTS:
+        count = int(parser[name]["SupportedObjects"])
+        assert count > 0
+        assert set(parser[name]) == {"SupportedObjects", *map(str, range(1, count + 1))}
+        for place in range(1, count + 1):
+            index = int(parser[name][str(place)], 16)
+            assert index not in listed
+            listed[index] = name
+    objects = {int(name, 16) for name in parser.sections() if re.fullmatch(r"[0-9A-F]{4}", name)}
+    assert set(listed) == objects
+    for index, name in listed.items():
+        is_own = 0x2000 <= index < 0x6000
+        expected = "MandatoryObjects" if index in MANDATORY else "ManufacturerObjects" if is_own else "OptionalObjects"
+        assert (hex(index), name) == (hex(index), expected)
+
+
+@EVERY_FILE
+def test_an_array_or_record_has_as_many_sub_indices_as_it_says(path: Path) -> None:
+    parser = sections_of(path)
+    for name in parser.sections():
+        if "SubNumber" not in parser[name]:
+            continue
+        subs = [int(other[len(name) + 3 :], 16) for other in parser.sections() if other.startswith(f"{name}sub")]
+        assert (name, len(subs)) == (name, int(parser[name]["SubNumber"], 0))
+        highest = parser[f"{name}sub0"]
+        assert number(highest["DataType"]) == 5
+        is_live = name == "1003" or name[:2] in ("16", "1A")  # how many there are now
+        if not is_live:
+            assert (name, number(highest["DefaultValue"])) == (name, max(subs))
+
+
+@EVERY_FILE
+def test_every_default_and_limit_fits_its_type(path: Path) -> None:
+    for (index, sub), row in variables(path).items():
+        kind = number(row["DataType"])
+        assert row["AccessType"] in ACCESS
+        assert row["PDOMapping"] in ("0", "1")
+        if kind not in BITS:
+            continue
+        low, high = (
+            (-(1 << (BITS[kind] - 1)), (1 << (BITS[kind] - 1)) - 1) if kind in SIGNED else (0, (1 << BITS[kind]) - 1)
+        )
+        values = [number(row[key]) for key in ("LowLimit", "DefaultValue", "HighLimit") if key in row]
+        assert all(low <= value <= high for value in values), (hex(index), sub)
+        assert values == sorted(values), (hex(index), sub)
+
+
+@EVERY_FILE
+def test_a_mapping_names_objects_that_can_be_mapped_in_its_direction(path: Path) -> None:
+    found = variables(path)
+    for (index, sub), row in found.items():
+        if index >> 8 not in (0x16, 0x17, 0x1A, 0x1B) or sub == 0:
+            continue
+        assert re.fullmatch(r"0x[0-9A-F]{8}", row["DefaultValue"]), (hex(index), sub)
+        entry = int(row["DefaultValue"], 16)
+        count = number(found[index, 0]["DefaultValue"])
+        assert (sub <= count) == (entry != 0)
+        if entry == 0:
+            continue
+        mapped = found[entry >> 16, entry >> 8 & 0xFF]
+        allowed = ("rw", "rww", "wo") if index < 0x1A00 else ("ro", "rw", "rwr", "const")
+        assert (mapped["PDOMapping"], mapped["AccessType"] in allowed) == ("1", True), hex(entry)
+        assert BITS[number(mapped["DataType"])] == entry & 0xFF
+
+
+@pytest.mark.parametrize("path", DRIVES, ids=lambda path: path.stem)
+def test_rated_torque_is_constant_and_has_no_value_that_two_motors_could_share(path: Path) -> None:
+    row = variables(path)[0x6076, 0]
+    assert (row["AccessType"], "DefaultValue" in row) == ("const", False)
+
+
+@EVERY_FILE
+def test_the_file_names_itself(path: Path) -> None:
+    assert sections_of(path)["FileInfo"]["FileName"] == path.name
