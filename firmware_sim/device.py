@@ -59,6 +59,9 @@ class Application(PdoUser, Protocol):
     def distrust_sync(self, t_ns: int) -> None:
         """Act on SYNCs that are no time base."""
 
+    def note_error(self) -> None:
+        """Take note that the error register, 0x1001, may have changed."""
+
     @property
     def is_at_work(self) -> bool:
         """Whether the device does what its objects must not be changed under."""
@@ -232,10 +235,15 @@ class Device(ObjectDictionary):
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
         """Report a watchdog that trips; once, until it has cleared."""
         self.watchdogs.trip(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+        if self._application is not None:
+            self._application.note_error()
 
     def clear(self, watchdog: Watchdog, t_ns: int) -> None:
         """Report that the cause of a tripped watchdog has gone, by an EMCY with code 0."""
-        self.watchdogs.clear(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+        if watchdog in self.watchdogs.tripped:
+            self.watchdogs.clear(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+            if self._application is not None:
+                self._application.note_error()
 
     def report_fault(self, code: int, t_ns: int) -> None:
         """Send the EMCY of a fault that no watchdog found."""

@@ -91,7 +91,7 @@ class DriveNode:
         self._stop = DISABLE
         self._ramp_end: DriveEvent | None = None
         self._is_braking = False
-        self._is_motor_limited = False
+        self._is_motor_limited = self._is_limiting = False
         self._standstill = Standstill()
         self._silent_syncs = _NO_COMMAND_YET
         self._sync_ns = 0
@@ -164,11 +164,15 @@ class DriveNode:
         word = STATE_BITS[self.state] | _REMOTE
         if Watchdog.COMMAND_PDO in self._tripped:
             word |= _WARNING
-        if self.is_enabled and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None:
+        if self._follows_target:
             word |= _FOLLOWS_TARGET
             if self._limits.is_limiting or self._is_motor_limited:
                 word |= _INTERNAL_LIMIT
         return word
+
+    @property
+    def _follows_target(self) -> bool:
+        return self.state is _ENABLED and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None
 
     @property
     def error_code(self) -> int:
@@ -285,6 +289,9 @@ class DriveNode:
         """Fault when enabled: torque that acts at SYNC has no time."""
         if self.is_enabled:
             self._fault(Watchdog.SYNC, t_ns)
+
+    def note_error(self) -> None:
+        """Do nothing: a drive's status has no error register."""
 
     def restart(self, is_node_reset: bool) -> None:
         """Forget the last command; a node reset also runs the state machine from its start (0, 1)."""
@@ -415,13 +422,14 @@ class DriveNode:
             self.device.trip(cause, t_ns)
 
     def _watch_motor(self, t_ns: int) -> None:
-        """Fault when the motor's state calls for it; note when its limits come and go."""
+        """Fault when the motor's state calls for it; note when limits come and go."""
         code = self._motor.error_code()
         if code:
             self._latch(code, None, t_ns)
         is_limited = self._motor.is_limited()
-        if is_limited != self._is_motor_limited:
-            self._is_motor_limited = is_limited
+        is_limiting = self._limits.is_limiting and self._follows_target
+        if is_limited != self._is_motor_limited or is_limiting != self._is_limiting:
+            self._is_motor_limited, self._is_limiting = is_limited, is_limiting
             self.has_news = True
 
     def _is_cause_present(self, t_ns: int) -> bool:
@@ -482,7 +490,7 @@ class DriveNode:
 
     def _drive_motor(self) -> None:
         """Tell the motor what the state allows: torque only in Operation enabled with mode 10."""
-        if self.state is _ENABLED and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None:
+        if self._follows_target:
             self._demand = self._limits.demand()
             self.torque_Nm = self._demand * self._rated_mNm * 1e-6
         else:

@@ -117,16 +117,18 @@ class SensorNode:
 
     def lose_heartbeat(self, t_ns: int) -> None:
         """Report it."""
-        self.has_news = True
         self.device.trip(Watchdog.HEARTBEAT, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
         """Clear the error."""
-        self.has_news = True
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def distrust_sync(self, t_ns: int) -> None:
         """Do nothing: who measures by SYNC has been told."""
+
+    def note_error(self) -> None:
+        """Let the status frame say so."""
+        self.has_news = True
 
     @property
     def is_at_work(self) -> bool:

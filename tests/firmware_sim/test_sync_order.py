@@ -46,8 +46,9 @@ def test_one_doubled_sync_is_ignored_counted_and_reported_by_every_node(clock_mo
     again(host)
     assert (host.bench.cycle, len(host.truths), host.bench.now_ns) == (cycle, truths, now_ns)
     frames = host.take()
-    assert [can_id for can_id, _ in frames] == [0x081, 0x082, 0x083, 0x084]
-    assert {struct.unpack_from("<HBB", data) for _, data in frames} == {(0x8200, 0x11, ORDER)}
+    assert [can_id for can_id, _ in frames] == [0x081, 0x082, 0x083, 0x084, 0x283, 0x284]
+    assert {struct.unpack_from("<HBB", data) for _, data in frames[:4]} == {(0x8200, 0x11, ORDER)}
+    assert {data for _, data in frames[4:]} == {b"\x00\x11"}  # the sensors' error register
     assert [counts(host, node) for node in NODES] == [[1, 0, 0, 0, 0]] * 4
     assert host.read(1, 0x2210, 2 + ORDER) == 1
     host.step(ENABLE)

@@ -5,19 +5,22 @@ import json
 import math
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
 from adacd_hil.config import load_settings
 from adacd_hil.log.layout import viewer_layout
+from adacd_hil.log.live.link_bodies import GRAVITY_M_S2
 from adacd_hil.log.live.robot_description import robot_description
 from adacd_hil.log.live.scene import Shape, transforms_of
+from adacd_hil.scheme.regressor import inverse_dynamics
 from adacd_hil.scheme.urdf import read_urdf
 
 LENGTHS_M = (0.42, 0.27)
 
 
-def settings_of(is_upright):
+def settings_of(is_upright, cad_theta=()):
     settings = load_settings("paper")
     arm = replace(
         settings.arm,
@@ -25,7 +28,7 @@ def settings_of(is_upright):
         position_limit_deg=(75.0, 120.0),
         velocity_limit_deg_s=(250.0, 300.0),
         torque_limit_Nm=(12.0, 6.0),
-        cad_theta=(),
+        cad_theta=cad_theta,
     )
     P0 = settings.estimator.P0 + ((0.5, 0.5) if is_upright else ())
     estimator = replace(settings.estimator, gravity=is_upright, P0=P0)
@@ -81,6 +84,79 @@ def test_the_urdf_has_the_limits_of_the_settings_and_the_names_of_the_log():
     assert (arm.position_low == -arm.position_high).all()
     assert np.degrees(arm.velocity_limit) == pytest.approx([250.0, 300.0])
     assert arm.torque_limit.tolist() == [12.0, 6.0]
+
+
+def random_theta(generator, is_upright):
+    """Draw the parameters of two links of any masses; link 1 may carry a counterweight."""
+    m, inertia = generator.uniform(0.2, 5.0, 2), generator.uniform(0.001, 0.1, 2)
+    c1, c2 = generator.uniform(0.0, 0.4), generator.uniform(0.0, 0.3)
+    l1 = LENGTHS_M[0]
+    alpha, beta, gamma = inertia[0] + m[0] * c1**2 + m[1] * l1**2, l1 * m[1] * c2, inertia[1] + m[1] * c2**2
+    gravity = (GRAVITY_M_S2 * (m[0] * generator.uniform(-0.9, 1.0) * c1 + m[1] * l1), GRAVITY_M_S2 * m[1] * c2)
+    friction = generator.uniform(0.0, 0.2, 4)
+    return tuple(map(float, (alpha + gamma, beta, gamma, *friction, *(gravity if is_upright else ()))))
+
+
+def mujoco_torque(model, q, dq, ddq):
+    """Give the torque that MuJoCo needs for a motion, friction included."""
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel, data.qacc = q, dq, ddq
+    mujoco.mj_inverse(model, data)
+    return data.qfrc_inverse + model.dof_frictionloss * np.sign(dq)
+
+
+@pytest.mark.parametrize("is_upright", [False, True])
+@pytest.mark.parametrize("seed", range(10))
+def test_the_urdf_moves_in_mujoco_as_the_cad_model_says(seed, is_upright):
+    generator = np.random.default_rng(seed)
+    theta = random_theta(generator, is_upright)
+    model = mujoco.MjModel.from_xml_string(robot_description(settings_of(is_upright, theta)))
+    model.opt.gravity[:] = (0.0, 0.0, -GRAVITY_M_S2)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT  # friction as a constraint, joint limits
+    assert (model.nq, model.body_mass[1:].min() > 0.0) == (2, True)
+    for _ in range(5):
+        q, dq, ddq = generator.uniform(-1.0, 1.0, (3, 2)) * [[1.2], [3.0], [30.0]]
+        expected = inverse_dynamics(q, dq, ddq, np.array(theta))
+        assert mujoco_torque(model, q, dq, ddq) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_the_built_in_arms_load_in_mujoco(profile):
+    settings = load_settings("certified", profile)
+    model = mujoco.MjModel.from_xml_string(robot_description(settings))
+    assert model.nq == 2
+    weighed_kg = {"P": 2.25, "S": 4.5, "M": 4.5}[profile]  # of the emulated arm
+    assert model.body_mass.sum() == pytest.approx(weighed_kg, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("theta", "said"),
+    [
+        ((), "arm.cad_theta is not given"),
+        ((0.1, 0.2, 0.01, 0.0, 0.0, 0.0, 0.0), "belong to no rigid links"),
+        ((0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), "belong to no rigid links"),
+    ],
+)
+def test_what_the_cad_model_does_not_tell_is_not_made_up(theta, said):
+    text = robot_description(settings_of(False, theta))
+    assert f"no inertia: {'' if not theta else 'arm.cad_theta: '}" in text
+    assert said in text
+    assert "<inertial>" not in text
+    with pytest.raises(ValueError, match="mass and inertia"):
+        mujoco.MjModel.from_xml_string(text)
+    assert read_urdf(text).joint_names == ("joint1", "joint2")
+
+
+def test_gravity_that_does_not_fit_the_inertia_is_said():
+    theta = list(random_theta(np.random.default_rng(0), True))
+    theta[8] *= 1.05
+    assert "but a2 = " in robot_description(settings_of(True, tuple(theta)))
+
+
+def test_a_link_whose_centre_is_on_its_joint_has_a_body_too():
+    model = mujoco.MjModel.from_xml_string(robot_description(settings_of(False, (0.2, 0.0, 0.02, 0.0, 0.0, 0.0, 0.0))))
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    assert mujoco_torque(model, [0.3, 0.7], [0.0, 0.0], [1.0, 0.0]) == pytest.approx([0.2, 0.02])
 
 
 def test_the_layout_holds_the_urdf_and_shows_every_panel_once():

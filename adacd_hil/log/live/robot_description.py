@@ -1,17 +1,22 @@
-"""The arm for viewers: a URDF of two links and a tip, made from the settings.
+"""The arm as a URDF of two links and a tip, made from the settings: for viewers, and for physics engines.
 
 Frames: `base` stands still, `link1` and `link2` begin at their joints with x along the link, `tip` is at the end. Joint
 axes are z. Where gravity acts on the joints the plane of motion is upright: `world` carries `base` with y up.
+
+Masses and friction are those of the CAD model, `arm.cad_theta`, without payload. It knows inertia about the joint axes
+only; about the link's own axis it is that of a bar of LINK_WIDTH_M. Without a CAD model the links have no inertia, and
+a comment says so: an engine then refuses the file, a viewer doesn't mind.
 """
 
 import math
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Comment, Element, SubElement
 
 import numpy as np
 
 from adacd_hil.config import Settings
-from adacd_hil.records import JOINT_NAMES
+from adacd_hil.log.live.link_bodies import LinkBody, ModelError, find_bodies
+from adacd_hil.records import JOINT_NAMES, PARAMETER_NAMES
 
 ROBOT_NAME = "robot.urdf"
 WORLD, BASE, TIP = "world", "base", "tip"
@@ -23,9 +28,17 @@ _COLORS = {"link": "0.35 0.45 0.6 1", "joint": "0.25 0.27 0.3 1"}
 
 
 def robot_description(settings: Settings) -> str:
-    """Write the URDF of the configured arm: lengths, limits and shapes, no masses."""
+    """Write the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction."""
     arm = settings.arm
     robot = Element("robot", name="adacd")
+    bodies: tuple[LinkBody, ...] = ()
+    try:
+        bodies = find_bodies(arm.cad_theta, arm.link_length_m[0]) if arm.cad_theta else ()
+        reason = "arm.cad_theta is not given"
+    except ModelError as error:
+        reason = f"arm.cad_theta: {error}"
+    if not bodies:
+        robot.append(Comment(f" no inertia: {reason} "))
     for color, rgba in _COLORS.items():
         SubElement(SubElement(robot, "material", name=color), "color", rgba=rgba)
     SubElement(robot, "link", name=WORLD)
@@ -46,8 +59,13 @@ def robot_description(settings: Settings) -> str:
             velocity=_text(arm.velocity_limit_rad_s[index]),
             effort=_text(arm.torque_limit_Nm[index]),
         )
+        if bodies:
+            viscous, coulomb = (arm.cad_theta[PARAMETER_NAMES.index(f"{name}{index + 1}")] for name in ("F_v", "F_c"))
+            SubElement(joint, "dynamics", damping=_text(viscous), friction=_text(coulomb))
         reach_m, parent = arm.link_length_m[index], link_name
         link = SubElement(robot, "link", name=link_name)
+        if bodies:
+            _add_inertia(link, bodies[index])
         size = f"{_text(reach_m)} {_text(LINK_WIDTH_M)} {_text(LINK_WIDTH_M)}"
         _add_shape(link, "link", "box", x_m=0.5 * reach_m, size=size)
         _add_shape(link, "joint", "cylinder", radius=_JOINT_RADIUS_M, length=1.5 * LINK_WIDTH_M)
@@ -70,6 +88,16 @@ def _add_joint(
     SubElement(joint, "child", link=child)
     SubElement(joint, "origin", xyz=f"{_text(x_m)} 0 0", rpy=f"{_text(roll_rad)} 0 0")
     return joint
+
+
+def _add_inertia(link: Element, body: LinkBody) -> None:
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", xyz=f"{_text(body.center_m)} 0 0", rpy="0 0 0")
+    SubElement(inertial, "mass", value=_text(body.mass_kg))
+    across = body.inertia_kg_m2
+    along = min(across, body.mass_kg * LINK_WIDTH_M**2 / 6.0)  # any more would be more than a rigid body can have
+    moments = {"ixx": along, "iyy": across, "izz": across}
+    SubElement(inertial, "inertia", {"ixy": "0", "ixz": "0", "iyz": "0"} | {k: _text(v) for k, v in moments.items()})
 
 
 def _add_shape(link: Element, color: str, shape: str, x_m: float = 0.0, **sizes: float | str) -> None:

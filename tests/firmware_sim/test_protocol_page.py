@@ -1,0 +1,172 @@
+"""What docs/protocol.md says of the devices, where a reader could take it one way or the other."""
+
+import re
+import struct
+from pathlib import Path
+
+import pytest
+from bench_host import CODEC, DISABLE_VOLTAGE, ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, BenchHost, quiet_scenario
+
+from firmware_sim.watchdogs import ERROR_CODES, WARNINGS, Watchdog
+
+PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
+READY, SWITCHED_ON, ENABLED = 0x21, 0x23, 0x27
+REMOTE, REACHED, LIMITED, FOLLOWS = 1 << 9, 1 << 10, 1 << 11, 1 << 12
+
+
+def running(torque: int = 0) -> BenchHost:
+    host = BenchHost(quiet_scenario(noise=True))
+    host.enable()
+    for _ in range(20):
+        host.step(ENABLE, torque)
+    host.take()
+    return host
+
+
+def crc8(data: bytes) -> int:
+    """Compute the CRC that the page describes, bit by bit."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x2F if crc & 0x80 else 0)) & 0xFF
+    return crc ^ 0xFF
+
+
+def test_the_pages_command_frame_is_right_and_taken_by_a_drive():
+    found = re.search(
+        r"counter (\d+), controlword (0x[0-9A-F]+), target torque (\d+)\..*The frame is `([0-9a-f ]+)`", PAGE
+    )
+    assert found is not None
+    counter, word, torque, text = int(found[1]), int(found[2], 16), int(found[3]), found[4]
+    frame = bytes.fromhex(text)
+    ids = CODEC.message("Drive1Command").data_ids
+    body = bytes([counter]) + struct.pack("<Hh", word, torque)
+    assert frame == bytes([crc8(body + ids[counter : counter + 1])]) + body
+    host = BenchHost()
+    host.start()
+    for earlier in (SHUTDOWN, SWITCH_ON):
+        host.step(earlier)
+    host.put(0x201, frame)
+    host.command(ENABLE, joints=(2,))
+    host.sync()
+    assert host.state_bits() == ENABLED
+    assert host.bench.drives[0].torque_Nm == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize("nibble", range(16))
+def test_a_drive_ignores_the_status_nibble_of_a_command(nibble):
+    host = BenchHost()
+    host.start()
+    frame = bytearray(2) + struct.pack("<Hh", SHUTDOWN, 0)
+    frame[1] = nibble << 4
+    host.put(0x201, host.senders[1].protect(frame))
+    host.sync()
+    assert host.state_bits() == READY
+
+
+def test_every_command_of_the_host_has_a_status_nibble_of_0():
+    host = running()
+    assert host.command_frame(1, ENABLE, 100)[1] >> 4 == 0
+    assert CODEC.message("Drive1Command").encode_raw(ENABLE, 100)[1] >> 4 == 0
+
+
+def test_the_status_of_a_drive_follows_statusword_mode_and_error_and_not_the_torque():
+    host = running()
+    for _ in range(50):
+        host.step(ENABLE, 50)  # torque actual changes in each
+    assert [can_id for can_id, _ in host.take() if can_id == 0x281] == []
+    host.write(1, 0x1003, 0, 0)
+    host.step(ENABLE, 2000)  # more than rated: bit 11
+    (status,) = host.taken(0x281)
+    assert struct.unpack_from("<H", status)[0] & LIMITED == LIMITED
+    host.bench.drives[0].fail(0x2310, host.bench.now_ns)
+    host.sync()
+    assert [data[5:] for data in host.taken(0x281)] == [b"\x10\x23"]
+
+
+def test_the_status_of_a_sensor_follows_status_and_error_register():
+    host = running()
+    host.sync()
+    host.take()
+    host.bench.sensors[0].set_error(1)
+    host.sync()
+    host.sync()
+    assert host.taken(0x283) == [b"\x01\x00"]
+    host.put(0x080, b"")  # a SYNC of the wrong length: error register
+    assert host.taken(0x283) == [b"\x01\x11"]
+
+
+def test_what_sdo_writes_to_the_header_objects_is_dropped():
+    host = running()
+    host.step(DISABLE_VOLTAGE)
+    for sub in (1, 2):
+        before = host.read(1, 0x2100, sub)
+        host.write(1, 0x2100, sub, before ^ 0xFF)
+        assert host.read(1, 0x2100, sub) == before
+    frame = host.command_frame(1, DISABLE_VOLTAGE)
+    host.put(0x201, frame)
+    assert [host.read(1, 0x2100, 1), host.read(1, 0x2100, 2)] == [frame[0], frame[1]]
+
+
+def test_rated_torque_is_each_drives_own():
+    host = BenchHost()
+    assert [host.read(node, 0x6076) for node in (1, 2)] == [12_000, 6000]
+    host.enable()
+    host.step(ENABLE, 500)
+    assert [drive.torque_Nm for drive in host.bench.drives] == [pytest.approx(6.0), pytest.approx(3.0)]
+    assert "12 000 in drive 1 and 6000 in drive 2" in PAGE
+
+
+@pytest.mark.parametrize("bits", [READY, SWITCHED_ON, ENABLED])
+@pytest.mark.parametrize("bit", [4, 5, 6, 8, 9, 10, 11, 12, 13, 14, 15])
+def test_halt_and_the_other_bits_of_the_controlword_have_no_effect(bit, bits):
+    words = {READY: (SHUTDOWN,), SWITCHED_ON: (SHUTDOWN, SWITCH_ON), ENABLED: (SHUTDOWN, SWITCH_ON, ENABLE)}[bits]
+    host = BenchHost()
+    host.start()
+    for word in words:
+        host.step(word | 1 << bit, 100)
+    host.step(words[-1] | 1 << bit, 100)
+    assert host.state_bits() == bits
+    assert host.bench.drives[0].torque_Nm == pytest.approx(1.2 if bits == ENABLED else 0.0)
+
+
+def test_bits_9_10_and_12_of_the_statusword():
+    host = BenchHost()
+    host.start()
+    seen = []
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP):
+        host.step(word)
+        seen.append(host.statusword() & (REMOTE | REACHED | FOLLOWS))
+    assert seen == [REMOTE, REMOTE, REMOTE | FOLLOWS, REMOTE]
+
+
+def test_a_quick_stop_that_stays_never_says_target_reached():
+    host = BenchHost()
+    host.write(1, 0x605A, 0, 6)
+    host.enable()
+    host.wait_until_at_rest(QUICK_STOP)
+    assert host.statusword() & (0x6F | REACHED) == 0x07
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_after_nmt_start_the_first_sync_may_take_its_time_and_have_any_counter(clock_mode):
+    host = BenchHost(clock_mode=clock_mode)
+    host.start()
+    host.take()
+    host.t_ns += 60_000_000_000
+    host.bench.advance_to(host.t_ns)
+    assert [can_id for can_id, _ in host.take() if can_id < 0x100] == []
+    host.cycle = 123
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE, ENABLE):
+        host.step(word)
+    assert (host.state_bits(), [host.read(1, 0x2211, sub) for sub in range(1, 6)]) == (ENABLED, [0] * 5)
+
+
+def test_the_page_names_every_watchdog_with_its_code():
+    for watchdog in Watchdog:
+        assert f"0x{ERROR_CODES[watchdog]:04X}" in PAGE
+    numbers = re.search(r"Byte 3 of each EMCY is the watchdog: (.*?);", PAGE)
+    assert numbers is not None
+    assert [int(entry.split()[0]) for entry in numbers[1].split(", ")] == sorted(Watchdog)
+    assert {watchdog for watchdog in Watchdog if watchdog >= 5} == WARNINGS
