@@ -286,6 +286,7 @@ def cycles_of_a_bus_without_devices() -> dict[str, Any]:
 
 
 EXAMPLES: dict[str, Callable[[], dict[str, Any]]] = {
+    "formats.md": dict,
     "scheme-any-arm.md": free_and_pushed_motion,
     "scheme.md": cycles_of_a_bus_without_devices,
 }
@@ -301,6 +302,8 @@ def test_a_python_example_runs(page, documents, folder, capsys):
     assert len(blocks) == 1
     if page == "scheme-any-arm.md":  # the contact that it prints
         assert re.fullmatch(r"10\d\d link2 \S.*\n", capsys.readouterr().out)
+    elif page == "formats.md":  # the last message of the log
+        assert names["message"].__msgtype__ == names["connection"].msgtype
     else:
         assert names["tau_ext_hat"].shape == (300, 2)
 
