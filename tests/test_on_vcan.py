@@ -20,9 +20,9 @@ from adacd_hil.wire.codec import contract_folder
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 SEED = "7"
-FIRST_CONTACT = '[operator]\nscript = [{ at_s = 11.5, request = "finish" }]\n'
+FIRST_CONTACT = 'extends = "demo_paper"\n[operator]\nscript = [{ at_s = 11.5, request = "finish" }]\n'
 """One adaptation, one contact and the reaction to it: what comes after is the same code."""
-TWO_CONTACTS = '[operator]\nscript = [{ at_s = 14.5, request = "finish" }]\n'
+TWO_CONTACTS = 'extends = "demo_paper"\n[operator]\nscript = [{ at_s = 14.5, request = "finish" }]\n'
 
 
 @pytest.fixture(scope="module")

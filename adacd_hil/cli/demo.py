@@ -25,7 +25,9 @@ from firmware_sim.scenario import Scenario, load_scenario, named_profile
 from firmware_sim.truth import TruthLog
 
 SCENARIO = "paper"
-"""Whose requests to the host the configuration has in its script; the user of another one only asks to finish."""
+"""Whose requests to the host are in a script; the user of another one only asks to finish."""
+USER = "demo"
+"""The configuration with that script, for those that have none."""
 
 
 class Cast(NamedTuple):
@@ -38,17 +40,20 @@ class Cast(NamedTuple):
 def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None) -> Cast:
     """Read configuration and scenario. Raises ConfigError.
 
-    The profile is the given one, else that of the scenario's file, else the configuration's.
+    The profile is the given one, else that of the scenario's file, else the configuration's. A configuration without a
+    script gets the demo's user: who only watches can't acknowledge.
     """
     settings = load_settings(config, profile or named_profile(scenario_name))
     scenario = load_scenario(scenario_name, settings.arm.profile, seed)
-    if scenario_name == SCENARIO:
-        return Cast(settings, scenario)
-    operator = dataclasses.replace(
-        settings.operator,
-        script=(RequestSettings(at_s=scenario.lasts_s, request="finish"),),
-        acknowledge_faults=scenario.acknowledge_faults,
-    )
+    operator = settings.operator
+    if not operator.script:  # nobody else plays the user of an emulated arm
+        operator = load_settings(USER).operator
+    if scenario_name != SCENARIO:
+        operator = dataclasses.replace(
+            operator,
+            script=(RequestSettings(at_s=scenario.lasts_s, request="finish"),),
+            acknowledge_faults=scenario.acknowledge_faults,
+        )
     return Cast(dataclasses.replace(settings, operator=operator), scenario)
 
 

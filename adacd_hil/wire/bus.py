@@ -196,6 +196,22 @@ def can_interfaces() -> list[str]:
     return names
 
 
+def is_virtual(interface: str, channel: str) -> bool:
+    """Tell whether a channel surely has no wire behind it: vcan, vxcan, python-can's own virtual bus.
+
+    A serial adapter (slcan) has no device of its own and is no such channel. Where the kernel doesn't say what kind an
+    interface is, its name does.
+    """
+    if interface != "socketcan":
+        return interface == "virtual"
+    if (_INTERFACES / channel / "device").exists():
+        return False
+    from adacd_hil.wire.link import read_link  # which asks another program
+
+    link = read_link(channel)
+    return link is not None and link.is_virtual
+
+
 def is_hardware(interface: str, channel: str) -> bool:
     """Tell whether a channel may have a real bus behind it: everything but vcan and python-can's own virtual bus."""
     if interface == "socketcan":

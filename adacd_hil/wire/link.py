@@ -95,12 +95,19 @@ def read_sysfs_link(folder: Path) -> Link | None:
         return Link(
             name=folder.name,
             is_up=bool(int((folder / "flags").read_text(), 16) & _IFF_UP),
-            kind="" if (folder / "device").exists() else "vcan",
+            kind=_kind_of(folder),
             mtu=int((folder / "mtu").read_text()),
             txqueuelen=int((folder / "tx_queue_len").read_text()),
         )
     except (OSError, ValueError):
         return None
+
+
+def _kind_of(folder: Path) -> str:
+    """Guess by its name what kind an interface without a device is: sysfs doesn't say. "" where it may be any."""
+    if (folder / "device").exists():
+        return ""
+    return next((kind for kind in ("vcan", "vxcan", "slcan") if folder.name.startswith(kind)), "")
 
 
 def carried_frames(name: str) -> int | None:
