@@ -200,6 +200,9 @@ class ArmSettings:
     torque_limit_Nm: tuple[float, float] = setting(
         (12.0, 6.0), unit="Nm", low=0.0, high=1000.0, meaning="largest commanded torque"
     )
+    torque_error_share: float = setting(
+        0.3, low=0.01, high=10.0, meaning="largest difference of commanded and actual torque, part of rated torque"
+    )
     torque_rate_limit_Nm_s: tuple[float, float] = setting(
         (2000.0, 1000.0), unit="Nm/s", low=1.0, high=1e6, meaning="largest change of commanded torque"
     )
@@ -289,6 +292,24 @@ class BusSettings:
 
 
 @dataclass(frozen=True)
+class DataSettings:
+    """How much of the cyclic data may be missing. Shares are of the cycles of any second with enabled drives."""
+
+    blind_cycles: int = setting(
+        5, low=2, high=1000, meaning="cycles in a row without a fresh sample for the model; then the run faults"
+    )
+    incomplete_share: float = setting(
+        0.1, low=0.0, high=1.0, meaning="cycles in which some frame is missing or late; more is said and judged"
+    )
+    no_new_data_share: float = setting(
+        0.05, low=0.0, high=1.0, meaning="cycles without a new frame of one device; more is said and judged"
+    )
+    repeated_share: float = setting(
+        0.01, low=0.0, high=1.0, meaning="cycles with a repeated frame of one device; more is said and judged"
+    )
+
+
+@dataclass(frozen=True)
 class DevicesSettings:
     """Which devices are on the bus, by joint, and the contract that describes their frames."""
 
@@ -305,6 +326,9 @@ class DevicesSettings:
         2.0, unit="s", low=0.1, high=60.0, meaning="longest wait for the nodes to boot after a reset of communication"
     )
     start: str = setting("sensors_first", choices=("sensors_first", "all"), meaning="order of the NMT start commands")
+    reread_ms: int = setting(
+        100, unit="ms", low=0, high=60_000, meaning="how often one object of the set-up is read again; 0: never"
+    )
     quick_stop_option: int | None = setting(None, low=0, high=8, meaning="0x605A of the drives; unset: the profile's")
     fault_reaction_option: int | None = setting(
         None, low=0, high=4, meaning="0x605E of the drives; unset: the profile's"
@@ -610,6 +634,12 @@ class ControllerSettings:
 
     Kp: tuple[float, float] = setting((250.0, 20.0), unit="Nm/rad", low=0.0, high=1e5, meaning="position gain")
     Kd: tuple[float, float] = setting((12.5, 0.75), unit="Nm s/rad", low=0.0, high=1e4, meaning="velocity gain")
+    following_window_deg: tuple[float, float] = setting(
+        (20.0, 30.0), unit="deg", low=0.1, high=360.0, meaning="largest |q - q_d| of an arm that nobody touches"
+    )
+    following_timeout_s: float = setting(
+        0.1, unit="s", low=0.001, high=60.0, meaning="how long it may be larger until the run faults"
+    )
     feedforward: bool = setting(True, meaning="feed the identified model forward once it is valid")
 
 
@@ -633,6 +663,14 @@ class OperatorSettings:
     acknowledge_fault_after_s: float = setting(
         1.0, unit="s", low=0.0, high=3600.0, meaning="how long after a fault it is acknowledged by itself"
     )
+    acknowledge_on_hardware: bool = setting(
+        False, meaning="let stops and faults be acknowledged by themselves where a real arm may be on the bus, too"
+    )
+
+    @property
+    def acknowledges(self) -> bool:
+        """Whether stops or faults are acknowledged by themselves."""
+        return self.acknowledge_after_s > 0.0 or self.acknowledge_faults > 0
 
 
 @dataclass(frozen=True)
@@ -730,10 +768,15 @@ class LogSettings:
 class SafetySettings:
     """Checks before torque."""
 
-    commission_cycles: int = setting(200, low=10, high=100_000, meaning="complete cycles at rest before enabling")
+    commission_s: float = setting(
+        0.2, unit="s", low=0.01, high=100.0, meaning="how long the arm rests, with complete data, before enabling"
+    )
     rest_velocity_rad_s: float = setting(0.05, unit="rad/s", low=1e-4, high=1.0, meaning="|dq| that counts as at rest")
     rest_torque_Nm: float = setting(1.0, unit="Nm", low=0.01, high=100.0, meaning="largest |tau_J| before enabling")
     phase_timeout_s: float = setting(5.0, unit="s", low=0.1, high=600.0, meaning="longest COMMISSION and ENABLE")
+    tolerated_emergencies: tuple[int, ...] = setting(
+        (), low=0x0100, high=0xFFFF, meaning="EMCY error codes that don't stop the arm; any other does at once"
+    )
 
 
 @dataclass(frozen=True)
@@ -791,6 +834,7 @@ class Settings:
     scheme: str = setting("paper", choices=("paper", "certified"), meaning="the paper's scheme, or the one beyond it")
     arm: ArmSettings = setting(ArmSettings, meaning="the arm")
     bus: BusSettings = setting(BusSettings, meaning="timing on the bus")
+    data: DataSettings = setting(DataSettings, meaning="how much of the cyclic data may be missing")
     devices: DevicesSettings = setting(DevicesSettings, meaning="drives and sensors")
     filter: FilterSettings = setting(FilterSettings, meaning="torque filter")
     estimator: EstimatorSettings = setting(EstimatorSettings, meaning="adaptation law")
@@ -807,6 +851,11 @@ class Settings:
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
     log: LogSettings = setting(LogSettings, meaning="the log")
+
+    @property
+    def blind_cycles(self) -> int:
+        """Cycles in a row without a fresh sample that fault the run: not fewer than a value may be old."""
+        return max(self.data.blind_cycles, self.bus.max_age_cycles)
 
     @property
     def further_names(self) -> tuple[str, ...]:
@@ -852,6 +901,20 @@ class Settings:
             )
         if self.bus.host_node in (*self.devices.drive_node, *self.devices.sensor_node):
             raise ConfigError(f"`bus.host_node` = {self.bus.host_node} is the node id of a device")
+
+
+def renewed(table: dict[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a log with today's keys in place of those that older versions had."""
+    safety = table.get("safety")
+    if not isinstance(safety, dict) or "commission_cycles" not in safety:
+        return table
+    bus = table.get("bus")
+    period_us = bus.get("period_us", 1000) if isinstance(bus, dict) else 1000
+    cycles = safety["commission_cycles"]
+    if not (isinstance(cycles, int) and isinstance(period_us, int)):
+        return table
+    kept = {key: value for key, value in safety.items() if key != "commission_cycles"}
+    return table | {"safety": kept | {"commission_s": cycles * period_us * 1e-6}}
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

@@ -179,13 +179,17 @@ class SchemeState(IntEnum):
 
 
 class Request(IntEnum):
-    """What the user asks of a running arm."""
+    """What is asked of a running arm, by the user or by the host's own checks."""
 
     NONE = 0
     ACKNOWLEDGE = 1  # the collision has been seen to; go on
     PAYLOAD = 2  # park the arm, the payload is about to change
     PAYLOAD_CHANGED = 3  # the payload has changed; adapt again
     FINISH = 4  # end the run: come to rest, then disable the drives
+    # What this host's own checks ask for, in place of the user: FAULT, with the reason of that name.
+    FAULT_TORQUE = 5
+    FAULT_FOLLOWING = 6
+    FAULT_TAMPERED = 7
 
 
 class Reaction(IntEnum):
@@ -204,8 +208,8 @@ class FaultReason(IntEnum):
 
     NONE = 0
     DATA_AGE = 1  # a signal older than its budget
-    DRIVE = 2  # a drive left Operation enabled by itself
-    SENSOR = 3  # a torque sensor reports an error
+    DRIVE = 2  # a drive left Operation enabled by itself, or reported an error by EMCY
+    SENSOR = 3  # a torque sensor reports an error, by its status or by EMCY
     LIMIT = 4  # position or velocity outside the arm's limits
     NOT_A_NUMBER = 5  # a value that is not finite
     COMMISSION_TIMEOUT = 6
@@ -213,14 +217,21 @@ class FaultReason(IntEnum):
     ADAPT_TIMEOUT = 8
     HEARTBEAT = 9  # a device has fallen silent or left Operational
     DEADLINE = 10  # the host has skipped too many periods
+    BLIND = 11  # the model has had no fresh sample for too long
+    FOREIGN_FRAMES = 12  # somebody else sends what only this host, or only one device of the arm, sends
+    TORQUE = 13  # a drive's torque is not the one that was commanded
+    FOLLOWING = 14  # the arm doesn't follow the desired motion
+    TAMPERED = 15  # a parameter of a device is no longer what the host has written
 
 
 class ArmState(NamedTuple):
     """What the arm reported in one cycle.
 
     Ages count cycles since the value was sampled: 0 is this cycle's SYNC. `periods` is how many periods have passed
-    since the previous ArmState, 1 unless the cycle overran. `is_late`: the host has skipped so many that the arm is to
-    be held.
+    since the previous ArmState, 1 unless the cycle overran. `is_complete`: q, dq and tau_J were sampled on one SYNC,
+    and no ArmState before had that sample; where devices answer late it is not this cycle's. `is_late`: the host has
+    skipped so many that the arm is to be held. `steps`: periods between this sample and the last complete one before
+    it, 0 when it isn't complete. `sampled_ns`: t_ns of the SYNC that it was sampled on; None: this cycle's.
     """
 
     cycle: int
@@ -235,13 +246,15 @@ class ArmState(NamedTuple):
     is_complete: bool
     fault: FaultReason
     is_late: bool = False
+    steps: int = 1
+    sampled_ns: int | None = None
 
 
 class ArmBatch(NamedTuple):
     """ArmStates of n consecutive cycles, as columns.
 
     cycle, t_ns, periods (n,) int64; q, dq, tau_J (n, 2); age_q, age_tau_J (n, 2) int64; is_enabled, is_complete,
-    is_late (n,) bool; fault (n,) uint8 of FaultReason.
+    is_late (n,) bool; fault (n,) uint8 of FaultReason; steps, sampled_ns (n,) int64.
     """
 
     cycle: NDArray[np.int64]
@@ -256,6 +269,8 @@ class ArmBatch(NamedTuple):
     is_complete: NDArray[np.bool_]
     fault: NDArray[np.uint8]
     is_late: NDArray[np.bool_]
+    steps: NDArray[np.int64]
+    sampled_ns: NDArray[np.int64]
 
 
 class ArmCommand(NamedTuple):

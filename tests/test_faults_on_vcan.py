@@ -39,7 +39,7 @@ sync_patience_periods = 25.0
 misses = 1000000
 
 [safety]
-commission_cycles = 20
+commission_s = 0.2
 
 [controller]
 Kp = [40.0, 6.0]

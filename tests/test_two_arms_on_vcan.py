@@ -31,7 +31,7 @@ PATIENT = f"""
 Kp = [20.0, 2.0]
 Kd = [4.0, 0.3]
 [safety]
-commission_cycles = 50
+commission_s = 0.5
 phase_timeout_s = 60.0
 [realtime]
 misses = 1000000

@@ -46,7 +46,7 @@ def rig_settings(**sections: Any) -> Settings:
         "arm": {"cad_theta": list(paper.arm.cad_theta)},
         "filter": {"a_rad_s": CUT_OFF_rad_s, "b_rad_s": CUT_OFF_rad_s},
         "detector": {"threshold_Nm": [0.15, 0.08], "collision_Nm": [2.0, 1.0]},
-        "safety": {"commission_cycles": 10},
+        "safety": {"commission_s": 0.01},
         "reaction": {"start": "measured", "rebound_s": 0.2},
         "realtime": {"sample_period": "nominal"},
     }

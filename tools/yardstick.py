@@ -4,7 +4,6 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from adacd_hil.cli.connection import received_ids
 from adacd_hil.wire.codec import Codec
 
 SOURCE = Path(__file__).resolve().parent / "yardstick.c"
@@ -45,7 +44,7 @@ def command_frames(codec: Codec, name: str) -> list[bytes]:
 def arguments(codec: Codec, channel: str, period_us: int, seconds: float, warm_up_s: float, samples: Path) -> list[str]:
     """Write the command line for a contract: nodes reset and started, commands that leave the drives disabled."""
     answers = [codec.message(name).can_id for name in ANSWERS]
-    others = [can_id for can_id in received_ids(codec) if can_id not in answers]
+    others = [message.can_id for message in codec.messages.values() if message.can_id not in answers]
     nmt = codec.message("Nmt").can_id
     heartbeat = codec.message("HostHeartbeat").can_id
     every = max(1, round(HEARTBEAT_S * 1e6 / period_us))

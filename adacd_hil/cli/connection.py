@@ -13,9 +13,13 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.strangers import host_frames
 from adacd_hil.terminal import hurry
-from adacd_hil.wire.bus import Bus, BusError, BusMissingError, is_hardware, open_bus
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError, is_hardware, is_virtual, open_bus
 from adacd_hil.wire.codec import Codec
+
+MOST_BLIND_CYCLES = 5
+"""Cycles without data that a real arm may go through: at 100 deg/s and 1 ms half a degree."""
 
 
 def make_clock(name: str) -> Clock:
@@ -28,6 +32,33 @@ def check_clock(name: str, interface: str, channel: str) -> None:
     if name == "lockstep" and is_hardware(interface, channel):
         raise CommandError(
             f"--clock lockstep is for emulated arms; {interface} {channel} is hardware and needs --clock realtime",
+            ExitCode.USAGE,
+        )
+
+
+def check_autonomy(settings: Settings, interface: str, channel: str) -> None:
+    """Raise CommandError where a real arm may be on the bus and the settings let it act without data or without a user.
+
+    What may stand on the other side of anything but vcan, vxcan and python-can's own virtual bus is not known.
+    """
+    if is_virtual(interface, channel):
+        return
+    for name, value in (
+        ("bus.max_age_cycles", settings.bus.max_age_cycles),
+        ("data.blind_cycles", settings.data.blind_cycles),
+    ):
+        if value > MOST_BLIND_CYCLES:
+            raise CommandError(
+                f"`{name}` = {value} lets an arm move without data; on {interface} {channel} at most "
+                f"{MOST_BLIND_CYCLES}, more on vcan only",
+                ExitCode.USAGE,
+            )
+    operator = settings.operator
+    if operator.acknowledges and not operator.acknowledge_on_hardware:
+        name = "acknowledge_after_s" if operator.acknowledge_after_s > 0.0 else "acknowledge_faults"
+        raise CommandError(
+            f"`operator.{name}` = {getattr(operator, name):g} acknowledges by itself what stopped the arm; on "
+            f"{interface} {channel} that needs `operator.acknowledge_on_hardware` = true",
             ExitCode.USAGE,
         )
 
@@ -49,12 +80,9 @@ def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) 
     return make_lockstep_bus(bus, clock, codec, settings)
 
 
-def received_ids(codec: Codec, is_following: bool = False) -> list[int]:
-    """List the identifiers that the host receives, SYNC among them where another host sends it."""
-    sent = {message.name for message in codec.messages.values() if "HOST" in message.senders}
-    if is_following:
-        sent.discard("Sync")
-    return [message.can_id for message in codec.messages.values() if message.name not in sent]
+def received_ids(codec: Codec, settings: Settings) -> list[int]:
+    """List the identifiers that the host receives: the contract's, and what nobody else may send."""
+    return sorted({message.can_id for message in codec.messages.values()} | host_frames(settings, codec).keys())
 
 
 @dataclass(frozen=True)
@@ -85,7 +113,7 @@ class Connection:
 
         Raises BusMissingError, CodecError.
         """
-        can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings.bus.follows)
+        can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
         return model_time(bus, clock, codec, settings) if isinstance(clock, VirtualClock) else bus
 
@@ -113,7 +141,10 @@ def raise_interrupt() -> NoReturn:
 
 @contextmanager
 def on_interrupt(interrupt: Callable[[], None]) -> Iterator[None]:
-    """Let SIGINT and SIGTERM call a function instead of ending the process; outside the main thread, nothing can."""
+    """Let SIGINT, SIGTERM and SIGHUP call a function and not end the process; outside the main thread, nothing can.
+
+    SIGHUP stays ignored where it was.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -122,7 +153,9 @@ def on_interrupt(interrupt: Callable[[], None]) -> Iterator[None]:
         hurry()
         interrupt()
 
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    if previous[signal.SIGHUP] is signal.SIG_IGN:  # started to outlive its terminal
+        del previous[signal.SIGHUP]
     for number in previous:
         signal.signal(number, handle)
     try:

@@ -1,12 +1,20 @@
 """Runs on a bus: opens it, lets a session run, says how it ended."""
 
+import dataclasses
 import functools
 import sys
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, on_interrupt
+from adacd_hil.cli.connection import (
+    Connection,
+    check_autonomy,
+    check_clock,
+    check_shared,
+    make_clock,
+    on_interrupt,
+)
 from adacd_hil.cli.exit_codes import ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.run_folder import run_folder
@@ -59,6 +67,7 @@ def run_on_bus(
     check_clock(clock_name, interface, channel)
     settings = connection.settings()
     check_shared(clock_name, settings)
+    check_autonomy(settings, interface, channel)
     tare = None
     if tare_path is not None:
         tare = use_tare(tare_path, settings, wall_ns())
@@ -108,7 +117,10 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
             "state": summary.result.state.name,
             "fault": summary.result.fault.name,
             "recoveries": summary.recoveries,
+            "data": dataclasses.asdict(summary.result.data),
         }
+        for line in summary.result.data.excesses:
+            print(f"adacd-hil: {line}", file=sys.stderr)
     log = summary.log
     return described | {
         "frames": log.frames,

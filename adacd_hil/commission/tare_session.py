@@ -123,14 +123,14 @@ class TareSession:
     def _await_data(self) -> None:
         """Wait until all devices have answered for a while. Raises TareRefusedError when they don't."""
         safety = self.settings.safety
-        good = 0
-        for _ in range(safety.commission_cycles + self._cycles(safety.phase_timeout_s)):
+        good, enough = 0, self._cycles(safety.commission_s)
+        for _ in range(enough + self._cycles(safety.phase_timeout_s)):
             good = good + 1 if self._step().is_complete else 0
-            if good == safety.commission_cycles:
+            if good == enough:
                 return
         missing = ", ".join(self._arm.missing_names()) or "now and then a device"
         raise TareRefusedError(
-            f"data are missing from {missing}: no {safety.commission_cycles} complete cycles in a row within "
+            f"data are missing from {missing}: no {safety.commission_s:g} s of complete cycles within "
             f"safety.phase_timeout_s = {safety.phase_timeout_s:g} s"
         )
 

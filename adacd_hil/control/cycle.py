@@ -12,6 +12,7 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
+from adacd_hil.control.commission_report import CommissionReport
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
@@ -20,8 +21,11 @@ from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import Pacer, Tick
 from adacd_hil.control.reference import Reference
+from adacd_hil.control.self_checks import SelfChecks
+from adacd_hil.control.stop_escalation import StopEscalation
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import ArmWatch
+from adacd_hil.device.data_watch import DataShares, DataWatch
 from adacd_hil.device.network import Master
 from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
@@ -53,13 +57,14 @@ _ENABLING = POWERED | {SchemeState.ENABLE}
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended. `fault`: NONE when it ended as asked."""
+    """How a run ended. `fault`: NONE when it ended as asked. `data`: how much of the cyclic data came."""
 
     cycles: int
     overruns: int
     state: SchemeState
     fault: FaultReason
     is_interrupted: bool
+    data: DataShares
 
 
 class Cycle:
@@ -86,6 +91,8 @@ class Cycle:
         self._exchange = Exchange(settings, bus, arm, master, clock)
         self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
         self._watch = ArmWatch(settings, master.watch)
+        self._data = DataWatch(settings, arm)
+        self._commission = CommissionReport(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = pipeline_of(settings)
         self._controller = Controller(settings)
@@ -96,11 +103,25 @@ class Cycle:
         self._q_d, self._dq_d, self._ddq_d = fields["q_d"], fields["dq_d"], fields["ddq_d"]
         self._tau_d, self._tau_c = fields["tau_d"], fields["tau_c"]
         self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)
+        self._checks = SelfChecks(settings, arm, master.parameters, self._q_d)
+        self._escalation = StopEscalation(arm, master)
         self._state = SchemeState.INIT
         self._enabled_cycle: int | None = None
         self._faulted_cycle: int | None = None
         self._interrupts = 0
         self._is_finishing = False
+        self._carried: Request | None = None
+        self._unserved = Request.NONE
+
+    def carry(self, request: Request) -> None:
+        """Ask what was asked of an attempt before and not served, once the drives are enabled. Before `run`."""
+        self._carried = None if request is Request.NONE else request
+        self._unserved = request
+
+    @property
+    def unserved(self) -> Request:
+        """What the user has asked for and not got: the end of the run, or a stop to change the payload; else NONE."""
+        return self._unserved
 
     def compile(self) -> None:
         """Compile everything the loop calls; to be done before the drives are enabled."""
@@ -122,7 +143,9 @@ class Cycle:
         while not self._is_over(output):
             tick = self._pacer.next()
             arm = self._watch.judge(self._exchange.read(tick))
-            request = self._request(tick)
+            self._data.note(arm)
+            self._commission.note(self._state, arm)
+            request = self._checks.judge(arm, self._state) or self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
             self._follow(arm, output)
@@ -132,17 +155,32 @@ class Cycle:
             record = self._evidence.record(tick, arm, self._pacer.overruns, recorder.waiting_bytes)
             if self._heartbeats.is_due(tick.cycle):
                 self._master.send_heartbeat()
+            self._look_after_devices(arm, output)
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
-        return RunResult(self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0)
+        return RunResult(
+            self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0, self._data.shares()
+        )
+
+    def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
+        """Stop drives that a command has not stopped; else read again what was written into the devices."""
+        if self._faulted_cycle is not None:
+            self._escalation.step(arm.cycle - self._faulted_cycle, arm.t_ns, output.fault)
+        elif output.state in POWERED:
+            self._master.parameters.step(arm.cycle, arm.t_ns)
 
     def _request(self, tick: Tick) -> Request:
         """Ask the operator; what concerns the end of the run stays here."""
         if self._interrupts and not self._is_finishing:
             return self._finish()
         elapsed_s = None if self._enabled_cycle is None else (tick.cycle - self._enabled_cycle) * self._period_s
-        request = self._operator.request(elapsed_s, self._state)
+        if self._carried is not None and elapsed_s is not None:
+            request, self._carried = self._carried, None
+        else:
+            request = self._operator.request(elapsed_s, self._state)
+        if request in (Request.FINISH, Request.PAYLOAD) and self._unserved is not Request.FINISH:
+            self._unserved = request
         return self._finish() if request is Request.FINISH else request
 
     def _finish(self) -> Request:
@@ -168,7 +206,7 @@ class Cycle:
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
         is_open = output.state in POWERED and arm.is_enabled and not is_stale
-        flags = self._gate.limit(self._tau_d, is_open, self._tau_c)
+        flags = self._gate.limit(self._tau_d, is_open, self._tau_c, max(arm.age_q))
         quick_stop = output.state is SchemeState.FAULT or (bool(flags) and GateFlag.NOT_A_NUMBER in flags)
         return ArmCommand(self._tau_c, output.state in _ENABLING, quick_stop), flags
 
@@ -195,7 +233,17 @@ class Cycle:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
         exchange = self._exchange
-        for source in (self._master, exchange.troubles, exchange.late_commands, self._evidence, self._pipeline):
+        for source in (
+            self._master,
+            self._arm.strangers,
+            self._data,
+            self._master.parameters,
+            self._escalation,
+            exchange.troubles,
+            exchange.late_commands,
+            self._evidence,
+            self._pipeline,
+        ):
             for event in source.take_events():
                 recorder.event(t_ns, event)
         if output.state is not self._state:
@@ -214,9 +262,15 @@ class Cycle:
         excess = self._arm.describe_excess() if output.fault is FaultReason.LIMIT else []
         late = [self._watch.deadline.describe()] if output.fault is FaultReason.DEADLINE else []
         missing = self._pipeline.describe_missing() if output.fault is FaultReason.ADAPT_TIMEOUT else []
+        if output.fault is FaultReason.COMMISSION_TIMEOUT:
+            missing = self._commission.describe()
+        gaps = self._arm.describe_gaps() if output.fault in (FaultReason.BLIND, FaultReason.DATA_AGE) else []
+        checked = [self._checks.line] if output.fault is self._checks.reason else []
         causes = [
             *late,
+            *checked,
             *missing,
+            *gaps,
             *excess,
             *self._arm.describe_faults(),
             *self._watch.lost,
@@ -231,6 +285,8 @@ class Cycle:
             self._enabled_cycle = cycle
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle
+        if state is SchemeState.PAYLOAD and self._unserved is Request.PAYLOAD:
+            self._unserved = Request.NONE
 
     def _is_over(self, output: SchemeOutput | None) -> bool:
         if output is None:

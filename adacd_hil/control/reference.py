@@ -31,6 +31,11 @@ THROWN_S = 0.15
 THROWN_rad_s = 0.2
 """Faster than planned by this, away from what pushes, an arm has been thrown."""
 
+OLD_CYCLES = 1
+"""Age of the feedback up to which the desired motion goes on."""
+LOST_CYCLES = 5
+"""After so many cycles of waiting the arm is no longer where it was: the motion begins anew from where it is found."""
+
 ENDING = 0.6
 """A blow ends when its torque has fallen to this part of its largest."""
 
@@ -72,6 +77,7 @@ class Reference:
         self._contact_cycle = 0
         self._is_parking = False
         self._park_end_cycle = 0
+        self._waited_cycles = 0
 
     def compile(self) -> None:
         """Plan and run every kind of motion once, so that nothing happens for the first time in the cycle."""
@@ -111,6 +117,8 @@ class Reference:
         cycle = arm.cycle
         if output.state is not output.previous_state:
             self._enter(output, arm)
+        elif self._waits(arm):
+            return
         if self._state in _REACTING and output.reaction is not self._reaction:
             self._react(output, arm)
         if self._is_parking and self._segment is None and self._state not in _REACTING:
@@ -121,6 +129,32 @@ class Reference:
             self._stay(arm)
             return
         self._advance(cycle)
+
+    def _waits(self, arm: ArmState) -> bool:
+        """Let the desired motion wait while the feedback is old; go on, or begin anew, once it is fresh."""
+        if max(arm.age_q) > OLD_CYCLES:
+            self._waited_cycles += arm.periods
+            self._start_cycle += arm.periods
+            self._park_end_cycle += arm.periods
+            if self._follows_at_cycle is not None:
+                self._follows_at_cycle += arm.periods
+            return True
+        if self._waited_cycles > LOST_CYCLES:
+            self._begin_anew(arm)
+        self._waited_cycles = 0
+        return False
+
+    def _begin_anew(self, arm: ArmState) -> None:
+        """Plan from the measured motion what the state asks for."""
+        self._q_d[:], self._dq_d[:], self._ddq_d[:] = arm.q, arm.dq, 0.0
+        if self._is_parking and self._state not in _REACTING:
+            self._segment = None
+        elif self._state in _FOLLOWING:
+            self._follows_at_cycle = self._approach(arm.cycle)
+        elif self._state is SchemeState.PAYLOAD:
+            self._approach(arm.cycle)
+        elif self._segment is not None:
+            self._brake(arm.cycle)
 
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
         """Fill the desired motion of a reaction that has no plan, or plan a blow's anew; tell whether it is filled."""

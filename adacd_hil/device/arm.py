@@ -10,10 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.config import Settings
+from adacd_hil.device.answer_clock import AnswerClock
 from adacd_hil.device.drive import Cia402State, Drive, option_codes, torque_limit_permille
 from adacd_hil.device.emergency import name_error
 from adacd_hil.device.heartbeat import PATIENCE_PERIODS
 from adacd_hil.device.placement import Device, place_devices
+from adacd_hil.device.sample_alignment import KEPT, SampleAlignment
+from adacd_hil.device.strangers import Strangers
 from adacd_hil.device.torque_sensor import USABLE, SensorStatus, TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
 from adacd_hil.wire.bus import Bus, Frame
@@ -28,6 +31,10 @@ _Take = Callable[[bytes, int], bool]
 _Command = tuple[list[float], bool, bool]
 """Commanded torque of each joint, Nm; whether the drives are to be enabled; whether they are to stop quickly."""
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
+_STATUS = -1  # in place of a device's: a status frame, which answers no SYNC
+EMERGENCY_ID = 0x080
+_EMERGENCY_BYTES = 8
+_REMEMBERED = 0xFF  # bits of as many cycles: which of them a device left without a usable frame
 
 
 class SignalAge(NamedTuple):
@@ -79,18 +86,31 @@ class Arm:
         self._received = 0
         self._seen = 0
         self._was_enabled = False
+        self._ordinal = -1  # of the last SYNC
+        self._sync_cycles, self._sync_ns = [-1] * KEPT, [0] * KEPT  # of the last SYNCs, by ordinal
+        self._clocks = tuple(AnswerClock() for _ in self.devices)
+        self._alignment = SampleAlignment(len(self.devices))
+        self._sampled_ordinal = self._sampled_cycle = -1  # of the last complete sample
+        self._gaps = [0] * len(self.devices)  # bit k: no usable frame k cycles ago
+        self._last_data = [b""] * len(self.devices)
+        self.repeats = [0] * len(self.devices)
+        """How often each device's frame came again, the same or with the same counter."""
+        self.strangers = Strangers(settings, codec)
+        self._emergency_ids = {EMERGENCY_ID + device.node_id: device for device in self.devices}
+        self._tolerated_codes = frozenset(settings.safety.tolerated_emergencies)
+        self._emergencies: dict[str, int] = {}
         self.has_all_frames = False
         """Whether all cyclic frames of this cycle are in, passed their checks or not."""
 
     def _build_handlers(self) -> dict[int, tuple[_Take, int]]:
         handlers: dict[int, tuple[_Take, int]] = {}
         for joint, (drive, sensor) in enumerate(zip(self.drives, self.sensors, strict=True)):
-            handlers[drive.feedback_message.can_id] = (drive.accept_feedback, 1 << joint)
-            handlers[sensor.torque_message.can_id] = (sensor.accept_torque, 4 << joint)
+            handlers[drive.feedback_message.can_id] = (drive.accept_feedback, joint)
+            handlers[sensor.torque_message.can_id] = (sensor.accept_torque, JOINTS + joint)
             if drive.status_message is not None:
-                handlers[drive.status_message.can_id] = (drive.accept_status, 0)
+                handlers[drive.status_message.can_id] = (drive.accept_status, _STATUS)
             if sensor.status_message is not None:
-                handlers[sensor.status_message.can_id] = (sensor.accept_status, 0)
+                handlers[sensor.status_message.can_id] = (sensor.accept_status, _STATUS)
         return handlers
 
     @property
@@ -103,10 +123,11 @@ class Arm:
 
         SYNC is sent here, unless another host sends it; pipelined commands leave behind it.
         """
-        if self._cycle >= 0 and not self.has_all_frames:
-            self._miss()
-        self._cycle = cycle
-        self._t_ns = t_ns
+        if self._cycle >= 0:
+            if not self.has_all_frames:
+                self._miss()
+            self._remember_gaps()
+        self._begin_cycle(cycle, t_ns)
         self._periods = periods
         self._received = 0
         self._seen = 0
@@ -121,32 +142,133 @@ class Arm:
             self._pending = None
         self._bus.send_all(frames)
 
+    def _begin_cycle(self, cycle: int, t_ns: int) -> None:
+        self._cycle = cycle
+        self._t_ns = t_ns
+        self._ordinal += 1
+        place = self._ordinal % KEPT
+        self._sync_cycles[place], self._sync_ns[place] = cycle, t_ns
+
     def _miss(self) -> None:
         """Let every device note that its frame of the cycle that ends now did not come."""
         for bit, device in enumerate(self.devices):
             if not self._seen & (1 << bit):
                 device.miss()
 
+    def _remember_gaps(self) -> None:
+        for place, gaps in enumerate(self._gaps):
+            self._gaps[place] = (gaps << 1 | ~self._received >> place & 1) & _REMEMBERED
+
+    def pass_by(self, cycles: int, cycle: int, t_ns: int) -> None:
+        """Take so many cycles, all complete and in time, for read elsewhere; the last one and its SYNC are given."""
+        for device in self.devices:
+            device.skip(cycles)
+        self._ordinal += cycles - 1
+        self._begin_cycle(cycle, t_ns)
+        for clock in self._clocks:
+            clock.pass_by(self._ordinal)
+        self._sampled_ordinal, self._sampled_cycle = self._ordinal, cycle
+        self._gaps = [0] * len(self.devices)
+        self._received = self._seen = _COMPLETE
+        self.has_all_frames = True
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether every device has answered the last SYNC in time, and it is known when each usually does."""
+        return all(clock.is_settled and clock.answered == self._ordinal for clock in self._clocks)
+
     def accept(self, frame: Frame, is_late: bool = False) -> bool:
         """Take one frame; False when it is not one of the arm's. A frame that fails a check changes nothing.
 
-        `is_late`: it belongs to the cycle before.
+        `is_late`: it came before SYNC, so it answers an earlier one.
         """
         handler = self._handlers.get(frame.can_id)
-        if handler is None or frame.is_error:
+        if frame.is_error:
             return False
-        take, bit = handler
-        if is_late:
+        if handler is None:
+            self._hear_emergency(frame)
+            return self.strangers.accept(frame, self._cycle)
+        take, place = handler
+        if place != _STATUS:
+            self._answer(frame, take, place, self._ordinal - 1 if is_late and self._ordinal else self._ordinal)
+        elif is_late:
             take(frame.data, self._cycle - self._periods)
-            return True
-        self._seen |= bit
-        self.has_all_frames = self._seen == _COMPLETE
-        if take(frame.data, self._cycle):
-            self._received |= bit
+        else:
+            take(frame.data, self._cycle)
         return True
 
+    def _answer(self, frame: Frame, take: _Take, place: int, newest: int) -> None:
+        """Take a cyclic frame for the SYNC that it answers; `newest`: the last one before it came."""
+        if newest < 0:
+            return  # before any SYNC there is nothing to answer
+        device, clock, data = self.devices[place], self._clocks[place], frame.data
+        offset_ns = frame.t_ns - self._sync_ns[newest % KEPT]
+        step = device.end_to_end.step_of(data)
+        error = self._position_error(place, data, newest)
+        ordinal = None if step == 0 else clock.find(newest, offset_ns, step, error)
+        if ordinal is None:
+            self._refuse(frame, take, place, step, is_second=clock.answered is not None and clock.answered >= newest)
+            return
+        is_present = ordinal == self._ordinal
+        if is_present and len(data) == device.cyclic_length:
+            self._seen |= 1 << place
+            self.has_all_frames = self._seen == _COMPLETE
+        is_revised = clock.answered == ordinal  # what was taken for it was the one before
+        if is_revised:
+            self._alignment.put(place, ordinal - 1, device.values)
+        if take(data, self._sync_cycles[ordinal % KEPT]):
+            clock.note(ordinal, newest, offset_ns, device.is_protected)
+            self._alignment.put(place, ordinal, device.values)
+            self._last_data[place] = data
+            if is_present:
+                self._received |= 1 << place
+        elif device.end_to_end.status is E2eStatus.WRONG_SEQUENCE:
+            clock.pass_by(newest)  # the device has begun anew, so that its counter says nothing of before
+        elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
+            clock.note(ordinal, newest, offset_ns, device.is_protected)
+
+    def _position_error(self, place: int, data: bytes, newest: int) -> Callable[[int], float] | None:
+        """Return what tells by the motion how many periods lie before a drive's frame; None where that isn't needed."""
+        if place >= JOINTS or self._clocks[place].answered == newest - 1:
+            return None
+        drive = self.drives[place]
+        return lambda periods: drive.position_error(data, periods)
+
+    def _refuse(self, frame: Frame, take: _Take, place: int, step: int | None, is_second: bool) -> None:
+        """Judge a frame that answers no SYNC; its values are not used.
+
+        The same frame twice says nothing new, a counter that stands still nothing true. Another frame, whose check is
+        right, beside the one that has answered the SYNC (`is_second`) has another sender.
+        """
+        device, data = self.devices[place], frame.data
+        is_right = len(data) == device.cyclic_length and device.end_to_end.is_signed(data)
+        is_same = data == self._last_data[place]
+        self.repeats[place] += step == 0 or (is_right and is_same)
+        if step == 0 or not is_right:
+            take(data, self._cycle)  # the check counts it
+        if is_second and is_right and not is_same:
+            behind = 0 if not step else device.end_to_end.counter_range - step
+            if not self._clocks[place].is_straggler(behind):
+                self.strangers.hear_device(frame, device.name, self._cycle)
+
+    def _hear_emergency(self, frame: Frame) -> None:
+        """Take note of an EMCY of the arm's; whoever describes it gets it, too. Source: CiA 301, clause 7.2.7."""
+        device = self._emergency_ids.get(frame.can_id)
+        if device is None or len(frame.data) != _EMERGENCY_BYTES:
+            return
+        code = int.from_bytes(frame.data[:2], "little")
+        if code >> 8 == 0:
+            self._emergencies.pop(device.name, None)
+        elif code not in self._tolerated_codes:
+            self._emergencies[device.name] = code
+
+    @property
+    def unusual_ids(self) -> tuple[int, ...]:
+        """Identifiers of frames that change what the arm reports whenever one comes."""
+        return (*self.strangers.can_ids, *self._emergency_ids)
+
     def accept_past(self, frame: Frame, cycle: int) -> bool:
-        """Take one frame of a cycle that is over; False when it is not one of the arm's."""
+        """Take one status frame of a cycle that is over; False when it is not one of the arm's."""
         handler = self._handlers.get(frame.can_id)
         if handler is not None:
             handler[0](frame.data, cycle)
@@ -162,30 +284,59 @@ class Arm:
         """Count the cyclic frames of this cycle that are not in or failed their checks."""
         return (_COMPLETE & ~self._received).bit_count()
 
+    @property
+    def received(self) -> int:
+        """Bits of the devices whose cyclic frame of this cycle is in and passed its checks."""
+        return self._received
+
     def missing_names(self) -> list[str]:
         """Name the devices whose cyclic frame of this cycle is not in or failed its checks."""
         names = [drive.name for drive in self.drives] + [sensor.name for sensor in self.sensors]
         return [name for bit, name in enumerate(names) if not self._received & (1 << bit)]
 
     def state(self) -> ArmState:
-        """Join what has been received into the state of this cycle."""
-        (drive1, drive2), (sensor1, sensor2) = self.drives, self.sensors
+        """Join what has been received into the state of this cycle: the newest complete sample, else what is newest."""
+        cycle = self._cycle
+        if self._received == _COMPLETE:
+            return self._state_of(self._ordinal, tuple(device.values for device in self.devices), (cycle,) * 4)
+        sample = self._alignment.newest(self._ordinal, self._sampled_ordinal)
+        if sample is not None:
+            sampled = self._sync_cycles[sample.ordinal % KEPT]
+            return self._state_of(sample.ordinal, sample.values, (sampled,) * 4)
+        return self._state_of(
+            None,
+            tuple(device.values for device in self.devices),
+            tuple(device.sample_cycle for device in self.devices),
+        )
+
+    def _state_of(
+        self, ordinal: int | None, values: tuple[tuple[float, ...], ...], sampled: tuple[int, ...]
+    ) -> ArmState:
+        """Make the state of values sampled in given cycles; `ordinal`: of the SYNC of a complete sample."""
+        (q1, dq1), (q2, dq2), (tau1,), (tau2,) = values
         sign1, sign2 = self._sign
         offset1, offset2 = self._offset_Nm
         cycle = self._cycle
-        is_enabled = drive1.is_enabled and drive2.is_enabled
+        steps, sampled_ns = 0, self._t_ns
+        if ordinal is not None:
+            steps = sampled[0] - self._sampled_cycle if self._sampled_ordinal >= 0 else 1
+            sampled_ns = self._sync_ns[ordinal % KEPT]
+            self._sampled_ordinal, self._sampled_cycle = ordinal, sampled[0]
+        is_enabled = self.drives[0].is_enabled and self.drives[1].is_enabled
         return ArmState(
             cycle=cycle,
             t_ns=self._t_ns,
             periods=self._periods,
-            q=np.array((sign1 * drive1.position_rad, sign2 * drive2.position_rad)),
-            dq=np.array((sign1 * drive1.velocity_rad_s, sign2 * drive2.velocity_rad_s)),
-            tau_J=np.array((sign1 * sensor1.torque_Nm - offset1, sign2 * sensor2.torque_Nm - offset2)),
-            age_q=(cycle - drive1.sample_cycle, cycle - drive2.sample_cycle),
-            age_tau_J=(cycle - sensor1.sample_cycle, cycle - sensor2.sample_cycle),
+            q=np.array((sign1 * q1, sign2 * q2)),
+            dq=np.array((sign1 * dq1, sign2 * dq2)),
+            tau_J=np.array((sign1 * tau1 - offset1, sign2 * tau2 - offset2)),
+            age_q=(cycle - sampled[0], cycle - sampled[1]),
+            age_tau_J=(cycle - sampled[2], cycle - sampled[3]),
             is_enabled=is_enabled,
-            is_complete=self.is_complete,
+            is_complete=ordinal is not None,
             fault=self._device_fault(is_enabled),
+            steps=steps,
+            sampled_ns=sampled_ns,
         )
 
     def _device_fault(self, is_enabled: bool) -> FaultReason:
@@ -199,7 +350,10 @@ class Arm:
         (drive1, drive2), (limit1, limit2) = self.drives, self.status_age_limits
         if is_enabled and (self._cycle - drive1.status_cycle > limit1 or self._cycle - drive2.status_cycle > limit2):
             return FaultReason.DATA_AGE
-        return FaultReason.NONE
+        if self._emergencies:
+            is_drive = any(drive.name in self._emergencies for drive in self.drives)
+            return FaultReason.DRIVE if is_drive else FaultReason.SENSOR
+        return FaultReason.FOREIGN_FRAMES if self.strangers.are_heard(self._cycle) else FaultReason.NONE
 
     def ages(self) -> list[SignalAge]:
         """Return the age of every signal that the arm is run by, against its limit."""
@@ -231,6 +385,17 @@ class Arm:
             (drive2.command_id, drive2.command(round(tau2 * ratio2), enable, quick_stop)),
         )
 
+    def describe_gaps(self) -> list[str]:
+        """Say of which devices no usable frame came in time in how many of the last cycles, one line each."""
+        present = [~self._received >> place & 1 for place in range(len(self.devices))]
+        gaps = [bits << 1 | now for bits, now in zip(self._gaps, present, strict=True)]
+        return [
+            f"{device.name}: no usable frame in time in {bits.bit_count()} of the last {_REMEMBERED.bit_length() + 1} "
+            "cycles"
+            for device, bits in zip(self.devices, gaps, strict=True)
+            if bits
+        ]
+
     def frame_checks(self) -> FrameChecks:
         """Return what the checks have said of all cyclic frames so far."""
         return FrameChecks(
@@ -257,6 +422,7 @@ class Arm:
                 lines.append(
                     f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"
                 )
+        lines += self.strangers.describe(self._cycle)
         for sensor in self.sensors:
             if sensor.status:
                 lines.append(f"{sensor.name}: status 0x{int(sensor.status):02X}: {_describe_status(sensor.status)}")

@@ -5,8 +5,8 @@ and pass their checks, and nothing else of what came changes more than an age: n
 state. Then the ArmState is fresh, complete and without fault. The first cycle that is otherwise ends the stretch, and
 with it all that this module knows: the live classes go on from there.
 
-Kinds of frames, by identifier: 1 to 4 feedback 1, 2 and torque 1, 2; 5 to 8 the status of the same devices; from 9 on
-heartbeats; 0 what the arm is not concerned with.
+Kinds of frames, by identifier: 1 to 4 feedback 1, 2 and torque 1, 2; 5 to 8 the status of the same devices; 9 to 12
+heartbeats; 13 what is never ordinary, as an EMCY or what only the host sends; 0 what the arm is not concerned with.
 """
 
 from typing import Any, NamedTuple
@@ -26,6 +26,8 @@ STATUS = DEVICES
 """Kinds up to it are cyclic frames; beyond it status frames."""
 HEARTBEAT = 2 * DEVICES
 KINDS = 3 * DEVICES + 1
+UNUSUAL = KINDS
+"""Kind of the frames of which one ends a stretch."""
 STANDARD_IDS = 0x800
 MOST_WATCHED = 8
 
@@ -148,7 +150,7 @@ def _check(
                 has_sync = True
         elif not frames.is_error[place] and can_id < STANDARD_IDS and kinds[can_id] > 0:
             kind = int(kinds[can_id])
-            if not has_sync or (kind <= STATUS and found[kind] >= 0):
+            if kind == UNUSUAL or not has_sync or (kind <= STATUS and found[kind] >= 0):
                 return -1
             if not _is_usual(frames, place, kind, t_ns, constants, messages, memory, values):
                 return -1

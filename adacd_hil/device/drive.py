@@ -4,6 +4,7 @@ Positions, velocities and torques are the device's own: sign and ratio belong to
 Source: CiA 402-2 / IEC 61800-7-201, clause 10.3 (state machine), clause 16 (cyclic synchronous torque).
 """
 
+from collections import deque
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
@@ -135,6 +136,9 @@ rules of their own."""
 
 _FIRST_STAYING_OPTION = 5
 """0x605A: from 5 on the drive stays in QUICK_STOP_ACTIVE; below it goes on to SWITCH_ON_DISABLED at standstill."""
+_INTERNAL_LIMIT = 1 << 11  # of the statusword; torque: the drive has less than it is told
+_RECENT_COMMANDS = 8
+"""Commands with which a drive's actual torque is compared: it is of some cycles ago, through a current loop."""
 _TARGET_REACHED = 1 << 10  # of the statusword; in QUICK_STOP_ACTIVE with such an option: the drive stands still
 _STANDSTILL_RAD_S = 0.02
 """Speed of the joint that counts as standing still, for drives that leave bit 10 alone."""
@@ -224,6 +228,8 @@ class Drive:
         self._received_position_rad: float | None = None
         self._received_cycle = 0
         self._last_controlword = int(Controlword.DISABLE_VOLTAGE)
+        self.recent_permille: deque[int] = deque([0], maxlen=_RECENT_COMMANDS)
+        """Commanded torque of the last cycles, per mille of rated torque."""
         self.position_rad = 0.0
         self.velocity_rad_s = 0.0
         self.sample_cycle = -1
@@ -274,6 +280,34 @@ class Drive:
             self.implausible_frames += 1
             return False
         return True
+
+    @property
+    def shows_torque(self) -> bool:
+        """Whether some frame carries the actual torque, 0x6077."""
+        return max(self._feedback_status.torque_actual, self._status_places.torque_actual) >= 0
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether the drive says that a limit of its own keeps it from the commanded torque."""
+        return bool(self.statusword & _INTERNAL_LIMIT)
+
+    @property
+    def cyclic_length(self) -> int:
+        """Bytes of its cyclic frame."""
+        return self.feedback_message.length
+
+    @property
+    def values(self) -> tuple[float, float]:
+        """Position, rad, and velocity, rad/s, in use."""
+        return self.position_rad, self.velocity_rad_s
+
+    def position_error(self, data: bytes, periods: int) -> float:
+        """Say by how much a frame's position is off, rad, if so many periods lie between it and the last that came."""
+        if self._received_position_rad is None or len(data) != self.feedback_message.length:
+            return 0.0
+        values = self.feedback_message.decode_values(data)
+        travel = values[self._velocity_at] * periods * self._period_s
+        return abs(values[self._position_at] - self._received_position_rad - travel)
 
     @property
     def is_steady(self) -> bool:
@@ -336,7 +370,9 @@ class Drive:
         self._last_controlword = controlword
         raw = self._command
         raw[self._controlword_at] = controlword
-        raw[self._torque_at] = torque_permille if goal is Goal.OPERATION_ENABLED and self.is_enabled else 0
+        torque = torque_permille if goal is Goal.OPERATION_ENABLED and self.is_enabled else 0
+        raw[self._torque_at] = torque
+        self.recent_permille.append(torque)
         return self._sender.protect(self.command_message.encode_raw(*raw))
 
     def _next_controlword(self, goal: Goal) -> int:

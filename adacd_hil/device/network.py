@@ -13,6 +13,7 @@ from adacd_hil.device.canopen_bus import CanopenBus, DeviceError
 from adacd_hil.device.drive_setup import command_deadline_ms, set_up_drive
 from adacd_hil.device.emergency import describe_emergency
 from adacd_hil.device.heartbeat import OPERATIONAL, PATIENCE_PERIODS, follow_devices
+from adacd_hil.device.parameter_watch import ParameterWatch
 from adacd_hil.device.pdo_mapping import set_up_pdos
 from adacd_hil.device.placement import place_devices
 from adacd_hil.device.profile import EMCY_INHIBIT_100US
@@ -66,6 +67,7 @@ class Master:
             self.nodes[device.name] = node
             self.slaves.append(Slave(device, node))
         self._heartbeats = follow_devices(devices, settings.bus.heartbeat_ms, self._events.append)
+        self.parameters = ParameterWatch(settings, bus)
         self._canopen.bystander = self._heartbeats.accept
 
     def _emergency_listener(self, name: str) -> Callable[[Any], None]:
@@ -82,6 +84,8 @@ class Master:
 
     def accept(self, frame: Frame) -> None:
         """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY."""
+        if self.parameters.accept(frame):
+            return
         self._heartbeats.accept(frame)
         self._canopen.accept(frame)
 
@@ -177,6 +181,7 @@ class Master:
                     self._events.append(Event("info", slave.name, status))
             for extra in slave.device.settings.setup:
                 slave.write_checked(extra.name.index, extra.name.sub, extra.value)
+        self.parameters.follow(self.slaves)
 
     def _set_up_sync(self, slave: Slave) -> None:
         if slave.has(0x1005):
@@ -222,6 +227,10 @@ class Master:
         """Put all nodes back to pre-operational; drives drop out if they are still enabled. Raises BusError."""
         self._heartbeats.stop()
         self._command(ENTER_PRE_OPERATIONAL)
+
+    def leave_operational(self, node_id: int) -> None:
+        """Put one node back to pre-operational. Raises BusError."""
+        self._canopen.command(_ENTER_PRE_OPERATIONAL, node_id)
 
     def _command(self, nmt_command: int) -> None:
         """Send an NMT command to the arm: to all nodes at once, or to each of its own where other arms listen too."""

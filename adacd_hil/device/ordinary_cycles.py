@@ -19,6 +19,7 @@ from adacd_hil.device.arm_batch import (
     MOST_WATCHED,
     STANDARD_IDS,
     STATUS,
+    UNUSUAL,
     FrameColumns,
     read_cycles,
 )
@@ -81,6 +82,8 @@ class OrdinaryCycles:
             self._lay_out_drive(index, drive)
         for index, sensor in enumerate(arm.sensors, JOINTS):
             self._lay_out_sensor(index, sensor, settings.bus.period_s)
+        for can_id in arm.unusual_ids:
+            self._name(can_id, UNUSUAL)
 
     def _lay_out_arm(self, settings: Settings) -> None:
         constants = self._constants[0]
@@ -194,6 +197,8 @@ class OrdinaryCycles:
         batch.is_complete[read] = True
         batch.fault[read] = FaultReason.NONE
         batch.is_late[read] = False
+        batch.steps[read] = 1
+        batch.sampled_ns[read] = batch.t_ns[read]
         places, cycles = memory[0]["frame"].tolist(), memory[0]["frame_cycle"].tolist()
         return Stretch(count, last, [(at, cycle) for at, cycle in zip(places, cycles, strict=True) if at >= 0])
 
@@ -203,7 +208,7 @@ class OrdinaryCycles:
         if state.fault is not FaultReason.NONE or state.is_late or not (state.is_complete and arm.has_all_frames):
             return False
         heard_ns = self._heartbeats.heard_ns()
-        if heard_ns is None or not all(device.is_steady for device in arm.devices):
+        if heard_ns is None or not (arm.is_settled and all(device.is_steady for device in arm.devices)):
             return False
         memory = self._memory[0]
         memory["cycle"] = state.cycle

@@ -6,9 +6,9 @@ logged with. That is all that the live loop went by:
 - SYNC is the host's own where it sends it; where it follows another host's, the last one received with the time of the
   cycle. That one may have been logged with the cycle before, as its last frame.
 - What was received before SYNC was taken for the cycle before, whatever its stamp.
-- What was received after SYNC belongs to the cycle, or to the one before where its stamp is older than SYNC. Frames
-  that came once all cyclic ones were in, or when the time for them was over, were read in the next cycle and stand
-  there.
+- What was received after SYNC came for that SYNC or an earlier one, for an earlier one where its stamp is older than
+  SYNC: `answer_clock`. Frames that came once all cyclic ones were in, or when the time for them was over, were read in
+  the next cycle and stand there.
 - Before the host's NMT start nothing counts: a heartbeat of before it says no more than none.
 - An attempt begins with the host's NMT reset; nothing of what was before survives it.
 
@@ -126,8 +126,8 @@ class RecordedArm:
         skipped = stretch.cycles - 1
         if skipped <= 0:
             return 0, at
-        for device in self._arm.devices:
-            device.skip(skipped)
+        last = place + skipped - 1
+        self._arm.pass_by(skipped, int(batch.cycle[last]), int(batch.t_ns[last]))
         for news, cycle in stretch.news:
             ((_, frame),) = _unpack(columns, news, news + 1)
             if not self._arm.accept_past(frame, cycle):
@@ -218,6 +218,8 @@ def _empty_batch(ticks: Ticks) -> ArmBatch:
         is_complete=np.empty(count, np.bool_),
         fault=np.empty(count, np.uint8),
         is_late=np.empty(count, np.bool_),
+        steps=np.empty(count, np.int64),
+        sampled_ns=np.empty(count, np.int64),
     )
 
 

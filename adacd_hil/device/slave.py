@@ -14,6 +14,8 @@ class Slave:
         self.device = device
         self.name = device.name
         self.node_id = device.node_id
+        self.known: dict[tuple[int, int], int] = {}
+        """What the set-up has written or compared, by index and sub-index."""
         self._node = node
 
     def has(self, index: int, sub: int = 0) -> bool:
@@ -34,6 +36,7 @@ class Slave:
         """Write a number. Raises DeviceError."""
         with explained(self.name, self.node_id, f"writing {self.describe(index, sub)} = {_number(value)}"):
             self._entry(index, sub).raw = value
+        self.known[index, sub] = value
 
     def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
         """Write a number and read it back. Raises DeviceError."""
@@ -45,6 +48,7 @@ class Slave:
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> None:
         """Compare an object with what it must be. Raises DeviceError."""
         found = self.read(index, sub)
+        self.known[index, sub] = expected
         if found != expected:
             values = [f"0x{value:08X}" if is_hex else _with(value, unit) for value in (found, expected)]
             self.fail(f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected")

@@ -109,6 +109,16 @@ class TorqueSensor:
             self.status = _judge_range(torque, self.torque_range_Nm)
 
     @property
+    def cyclic_length(self) -> int:
+        """Bytes of its cyclic frame."""
+        return self.torque_message.length
+
+    @property
+    def values(self) -> tuple[float]:
+        """Torque in use, Nm."""
+        return (self.torque_Nm,)
+
+    @property
     def is_steady(self) -> bool:
         """Whether the last torque that came is in use, and the next is to follow it without loss."""
         if self.is_protected:

@@ -62,6 +62,8 @@ def arm_at(arms: ArmBatch, row: int) -> ArmState:
         is_complete=bool(arms.is_complete[row]),
         fault=FaultReason(arms.fault[row]),
         is_late=bool(arms.is_late[row]),
+        steps=int(arms.steps[row]),
+        sampled_ns=int(arms.sampled_ns[row]),
     )
 
 
@@ -96,7 +98,7 @@ class RunsBatches(ABC):
         """Take in n cycles, as `step` does one by one. requests (n,): of `Request`."""
         count = arms.cycle.size
         supervisor = self._supervisor
-        samples = samples_of(arms, self._intervals.between(arms.t_ns), supervisor.findings(arms))
+        samples = samples_of(arms, self._intervals.between(arms), supervisor.findings(arms))
         recorded = Recorded(np.zeros(count, dtype=np.int64), np.empty((count, self._values.size)))
         state, previous_state, fault, reaction = (np.zeros(count, dtype=np.uint8) for _ in range(4))
         is_model_valid = np.zeros(count, dtype=np.bool_)

@@ -21,7 +21,7 @@ def step(
     mode: int,
     main: Structured,
     is_complete: int,
-    periods: int,
+    steps: int,
 ) -> int:
     """Take in the sample that the main scheme's block has, fill that block's fields, and return the next mode.
 
@@ -31,7 +31,7 @@ def step(
     for i in range(JOINTS):
         own["q"][i], own["dq"][i], own["tau_J"][i] = out["q"][i], out["dq"][i], out["tau_J"][i]
     own["period_s"][0] = out["period_s"][0]
-    observation = kernel.step(constants, memory, block, is_complete, periods, mode)
+    observation = kernel.step(constants, memory, block, is_complete, steps, mode)
     if observation & _ADAPTED:
         mode = kernel.ARMED
     out["paper_is_armed"][0] = 1.0 if mode == kernel.ARMED else 0.0
@@ -69,6 +69,6 @@ class Beside:
         kernel.begin_adaptation(self.constants, self.memory, self.block)
         self.mode = kernel.LEARN
 
-    def step(self, main: Structured, is_complete: int, periods: int) -> None:
+    def step(self, main: Structured, is_complete: int, steps: int) -> None:
         """Take in one cycle, and put what it comes to into the block of the scheme in charge."""
-        self.mode = step(self.constants, self.memory, self.block, self.mode, main, is_complete, periods)
+        self.mode = step(self.constants, self.memory, self.block, self.mode, main, is_complete, steps)

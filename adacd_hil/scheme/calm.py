@@ -23,7 +23,7 @@ class ArmFinding(IntFlag):
     COMPLETE = 1 << 41
     LATE = 1 << 42
     FAULTY = 1 << 43
-    OLD = 1 << 44  # a value older than its budget
+    OLD = 1 << 44  # a value older than a cycle, which is too old if it stays so or exceeds its budget
 
 
 class Calm(NamedTuple):
@@ -40,7 +40,7 @@ class Calm(NamedTuple):
     due: int = NEVER
 
 
-def findings_of(arms: ArmBatch, max_age_cycles: int) -> NDArray[np.int64]:
+def findings_of(arms: ArmBatch) -> NDArray[np.int64]:
     """Return the bits of `ArmFinding` of each cycle (n,)."""
     oldest = np.maximum(arms.age_q.max(axis=1, initial=0), arms.age_tau_J.max(axis=1, initial=0))
     findings = np.zeros(arms.cycle.size, dtype=np.int64)
@@ -49,7 +49,7 @@ def findings_of(arms: ArmBatch, max_age_cycles: int) -> NDArray[np.int64]:
         (ArmFinding.COMPLETE, arms.is_complete),
         (ArmFinding.LATE, arms.is_late),
         (ArmFinding.FAULTY, arms.fault != FaultReason.NONE),
-        (ArmFinding.OLD, oldest > max_age_cycles),
+        (ArmFinding.OLD, oldest > 1),
     ):
         findings[holds] |= int(bit)
     return findings

@@ -34,7 +34,7 @@ from adacd_hil.scheme import (
     sensitivity,
     termination,
 )
-from adacd_hil.scheme.kernel import Structured, block_dtype
+from adacd_hil.scheme.kernel import Structured, block_dtype, is_filled, keep_sample, put_between
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 
 # What a cycle does, as bits.
@@ -58,10 +58,7 @@ _COLLISION = int(Observation.COLLISION)
 _FITTED = int(Observation.FITTED)
 _CERTIFIED = int(Observation.CERTIFIED)
 _REFUTED = int(Observation.REFUTED)
-
-# Shares of the nominal period: the shortest and the longest interval of two samples that follow each other.
-_SHORTEST_SHARE = 0.5
-_LONGEST_SHARE = 1.5
+_UNSEEN = int(Observation.UNSEEN)
 
 _EIGENVALUE_EVERY = 64
 """Samples between two looks at the eigenvalues: they take 8 µs, the rest of a step about 3 µs."""
@@ -176,6 +173,8 @@ def new_memory(settings: Settings) -> Structured:
         "tau_f": (filter_count, JOINTS),
         "tau_old": (filter_count, JOINTS),
         "rates": (3, filter_count),
+        "last": (3, JOINTS),
+        "between": (3, JOINTS),
         # model in use
         "theta": parameter,
         "P": square,
@@ -328,25 +327,24 @@ def _use_belief(m: Any) -> None:
 
 
 @compiled
-def step(
-    constants: Structured, memory: Structured, block: Structured, is_complete: int, periods: int, mode: int
-) -> int:
+def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
     """Take in the block's q, dq, tau_J and fill the rest of it; return bits of `Observation`.
 
-    is_complete: 1 if all values are this cycle's. periods: since the previous step. mode: MEASURE to REFINE.
+    is_complete: 1 if it is a fresh sample. steps: periods since the fresh sample before it. mode: MEASURE to REFINE.
     """
     k, m, out = constants[0], memory[0], block[0]
-    observation = observe(k, out)
+    observation = observe(k, out) | _UNSEEN
     if out["period_s"][0] == 0.0:
-        out["period_s"][0] = k["period_s"]
+        out["period_s"][0] = max(steps, 1) * k["period_s"]
     is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
     if is_fresh:
         if mode & MEASURE:
             _measure_noise(k, m, out["tau_J"])
-        _filter(k, m, out, periods)
+        if _filter(k, m, out, steps):
+            observation &= ~_UNSEEN
         if not (np.all(np.isfinite(m["r"])) and np.all(np.isfinite(m["theta"]))):
             observation |= _NOT_A_NUMBER
-    else:
+    elif is_complete != 0:
         m["has_gap"] = 1.0
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
@@ -392,45 +390,66 @@ def _measure_noise(k: Any, m: Any, tau_J: Vector) -> None:
 
 
 @compiled
-def _filter(k: Any, m: Any, out: Any, periods: int) -> None:
-    """Take the bank to this sample and estimate the external torque that each filter sees."""
-    base = int(k["base"])
-    q, dq, tau_J, cutoff = out["q"], out["dq"], out["tau_J"], k["cutoff"]
-    _fill_regressor(k, m, q, dq, tau_J)
+def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
+    """Take the bank to this sample and estimate the external torque that each filter sees.
+
+    Return whether the filters took it in; after a gap they only resume.
+    """
     nominal_s: float = k["period_s"]
     period_s: float = out["period_s"][0]
-    is_near = _SHORTEST_SHARE * nominal_s <= period_s <= _LONGEST_SHARE * nominal_s
-    if m["has_gap"] != 0.0 or periods != 1 or not is_near:
-        bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
-        m["has_gap"] = 0.0
-        m["is_steady"] = 0.0
+    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s)
+    if is_seen:
+        _choose_rates(k, m, period_s / steps)
+        for between in range(1, steps):
+            put_between(m["last"], out["q"], out["dq"], out["tau_J"], between / steps, m["between"])
+            m["is_steady"] = 0.0
+            _take_sample(k, m, m["between"][0], m["between"][1], m["between"][2], True, out["tau_ext_wide_hat"])
+    m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
+    _take_sample(k, m, out["q"], out["dq"], out["tau_J"], is_seen, out["tau_ext_wide_hat"])
+    m["has_gap"] = 0.0
+    keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
+    out["tau_f"][:] = m["tau_f"][_FIT]
+    detector.predict(m["W_f"][_FIT], k["theta_cad"], out["tau_f_cad"])
+    for i in range(out["q"].shape[0]):
+        out["tau_ext_hat"][i] = m["r"][_FIT, i]
+        out["tau_f_hat"][i] = m["r"][_FIT, i] + out["tau_f"][i]
+        out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
+    return bool(is_seen)
+
+
+@compiled
+def _choose_rates(k: Any, m: Any, period_s: float) -> None:
+    """Fill what one period does to each filter."""
+    decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
+    if period_s == k["period_s"]:
+        decay[:] = k["decay"]
+        old[:] = k["weight_old"]
+        new[:] = k["weight_new"]
     else:
-        m["is_steady"] = 1.0
+        bank.discretise(k["cutoff"], period_s, decay, old, new)
+
+
+@compiled
+def _take_sample(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector, is_seen: bool, tau_ext_wide_hat: Vector) -> None:
+    """Take the bank over one period to a sample, or let it resume from there, and compare with the model in use."""
+    cutoff = k["cutoff"]
+    _fill_regressor(k, m, q, dq, tau_J)
+    if is_seen:
         decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
-        if period_s == nominal_s:
-            decay[:] = k["decay"]
-            old[:] = k["weight_old"]
-            new[:] = k["weight_new"]
-        else:
-            bank.discretise(cutoff, period_s, decay, old, new)
         bank.advance(
             cutoff, decay, old, new, m["Y_p"], m["Y_h"], tau_J,
             m["tau_old"], m["input_old"], m["S"], m["tau_f"], m["W_f"],
         )  # fmt: skip
-    bank.fill_lag(cutoff, tau_J, m["tau_f"], base + q.shape[0], m["W_f"])
+    else:
+        bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
+    bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
     bank.smooth(k["smoothing"], m["r"], m["y"])
     if m["is_steady"] != 0.0:
         sensitivity.follow_velocity_noise(k, m, dq)
     sensitivity.follow_standstill(dq, k["still_rad_s"], k["decay"], k["smoothing"], m["still"], m["still_smooth"])
     sensitivity.follow_friction(k, m, _FIT)
-    out["tau_f"][:] = m["tau_f"][_FIT]
-    detector.predict(m["W_f"][_FIT], k["theta_cad"], out["tau_f_cad"])
-    for i in range(q.shape[0]):
-        out["tau_ext_hat"][i] = m["r"][_FIT, i]
-        out["tau_f_hat"][i] = m["r"][_FIT, i] + out["tau_f"][i]
-        out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
-    contact.undo_filter(m["r"][WIDE], k["decay"][WIDE], m["history"], out["tau_ext_wide_hat"])
+    contact.undo_filter(m["r"][WIDE], k["decay"][WIDE], m["history"], tau_ext_wide_hat)
 
 
 @compiled

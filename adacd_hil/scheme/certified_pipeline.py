@@ -101,12 +101,10 @@ class CertifiedPipeline(RunsBatches):
         self._q[:] = arm.q
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
-        self._period_s[0] = self._intervals.since_last(arm.t_ns)
-        is_complete, periods = int(arm.is_complete), int(arm.periods)
-        observation = certified_kernel.step(
-            self._constants, self._memory, self._block, is_complete, periods, self._mode
-        )
-        self._paper.step(self._block, is_complete, periods)
+        self._period_s[0] = self._intervals.since_last(arm)
+        is_complete, steps = int(arm.is_complete), int(arm.steps)
+        observation = certified_kernel.step(self._constants, self._memory, self._block, is_complete, steps, self._mode)
+        self._paper.step(self._block, is_complete, steps)
         return self._conclude(arm, request, observation)
 
     @property

@@ -7,9 +7,10 @@ Three structured arrays of one element each carry everything, so that fields hav
 - block: `records.scheme_layout`, filled in every cycle. q, dq, tau_J and the measured period_s are put there by the
   caller; a period_s of 0 was not measured.
 
-A cycle without fresh data (a lost frame, a value that is not a number) leaves filters and estimate as they were and
-makes a gap; the next fresh sample resumes as `filters` says. So does one after skipped periods, or after an interval
-that is not near the nominal one.
+A cycle without a fresh sample leaves filters and estimate as they were. Up to `MOST_FILLED` samples that are missing
+before one are taken to lie on the straight line between their neighbours, so that a lost frame leaves nothing unseen. A
+longer gap, a value that is not a number, or an interval that is not near the nominal one makes a gap from which the
+filters resume as `filters` says. The step says whether they took a sample in.
 
 The measured interval goes into what integrates: filters, estimator, information, impulse. It does not go into what only
 counts: T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period. Nor does it into
@@ -40,10 +41,38 @@ _AT_REST = int(Observation.AT_REST)
 _UNLOADED = int(Observation.UNLOADED)
 _ADAPTED = int(Observation.ADAPTED)
 _COLLISION = int(Observation.CONTACT | Observation.COLLISION)
+_UNSEEN = int(Observation.UNSEEN)
 
 # Shares of the nominal period: the shortest and the longest interval of two samples that follow each other.
 _SHORTEST_SHARE = 0.5
 _LONGEST_SHARE = 1.5
+MOST_FILLED = 3
+"""Missing samples that are put on the line between their neighbours: as many as a value may be old by default. Over
+4 ms the line is within 1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
+
+
+@compiled
+def is_filled(steps: int, period_s: float, nominal_s: float) -> bool:
+    """Tell whether a sample follows the one before it near enough. steps: periods between them, taking period_s."""
+    if not 1 <= steps <= MOST_FILLED + 1:
+        return False
+    return bool(_SHORTEST_SHARE * nominal_s * steps <= period_s <= _LONGEST_SHARE * nominal_s * steps)
+
+
+@compiled
+def put_between(last: Vector, q: Vector, dq: Vector, tau_J: Vector, share: float, between: Vector) -> None:
+    """Fill `between` (3, n) with the sample at a share of the way from `last` (3, n) to q, dq, tau_J (n,)."""
+    for i in range(between.shape[1]):
+        between[0, i] = last[0, i] + share * (q[i] - last[0, i])
+        between[1, i] = last[1, i] + share * (dq[i] - last[1, i])
+        between[2, i] = last[2, i] + share * (tau_J[i] - last[2, i])
+
+
+@compiled
+def keep_sample(q: Vector, dq: Vector, tau_J: Vector, last: Vector) -> None:
+    """Keep q, dq, tau_J (n,) in `last` (3, n)."""
+    for i in range(last.shape[1]):
+        last[0, i], last[1, i], last[2, i] = q[i], dq[i], tau_J[i]
 
 
 def block_dtype(layout: Layout) -> np.dtype[np.void]:
@@ -101,6 +130,8 @@ def new_memory(parameter_count: int) -> Structured:
         "S": columns,
         "W_f": columns,
         "tau_old": joint,
+        "last": (3, JOINTS),
+        "between": (3, JOINTS),
         # estimator
         "P": square,
         "v": parameter,
@@ -156,26 +187,27 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
 
 
 @compiled
-def step(
-    constants: Structured, memory: Structured, block: Structured, is_complete: int, periods: int, mode: int
-) -> int:
+def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
     """Take in the block's q, dq, tau_J and fill the rest of it; return bits of `Observation`.
 
-    is_complete: 1 if all values are this cycle's. periods: since the previous step. mode: LEARN, ARMED, REPORTING.
+    is_complete: 1 if it is a fresh sample. steps: periods since the fresh sample before it. mode: LEARN, ARMED,
+    REPORTING.
     """
     c, m, out = constants[0], memory[0], block[0]
     if out["period_s"][0] == 0.0:
-        out["period_s"][0] = c["period_s"]
+        out["period_s"][0] = max(steps, 1) * c["period_s"]
     period_s = c["period_s"]
-    observation = _observe(c, out)
+    observation = _observe(c, out) | _UNSEEN
     is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
     if is_fresh:
-        period_s = _filter(c, m, out, periods)
+        is_seen, period_s = _filter(c, m, out, steps)
+        if is_seen:
+            observation &= ~_UNSEEN
         if mode & LEARN:
             observation |= _learn(c, m, out, period_s)
         if not (np.all(np.isfinite(out["tau_ext_hat"])) and np.all(np.isfinite(out["theta_hat"]))):
             observation |= _NOT_A_NUMBER
-    else:
+    elif is_complete != 0:
         m["has_gap"] = 1.0
     if mode & ARMED:
         return observation | _watch(c, m, out, period_s, is_fresh, mode & REPORTING != 0)
@@ -203,34 +235,66 @@ def _observe(c: Any, out: Any) -> int:
 
 
 @compiled
-def _filter(c: Any, m: Any, out: Any, periods: int) -> float:
+def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
     """Take the filters to this sample and estimate the external torque with both models.
 
-    Return the time that the sample stands for: the measured interval, or after a gap the nominal one.
+    Return whether they took it in, and the time that it stands for: the measured interval, after a gap the nominal one.
     """
-    regressor.fill_momentum(out["q"], out["dq"], m["Y_p"])
-    regressor.fill_remainder(out["q"], out["dq"], m["Y_h"])
     a, b = c["a_rad_s"], c["b_rad_s"]
     nominal_s: float = c["period_s"]
     period_s: float = out["period_s"][0]
-    decay, old, new = c["decay"], c["weight_old"], c["weight_new"]
-    is_near = _SHORTEST_SHARE * nominal_s <= period_s <= _LONGEST_SHARE * nominal_s
-    if m["has_gap"] != 0.0 or periods != 1 or not is_near:
+    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s)
+    if is_seen:
+        step_s = period_s / steps
+        decay, old, new = c["decay"], c["weight_old"], c["weight_new"]
+        if step_s != nominal_s:
+            decay, old, new = filters.first_order_hold(a, b, step_s)
+        for k in range(1, steps):
+            put_between(m["last"], out["q"], out["dq"], out["tau_J"], k / steps, m["between"])
+            _advance(m, m["between"][0], m["between"][1], m["between"][2], a, b, decay, old, new, out["tau_f"])
+            _compare(c, m, m["between"][1], decay, out)
+        _advance(m, out["q"], out["dq"], out["tau_J"], a, b, decay, old, new, out["tau_f"])
+        _compare(c, m, out["dq"], decay, out)
+    else:
         period_s = nominal_s
+        regressor.fill_momentum(out["q"], out["dq"], m["Y_p"])
+        regressor.fill_remainder(out["q"], out["dq"], m["Y_h"])
         filters.resume(a, b, m["Y_p"], m["Y_h"], out["tau_J"], m["input_old"], m["tau_old"], m["S"], m["W_f"])
         m["has_gap"] = 0.0
-    else:
-        if period_s != nominal_s:
-            decay, old, new = filters.first_order_hold(a, b, period_s)
-        filters.advance_torque(decay, old, new, m["tau_old"], out["tau_J"], out["tau_f"])
-        filters.advance_regressor(decay, old, new, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
-    detector.follow_standstill(out["dq"], c["standstill_rad_s"], decay, m["standstill"])
+        _compare(c, m, out["dq"], c["decay"], out)
+    keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
+    return is_seen, period_s
+
+
+@compiled
+def _advance(
+    m: Any,
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    a: float,
+    b: float,
+    decay: float,
+    weight_old: float,
+    weight_new: float,
+    tau_f: Vector,
+) -> None:
+    """Take the filters over one period to a sample."""
+    regressor.fill_momentum(q, dq, m["Y_p"])
+    regressor.fill_remainder(q, dq, m["Y_h"])
+    filters.advance_torque(decay, weight_old, weight_new, m["tau_old"], tau_J, tau_f)
+    filters.advance_regressor(decay, weight_old, weight_new, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
+
+
+@compiled
+def _compare(c: Any, m: Any, dq: Vector, decay: float, out: Any) -> None:
+    """Compare the filtered torque with both predictions."""
+    detector.follow_standstill(dq, c["standstill_rad_s"], decay, m["standstill"])
     detector.predict(m["W_f"], out["theta_hat"], out["tau_f_hat"])
     detector.predict(m["W_f"], c["theta_cad"], out["tau_f_cad"])
     detector.estimate_external(out["tau_f"], out["tau_f_hat"], c["dc_gain"], out["tau_ext_hat"])
     detector.estimate_external(out["tau_f"], out["tau_f_cad"], c["dc_gain"], out["tau_ext_hat_cad"])
     contact.undo_filter(out["tau_ext_hat"], c["decay"], m["history"], out["tau_ext_wide_hat"])
-    return period_s
 
 
 @compiled
@@ -283,14 +347,14 @@ def step_record(
     dq: Vector,
     tau_J: Vector,
     is_complete: Vector,
-    periods: Vector,
+    steps: Vector,
     period_s: Vector,
     mode: int,
     blocks: Structured,
 ) -> None:
     """Run `step` over n samples in one mode; fills blocks (n,).
 
-    q, dq, tau_J (n, 2); is_complete, periods (n,) int64; period_s (n,), 0 where it was not measured.
+    q, dq, tau_J (n, 2); is_complete, steps (n,) int64; period_s (n,), 0 where it was not measured.
 
     blocks[0] must hold the theta_hat to begin with.
     """
@@ -302,4 +366,4 @@ def step_record(
         block[0]["dq"][:] = dq[k]
         block[0]["tau_J"][:] = tau_J[k]
         block[0]["period_s"][0] = period_s[k]
-        step(constants, memory, block, is_complete[k], periods[k], mode)
+        step(constants, memory, block, is_complete[k], steps[k], mode)

@@ -19,7 +19,7 @@ from adacd_hil.scheme.kernel import Structured
 
 
 class Samples(NamedTuple):
-    """What the loops read of n cycles, as columns. period_s: 0 where not measured. findings: of the arm."""
+    """What the loops read of n cycles, as columns. period_s: 0 where not measured; steps, findings: of the arm."""
 
     cycle: NDArray[np.int64]
     q: Vector
@@ -28,6 +28,7 @@ class Samples(NamedTuple):
     period_s: Vector
     is_complete: NDArray[np.int64]
     periods: NDArray[np.int64]
+    steps: NDArray[np.int64]
     findings: NDArray[np.int64]
 
 
@@ -62,10 +63,11 @@ class TouchWatch(NamedTuple):
 
 def samples_of(arms: ArmBatch, period_s: Vector, findings: NDArray[np.int64]) -> Samples:
     """Lay out the columns as the compiled loops read them."""
-    integers = (np.ascontiguousarray(column, dtype=np.int64) for column in (arms.cycle, arms.is_complete, arms.periods))
+    columns = (arms.cycle, arms.is_complete, arms.periods, arms.steps)
+    integers = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
     q, dq, tau_J = (np.ascontiguousarray(column, dtype=np.float64) for column in (arms.q, arms.dq, arms.tau_J))
-    cycle, is_complete, periods = integers
-    return Samples(cycle, q, dq, tau_J, period_s, is_complete, periods, findings)
+    cycle, is_complete, periods, steps = integers
+    return Samples(cycle, q, dq, tau_J, period_s, is_complete, periods, steps, findings)
 
 
 @compiled
@@ -87,7 +89,7 @@ def run_paper(
     passed = 0
     for k in range(first, last + 1):
         _put(block, samples, k)
-        observation = kernel.step(constants, memory, block, samples.is_complete[k], samples.periods[k], mode)
+        observation = kernel.step(constants, memory, block, samples.is_complete[k], samples.steps[k], mode)
         recorded.observations[k] = observation
         for j in range(values.size):
             recorded.blocks[k, j] = values[j]
@@ -119,14 +121,14 @@ def run_certified(
     m, out = memory[0], block[0]
     written, passed = touch.written, 0
     for k in range(first, last + 1):
-        is_complete, periods = samples.is_complete[k], samples.periods[k]
+        is_complete, steps = samples.is_complete[k], samples.steps[k]
         _put(block, samples, k)
-        observation = certified_kernel.step(constants, memory, block, is_complete, periods, mode)
-        paper_mode = beside.step(paper[0], paper[1], paper[2], paper_mode, block, is_complete, periods)
+        observation = certified_kernel.step(constants, memory, block, is_complete, steps, mode)
+        paper_mode = beside.step(paper[0], paper[1], paper[2], paper_mode, block, is_complete, steps)
         recorded.observations[k] = observation
         for j in range(values.size):
             recorded.blocks[k, j] = values[j]
-        passed += periods
+        passed += samples.periods[k]
         y = m["y"][certified_kernel.WIDE]
         along_Nm = y[0] * touch.way[0] + y[1] * touch.way[1]
         if (

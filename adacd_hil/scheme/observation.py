@@ -24,3 +24,4 @@ class Observation(IntFlag):
     REFUTED = 256  # the frozen model has failed its test
     COLLISION = 512  # a joint is over its upper threshold
     OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
+    UNSEEN = 2048  # the filters took no sample in: the residual is not of now

@@ -84,9 +84,9 @@ class Pipeline(RunsBatches):
         self._q[:] = arm.q
         self._dq[:] = arm.dq
         self._tau_J[:] = arm.tau_J
-        self._period_s[0] = self._intervals.since_last(arm.t_ns)
+        self._period_s[0] = self._intervals.since_last(arm)
         observation = kernel.step(
-            self._constants, self._memory, self._block, int(arm.is_complete), int(arm.periods), self._mode
+            self._constants, self._memory, self._block, int(arm.is_complete), int(arm.steps), self._mode
         )
         return self._conclude(arm, request, observation)
 

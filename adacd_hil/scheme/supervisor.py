@@ -31,6 +31,7 @@ REST_HOLD_S = 0.05
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
 _OVER_SPEED = int(Observation.OVER_SPEED)
+_UNSEEN = int(Observation.UNSEEN)
 _AT_REST = int(Observation.AT_REST)
 _REST_UNLOADED = int(Observation.AT_REST | Observation.UNLOADED)
 _ADAPTED = int(Observation.ADAPTED)
@@ -63,9 +64,19 @@ _KEPT_IN = MappingProxyType(
         Request.PAYLOAD: POWERED - {SchemeState.PAYLOAD},
         Request.PAYLOAD_CHANGED: frozenset((SchemeState.PAYLOAD,)),
         Request.FINISH: frozenset[SchemeState](),
+        Request.FAULT_TORQUE: frozenset[SchemeState](),
+        Request.FAULT_FOLLOWING: frozenset[SchemeState](),
+        Request.FAULT_TAMPERED: frozenset[SchemeState](),
     }
 )
-"""Where a request waits to be served. FINISH is the control layer's."""
+"""Where a request waits to be served. FINISH is the control layer's; a fault is served at once, or not at all."""
+_FAULT_ASKED = MappingProxyType(
+    {
+        Request.FAULT_TORQUE: FaultReason.TORQUE,
+        Request.FAULT_FOLLOWING: FaultReason.FOLLOWING,
+        Request.FAULT_TAMPERED: FaultReason.TAMPERED,
+    }
+)
 
 _RAISED_BY = MappingProxyType(
     {
@@ -81,7 +92,9 @@ _RAISED_BY = MappingProxyType(
     }
 )
 """Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
-_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _NOT_A_NUMBER | _OVER_LIMIT | _OVER_SPEED
+_NOT_WELL = (
+    int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _NOT_A_NUMBER | _OVER_LIMIT | _OVER_SPEED | _UNSEEN
+)
 """Findings without which `_check` finds nothing in an arm that is enabled."""
 
 
@@ -92,6 +105,8 @@ def _calm_in(state: SchemeState) -> tuple[int, int]:
         watched |= _RAISED_BY.get(event, 0)
     if state in _CHECKED or state is SchemeState.COMMISSION:
         watched |= _NOT_WELL
+    if state is SchemeState.INIT:
+        watched |= int(ArmFinding.OLD)
     if state in POWERED:
         expected |= int(ArmFinding.ENABLED)
     if state is SchemeState.COMMISSION:
@@ -125,7 +140,8 @@ class Supervisor:
     def __init__(self, settings: Settings) -> None:
         period_s = settings.bus.period_s
         self._max_age_cycles = settings.bus.max_age_cycles
-        self._commission_cycles = settings.safety.commission_cycles
+        self._blind_limit = settings.blind_cycles
+        self._commission_cycles = max(1, round(settings.safety.commission_s / period_s))
         self._rest_cycles = round(REST_HOLD_S / period_s)
         self._clear_cycles = round(settings.reaction.clear_s / period_s)
         self._patience_cycles = round(settings.reaction.patience_s / period_s)
@@ -149,6 +165,8 @@ class Supervisor:
         self._commissioned_cycles = 0
         self._still_cycles = 0
         self._cleared_cycles = 0
+        self._blind_cycles = 0
+        self._stale_cycles = 0
 
     @property
     def state(self) -> SchemeState:
@@ -182,18 +200,22 @@ class Supervisor:
         self._learning_cycles += arm.periods if self._state in _LEARNING else 0
         self._still_cycles = self._still_cycles + 1 if observation & _AT_REST else 0
         self._cleared_cycles = 0 if observation & _ANY_CONTACT else self._cleared_cycles + 1
+        self._blind_cycles = self._blind_cycles + 1 if observation & _UNSEEN else 0
+        is_stale = max(*arm.age_q, *arm.age_tau_J) > 1
+        self._stale_cycles = self._stale_cycles + 1 if is_stale else 0
         if request is not Request.NONE:
             self._take(request)
         if self._state is SchemeState.REACT and not self._is_latched:
             self._is_latched = self._has_grown(arm, observation)
-        event = self._event(arm, observation, is_reporting, goes_on)
+        asked = _FAULT_ASKED.get(request, FaultReason.NONE)
+        event = self._event(arm, observation, is_reporting, goes_on, asked)
         if event is not SchemeEvent.NONE:
             self._enter(next_state(self._state, event, self._origin), event)
         return self._state
 
     def findings(self, arms: ArmBatch) -> NDArray[np.int64]:
         """Return what the arm says of itself in each cycle, bits of `ArmFinding` (n,)."""
-        return findings_of(arms, self._max_age_cycles)
+        return findings_of(arms)
 
     def calm(self, is_reporting: bool, goes_on: bool = False) -> Calm:
         """Return bounds within which cycles without a request change nothing here but what `pass_by` counts.
@@ -236,6 +258,8 @@ class Supervisor:
         elapsed = int(periods.sum())
         self._phase_cycles += elapsed
         self._learning_cycles += elapsed if self._state in _LEARNING else 0
+        self._blind_cycles = _run_at_end(observations & _UNSEEN != 0, self._blind_cycles)
+        self._stale_cycles = 0  # where it counts, a stale value is not calm
         self._still_cycles = _run_at_end(observations & _AT_REST != 0, self._still_cycles)
         self._cleared_cycles = _run_at_end(observations & _ANY_CONTACT == 0, self._cleared_cycles)
         if self._state is SchemeState.COMMISSION:
@@ -271,9 +295,11 @@ class Supervisor:
         self._commissioned_cycles = 0
         self._pending = {request for request in self._pending if self._keeps(request, state)}
 
-    def _event(self, arm: ArmState, observation: int, is_reporting: bool, goes_on: bool) -> SchemeEvent:
-        """Return the first event of this cycle that means something in this state."""
-        fault = self._check(arm, observation) if self._state in _CHECKED else FaultReason.NONE
+    def _event(
+        self, arm: ArmState, observation: int, is_reporting: bool, goes_on: bool, asked: FaultReason
+    ) -> SchemeEvent:
+        """Return the first event of this cycle that means something in this state. asked: a fault that is asked for."""
+        fault = (self._check(arm, observation) or asked) if self._state in _CHECKED else FaultReason.NONE
         event = self._touch(arm, observation)
         if event is SchemeEvent.NONE:
             event = self._progress(arm, observation, is_reporting, goes_on)
@@ -350,13 +376,20 @@ class Supervisor:
         """Return why the arm must not go on, or NONE."""
         if arm.fault is not FaultReason.NONE:
             return arm.fault
-        if observation & _NOT_A_NUMBER:
-            return FaultReason.NOT_A_NUMBER
-        if max(*arm.age_q, *arm.age_tau_J) > self._max_age_cycles:
-            return FaultReason.DATA_AGE
+        fault = self._check_data(arm, observation)
+        if fault is not FaultReason.NONE:
+            return fault
         is_thrown = self._state is SchemeState.REACT and self._phase_cycles <= self._rebound_cycles
         if observation & _OVER_LIMIT or (observation & _OVER_SPEED and not is_thrown):
             return FaultReason.LIMIT
         if self._state in POWERED and not arm.is_enabled:
             return FaultReason.DRIVE
         return FaultReason.DEADLINE if arm.is_late and self._state not in _HELD_FROM else FaultReason.NONE
+
+    def _check_data(self, arm: ArmState, observation: int) -> FaultReason:
+        """Return why the data must not be acted on, or NONE."""
+        if observation & _NOT_A_NUMBER:
+            return FaultReason.NOT_A_NUMBER
+        if max(*arm.age_q, *arm.age_tau_J) > self._max_age_cycles or self._stale_cycles > self._blind_limit:
+            return FaultReason.DATA_AGE
+        return FaultReason.BLIND if self._blind_cycles >= self._blind_limit else FaultReason.NONE

@@ -150,6 +150,13 @@ class E2eReceiver:
     def __init__(self) -> None:
         self.counts = [0] * len(E2eStatus)
         """How often each status was found; the index is its number."""
+        self.status = E2eStatus.NO_NEW_DATA
+        """What the last frame's check said."""
+
+    @property
+    def counter_range(self) -> int:
+        """How many values the counter has; 0 without one."""
+        return 0
 
     @property
     def counter(self) -> int | None:
@@ -158,9 +165,17 @@ class E2eReceiver:
 
     def check(self, frame: bytes) -> E2eStatus:
         """Check one frame; only a valid one may change a value."""
-        status = self._judge(frame)
+        status = self.status = self._judge(frame)
         self.counts[status] += 1
         return status
+
+    def step_of(self, frame: bytes) -> int | None:  # noqa: ARG002
+        """Say by how much a frame's counter is ahead of the last one's, unchecked; None without counter, or before."""
+        return None
+
+    def is_signed(self, frame: bytes) -> bool:  # noqa: ARG002
+        """Tell whether length and CRC of a frame are right; changes nothing."""
+        return True
 
     def miss(self) -> E2eStatus:
         """Note a cycle in which no frame came."""
@@ -259,6 +274,21 @@ class Profile2Receiver(_SequenceReceiver):
         """The last frame's counter while that frame was in sequence; None when it wasn't or none came."""
         return super().counter if self._max_delta == self._tolerance.max_delta else None
 
+    @property
+    def counter_range(self) -> int:
+        """How many values the counter has."""
+        return _COUNTER_MASK_2 + 1
+
+    def step_of(self, frame: bytes) -> int | None:
+        """Say by how much a frame's counter is ahead of the last one's, unchecked; None before the first."""
+        if self._last is None or len(frame) != self._length:
+            return None
+        return (frame[1] - self._last) & _COUNTER_MASK_2
+
+    def is_signed(self, frame: bytes) -> bool:
+        """Tell whether length and CRC of a frame are right; changes nothing."""
+        return len(frame) == self._length and frame[0] == crc8(frame, self._data_ids[frame[1] & _COUNTER_MASK_2])
+
     def _note_silence(self) -> None:
         self._widen()
         self._missing += 1
@@ -269,11 +299,9 @@ class Profile2Receiver(_SequenceReceiver):
 
     def _judge(self, frame: bytes) -> E2eStatus:
         self._widen()
-        if len(frame) != self._length:
+        if not self.is_signed(frame):
             return E2eStatus.WRONG_CRC
         counter = frame[1] & _COUNTER_MASK_2
-        if frame[0] != crc8(frame, self._data_ids[counter]):
-            return E2eStatus.WRONG_CRC
         if self._last is None:
             self._max_delta = self._tolerance.max_delta
             return self._begin(counter)
@@ -300,8 +328,23 @@ class Profile5Receiver(_SequenceReceiver):
         super().__init__(length, tolerance)
         self._data_id = data_id
 
+    @property
+    def counter_range(self) -> int:
+        """How many values the counter has."""
+        return _COUNTER_MASK_5 + 1
+
+    def step_of(self, frame: bytes) -> int | None:
+        """Say by how much a frame's counter is ahead of the last one's, unchecked; None before the first."""
+        if self._last is None or len(frame) != self._length:
+            return None
+        return (frame[2] - self._last) & _COUNTER_MASK_5
+
+    def is_signed(self, frame: bytes) -> bool:
+        """Tell whether length and CRC of a frame are right; changes nothing."""
+        return len(frame) == self._length and frame[0] | frame[1] << 8 == crc16(frame, self._data_id)
+
     def _judge(self, frame: bytes) -> E2eStatus:
-        if len(frame) != self._length or frame[0] | frame[1] << 8 != crc16(frame, self._data_id):
+        if not self.is_signed(frame):
             return E2eStatus.WRONG_CRC
         last, self._last = self._last, frame[2]
         if last is None:

@@ -307,7 +307,7 @@ def test_a_saturated_sensor_is_refused(offset: tuple[float, float], status: str,
 def test_a_device_that_never_answers_is_named() -> None:
     rig = TareRig()
     rig.tamper = lambda cycle, can_id, data: None if can_id == 0x184 else data
-    assert "data are missing from Sensor2: no 200 complete cycles in a row within" in refusal_of(rig)
+    assert "data are missing from Sensor2: no 0.2 s of complete cycles within" in refusal_of(rig)
 
 
 def test_boot_ups_from_before_the_reset_are_not_taken_for_answers() -> None:

@@ -85,10 +85,10 @@ def test_feedback_that_was_read_with_a_followed_sync_came_when_its_last_frame_di
     bus = rig.bench.bus
     rig.read()
     tick = rig.begin()
-    rig.bench.arm.synchronise(tick.cycle, tick.t_ns, 1)  # for another cycle's answers, as they wait beside its SYNC
+    bus.send(0x080, bytes((1 + tick.cycle,)))  # for the answers, as they wait beside a SYNC of another host
     ahead = tuple(frame._replace(t_ns=tick.t_ns + 1000 * place) for place, frame in enumerate(drain(bus), 1))
     rig.bench.tamper = lambda can_id, data: None
-    rig.exchange.read(tick._replace(cycle=tick.cycle + 1, ahead=ahead))
+    rig.exchange.read(tick._replace(ahead=ahead))
     assert rig.exchange.feedback_ns == ahead[-1].t_ns == tick.t_ns + 4000
 
 

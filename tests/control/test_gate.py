@@ -182,5 +182,5 @@ def test_the_step_is_the_rate_times_the_period(period_s: float) -> None:
 
 def test_the_flags_have_the_numbers_that_logs_hold() -> None:
     numbers = {flag.name: int(flag) for flag in GateFlag}
-    assert numbers == {"TORQUE": 1, "RATE": 2, "NOT_A_NUMBER": 4, "CLOSED": 8}
+    assert numbers == {"TORQUE": 1, "RATE": 2, "NOT_A_NUMBER": 4, "CLOSED": 8, "HELD": 16}
     assert GateFlag.NONE.value == 0

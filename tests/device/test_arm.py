@@ -80,6 +80,7 @@ def test_ages_count_cycles_since_the_sample() -> None:
     devices = Devices()
     devices.arm.synchronise(0, 0, 1)
     devices.answer()
+    devices.arm.state()
     devices.arm.synchronise(2, 0, 2)
     devices.answer(without=("Drive2Feedback", "Sensor1Torque"))
     state = devices.arm.state()

@@ -30,7 +30,7 @@ TROUBLES = [
     {"kind": "reorder", "node": "sensor1", "frame": "torque", "count": 1, "at_s": 0.08},
     {"kind": "corrupt", "node": "drive1", "frame": "feedback", "mask": "00001000", "count": 1, "at_s": 0.1},
     {"kind": "delay", "node": "sensor1", "frame": "torque", "delay_us": 1500.0, "duration_s": 0.01, "at_s": 0.12},
-    {"kind": "emcy_storm", "node": "sensor1", "code": 0x1000, "rate_Hz": 500.0, "duration_s": 0.02, "at_s": 0.14},
+    {"kind": "emcy_storm", "node": "sensor1", "code": 0x0010, "rate_Hz": 500.0, "duration_s": 0.02, "at_s": 0.14},
     {"kind": "silence", "node": "all", "duration_s": 0.002, "at_s": 0.16},
     {"kind": "drive_fault", "node": "drive1", "code": 0x2310, "at_s": 0.2},
 ]
@@ -69,7 +69,7 @@ def test_the_run_that_is_compared_has_old_values_and_a_fault(read: ArmBatch) -> 
     assert set(np.unique(read.age_tau_J)) == {0, 1, 2}
     assert set(np.unique(read.age_q)) >= {0, 1, 2}
     assert set(np.unique(read.fault)) == {FaultReason.NONE, FaultReason.DRIVE}
-    assert np.count_nonzero(~read.is_complete) > 10
+    assert np.count_nonzero(~read.is_complete) >= 10
 
 
 def test_a_new_attempt_forgets_the_one_before(troubled: Live) -> None:

@@ -15,7 +15,7 @@ from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
 PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")
-SETTINGS = replace(SETTINGS, safety=replace(SETTINGS.safety, commission_cycles=10))
+SETTINGS = replace(SETTINGS, safety=replace(SETTINGS.safety, commission_s=0.01))
 NAMES = certified_kernel.parameter_names(SETTINGS)
 
 

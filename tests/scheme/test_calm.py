@@ -11,7 +11,7 @@ from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.supervisor import Supervisor
 
 SETTINGS = settings_with(
-    safety={"commission_cycles": 12, "phase_timeout_s": 0.15},
+    safety={"commission_s": 0.012, "phase_timeout_s": 0.15},
     termination={"timeout_s": 1.0},
     reaction={"clear_s": 0.07, "patience_s": 0.3, "rebound_s": 0.02},
     bus={"max_age_cycles": 3},
@@ -53,7 +53,7 @@ def walk(seed):
         (chance(COUNT) > 0.003) & (cycle % 500 > 20),
         (chance(COUNT) > 0.01) & (cycle % 400 < 330),
         seldom(0, range(1, 11), 5e-4).astype(np.uint8),
-        chance(COUNT) < 0.002,
+        chance(COUNT) < 0.002, np.ones(COUNT, dtype=np.int64), cycle * 1_000_000,
     )  # fmt: skip
     return arms, observations, seldom(0, [int(request) for request in Request], 0.02)
 
@@ -104,8 +104,9 @@ def healthy(count):
     zeros, ages, no = np.zeros((count, 2)), np.zeros((count, 2), dtype=np.int64), np.zeros(count, dtype=bool)
     cycle = np.arange(count)
     arms = ArmBatch(
-        cycle, cycle, np.ones_like(cycle), zeros, zeros, zeros, ages, ages, ~no, ~no, no.astype(np.uint8), no
-    )
+        cycle, cycle, np.ones_like(cycle), zeros, zeros, zeros, ages, ages, ~no, ~no, no.astype(np.uint8), no,
+        np.ones_like(cycle), cycle,
+    )  # fmt: skip
     return arms, observations, np.zeros(count, dtype=np.uint8)
 
 
@@ -141,6 +142,6 @@ def test_the_arm_s_findings_are_bits_of_their_own():
         (ArmFinding.COMPLETE, arms.is_complete),
         (ArmFinding.LATE, arms.is_late),
         (ArmFinding.FAULTY, arms.fault != FaultReason.NONE),
-        (ArmFinding.OLD, np.maximum(arms.age_q.max(axis=1), arms.age_tau_J.max(axis=1)) == 4),
+        (ArmFinding.OLD, np.maximum(arms.age_q.max(axis=1), arms.age_tau_J.max(axis=1)) > 1),
     ):
         np.testing.assert_array_equal(found & int(bit) != 0, holds)

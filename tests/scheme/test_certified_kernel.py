@@ -126,8 +126,37 @@ def test_what_was_lost_is_a_gap_for_the_sample_after_it(smooth):
     before = kernel.m["r"].copy()
     kernel.step(q[299] + 9.0, dq[299], tau_J[299] + 9.0, is_complete=0)
     np.testing.assert_array_equal(kernel.m["r"], before)
-    kernel.step(q[302], dq[302], tau_J[302])
+    kernel.step(q[305], dq[305], tau_J[305], periods=6)
     np.testing.assert_allclose(kernel.m["r"], before, atol=1e-12)
+
+
+@pytest.mark.parametrize("lost", [1, 2, 3])
+def test_a_few_lost_samples_lie_between_their_neighbours(smooth, lost):
+    """A push that begins in them is felt with the first sample after them."""
+    q, dq, tau_J = smooth
+    pushed, whole = Kernel(theta=SMOOTH), Kernel(theta=SMOOTH)
+    for kernel in (pushed, whole):
+        kernel.run(q[:300], dq[:300], tau_J[:300])
+    assert pushed.step(q[300], dq[300], tau_J[300], is_complete=0) & Observation.UNSEEN
+    after = slice(300, 301 + lost)
+    expected = whole.run(q[after], dq[after], tau_J[after] - 1.0)[1][-1]
+    seen = pushed.step(q[300 + lost], dq[300 + lost], tau_J[300 + lost] - 1.0, periods=lost + 1)
+    assert not seen & Observation.UNSEEN
+    assert np.all(np.abs(pushed.m["r"]) > 0.4 * np.abs(expected))
+    unpushed = Kernel(theta=SMOOTH)
+    unpushed.run(q[:300], dq[:300], tau_J[:300])
+    unpushed.step(q[300 + lost], dq[300 + lost], tau_J[300 + lost], periods=lost + 1)
+    assert np.max(np.abs(unpushed.m["r"])) < 1e-3
+
+
+def test_an_incomplete_cycle_and_the_sample_after_a_gap_are_said_to_be_unseen(smooth):
+    q, dq, tau_J = smooth
+    kernel = Kernel(theta=SMOOTH)
+    found = [kernel.step(q[k], dq[k], tau_J[k]) & Observation.UNSEEN for k in range(3)]
+    found.append(kernel.step(q[3], dq[3], tau_J[3], is_complete=0) & Observation.UNSEEN)
+    found.append(kernel.step(q[12], dq[12], tau_J[12], periods=10) & Observation.UNSEEN)
+    found.append(kernel.step(q[13], dq[13], tau_J[13]) & Observation.UNSEEN)
+    assert [bool(bits) for bits in found] == [True, False, False, True, True, False]
 
 
 def test_a_sample_that_is_no_number_is_told_and_filtered_by_nobody(smooth):

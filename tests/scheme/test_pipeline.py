@@ -222,17 +222,18 @@ def test_lost_frames_do_not_keep_the_adaptation_from_ending(share):
     """Held values would: with one frame in ten lost the adaptation then doesn't end."""
     loop = ClosedLoop(settings_with(**NEVER_ALARM), THETA["P"])
     lost = np.random.default_rng(5)
-    whole, held = loop.measure, None
+    whole, held, steps = loop.measure, None, 1
 
     def measure():
-        nonlocal held
+        nonlocal held, steps
         fresh = whole()
         if held is not None and loop.is_moving and lost.random() < share:
+            steps += 1
             return fresh._replace(
-                q=held.q, dq=held.dq, tau_J=held.tau_J, is_complete=False, age_q=(1, 1), age_tau_J=(1, 1)
+                q=held.q, dq=held.dq, tau_J=held.tau_J, is_complete=False, age_q=(1, 1), age_tau_J=(1, 1), steps=0
             )
-        held = fresh
-        return fresh
+        held, steps = fresh._replace(steps=steps), 1
+        return held
 
     loop.measure = measure
     loop.run_until(SchemeState.ADAPT)
@@ -289,7 +290,7 @@ def test_an_incomplete_cycle_holds_the_estimate():
     ],
 )
 def test_a_moving_arm_that_is_not_well_faults(changes, reason):
-    pipeline = Pipeline(settings_with(safety={"commission_cycles": 10}))
+    pipeline = Pipeline(settings_with(safety={"commission_s": 0.01}))
     states = [pipeline.step(arm_state(k)).state for k in range(20)]
     assert states[-1] is SchemeState.ADAPT
     assert pipeline.step(arm_state(20, **changes)).fault is reason
@@ -297,13 +298,13 @@ def test_a_moving_arm_that_is_not_well_faults(changes, reason):
 
 @pytest.mark.parametrize("changes", [{"dq": (0.06, 0.0)}, {"dq": (0.0, -0.06)}, {"tau_J": (1.1, 0.0)}])
 def test_an_arm_that_moves_or_is_loaded_is_not_commissioned(changes):
-    pipeline = Pipeline(settings_with(safety={"commission_cycles": 10}))
+    pipeline = Pipeline(settings_with(safety={"commission_s": 0.01}))
     states = [pipeline.step(arm_state(k, **changes)).state for k in range(100)]
     assert states[-1] is SchemeState.COMMISSION
 
 
 EASY = {
-    "safety": {"commission_cycles": 10},
+    "safety": {"commission_s": 0.01},
     "termination": {
         "beta_Nm": 50.0,
         "hold_s": 0.1,
@@ -398,7 +399,7 @@ def test_an_adaptation_needs_travel_and_speed_of_its_own(missing, sign):
 
 
 def test_an_adaptation_forgets_what_the_filters_held():
-    pipeline = Pipeline(settings_with(safety={"commission_cycles": 10}))
+    pipeline = Pipeline(settings_with(safety={"commission_s": 0.01}))
     outputs = [pipeline.step(arm_state(k, tau_J=(0.5, 0.0), is_enabled=k > 500)) for k in range(510)]
     begin = next(k for k, output in enumerate(outputs) if output.state is SchemeState.ADAPT)
     assert abs(outputs[begin].tau_ext_hat[0]) > 0.4

@@ -89,7 +89,11 @@ def test_across_gaps_the_true_model_still_leaves_nothing(motion, gap):
         periods = np.diff(kept, prepend=-1)
         blocks = run_kernel(settings_with(), q[kept], dq[kept], tau_J[kept], SMOOTH, 0, periods=periods)
     else:
-        blocks = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, 0, is_complete=(~is_lost).astype(np.int64))
+        fresh = np.flatnonzero(~is_lost)
+        periods = np.zeros(t_s.size, dtype=np.int64)
+        periods[fresh] = np.diff(fresh, prepend=-1)
+        is_complete = (~is_lost).astype(np.int64)
+        blocks = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, 0, is_complete=is_complete, periods=periods)
     assert np.max(np.abs(tau_ext_hat_of(blocks))) < LEFT_NM
 
 
@@ -187,7 +191,7 @@ def test_an_interval_far_from_the_nominal_one_is_a_gap(motion, interval_s):
     _, q, dq, ddq = motion
     tau_J = torque_of(q, dq, ddq, SMOOTH)
     period_s, periods = np.full(len(q), T), np.ones(len(q), dtype=np.int64)
-    period_s[1000], periods[1000] = interval_s, 2
+    period_s[1000], periods[1000] = interval_s, 6
     odd = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, kernel.LEARN, period_s=period_s)
     gap = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, kernel.LEARN, periods=periods)
     assert tau_ext_hat_of(odd).tobytes() == tau_ext_hat_of(gap).tobytes()

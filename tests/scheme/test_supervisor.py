@@ -70,7 +70,7 @@ def test_events_are_numbered_in_order_of_precedence():
 
 
 SETTINGS = settings_with(
-    safety={"commission_cycles": 20, "phase_timeout_s": 0.1},
+    safety={"commission_s": 0.02, "phase_timeout_s": 0.1},
     termination={"timeout_s": 1.0},
     reaction={"clear_s": 0.2, "patience_s": 3.0, "rebound_s": 0.1},
     bus={"max_age_cycles": 3},

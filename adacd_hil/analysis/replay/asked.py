@@ -23,6 +23,9 @@ class Script(Protocol):
         """Return what it asks in a cycle. `elapsed_s`: since the drives were enabled, None before."""
 
 
+_OWN_CHECKS = (Request.FAULT_TORQUE, Request.FAULT_FOLLOWING, Request.FAULT_TAMPERED)
+"""What the host asked for in place of the user; no script has them."""
+
 ScriptOf = Callable[[OperatorSettings], Script]
 
 
@@ -94,6 +97,8 @@ class RequestCheck:
         """Compare a stretch."""
         for row in np.flatnonzero(logged != asked).tolist():
             cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
+            if logged[row] in _OWN_CHECKS:
+                continue
             if logged[row] == Request.FINISH and not self.interrupts:
                 self.interrupts.append((cycle, t_ns))
             else:

@@ -12,7 +12,7 @@ import numpy as np
 
 from adacd_hil.analysis.replay.attempts import AttemptSplitter, Stretch
 from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
-from adacd_hil.config import Settings, parse
+from adacd_hil.config import Settings, parse, renewed
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.ros_types import unpack_log
 from adacd_hil.log.stream import LogStream, Piece
@@ -98,7 +98,7 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
     if "config.toml" not in attachments:
         raise LogError(f"log {path} has no config.toml attached: its settings are not known")
     try:
-        return parse(Settings, tomllib.loads(attachments["config.toml"].decode()))
+        return parse(Settings, renewed(tomllib.loads(attachments["config.toml"].decode())))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise LogError(f"log {path}: its config.toml can't be read: {error}") from None
 

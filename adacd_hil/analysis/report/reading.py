@@ -10,7 +10,7 @@ import numpy as np
 
 from adacd_hil.analysis.run import CertifiedStream, Motion, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import Cycles, columns_of_series
-from adacd_hil.config import Settings, parse
+from adacd_hil.config import Settings, parse, renewed
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import RunLog, Series, read_log
@@ -143,7 +143,7 @@ def _settings(log: RunLog) -> Settings:
     if text is None:
         raise LogError(f"log {log.path} has no attachment config.toml")
     try:
-        return parse(Settings, tomllib.loads(text.decode("utf-8")))
+        return parse(Settings, renewed(tomllib.loads(text.decode("utf-8"))))
     except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
         raise LogError(f"log {log.path}, attachment config.toml: {error}") from None
 

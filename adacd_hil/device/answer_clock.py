@@ -1,0 +1,120 @@
+"""Which SYNC a cyclic frame answers: the ledger of one device.
+
+A device answers every SYNC with one frame. A frame that comes in time answers the last SYNC. One that comes later than
+the host waits, or behind the next SYNC, answers an earlier one, and its value is as old as that: taken for the last
+SYNC's, the model would compare torque and motion of different moments.
+
+SYNCs have ordinals, counted by those that were sent. Of the SYNCs that are owed an answer, a frame answers
+
+- the one that its alive counter says, where it has one: that counter goes by one a frame;
+- else the oldest, unless a lost frame explains it better: it comes when the device usually answers, or its position
+  fits the motion over that time and not over a shorter one. It can't answer a SYNC sooner than the device ever did.
+
+A frame whose counter is behind the last one's is a straggler where an answer is missing there; else somebody sends an
+old frame again.
+
+What no frame can tell: whether a device with a counter has missed a SYNC or answers a whole period late. It counts as
+late. And whether a frame without counter that comes when it usually does is a period late or follows a lost one, unless
+the arm moves. It counts as the latter; a second frame on the same SYNC shows that it was the former.
+"""
+
+from collections.abc import Callable
+
+USUAL_ANSWERS = 100
+"""Answers from which the usual time is taken, at the beginning of an attempt, while the arm rests: 0.1 s at 1 kHz."""
+TOLERANCE_NS = 50_000
+"""How much sooner or later than any of those an answer may come and be usual: half a frame of a classic bus at
+1 Mbit/s, which may be sent in between."""
+_MASK = 0xFFFF
+CLEAR_RAD = 2e-4
+"""Difference of two errors of position that decides. The drive's velocity lags 1.6 ms, so that 100 rad/s² leave
+1.6e-4 rad in a period of 1 ms."""
+
+
+class AnswerClock:
+    """The answers of one device. `answered`: the ordinal of the last SYNC that was answered; None before the first."""
+
+    def __init__(self) -> None:
+        self.answered: int | None = None
+        self._earliest_ns = self._latest_ns = 0
+        self._usual_count = 0
+        self._is_guess = False
+        self._unanswered = 0  # bit k: the SYNC k before the last answered one has no answer
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it is known when the device usually answers."""
+        return self._usual_count >= USUAL_ANSWERS
+
+    def find(
+        self,
+        newest: int,
+        offset_ns: int,
+        step: int | None,
+        position_error: Callable[[int], float] | None = None,
+    ) -> int | None:
+        """Return the ordinal of the SYNC that a frame answers; None when every SYNC has its answer already.
+
+        newest: the last SYNC before the frame came, `offset_ns` later. step: of its alive counter since the last frame;
+        None without one, and at the beginning. position_error: by how much the frame's position differs from what its
+        velocity makes of the last one, rad, if so many SYNCs lie between.
+        """
+        answered = self.answered
+        if answered is None or answered == newest - 1:
+            return newest
+        if answered >= newest:
+            return newest if self._is_guess and self._is_newer(offset_ns, position_error) else None
+        if step is not None:
+            return min(answered + max(step, 1), newest)
+        return newest if self._follows_lost_ones(newest - answered, offset_ns, position_error) else answered + 1
+
+    def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
+        """Tell whether a second frame without counter on the same SYNC is its answer, and the first was a late one."""
+        if not self._is_usual(offset_ns):
+            return False
+        return position_error is None or position_error(1) <= position_error(-1) + CLEAR_RAD
+
+    def _is_usual(self, offset_ns: int) -> bool:
+        return not self._usual_count or offset_ns <= self._latest_ns + TOLERANCE_NS
+
+    def _follows_lost_ones(self, owed: int, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
+        """Tell whether a frame without counter answers the last SYNC, and those before it have lost their answers."""
+        if self._usual_count and offset_ns < self._earliest_ns - TOLERANCE_NS:
+            return False
+        advantage_rad = 0.0 if position_error is None else position_error(1) - position_error(owed)
+        if abs(advantage_rad) > CLEAR_RAD:
+            return advantage_rad > 0.0
+        return self._is_usual(offset_ns)
+
+    def is_straggler(self, behind: int) -> bool:
+        """Tell whether a frame that answers no SYNC is one that was overtaken. `behind`: by its counter, 0 without one.
+
+        Each straggler is believed once.
+        """
+        if behind == 0:
+            was_guess, self._is_guess = self._is_guess, False
+            return was_guess
+        is_missing = bool(self._unanswered >> behind & 1)
+        self._unanswered &= ~(1 << behind)
+        return is_missing
+
+    def note(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
+        """Take note that a frame which `find` was asked about has answered a SYNC. `is_counted`: it has a counter."""
+        before, self.answered = self.answered, ordinal
+        if before is not None and ordinal > before:
+            passed = ordinal - before
+            self._unanswered = (self._unanswered << passed | (1 << passed) - 2) & _MASK
+        self._is_guess = not is_counted and before is not None and before < newest - 1 and ordinal == newest
+        if ordinal != newest or self._is_guess or self._usual_count >= USUAL_ANSWERS or before is None:
+            return
+        if not self._usual_count:
+            self._earliest_ns = self._latest_ns = offset_ns
+        self._earliest_ns = min(self._earliest_ns, offset_ns)
+        self._latest_ns = max(self._latest_ns, offset_ns)
+        self._usual_count += 1
+
+    def pass_by(self, ordinal: int) -> None:
+        """Take note that every SYNC up to this one was answered in time by frames that were read elsewhere."""
+        self.answered = ordinal
+        self._is_guess = False
+        self._unanswered = 0

@@ -1,0 +1,109 @@
+"""How much of the cyclic data comes in time: shares of cycles, second by second, against the limits of `[data]`.
+
+Counted while the drives are enabled: what a device does before and after is no measure of a run.
+"""
+
+from dataclasses import dataclass
+
+from adacd_hil.config import Settings
+from adacd_hil.device.arm import Arm
+from adacd_hil.records import ArmState, Event
+
+WINDOW_S = 1.0
+_SHORTEST_SHARE = 0.2
+"""Part of a window that is judged, too, when the attempt ends in it."""
+
+
+@dataclass(frozen=True)
+class DataShares:
+    """Shares of a run's cycles with enabled drives, 0…1.
+
+    incomplete: some cyclic frame was missing, late or wrong. late: the scheme's sample was older than the cycle.
+    no_new_data, repeated: by device; its frame was not in time, or came again. excesses: what was over its limit in
+    some second, a line each with the worst.
+    """
+
+    cycles: int
+    incomplete: float
+    late: float
+    no_new_data: dict[str, float]
+    repeated: dict[str, float]
+    excesses: tuple[str, ...]
+
+
+class DataWatch:
+    """Follows one attempt."""
+
+    def __init__(self, settings: Settings, arm: Arm) -> None:
+        limits = settings.data
+        self._arm = arm
+        self._window_cycles = max(1, round(WINDOW_S / settings.bus.period_s))
+        self._names = [device.name for device in arm.devices]
+        self._limits = {"incomplete cycles": limits.incomplete_share}
+        self._limits |= {f"no frame of {name} in time": limits.no_new_data_share for name in self._names}
+        self._limits |= {f"frames of {name} repeated": limits.repeated_share for name in self._names}
+        self._totals = dict.fromkeys(self._limits, 0)
+        self._worst = dict.fromkeys(self._limits, 0.0)
+        self._over: set[str] = set()
+        self._missing = [0] * len(self._names)  # of the present window
+        self._repeats_before = list(arm.repeats)
+        self._cycles = self._all_cycles = self._incomplete = self._late = 0
+        self._events: list[Event] = []
+
+    def note(self, state: ArmState) -> None:
+        """Take in one cycle, once its frames are in."""
+        if not state.is_enabled:
+            return
+        if self._cycles == 0:
+            self._repeats_before = list(self._arm.repeats)
+        self._cycles += 1
+        if self._arm.missing_frames:
+            self._incomplete += 1
+            self._late += state.is_complete
+            received = self._arm.received
+            for place in range(len(self._missing)):
+                self._missing[place] += ~received >> place & 1
+        if self._cycles == self._window_cycles:
+            self._end_window()
+
+    def _end_window(self) -> None:
+        """Judge the cycles since the last window; say what is over its limit now, and what is no longer."""
+        repeats = [now - before for now, before in zip(self._arm.repeats, self._repeats_before, strict=True)]
+        for name, count in zip(self._limits, [self._incomplete, *self._missing, *repeats], strict=True):
+            share, limit = count / self._cycles, self._limits[name]
+            self._totals[name] += count
+            self._worst[name] = max(self._worst[name], share)
+            if (share > limit) == (name in self._over):
+                continue
+            self._over ^= {name}
+            level = "warning" if share > limit else "info"
+            text = f"{name}: {share:.1%} of the last {self._cycles} cycles, {limit:.1%} allowed"
+            self._events.append(Event(level, "data", text))
+        self._all_cycles += self._cycles
+        self._cycles = self._incomplete = 0
+        self._missing = [0] * len(self._names)
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def shares(self) -> DataShares:
+        """Sum up the attempt."""
+        if self._cycles >= _SHORTEST_SHARE * self._window_cycles:
+            self._end_window()
+        cycles = max(self._all_cycles, 1)
+        share = [total / cycles for total in self._totals.values()]
+        count = len(self._names)
+        return DataShares(
+            cycles=self._all_cycles,
+            incomplete=share[0],
+            late=self._late / cycles,
+            no_new_data=dict(zip(self._names, share[1 : 1 + count], strict=True)),
+            repeated=dict(zip(self._names, share[1 + count :], strict=True)),
+            excesses=tuple(
+                f"{name}: up to {worst:.1%} of the cycles of a second, {self._limits[name]:.1%} allowed"
+                for name, worst in self._worst.items()
+                if worst > self._limits[name]
+            ),
+        )
