@@ -230,7 +230,7 @@ class Master:
 
     def leave_operational(self, node_id: int) -> None:
         """Put one node back to pre-operational. Raises BusError."""
-        self._canopen.command(_ENTER_PRE_OPERATIONAL, node_id)
+        self._canopen.command(ENTER_PRE_OPERATIONAL, node_id)
 
     def _command(self, nmt_command: int) -> None:
         """Send an NMT command to the arm: to all nodes at once, or to each of its own where other arms listen too."""
