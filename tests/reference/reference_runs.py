@@ -121,7 +121,7 @@ class Reference:
         """Keep the whole blocks of the first so many cycles, and no decisions."""
         count = cycles // BLOCK_CYCLES
         bits = {
-            topic: {field: " ".join(text.split()[:count]) for field, text in fields.items()}
+            topic: {field: " ".join([*text.split(), *["-"] * count][:count]) for field, text in fields.items()}
             for topic, fields in self.bits.items()
             if topic != "/contact"  # written when there is one, so its last block may be short
         }
