@@ -13,7 +13,7 @@ import numpy as np
 
 from adacd_hil.analysis.run import Mask, PaperStream, Run
 from adacd_hil.analysis.sections import Section, rows_of
-from adacd_hil.analysis.touches import Touch, forgotten_s, row_at
+from adacd_hil.analysis.touches import Touch, forgotten_s, row_at, true_contacts
 from adacd_hil.records import Vector
 
 SETTLING_TIME_CONSTANTS = 10.0
@@ -45,79 +45,131 @@ class Beside:
     missed: int | None
 
 
-def evaluate_beside(
-    run: Run, stream: PaperStream, sections: Sequence[Section], touches: Sequence[Touch], free: Mask
-) -> Beside:
-    """Judge the paper's scheme. free: cycles (n,) in which nothing touches the arm."""
+@dataclass(frozen=True)
+class Reached:
+    """What the paper's scheme reached over all cycles: see `Beside`; of each contact when it detected it, s."""
+
+    adaptation_s: dict[str, float | None]
+    frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
+    detected_s: tuple[float | None, ...]
+    false_alarms_s: tuple[float, ...]
+
+
+def evaluate_beside(run: Run, stream: PaperStream, sections: Sequence[Section], reached: Reached) -> Beside:
+    """Judge the paper's scheme. reached: by all its cycles, see `untouched`."""
     time_s = run.time_s()
-    armed = stream.is_armed & ~_parked(run, sections)
-    over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
-    a = run.settings.filter.a_rad_s
-    threshold = np.array(run.settings.detector.threshold_Nm)
-    unexplained = over if run.finish_cycle is None else over & (run.cycle < run.finish_cycle)
-    contacts = []
-    for number, touch in enumerate(touches, start=1):
-        explained = (time_s >= touch.onset_s) & (time_s <= forgotten_s(run, touch, a, threshold))
-        unexplained = unexplained & ~explained
-        first = np.flatnonzero(over & explained)
-        detected_s = float(time_s[first[0]]) if first.size else None
-        contacts.append(
-            BesideContact(
-                number=number,
-                is_armed=bool(armed[max(row_at(run, touch.onset_s) - 1, 0)]),
-                detected_s=detected_s,
-                delay_ms=None if detected_s is None else (detected_s - touch.onset_s) * 1e3,
-            )
+    armed = stream.is_armed & ~_parked(time_s, sections, float(time_s[-1]))
+    contacts = [
+        BesideContact(
+            number=number,
+            is_armed=bool(armed[max(row_at(run, touch.onset_s) - 1, 0)]),
+            detected_s=detected_s,
+            delay_ms=None if detected_s is None else (detected_s - touch.onset_s) * 1e3,
         )
-    false_s = _episodes(time_s[unexplained], SETTLING_TIME_CONSTANTS / a)
+        for number, (touch, detected_s) in enumerate(zip(true_contacts(run), reached.detected_s, strict=True), start=1)
+    ]
     has_truth = run.truth is not None
     return Beside(
-        adaptation_s=_adaptation_s(run, stream, sections),
-        frozen_residual_max_Nm={
-            section.label: largest_of(stream.tau_ext_hat[rows_of(run, section) & free & armed])
-            for section in sections
-            if section.kind == "detection"
-        },
+        adaptation_s=reached.adaptation_s,
+        frozen_residual_max_Nm=reached.frozen_residual_max_Nm,
         contacts=tuple(contacts),
-        false_alarms=len(false_s) if has_truth else None,
-        false_alarms_s=false_s if has_truth else None,
+        false_alarms=len(reached.false_alarms_s) if has_truth else None,
+        false_alarms_s=reached.false_alarms_s if has_truth else None,
         missed=sum(contact.is_armed and contact.detected_s is None for contact in contacts) if has_truth else None,
     )
 
 
-def largest_of(residual: Vector) -> tuple[float, float] | None:
-    """Give the largest |residual| (n, 2) of each joint, Nm; None of no cycle."""
-    if residual.shape[0] == 0:
-        return None
-    largest = np.abs(residual).max(axis=0)
-    return float(largest[0]), float(largest[1])
+def larger(largest: Vector | None, values: Vector) -> Vector | None:
+    """Give the larger of the sizes of `values` (k, …) and of what was the largest of each so far (…).
+
+    None so far: none. NaN stays.
+    """
+    if values.shape[0] == 0:
+        return largest
+    found = np.abs(values).max(axis=0)
+    return np.asarray(found if largest is None else np.maximum(largest, found))
 
 
-def _parked(run: Run, sections: Sequence[Section]) -> Mask:
-    parked = np.zeros(run.cycle.size, dtype=np.bool_)
+class BesideGatherer:
+    """Gathers what the paper's scheme reached, piece by piece."""
+
+    def __init__(self, run: Run, sections: Sequence[Section], touches: Sequence[Touch]) -> None:
+        a = run.settings.filter.a_rad_s
+        threshold = np.array(run.settings.detector.threshold_Nm)
+        self._sections = sections
+        self._windows = [(touch.onset_s, forgotten_s(run, touch, a, threshold)) for touch in touches]
+        self._finish_cycle = run.finish_cycle
+        self._pause_s = SETTLING_TIME_CONSTANTS / a
+        self._end_s = float(run.time_s()[-1]) if run.cycle.size else 0.0
+        self._adaptations = [
+            (section.label, section.start_s, _left_s(section, sections))
+            for section in sections
+            if section.kind == "adaptation"
+        ]
+        self._adaptation_s: dict[str, float | None] = dict.fromkeys(label for label, _, _ in self._adaptations)
+        self._largest: dict[str, Vector | None] = dict.fromkeys(
+            section.label for section in sections if section.kind == "detection"
+        )
+        self._detected_s: list[float | None] = [None] * len(touches)
+        self._false_s: list[float] = []
+        self._last_s = -np.inf  # of what no contact explains
+
+    def add(self, piece: Run, time_s: Vector, free: Mask) -> None:
+        """Take in the next cycles, at such times (n,); free: those in which nothing touches the arm (n,)."""
+        stream = piece.beside
+        assert stream is not None
+        armed = stream.is_armed & ~_parked(time_s, self._sections, self._end_s)
+        over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
+        unexplained = over if self._finish_cycle is None else over & (piece.cycle < self._finish_cycle)
+        unexplained = unexplained.copy()
+        for number, (start_s, end_s) in enumerate(self._windows):
+            if start_s > time_s[-1] or end_s < time_s[0]:
+                continue
+            explained = slice(np.searchsorted(time_s, start_s), np.searchsorted(time_s, end_s, side="right"))
+            unexplained[explained] = False
+            first = np.flatnonzero(over[explained])
+            if first.size and self._detected_s[number] is None:
+                self._detected_s[number] = float(time_s[explained][first[0]])
+        self._add_false_alarms(time_s[unexplained])
+        for label, start_s, left_s in self._adaptations:
+            if self._adaptation_s[label] is None and start_s <= time_s[-1] and left_s >= time_s[0]:
+                # In the first cycle of ADAPT it is still what it was before.
+                rows = slice(np.searchsorted(time_s, start_s, "right"), np.searchsorted(time_s, left_s, "right"))
+                first = np.flatnonzero(stream.is_armed[rows])
+                if first.size:
+                    self._adaptation_s[label] = float(time_s[rows][first[0]]) - start_s
+        for section in self._sections:
+            if section.label in self._largest and section.start_s <= time_s[-1] and section.end_s >= time_s[0]:
+                rows = rows_of(time_s, section, self._end_s)
+                values = stream.tau_ext_hat[rows][free[rows] & armed[rows]]
+                self._largest[section.label] = larger(self._largest[section.label], values)
+
+    def _add_false_alarms(self, times_s: Vector) -> None:
+        """Take in when it was over its threshold and no contact explains it: each that comes after a pause counts."""
+        if times_s.size:
+            begins = np.diff(times_s, prepend=self._last_s) > self._pause_s
+            self._false_s += times_s[begins].tolist()
+            self._last_s = float(times_s[-1])
+
+    def reached(self) -> Reached:
+        """Sum up what has been taken in."""
+        largest = {
+            label: None if values is None else (float(values[0]), float(values[1]))
+            for label, values in self._largest.items()
+        }
+        return Reached(self._adaptation_s, largest, tuple(self._detected_s), tuple(self._false_s))
+
+
+def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:
+    """Give when an adaptation and the detection after it are left, s; infinite at the end of the run."""
+    later = (section for section in sections if section.start_s > adaptation.start_s and section.kind != "detection")
+    return next((section.start_s for section in later), np.inf)
+
+
+def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
+    """Mark the cycles at such times (n,) in which the payload is changed. end_s: when the run ends."""
+    parked = np.zeros(time_s.size, dtype=np.bool_)
     for section in sections:
         if section.kind == "payload":
-            parked |= rows_of(run, section)
+            parked[rows_of(time_s, section, end_s)] = True
     return parked
-
-
-def _adaptation_s(run: Run, stream: PaperStream, sections: Sequence[Section]) -> dict[str, float | None]:
-    """Give how long the paper's scheme has adapted, from the start of each adaptation up to the next payload change."""
-    time_s = run.time_s()
-    found: dict[str, float | None] = {}
-    for section in sections:
-        if section.kind != "adaptation":
-            continue
-        ends_s = [other.start_s for other in sections if other.start_s > section.start_s and other.kind != "detection"]
-        # In the first cycle of ADAPT it is still what it was before.
-        rows = np.flatnonzero((time_s > section.start_s) & (time_s <= min(ends_s, default=np.inf)) & stream.is_armed)
-        found[section.label] = float(time_s[rows[0]]) - section.start_s if rows.size else None
-    return found
-
-
-def _episodes(times_s: Vector, pause_s: float) -> tuple[float, ...]:
-    """Give the first of the times (k,) and each that comes more than a pause after the one before, s."""
-    if times_s.size == 0:
-        return ()
-    begins = np.concatenate(([True], np.diff(times_s) > pause_s))
-    return tuple(times_s[begins].tolist())

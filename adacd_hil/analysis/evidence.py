@@ -9,11 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.analysis.beside import Beside, largest_of
-from adacd_hil.analysis.run import CertifiedStream, Mask, Run
+from adacd_hil.analysis.beside import Beside, larger
+from adacd_hil.analysis.distribution import Distribution
+from adacd_hil.analysis.run import CertifiedStream, Run
 from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.analysis.touches import bank_channels
-from adacd_hil.records import JOINTS, SchemeState
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, SchemeState, Vector
 
 
 @dataclass(frozen=True)
@@ -60,37 +62,40 @@ class Evidence:
 
 
 def evaluate_certified(
-    run: Run, stream: CertifiedStream, sections: Sequence[Section], free: Mask, beside: Beside | None
+    run: Run,
+    stream: CertifiedStream,
+    sections: Sequence[Section],
+    margins: dict[str, tuple[ChannelMargin, ...]],
+    promotions: int,
+    beside: Beside | None,
 ) -> Evidence:
-    """Judge a run of the certified scheme. free: cycles (n,) in which nothing touches the arm."""
+    """Judge a run of the certified scheme. margins, promotions: of all its cycles, see `untouched`."""
     adaptations = [section for section in sections if section.kind == "adaptation"]
     stays = {section.label: _tests(run, section) for section in adaptations}
-    margins = {}
-    for section in sections:
-        if section.kind in ("adaptation", "detection"):
-            rows = rows_of(run, section) & free & np.isfinite(stream.threshold).all(axis=(1, 2))
-            if rows.any():
-                margins[section.label] = _margins(run, stream, rows)
     return Evidence(
         tests={label: len(lengths_s) for label, lengths_s in stays.items()},
         test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
         estimates={section.label: _estimates(run, stream, section) for section in adaptations},
         margins=margins,
-        promotions=int(np.maximum(np.diff(stream.promotions, prepend=0.0), 0.0).sum()),
+        promotions=promotions,
         paper_beside=beside,
     )
 
 
 def last_row(run: Run, section: Section) -> int:
     """Give the row with an adaptation's result: the next section's first cycle, which still learns."""
-    return int(np.flatnonzero(rows_of(run, section))[-1]) + int(section.is_complete)
+    time_s = run.time_s()
+    end = int(rows_of(time_s, section, float(time_s[-1])).stop)
+    return end - 1 + int(section.is_complete)
 
 
 def _tests(run: Run, section: Section) -> list[float]:
     """Give the lengths of the stays in CERTIFY of a section, s."""
-    inside = np.concatenate(([False], (run.state == SchemeState.CERTIFY) & rows_of(run, section), [False]))
-    edges = np.flatnonzero(inside[1:] != inside[:-1])
-    time_s = np.append(run.time_s(), section.end_s)
+    time_s = run.time_s()
+    rows = rows_of(time_s, section, float(time_s[-1]))
+    inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))
+    edges = np.flatnonzero(inside[1:] != inside[:-1]) + rows.start
+    time_s = np.append(time_s, section.end_s)
     return [float(time_s[end] - time_s[start]) for start, end in edges.reshape(-1, 2)]
 
 
@@ -104,21 +109,41 @@ def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str,
     }
 
 
-def _margins(run: Run, stream: CertifiedStream, rows: Mask) -> tuple[ChannelMargin, ...]:
-    found = []
-    for place, (cutoff, smoothing) in enumerate(bank_channels(run.settings)):
-        residual, threshold = np.abs(stream.tau_ext[rows, place]), stream.threshold[rows, place]
-        share, middle = (residual / threshold).max(axis=0), np.median(threshold, axis=0)
-        found.append(
-            ChannelMargin(
-                cutoff_rad_s=cutoff,
-                smoothing_rad_s=smoothing,
-                residual_max_Nm=largest_of(residual) or (0.0, 0.0),
-                threshold_Nm=(float(middle[0]), float(middle[1])),
-                margin=(_inverse(float(share[0])), _inverse(float(share[JOINTS - 1]))),
+class MarginGatherer:
+    """Gathers the margins of one section, cycles at a time."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._channels = bank_channels(settings)
+        self._residual: Vector | None = None  # largest (channels, 2)
+        self._share: Vector | None = None  # largest residual / threshold (channels, 2)
+        self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]
+
+    def add(self, tau_ext: Vector, threshold: Vector) -> None:
+        """Take in cycles in which nothing touches the arm: residuals and thresholds (k, channels, 2), k > 0."""
+        self._residual = larger(self._residual, tau_ext)
+        self._share = larger(self._share, np.abs(tau_ext) / threshold)
+        for place, distributions in enumerate(self._thresholds):
+            for joint, distribution in enumerate(distributions):
+                distribution.add(threshold[:, place, joint])
+
+    def margins(self) -> tuple[ChannelMargin, ...]:
+        """Sum up each channel; nothing has to have been gathered for none."""
+        if self._residual is None or self._share is None:
+            return ()
+        found = []
+        for place, (cutoff, smoothing) in enumerate(self._channels):
+            residual, share = self._residual[place].tolist(), self._share[place].tolist()
+            middle = [distribution.median() for distribution in self._thresholds[place]]
+            found.append(
+                ChannelMargin(
+                    cutoff_rad_s=cutoff,
+                    smoothing_rad_s=smoothing,
+                    residual_max_Nm=(residual[0], residual[1]),
+                    threshold_Nm=(middle[0], middle[1]),
+                    margin=(_inverse(share[0]), _inverse(share[JOINTS - 1])),
+                )
             )
-        )
-    return tuple(found)
+        return tuple(found)
 
 
 def _inverse(share: float) -> float:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.drawing import (
     COLOURS,
     PANEL_BINS,
@@ -25,7 +26,7 @@ from adacd_hil.analysis.drawing import (
     plot,
     style,
 )
-from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.sections import Section
 from adacd_hil.analysis.touches import bank_channels, filtered, row_at
@@ -442,7 +443,7 @@ def _ideal(run: Run, onset_s: float, after_s: float, a_rad_s: float) -> tuple[Ve
     """Give time in ms and the true torque through the filter, Nm, around an onset."""
     truth = run.truth
     assert truth is not None
-    time_s = run.time_of_s(truth.cycle)
+    time_s = run.truth_time_s()
     rows = np.flatnonzero((time_s >= onset_s - _BEFORE_S) & (time_s <= onset_s + after_s))
     ideal = filtered(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, a_rad_s)
     return (time_s[rows] - onset_s) * 1e3, ideal

@@ -28,6 +28,10 @@ class LogHistogram(NamedTuple):
     below: int
     above: int
 
+    def joined(self, other: "LogHistogram") -> "LogHistogram":
+        """Add the counts of another one with the same bins."""
+        return LogHistogram(self.edges, self.counts + other.counts, self.below + other.below, self.above + other.above)
+
     def as_json(self) -> dict[str, Any]:
         """Give it in plain values; empty bins at both ends are left out."""
         filled = np.flatnonzero(self.counts)

@@ -21,7 +21,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Truth:
-    """What the emulator knows, on its own cycles (m,): external torque (m, 2), contact, payload, parameters (m, 7)."""
+    """What the emulator knows, on its own cycles (m,): external torque (m, 2), contact, payload, parameters (m, 7).
+
+    Of a long run it has the cycles of contacts and the one after each. Payload and parameters then have cycles of their
+    own, `model_cycle` (k,): those from which on they are as they are.
+    """
 
     cycle: Cycles
     tau_ext: Vector
@@ -30,6 +34,13 @@ class Truth:
     payload_kg: Vector
     theta: Vector
     force_N: Vector | None = None  # size of the contact force (m,)
+    time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
+    model_cycle: Cycles | None = None
+
+    def model_row(self, cycle: int) -> int | None:
+        """Give the row of payload and parameters in a cycle; None without any."""
+        cycles = self.cycle if self.model_cycle is None else self.model_cycle
+        return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
 
 @dataclass(frozen=True)
@@ -37,14 +48,13 @@ class CertifiedStream:
     """What the block of the certified scheme has beyond the paper's, over n cycles.
 
     tau_ext, threshold: of the bank (n, channels, 2): each filter smoothed, then all but the slowest bare. theta_further
-    (n, k): offsets, lags and friction terms; theta_std (n, p + k); condition, promotions (n,).
+    (n, k): offsets, lags and friction terms; theta_std (n, p + k); promotions (n,).
     """
 
     tau_ext: Vector
     threshold: Vector
     theta_further: Vector
     theta_std: Vector
-    condition: Vector
     promotions: Vector
 
 
@@ -69,7 +79,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class Run:
-    """A run as plain arrays over its n cycles; `truth` is None on a real arm."""
+    """A run as plain arrays over n of its cycles: over all, or of a long one over those that `long_run` keeps.
+
+    `truth` is None on a real arm.
+    """
 
     cycle: Cycles
     t_ns: Cycles
@@ -79,7 +92,6 @@ class Run:
     tau_ext_hat_cad: Vector
     theta_hat: Vector
     threshold: Vector
-    quiet_s: Vector
     reports: tuple[ContactReport, ...]
     timing: CycleColumns
     truth: Truth | None
@@ -93,6 +105,7 @@ class Run:
     beside: PaperStream | None = None
     motion: Motion | None = None
     events: tuple[LoggedEvent, ...] = ()
+    motion_start_ns: int | None = None  # None: the first cycle in ADAPT, else the first cycle
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -112,7 +125,9 @@ class Run:
 
     @property
     def zero_ns(self) -> int:
-        """Motion start: the first cycle in ADAPT, else the first cycle."""
+        """Motion start, ns."""
+        if self.motion_start_ns is not None:
+            return self.motion_start_ns
         if self.t_ns.size == 0:
             return 0
         adapting = self.state == SchemeState.ADAPT
@@ -128,3 +143,10 @@ class Run:
         if self.cycle.size == 0:
             return np.zeros(len(cycle))
         return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
+
+    def truth_time_s(self, rows: slice = slice(None)) -> Vector:
+        """Give the time of the cycles of the truth, or of some rows of it, since motion start, s (k,)."""
+        if self.truth is None:
+            return np.zeros(0)
+        time_s = self.truth.time_s
+        return self.time_of_s(self.truth.cycle[rows]) if time_s is None else time_s[rows]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.run import Mask, Run
-from adacd_hil.records import SchemeState
+from adacd_hil.records import SchemeState, Vector
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,11 @@ def section_at(sections: Iterable[Section], time_s: float) -> str | None:
     return next((section.label for section in sections if section.start_s <= time_s <= section.end_s), None)
 
 
-def rows_of(run: Run, section: Section) -> Mask:
-    """Mark the cycles of a section; the last one of the run belongs to it, the first one of the next does not."""
-    time_s = run.time_s()
-    is_last = bool(section.end_s >= time_s[-1])
-    inside: Mask = (time_s >= section.start_s) & ((time_s <= section.end_s) if is_last else (time_s < section.end_s))
-    return inside
+def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
+    """Give the rows of a section among cycles at such times (n,), which ascend.
+
+    end_s: when the run ends. Its last cycle belongs to the last section; the first one of the next section to that.
+    """
+    is_last = bool(section.end_s >= end_s)
+    first = int(np.searchsorted(time_s, section.start_s))
+    return slice(first, int(np.searchsorted(time_s, section.end_s, side="right" if is_last else "left")))

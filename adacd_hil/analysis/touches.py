@@ -1,6 +1,7 @@
 """True contacts, and what an ideal detector with the run's filters and thresholds makes of them."""
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ def true_contacts(run: Run) -> tuple[Touch, ...]:
     edges = np.flatnonzero(index[1:] != index[:-1]) + 1
     starts = np.concatenate(([0], edges))
     ends = np.concatenate((edges, [index.size]))
-    time_s = run.time_of_s(truth.cycle)
+    time_s = run.truth_time_s()
     return tuple(
         Touch(
             int(start),
@@ -126,7 +127,9 @@ def threshold_at(run: Run, time_s: float) -> Vector:
 
 def row_at(run: Run, time_s: float) -> int:
     """Give the first cycle's row that is not before a time; the last one after the end."""
-    return min(int(np.searchsorted(run.time_s(), time_s)), len(run.cycle) - 1)
+    t_ns, zero_ns = run.t_ns, run.zero_ns
+    row = bisect_left(range(len(t_ns)), time_s, key=lambda row: float((t_ns[row] - zero_ns) * 1e-9))
+    return min(row, len(t_ns) - 1)
 
 
 def channels_at(run: Run, time_s: float) -> tuple[Channel, ...]:

@@ -51,7 +51,6 @@ def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str
         tau_ext_hat_cad=np.zeros((count, 2)),
         theta_hat=np.zeros((count, 7)),
         threshold=threshold,
-        quiet_s=np.zeros(count),
         reports=(),
         timing=CycleColumns(
             EPOCH_NS + cycle * 1_000_000, {**dict.fromkeys(CycleRecord._fields, zeros), "cycle": cycle}
@@ -89,7 +88,6 @@ def make_certified_run(*stays: tuple[SchemeState, int], **changes: Any) -> Run:
             threshold=np.full((count, settings.channel_count, 2), 0.1),
             theta_further=np.full((count, further), 0.001),
             theta_std=np.full((count, 7 + further), 0.01),
-            condition=np.zeros(count),
             promotions=np.zeros(count),
         ),
         beside=PaperStream(

@@ -173,7 +173,7 @@ def test_the_onset_of_a_contact_in_a_skipped_cycle_lies_between_its_neighbours()
     run = make_run()
     touch(run, 2000, 250, (5.0, 0.0))
     kept = np.r_[0:1999, 2001:4000]
-    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
+    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
     run = replace(run, **{name: getattr(run, name)[kept] for name in names})
     assert evaluate(run).contacts[0].onset_s == pytest.approx((2000 - ZERO_ROW) * 1e-3)
 
@@ -654,7 +654,7 @@ def test_a_missed_contact_alone_makes_a_run_unclean():
 
 def empty_run():
     run = make_run((A, 1))
-    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
+    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
     return replace(run, timing=columns_of_records([], []), **{name: getattr(run, name)[:0] for name in names})
 
 

@@ -378,7 +378,7 @@ def test_texts_of_a_log_cannot_become_markup(tmp_path):
 
 def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
     run = make_run((A, 1))
-    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold", "quiet_s")
+    names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
     run = replace(run, **{name: getattr(run, name)[:0] for name in names})
     page = Page(write_run_report(run, tmp_path, Source("run.mcap")).html_path.read_text(encoding="utf-8"))
     assert page.unbalanced == []

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from html import escape
 from typing import Final
 
-from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.contacts import Contact
+from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.arm_drawing import Push, draw_arm
 from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
 from adacd_hil.analysis.report.words import contact_rows, scaled, signs_text, uncertain_text

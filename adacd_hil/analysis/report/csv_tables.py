@@ -6,7 +6,8 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
-from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.contacts import Contact
+from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.timeline import stays_of
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.sections import section_at

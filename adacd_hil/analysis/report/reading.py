@@ -59,7 +59,6 @@ def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
         tau_ext_hat_cad=scheme["tau_ext_hat_cad"],
         theta_hat=scheme["theta_hat"],
         threshold=scheme["threshold"],
-        quiet_s=scheme["quiet_s"],
         reports=tuple(entry.report for entry in log.contacts),
         timing=columns_of_series(log.cycle),
         finish_cycle=_finish_cycle(scheme),
@@ -86,7 +85,6 @@ def _certified_stream(scheme: Series, settings: Settings) -> CertifiedStream | N
         threshold=scheme["threshold_bank"].reshape(shape),
         theta_further=scheme["theta_further"],
         theta_std=scheme["theta_std"],
-        condition=scheme["condition"],
         promotions=scheme["promotions"],
     )
 

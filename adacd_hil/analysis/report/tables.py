@@ -6,11 +6,12 @@ from string import ascii_letters
 from typing import Final
 
 from adacd_hil.analysis.evidence import Evidence
-from adacd_hil.analysis.metrics import Metrics, Residual
+from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.words import pair_text, paper_cells, paper_head, signed_text
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.untouched import Residual
 from adacd_hil.records import PARAMETER_UNITS
 
 

@@ -10,7 +10,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.contacts import Contact
+from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.page import number_text
 from adacd_hil.analysis.run import Run
 from adacd_hil.records import SchemeState

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import Final
 
-from adacd_hil.analysis.metrics import Contact, Metrics
+from adacd_hil.analysis.contacts import Contact
+from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.page import NONE, number_text
 
 

@@ -1,0 +1,221 @@
+"""The contacts of a run: each true one with its detection and what the scheme reports of it.
+
+A true contact is *armed* if the scheme is in MONITOR at its onset. `law_ms` and `ideal_ms` are those of the paper's
+filter, or of the fastest channel of the certified scheme's bank.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.analysis.detections import Detection
+from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.sections import Section, section_at
+from adacd_hil.analysis.touches import Touch, channels_at, ideal_response, row_at
+from adacd_hil.records import JOINTS, ContactReport, Location, SchemeState, Vector
+from adacd_hil.scheme.classification import WINDOW_S
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A true contact and its detection, or on a real arm a detection alone.
+
+    state: of the scheme at the onset, on a real arm at the detection.
+    law_ms: closed-form delay of a step of the largest torque up to the detection, the faster joint; None if never.
+    ideal_ms: delay that the filter alone gives to the true torque as it was; None if never.
+    link_at_alarm, link_detected: isolated at detection and at the end of the isolation window.
+    torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
+    true_force_N: size of the true force, at whatever angle.
+    level to blind_deg: what the last report says, in the names of `records`; None where it doesn't say. A sigma is a
+    standard deviation.
+    """
+
+    number: int
+    section: str | None
+    state: str
+    link: int | None
+    onset_s: float | None
+    end_s: float | None
+    is_armed: bool
+    detected_s: float | None
+    delay_ms: float | None
+    law_ms: float | None
+    ideal_ms: float | None
+    link_at_alarm: int | None
+    link_detected: int | None
+    direction: tuple[int, int] | None
+    direction_ok: bool | None
+    tau_ext_Nm: tuple[float, float] | None
+    tau_ext_peak_hat_Nm: tuple[float, float] | None
+    torque_error_ratio: float | None
+    true_force_N: float | None
+    level: str | None
+    kind: str | None
+    reaction: str | None
+    location: str | None
+    is_two_sided: bool | None
+    tau_ext_peak_sigma_Nm: tuple[float | None, float | None] | None
+    impulse_Nm_s: tuple[float, float] | None
+    impulse_sigma_Nm_s: tuple[float | None, float | None] | None
+    force_N: float | None
+    force_sigma_N: float | None
+    lever_m: float | None
+    lever_sigma_m: float | None
+    blind_deg: float | None
+
+    @property
+    def at_s(self) -> float:
+        """Its onset, or its detection where the onset is not known."""
+        at_s = self.onset_s if self.onset_s is not None else self.detected_s
+        assert at_s is not None
+        return at_s
+
+
+def list_contacts(
+    run: Run,
+    sections: tuple[Section, ...],
+    touches: tuple[Touch, ...],
+    detections: tuple[Detection, ...],
+    owners: tuple[int | None, ...],
+) -> tuple[Contact, ...]:
+    """List the true contacts with the first detection of each; without the truth the detections.
+
+    owners: of each detection, see `detections.assign`.
+    """
+    if run.truth is None:
+        return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, start=1))
+    first = {owner: detection for detection, owner in reversed(list(zip(detections, owners, strict=True)))}
+    return tuple(
+        _contact(run, number, sections, touch, first.get(number - 1)) for number, touch in enumerate(touches, start=1)
+    )
+
+
+def _reported(detection: Detection | None) -> dict[str, Any]:
+    """Give what the reports of a detection say."""
+    alarm = detection.alarm if detection else None
+    last = (detection.final or alarm) if detection else None
+    said: dict[str, Any] = {
+        "detected_s": detection.detected_s if detection else None,
+        "link_at_alarm": alarm.link if alarm else None,
+        "link_detected": last.link if last else None,
+        "direction": last.direction if last else None,
+        "tau_ext_peak_hat_Nm": last.tau_ext_peak if last else None,
+        "impulse_Nm_s": last.impulse if last else None,
+    }
+    is_told = last is not None and last.location is not Location.NOT_SOUGHT
+    return said | (_told(last) if last is not None and is_told else dict.fromkeys(_TOLD))
+
+
+_TOLD = (
+    "level", "kind", "reaction", "location", "is_two_sided", "tau_ext_peak_sigma_Nm", "impulse_sigma_Nm_s",
+    "force_N", "force_sigma_N", "lever_m", "lever_sigma_m", "blind_deg",
+)  # fmt: skip
+"""Of a contact, what only the certified scheme tells."""
+
+
+def _told(report: ContactReport) -> dict[str, Any]:
+    has_force, has_lever = math.isfinite(report.force_sigma), math.isfinite(report.lever_sigma)
+    peak_1, peak_2 = map(_finite, report.tau_ext_peak_sigma)
+    impulse_1, impulse_2 = map(_finite, report.impulse_sigma)
+    values = (
+        report.level.name, report.kind.name, report.reaction.name, report.location.name, report.is_two_sided,
+        (peak_1, peak_2), (impulse_1, impulse_2),
+        report.force_N if has_force else None, _finite(report.force_sigma),
+        report.lever_m if has_lever else None, _finite(report.lever_sigma),
+        math.degrees(report.blind_rad),
+    )  # fmt: skip
+    return dict(zip(_TOLD, values, strict=True))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _state_at(run: Run, time_s: float) -> SchemeState:
+    """Give the state in the cycle before a time."""
+    return SchemeState(run.state[max(row_at(run, time_s) - 1, 0)])
+
+
+def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: Detection) -> Contact:
+    return Contact(
+        number=number,
+        section=section_at(sections, detection.detected_s),
+        state=_state_at(run, detection.detected_s).name,
+        link=None,
+        onset_s=None,
+        end_s=None,
+        is_armed=True,
+        delay_ms=None,
+        law_ms=None,
+        ideal_ms=None,
+        direction_ok=None,
+        tau_ext_Nm=None,
+        torque_error_ratio=None,
+        true_force_N=None,
+        **_reported(detection),
+    )
+
+
+def _contact(
+    run: Run, number: int, sections: tuple[Section, ...], touch: Touch, detection: Detection | None
+) -> Contact:
+    truth = run.truth
+    assert truth is not None
+    rows = slice(touch.first, touch.last + 1)
+    tau_ext = truth.tau_ext[rows]
+    since_s = run.truth_time_s(rows) - touch.onset_s
+    delay_s = detection.detected_s - touch.onset_s if detection else math.inf
+    # What the host can have seen: up to the detection for the delay, up to the end of the window for the rest.
+    until_alarm = np.abs(tau_ext[since_s <= delay_s]).max(axis=0)
+    is_seen = since_s <= delay_s + _window_s(run)
+    until_final = tau_ext[is_seen]
+    channels = channels_at(run, touch.onset_s)
+    steps_s = [delay for channel in channels if (delay := channel.step_delay_s(until_alarm)) is not None]
+    is_over = [np.abs(ideal_response(run, touch, channel)) > channel.threshold for channel in channels]
+    over = np.flatnonzero(np.any(is_over, axis=(0, 2)))
+    ideal_ms = None
+    if over.size:
+        crossing = touch.first + int(over[0])
+        ideal_ms = float(run.truth_time_s(slice(crossing, crossing + 1))[0] - touch.onset_s) * 1e3
+    peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
+    reported = _reported(detection)
+    state = _state_at(run, touch.onset_s)
+    return Contact(
+        number=number,
+        section=section_at(sections, touch.onset_s),
+        state=state.name,
+        link=touch.link,
+        onset_s=touch.onset_s,
+        end_s=touch.end_s,
+        is_armed=state is SchemeState.MONITOR,
+        delay_ms=delay_s * 1e3 if detection else None,
+        law_ms=min(steps_s) * 1e3 if steps_s else None,
+        ideal_ms=ideal_ms,
+        direction_ok=_is_direction_right(reported["direction"], until_final.sum(axis=0)),
+        tau_ext_Nm=(float(peak[0]), float(peak[1])),
+        torque_error_ratio=_torque_ratio(reported["tau_ext_peak_hat_Nm"], peak),
+        true_force_N=None if truth.force_N is None else float(truth.force_N[rows][is_seen].max()),
+        **reported,
+    )
+
+
+def _window_s(run: Run) -> float:
+    """Give how long after the detection a report is made final."""
+    return run.settings.detector.isolation_window_s if run.certified is None else WINDOW_S
+
+
+def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> bool | None:
+    """Tell whether every joint with a direction was pushed that way, and one at least has a direction."""
+    if direction is None:
+        return None
+    told = [joint for joint in range(JOINTS) if direction[joint]]
+    return bool(told) and all(direction[joint] == np.sign(impulse[joint]) for joint in told)
+
+
+def _torque_ratio(peak_hat: tuple[float, float] | None, peak: Vector) -> float | None:
+    joint = int(np.argmax(np.abs(peak)))
+    if peak_hat is None or peak[joint] == 0.0:
+        return None
+    return float(peak_hat[joint] / peak[joint])

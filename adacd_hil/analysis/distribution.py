@@ -1,0 +1,114 @@
+"""Percentiles of values that come piece by piece, in bounded memory.
+
+Up to `EXACT` values all of them are kept, and percentiles are values that occurred. Further ones are counted in bins
+that are 2^-12 of a value wide, and a percentile is the end of its bin that is nearer to 0: less than the value that
+occurred by 0.024 % at most, and a whole number up to 4096 as it is. The smallest and the largest value are exact.
+Values nearer to 0 than 2^-30 count as 0, sizes from 2^63 on as infinite; NaN is left out.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.histogram import (
+    LOW_PERCENTILE_NAMES,
+    PERCENTILE_NAMES,
+    PERCENTILES,
+    Values,
+    low_percentiles,
+    percentiles,
+)
+
+EXACT: Final = 600_000
+"""Values that are kept as they are: ten minutes at 1 kHz."""
+_BINS_PER_OCTAVE: Final = 12
+"""Bits of the mantissa that tell two bins apart."""
+_SHIFT: Final = 52 - _BINS_PER_OCTAVE
+_LOW, _HIGH = 2.0**-30, 2.0**63
+
+
+def _code(size: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return exponent and first bits of the mantissa, which number the bins in the order of the sizes."""
+    return np.ascontiguousarray(size).view(np.int64) >> _SHIFT
+
+
+_FIRST: Final = int(_code(np.array([_LOW]))[0])
+_SIDE: Final = int(_code(np.array([_HIGH]))[0]) - _FIRST + 1
+"""Bins of each sign."""
+
+
+class Distribution:
+    """The values so far."""
+
+    def __init__(self, exact: int = EXACT) -> None:
+        self.count = 0
+        self._exact = exact
+        self._kept: list[NDArray[np.float64]] = []
+        self._bins: NDArray[np.int64] | None = None  # of -_SIDE to _SIDE, once there are more than `exact` values
+        self._range = (np.inf, -np.inf)
+
+    def add(self, values: Values) -> None:
+        """Take in values (k,)."""
+        new = np.asarray(values, dtype=np.float64)
+        new = new[~np.isnan(new)]
+        if new.size == 0:
+            return
+        self.count += new.size
+        self._range = (min(self._range[0], float(new.min())), max(self._range[1], float(new.max())))
+        if self._bins is not None:
+            self._sort_in(new)
+            return
+        self._kept.append(new)
+        if self.count > self._exact:
+            kept, self._kept = self._kept, []
+            for part in kept:
+                self._sort_in(part)
+
+    def _sort_in(self, values: NDArray[np.float64]) -> None:
+        size = np.minimum(np.abs(values), _HIGH)
+        place = np.maximum(_code(size) - _FIRST + 1, 0)
+        place = np.where(values < 0.0, -place, place)
+        low = int(place.min())
+        counts = np.bincount(place - low)
+        if self._bins is None:
+            self._bins = np.zeros(2 * _SIDE + 1, np.int64)
+        self._bins[_SIDE + low : _SIDE + low + counts.size] += counts
+
+    def percentiles(self) -> dict[str, float]:
+        """Give p50, p99, p99.9 and max; empty without a value."""
+        if self._bins is None:
+            return percentiles(self._values())
+        ranks = [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
+        return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
+
+    def low_percentiles(self) -> dict[str, float]:
+        """Give p50, p1, p0.1 and min, for values that must not be small; empty without a value."""
+        if self._bins is None:
+            return low_percentiles(self._values())
+        ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
+        return dict(zip(LOW_PERCENTILE_NAMES, map(self._at, ranks), strict=True))
+
+    def median(self) -> float:
+        """Give the median, of an even number the mean of the middle two; NaN without a value."""
+        if self.count == 0:
+            return float("nan")
+        if self._bins is None:
+            return float(np.median(self._values()))
+        return 0.5 * (self._at((self.count - 1) // 2) + self._at(self.count // 2))
+
+    def _values(self) -> NDArray[np.float64]:
+        self._kept = [np.concatenate(self._kept)] if self._kept else [np.empty(0)]
+        return self._kept[0]
+
+    def _at(self, rank: int) -> float:
+        """Give the value of a rank from 0: the end of its bin that is nearer to 0."""
+        if rank in (0, self.count - 1):
+            return self._range[rank != 0]
+        assert self._bins is not None
+        place = int(np.searchsorted(np.cumsum(self._bins), rank, side="right")) - _SIDE
+        if place == 0:
+            return 0.0
+        code = np.array([_FIRST + abs(place) - 1], np.int64)
+        size = float((code << _SHIFT).view(np.float64)[0]) if abs(place) < _SIDE else float("inf")
+        return min(max(size if place > 0 else -size, self._range[0]), self._range[1])

@@ -1,0 +1,153 @@
+"""What the paper printed, what its scheme makes of the same stream where it ran beside, and what was measured."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adacd_hil.analysis.beside import Beside
+from adacd_hil.analysis.contacts import Contact
+from adacd_hil.analysis.evidence import Evidence
+from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.sections import Section
+from adacd_hil.analysis.untouched import Residual
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """One line of *paper against measured*; `beside`: the paper's scheme on the same stream, None where none ran."""
+
+    quantity: str
+    paper: str
+    beside: str | None
+    measured: str
+
+
+def compare_with_paper(
+    run: Run,
+    sections: tuple[Section, ...],
+    adaptation_s: dict[str, float | None],
+    residuals: dict[str, Residual],
+    contacts: tuple[Contact, ...],
+    false_alarms: int,
+    payload_kg: dict[str, float | None],
+    evidence: Evidence | None,
+) -> tuple[PaperRow, ...]:
+    """Set what was measured beside what the paper printed."""
+    settings = run.settings
+    times_s = list(adaptation_s.values())
+    detections = [section.label for section in sections if section.kind == "detection"]
+    frozen = [residuals[label] for label in detections]
+    identified, cad = [residual.identified for residual in frozen], [residual.cad for residual in frozen]
+    adaptations = list(adaptation_s)
+    payload = payload_kg.get(adaptations[1]) if len(adaptations) > 1 else None
+    law = {"least_squares": "least squares", "gradient": "gradient"}[settings.estimator.law]
+    a, b = settings.filter.a_rad_s, settings.filter.b_rad_s
+    within = "within ±0.15"
+    seen = [contact.detected_s for contact in contacts if contact.detected_s is not None]
+    first = f"{seen[0]:.2f} s" if seen else "–"
+    kilograms = "–" if payload is None else f"{payload:g} kg"
+    settled = (
+        ("Bound β of eq. (15)", "0.1 Nm", f"{settings.termination.beta_Nm:g} Nm"),
+        ("Hold T of eq. (15)", "5 s", f"{settings.termination.hold_s:g} s"),
+        ("Threshold, joints 1 / 2", "0.15 Nm", _pair(settings.detector.threshold_Nm)),
+        ("Filter a / b", "10 / 10 rad/s", f"{a:g} / {b:g} rad/s"),
+        ("Estimator", "least squares", law),
+    )
+    rate = f"{1e3 / settings.bus.period_us:g} kHz"
+    names = (
+        ("First adaptation", "5.2 s"),
+        ("Adaptation after the payload change", "about 5.3 s"),
+        ("Payload", "1 kg"),
+        ("Frozen residual without payload, joints 1 / 2", within),
+        ("Frozen residual with payload, joints 1 / 2", within),
+        ("The CAD model's, without payload", "larger; joint 2 good"),
+        ("The CAD model's, with payload", "much larger, both joints"),
+        ("First contact detected at", "10 s"),
+    )
+    measured = (
+        _seconds(times_s, 0),
+        _seconds(times_s, 1),
+        kilograms,
+        _residual_text(identified, 0),
+        _residual_text(identified, 1),
+        _residual_text(cad, 0),
+        _residual_text(cad, 1),
+        first,
+    )
+    if evidence is None:
+        plain = [(*name, value) for name, value in zip(names, measured, strict=True)]
+        plain += [*settled, ("Control rate", "1 kHz", rate)]
+        return tuple(PaperRow(quantity, paper, None, value) for quantity, paper, value in plain)
+    beside = _beside_values(evidence.paper_beside, detections, (kilograms, *measured[5:7]))
+    rows = [(*name, theirs, value) for name, theirs, value in zip(names, beside[:8], measured, strict=True)]
+    armed = [contact for contact in contacts if contact.is_armed]
+    found = [contact for contact in armed if contact.delay_ms is not None]
+    has_truth = run.truth is not None
+    rows += [
+        ("Contacts detected", "–", beside[8], f"{len(found)} of {len(armed)}" if has_truth else str(len(contacts))),
+        ("Median delay", "–", beside[9], _median_text([c.delay_ms for c in found if c.delay_ms is not None])),
+        ("False alarms", "–", beside[10], str(false_alarms) if has_truth else "–"),
+    ]
+    ours = (
+        f"{settings.certified.beta_Nm:g} Nm, of the frozen model",
+        "test of " + (" and ".join("–" if t is None else f"{t:.2f} s" for t in evidence.test_s.values()) or "–"),
+        _threshold_text(evidence, detections),
+        f"{', '.join(f'{cutoff:g}' for cutoff in settings.certified.cutoffs_rad_s)} rad/s",
+        "least squares from a prior",
+    )
+    rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
+    margin = evidence.smallest_margin
+    rows.append(("Smallest threshold / residual", "–", "–", "–" if margin is None else f"{margin:.2f}"))
+    rows.append(("Control rate", "1 kHz", rate, rate))
+    return tuple(PaperRow(*row) for row in rows)
+
+
+def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str, str, str]) -> tuple[str, ...]:
+    """Give the column of the paper's scheme on the same stream; same: payload and the CAD model's residuals."""
+    if beside is None:
+        return ("–",) * 11
+    times_s = list(beside.adaptation_s.values())
+    frozen = [beside.frozen_residual_max_Nm[label] for label in detections]
+    armed = [contact for contact in beside.contacts if contact.is_armed]
+    found = [contact for contact in armed if contact.detected_s is not None]
+    seen = [contact.detected_s for contact in beside.contacts if contact.detected_s is not None]
+    return (
+        _seconds(times_s, 0),
+        _seconds(times_s, 1),
+        same[0],
+        _residual_text(frozen, 0),
+        _residual_text(frozen, 1),
+        *same[1:],
+        f"{seen[0]:.2f} s" if seen else "–",
+        "–" if beside.missed is None else f"{len(found)} of {len(armed)}",
+        _median_text([contact.delay_ms for contact in found if contact.delay_ms is not None]),
+        "–" if beside.false_alarms is None else str(beside.false_alarms),
+    )
+
+
+def _threshold_text(evidence: Evidence, detections: list[str]) -> str:
+    """Say where the thresholds of the slowest channel lie: the smallest and the largest median of a section."""
+    found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
+    return f"{min(found):.3f} to {max(found):.3f} Nm" if found else "–"
+
+
+def _median_text(delays_ms: list[float]) -> str:
+    return f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else "–"
+
+
+def _seconds(times_s: list[float | None], index: int) -> str:
+    if index >= len(times_s):
+        return "–"
+    value = times_s[index]
+    return "not finished" if value is None else f"{value:.2f} s"
+
+
+def _pair(values: tuple[float, float] | None) -> str:
+    if values is None:
+        return "–"
+    return f"{values[0]:g} Nm" if values[0] == values[1] else f"{values[0]:g} / {values[1]:g} Nm"
+
+
+def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
+    values = frozen[index] if index < len(frozen) else None
+    return "–" if values is None else f"{values[0]:.3f} / {values[1]:.3f} Nm"

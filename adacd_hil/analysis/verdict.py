@@ -1,0 +1,78 @@
+"""The verdict on a run: one sentence."""
+
+import itertools
+
+from adacd_hil.analysis.contacts import Contact
+from adacd_hil.analysis.evidence import Evidence
+from adacd_hil.analysis.run import Run
+
+
+def give_verdict(
+    run: Run,
+    contacts: tuple[Contact, ...],
+    false_s: tuple[float, ...],
+    missed: int,
+    adaptation_s: dict[str, float | None],
+    payload_kg: dict[str, float | None],
+    evidence: Evidence | None,
+    fault: str | None,
+    fault_s: float | None,
+) -> str:
+    """Say in one sentence how the run went."""
+    done = "identified" if evidence is None else "certified"
+    text = f"{_contacts_text(run, contacts, false_s, missed)}; {_identified_text(adaptation_s, payload_kg, done)}"
+    if evidence is not None and evidence.paper_beside is not None:
+        text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
+    if fault is not None:
+        text = f"the run ended in FAULT ({fault}) at {fault_s:.2f} s; {text}"
+    return text[:1].upper() + text[1:] + "."
+
+
+def _beside_text(times_s: list[float | None]) -> str:
+    if not any(time_s is not None for time_s in times_s):
+        return ""
+    took = " and ".join("did not end" if time_s is None else f"took {time_s:.2f} s" for time_s in times_s)
+    return f"; the paper's scheme on the same stream {took.replace(' and took', ' and')}"
+
+
+def _contacts_text(run: Run, contacts: tuple[Contact, ...], false_s: tuple[float, ...], missed: int) -> str:
+    if run.truth is None:
+        return f"{_number(len(contacts), 'detection')}, whose truth is not recorded"
+    armed = [contact for contact in contacts if contact.is_armed]
+    delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
+    within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
+    if not armed:
+        found = "no contact while detection was armed"
+    elif missed:
+        found = f"{len(armed) - missed} of {_number(len(armed), 'contact')} detected{within}, {missed} missed"
+    else:
+        found = f"{'the one contact' if len(armed) == 1 else f'all {len(armed)} contacts'} detected{within}"
+    false = "none false" if not false_s else _number(len(false_s), "false alarm")
+    if not armed and not false_s:
+        false = "no false alarm"
+    disarmed = [contact for contact in contacts if not contact.is_armed]
+    outside = f", {len(disarmed)} more while it was not armed" if disarmed else ""
+    early = sum(contact.detected_s is not None for contact in disarmed)
+    outside += f" ({early} of them detected)" if early else ""
+    return f"{found}{outside}, {false}"
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], done: str) -> str:
+    """Say how long the model took to be `done`, identified or certified."""
+    if not adaptation_s:
+        return "the arm never moved to adapt"
+    labels = list(adaptation_s)
+    if adaptation_s[labels[0]] is None:
+        return f"the model was not {done}"
+    text = f"the model was {done} in {adaptation_s[labels[0]]:.2f} s"
+    for before, label in itertools.pairwise(labels):
+        old, new, time_s = payload_kg[before], payload_kg[label], adaptation_s[label]
+        change = "the payload change"
+        if old is not None and new is not None and new != old:
+            change = f"{new - old:g} kg" if new > old else f"taking off {old - new:g} kg"
+        text += f", but not again after {change}" if time_s is None else f" and again in {time_s:.2f} s after {change}"
+    return text
