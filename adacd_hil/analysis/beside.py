@@ -66,7 +66,9 @@ def evaluate_beside(run: Run, stream: PaperStream, sections: Sequence[Section], 
             detected_s=detected_s,
             delay_ms=None if detected_s is None else (detected_s - touch.onset_s) * 1e3,
         )
-        for number, (touch, detected_s) in enumerate(zip(true_contacts(run), reached.detected_s, strict=True), start=1)
+        for number, (touch, detected_s) in enumerate(
+            zip(true_contacts(run), reached.detected_s, strict=True), run.first_contact
+        )
     ]
     has_truth = run.truth is not None
     return Beside(

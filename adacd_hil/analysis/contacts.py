@@ -85,10 +85,11 @@ def list_contacts(
     owners: of each detection, see `detections.assign`.
     """
     if run.truth is None:
-        return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, start=1))
+        return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
     first = {owner: detection for detection, owner in reversed(list(zip(detections, owners, strict=True)))}
     return tuple(
-        _contact(run, number, sections, touch, first.get(number - 1)) for number, touch in enumerate(touches, start=1)
+        _contact(run, run.first_contact + place, sections, touch, first.get(place))
+        for place, touch in enumerate(touches)
     )
 
 

@@ -4,7 +4,7 @@ Colours mean one thing throughout: blue the identified model, orange the CAD mod
 vision), green joint 1 and purple joint 2 where the two share an axis, red what was detected.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from adacd_hil.analysis.drawing import (
     style,
 )
 from adacd_hil.analysis.metrics import Metrics
+from adacd_hil.analysis.report.bounds import ADAPTATIONS
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.sections import Section
 from adacd_hil.analysis.touches import bank_channels, filtered, row_at
@@ -34,6 +35,10 @@ from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
 
 CLOSE_UPS: Final = 24
 """Contacts shown close up; six rows of four are a page."""
+_SHADED: Final = 120
+"""Sections that have room beside each other, with their letters."""
+_NUMBERED: Final = 60
+"""Contacts that have room beside each other, with their numbers."""
 _BEFORE_S: Final = 0.012
 _AFTER_S: Final = 0.06
 """From the onset, and at least: a typical detection, and the isolation window after it."""
@@ -46,7 +51,7 @@ def draw(run: Run, metrics: Metrics) -> list[Drawing]:
     with style():
         drawings = [residuals(run, metrics)]
         adaptations = [section for section in metrics.sections if section.kind == "adaptation"]
-        for number, section in enumerate(adaptations):
+        for number, section in enumerate(adaptations[:ADAPTATIONS]):
             drawings.append(adaptation(run, metrics, section, number))
         if metrics.contacts:
             drawings.append(close_ups(run, metrics))
@@ -108,8 +113,11 @@ def residuals(run: Run, metrics: Metrics) -> Drawing:
             "Estimated external torque of the certified scheme, slowest filter, with the CAD model, and of the paper's "
             "scheme on the same stream; below each, near zero and with the thresholds in force. Numbers mark contacts"
         )
+    if len(metrics.contacts) > _NUMBERED:
+        caption = caption.replace("Numbers", "Strokes")
     has_missed = any(contact.is_armed and contact.detected_s is None for contact in metrics.contacts)
     caption += ", a hollow mark one that was not detected" if has_missed else ""
+    caption += f"; of {len(metrics.sections)} sections the wide ones are lettered" if _is_narrow(metrics) else ""
     caption += ", a cross a false alarm." if metrics.false_alarms else "."
     return Drawing("fig5", "Figure 5 — error in (a) joint 1 and (b) joint 2", caption, figure)
 
@@ -145,8 +153,8 @@ def _stack(figure: Figure, tops: Sequence[float], height: float) -> list[Axes]:
     return [figure.add_axes((0.066, top - height, 0.919, height)) for top in tops]
 
 
-def _shade(axes: Axes, sections: Iterable[Section]) -> None:
-    for section in sections:
+def _shade(axes: Axes, sections: Sequence[Section]) -> None:
+    for section in _wide(sections):
         if section.kind != "detection":
             axes.axvspan(section.start_s, section.end_s, color=COLOURS[section.kind], linewidth=0.0, zorder=0)
         axes.axvline(section.start_s, color=COLOURS["rule"], linewidth=0.7, zorder=1)
@@ -160,9 +168,21 @@ _KIND_TITLES: Final = {
 }
 
 
-def _label(axes: Axes, sections: Iterable[Section], end_s: float) -> None:
+def _is_narrow(metrics: Metrics) -> bool:
+    return len(metrics.sections) > _SHADED
+
+
+def _wide(sections: Sequence[Section]) -> list[Section]:
+    """Choose the sections that can be told apart: of many, those as wide as their letters."""
+    if len(sections) <= _SHADED:
+        return list(sections)
+    least_s = (sections[-1].end_s - sections[0].start_s) / _SHADED
+    return [section for section in sections if section.duration_s >= least_s]
+
+
+def _label(axes: Axes, sections: Sequence[Section], end_s: float) -> None:
     """Write letter and kind of each section above the axes, the kind only where it has room."""
-    for section in sections:
+    for section in _wide(sections):
         room = 165.0 * section.duration_s / max(end_s, 1e-9)  # characters
         kind = _KIND_TITLES[section.kind]
         text = f"{section.label}  {kind}" if len(kind) + 3 < room else section.label
@@ -192,7 +212,22 @@ def _pad(axes: Axes, identified: Vector, cad: Vector, h: float) -> None:
 
 def _mark(axes: Axes, metrics: Metrics) -> None:
     lane = ("data", "axes fraction")
-    for contact in metrics.contacts:
+    is_crowded = len(metrics.contacts) > _NUMBERED
+    if is_crowded:
+        for is_seen in (True, False):
+            times_s = [contact.at_s for contact in metrics.contacts if (contact.detected_s is not None) == is_seen]
+            axes.plot(
+                times_s,
+                np.full(len(times_s), 0.915),
+                transform=axes.get_xaxis_transform(),
+                marker="|" if is_seen else "o",
+                markersize=7 if is_seen else 5,
+                color=COLOURS["alarm"],
+                markerfacecolor="none",
+                markeredgewidth=0.6 if is_seen else 0.9,
+                linestyle="none",
+            )
+    for contact in () if is_crowded else metrics.contacts:
         at_s = contact.at_s
         is_seen = contact.detected_s is not None
         face = COLOURS["alarm"] if is_seen else "none"
@@ -218,10 +253,10 @@ def _mark(axes: Axes, metrics: Metrics) -> None:
             fontweight="bold",
             color=PAPER if is_seen else COLOURS["alarm"],
         )
-    for false_s in metrics.false_alarms_s or ():
+    if metrics.false_alarms_s:
         axes.plot(
-            [false_s],
-            [0.915],
+            metrics.false_alarms_s,
+            np.full(len(metrics.false_alarms_s), 0.915),
             transform=axes.get_xaxis_transform(),
             marker="x",
             markersize=8,

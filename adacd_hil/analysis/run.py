@@ -6,7 +6,7 @@ ADAPT.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.timing import CycleColumns, Cycles
 from adacd_hil.config import Settings
 from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.log.stretch import Stretch
 from adacd_hil.records import ContactReport, SchemeState, Vector
 
 Mask = NDArray[np.bool_]
@@ -60,12 +61,11 @@ class CertifiedStream:
 
 @dataclass(frozen=True)
 class PaperStream:
-    """The paper's scheme beside, over n cycles: is_armed (n,), its residual and threshold (n, 2), theta_hat (n, p)."""
+    """The paper's scheme beside, over n cycles: is_armed (n,), its residual and threshold (n, 2)."""
 
     is_armed: Mask
     tau_ext_hat: Vector
     threshold: Vector
-    theta_hat: Vector
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,14 @@ class Motion:
     q: Vector
     dq: Vector
     tau_J: Vector
+
+
+class StretchOfRun(NamedTuple):
+    """A stretch of a log: as asked for, as found, widened so that it cuts nothing, and the contacts before it."""
+
+    asked: Stretch
+    found: Stretch
+    contacts_before: int
 
 
 @dataclass(frozen=True)
@@ -106,6 +114,15 @@ class Run:
     motion: Motion | None = None
     events: tuple[LoggedEvent, ...] = ()
     motion_start_ns: int | None = None  # None: the first cycle in ADAPT, else the first cycle
+    all_cycles: int | None = None  # of a long run: how many there are, of which the n are kept
+    bucket: int = 1  # of a long run: of so many cycles those with extremes are kept
+    log_start_ns: int | None = None  # the beginning of its log
+    stretch: StretchOfRun | None = None  # None: the whole log
+
+    @property
+    def first_contact(self) -> int:
+        """Number of the first contact: they are numbered over the whole log."""
+        return 1 if self.stretch is None else 1 + self.stretch.contacts_before
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

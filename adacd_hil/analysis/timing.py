@@ -75,6 +75,17 @@ class CycleColumns:
     def __contains__(self, name: str) -> bool:
         return name in self.columns
 
+    def rows(self, rows: Cycles) -> "CycleColumns":
+        """Give some of the cycles."""
+        return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
+
+    @staticmethod
+    def joined(parts: "Sequence[CycleColumns]") -> "CycleColumns":
+        """Put parts with the same columns one after the other."""
+        names = parts[0].columns
+        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
+        return CycleColumns(np.concatenate([part.t_ns for part in parts]), columns)
+
     def times_us(self, quantity: Quantity) -> Vector | None:
         """Give a time of the cycles that have it, µs; None where the log does not have it."""
         if quantity.column not in self:

@@ -1,10 +1,14 @@
 """The verdict on a run: one sentence."""
 
 import itertools
+from typing import Final
 
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.run import Run
+
+LISTED: Final = 4
+"""Adaptations that are listed one by one."""
 
 
 def give_verdict(
@@ -31,6 +35,8 @@ def give_verdict(
 def _beside_text(times_s: list[float | None]) -> str:
     if not any(time_s is not None for time_s in times_s):
         return ""
+    if len(times_s) > LISTED:
+        return f"; the paper's scheme on the same stream took {_summary(times_s, 'did not end')}"
     took = " and ".join("did not end" if time_s is None else f"took {time_s:.2f} s" for time_s in times_s)
     return f"; the paper's scheme on the same stream {took.replace(' and took', ' and')}"
 
@@ -57,6 +63,13 @@ def _contacts_text(run: Run, contacts: tuple[Contact, ...], false_s: tuple[float
     return f"{found}{outside}, {false}"
 
 
+def _summary(times_s: list[float | None], failed: str) -> str:
+    """Sum up many adaptations, of which some took their time: the shortest, the longest, and how many failed."""
+    took_s = [time_s for time_s in times_s if time_s is not None]
+    text = f"{min(took_s):.2f} to {max(took_s):.2f} s, {len(took_s)} times"
+    return text if len(took_s) == len(times_s) else f"{text}, and {failed} {len(times_s) - len(took_s)} times"
+
+
 def _number(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
@@ -66,6 +79,10 @@ def _identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str
     if not adaptation_s:
         return "the arm never moved to adapt"
     labels = list(adaptation_s)
+    if all(time_s is None for time_s in adaptation_s.values()):
+        return f"the model was not {done}"
+    if len(labels) > LISTED:
+        return f"the model was {done} in {_summary(list(adaptation_s.values()), f'not {done}')}"
     if adaptation_s[labels[0]] is None:
         return f"the model was not {done}"
     text = f"the model was {done} in {adaptation_s[labels[0]]:.2f} s"

@@ -3,12 +3,16 @@
 import json
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.log_export import export
-from adacd_hil.cli.options import explained, json_option
+from adacd_hil.cli.options import explained, json_option, stretch_options
+
+if TYPE_CHECKING:
+    from adacd_hil.log.stretch import Stretch
 
 _log_argument = click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
 _out_option = click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE")
@@ -89,8 +93,6 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 
 @log.command(epilog="Exit status: 0 done; 1 nothing there, or the log is damaged; 2 wrong usage.")
 @_log_argument
-@click.option("--from", "from_s", type=float, help="Begin here, s since the start of the log.")
-@click.option("--until", "until_s", type=float, help="End before here, s since the start of the log.")
 @click.option("--contact", type=click.IntRange(min=1), help="Cut around this contact, numbered from 1.")
 @click.option(
     "--around",
@@ -104,28 +106,24 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 @_out_option
 @json_option
 @explained
+@stretch_options
 def cut(
     log: Path,
-    from_s: float | None,
-    until_s: float | None,
     contact: int | None,
     around_s: float,
     topics: tuple[str, ...],
     out: Path | None,
     as_json: bool,
+    stretch: "Stretch",
 ) -> ExitCode:
     """Cut a stretch out of a log, whole cycles, with attachments and metadata. --out: default NAME.cut.mcap."""
-    from adacd_hil.log.editing.cut import Stretch, default_out, find_contact
     from adacd_hil.log.editing.cut import cut as cut_log
+    from adacd_hil.log.editing.cut import default_out, find_contact
 
-    if contact is not None and (from_s is not None or until_s is not None):
-        raise CommandError("--contact says where to cut: without --from and --until", ExitCode.USAGE)
-    if from_s is not None and until_s is not None and from_s >= until_s:
-        raise CommandError(f"--from {from_s:g} s is not before --until {until_s:g} s", ExitCode.USAGE)
     if contact is not None:
+        if not stretch.is_whole:
+            raise CommandError("--contact says where to cut: without --from and --until", ExitCode.USAGE)
         stretch = find_contact(log, contact, around_s)
-    else:
-        stretch = Stretch(float("-inf") if from_s is None else from_s, float("inf") if until_s is None else until_s)
     done = cut_log(log, out or default_out(log), stretch, topics, _tell)
     result = {"out": str(done.out), "from_s": _finite(stretch.start_s), "until_s": _finite(stretch.end_s)}
     result["messages"] = done.messages

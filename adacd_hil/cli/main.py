@@ -23,6 +23,7 @@ from adacd_hil.cli.options import (
     on_bus_or_url,
     profile_option,
     run_folder_option,
+    stretch_options,
 )
 from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
@@ -33,6 +34,7 @@ from adacd_hil.terminal import open_terminals
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
     from adacd_hil.control.session import LiveAddress
+    from adacd_hil.log.stretch import Stretch
 
 
 @click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
@@ -135,11 +137,15 @@ def tare(
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder; default: beside each log.")
 @json_option
 @explained
-def report(logs: tuple[Path, ...], out: Path | None, as_json: bool) -> ExitCode:
-    """Report logs: HTML, PDF, PNG, CSV and JSON. The emulator's truth.mcap beside a log is joined to it."""
+@stretch_options
+def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Stretch") -> ExitCode:
+    """Report logs: HTML, PDF, PNG, CSV and JSON. The emulator's truth.mcap beside a log is joined to it.
+
+    A stretch from --from until --until is widened so that it cuts no contact and no adaptation.
+    """
     from adacd_hil.cli.report import report_logs
 
-    reports, code = report_logs(logs, out)
+    reports, code = report_logs(logs, out, stretch)
     if as_json:
         print(json.dumps([entry.as_json() for entry in reports], indent=2))
     else:

@@ -1,6 +1,7 @@
 """Options and error handling that the commands share."""
 
 import functools
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -82,6 +83,26 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 clock_option = functools.partial(
     click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="What drives SYNC."
 )
+
+
+def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
+    """Give a command --from and --until; it takes them as a `Stretch`."""
+
+    @functools.wraps(command)
+    def bounded(*args: Any, from_s: float | None, until_s: float | None, **kwargs: Any) -> ExitCode:
+        from adacd_hil.log.stretch import Stretch
+
+        for name, bound_s in (("--from", from_s), ("--until", until_s)):
+            if bound_s is not None and not math.isfinite(bound_s):
+                raise CommandError(f"{name} {bound_s:g} is not a time", ExitCode.USAGE)
+        if from_s is not None and until_s is not None and from_s >= until_s:
+            raise CommandError(f"--from {from_s:g} s is not before --until {until_s:g} s", ExitCode.USAGE)
+        stretch = Stretch(-math.inf if from_s is None else from_s, math.inf if until_s is None else until_s)
+        return command(*args, stretch=stretch, **kwargs)
+
+    until = click.option("--until", "until_s", type=float, help="End before here, s since the beginning of the log.")
+    begin = click.option("--from", "from_s", type=float, help="Begin here, s since the beginning of the log.")
+    return begin(until(bounded))
 
 
 _BUS_OPTIONS = (  # last first: click lists them the other way round

@@ -3,17 +3,17 @@
 from pathlib import Path
 
 from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report.reading import RUN_TOPICS, run_from_log
+from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.control.session import SessionSummary
-from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason
 from firmware_sim.expectation import Outcome
 
 
 def outcome_of(summary: SessionSummary, truth_path: Path) -> Outcome:
     """Read the logs of a run that has ended. Raises LogError."""
-    truth = read_log(truth_path, ("/truth",))
-    metrics = evaluate(run_from_log(read_log(summary.log.path, RUN_TOPICS), truth))
+    run, gathered, _ = read_run(summary.log.path, truth_path)
+    metrics = evaluate(run, gathered)
+    force_N = None if run.truth is None else run.truth.force_N
     took_s = list(metrics.adaptation_s.values())
     found = [contact for contact in metrics.contacts if contact.delay_ms is not None]
     return Outcome(
@@ -26,7 +26,7 @@ def outcome_of(summary: SessionSummary, truth_path: Path) -> Outcome:
         false_alarms=metrics.false_alarms or 0,
         missed=metrics.missed or 0,
         delay_ms=max((contact.delay_ms for contact in found if contact.delay_ms is not None), default=None),
-        force_N=float(truth.truth["contact_force"].max(initial=0.0)),
+        force_N=0.0 if force_N is None else float(force_N.max(initial=0.0)),
     )
 
 

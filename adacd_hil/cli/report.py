@@ -4,12 +4,18 @@ from pathlib import Path
 
 from adacd_hil.analysis.report.report import Report, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.progress import Progress
 from adacd_hil.log.run_folder import TRUTH_NAME, log_in
+from adacd_hil.log.stretch import Stretch
 
 
-def report_logs(logs: tuple[Path, ...], out: Path | None) -> tuple[list[Report], ExitCode]:
-    """Report each log, beside it or in `out`; a folder stands for the run log in it. Raises LogError."""
+def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: Stretch) -> tuple[list[Report], ExitCode]:
+    """Report each log, or a stretch of it, beside it or in `out`; a folder stands for the run log in it.
+
+    Raises LogError, ConfigError.
+    """
     reports = []
+    progress = Progress()
     is_complete = True
     names: set[Path] = set()
     for given in logs:
@@ -19,7 +25,9 @@ def report_logs(logs: tuple[Path, ...], out: Path | None) -> tuple[list[Report],
             raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
         names.add(folder)
         truth = path.parent / TRUTH_NAME
-        report = write_report(path, truth if truth.exists() else None, folder, is_printed=True)
+        truth_path = truth if truth.exists() else None
+        report = write_report(path, truth_path, folder, is_printed=True, stretch=stretch, progress=progress)
         is_complete = is_complete and report.is_complete
         reports.append(report)
+    progress.close()
     return reports, ExitCode.OK if is_complete else ExitCode.PARTIAL

@@ -200,7 +200,7 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
         decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
         frames=joined_frames([piece.frames for piece in pieces]),
         events=[event for piece in pieces for event in events_of(piece.payloads, walk.topics, epoch_ns)],
-        contacts=_contacts(series["/contact"]),
+        contacts=contacts_of(series["/contact"]),
         parts=walk.parts,
     )
 
@@ -307,7 +307,8 @@ _CONTACT_TYPES: dict[str, Callable[[Any], Any]] = {
 """What each field of a report is made of the number or list that the log has."""
 
 
-def _contacts(series: Series) -> list[LoggedContact]:
+def contacts_of(series: Series) -> list[LoggedContact]:
+    """Give what /contact has."""
     contacts = []
     names = [name for name in ContactReport._fields if name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):

@@ -8,10 +8,13 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.bus_frames import is_of_frames
-from adacd_hil.log.reader import Series, open_log, own_topics, series_of
+from adacd_hil.log.bus_frames import FRAME_DTYPE, is_of_frames
+from adacd_hil.log.mcap_walk import Topic
+from adacd_hil.log.reader import LoggedEvent, Series, events_of, open_log, own_topics, series_of
+from adacd_hil.log.summary import DROPPED_KEY, LOST_KEY
 
 
 class Piece(NamedTuple):
@@ -54,26 +57,45 @@ class LogStream:
         """What the run was made with, by file name."""
         return self._walk.attachments
 
+    def empty(self) -> Piece:
+        """Give a piece without messages, with our own topics."""
+        return Piece(series_of({}, {}, self._own_topics(), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
+
     @property
     def problem(self) -> str:
         """What is missing, one line, as far as has been read; "" for a whole log."""
         return self._walk.problem
 
     @property
+    def is_complete(self) -> bool:
+        """Whether all that was read is whole, no packet was dropped, and nothing was lost before a recovery."""
+        return not self.problem and self.summary.get(DROPPED_KEY, "0") == "0" and LOST_KEY not in self.summary
+
+    @property
     def summary(self) -> dict[str, str]:
         """Frames, messages, dropped and ending, of the parts that have been read to their ends."""
         return self._walk.summary
+
+    def events(self, piece: Piece) -> list[LoggedEvent]:
+        """Unpack what a piece has of /events."""
+        return events_of(piece.payloads, self._walk.topics, self.epoch_ns)
 
     @property
     def parts(self) -> int:
         """How many files have been read."""
         return self._walk.parts
 
-    def __iter__(self) -> Iterator[Piece]:
+    def _own_topics(self) -> dict[str, Topic]:
+        """List those of our topics that pieces have series of."""
         own = own_topics(self.metadata)
-        if self._topics is not None:
-            own = {name: topic for name, topic in own.items() if name in self._topics}
-        own = {name: topic for name, topic in own.items() if not is_of_frames(topic)}
+        return {
+            name: topic
+            for name, topic in own.items()
+            if not is_of_frames(topic) and (self._topics is None or name in self._topics)
+        }
+
+    def __iter__(self) -> Iterator[Piece]:
+        own = self._own_topics()
         for gathered in self._walk.pieces(self._cycles_per_piece, self.epoch_ns):
             topics = {name: topic for name, topic in self._walk.topics.items() if not is_of_frames(topic)}
             yield Piece(series_of(gathered.records, topics, own, self.epoch_ns), gathered.frames, gathered.payloads)

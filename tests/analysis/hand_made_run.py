@@ -94,7 +94,6 @@ def make_certified_run(*stays: tuple[SchemeState, int], **changes: Any) -> Run:
             is_armed=is_armed,
             tau_ext_hat=np.zeros((count, 2)),
             threshold=np.where(is_armed, 0.15, np.inf)[:, None].repeat(2, axis=1),
-            theta_hat=np.zeros((count, 7)),
         ),
     )
 

@@ -94,13 +94,13 @@ class LogSource:
 
 
 def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
-    """Read the settings that a run had. Raises LogError, ConfigError."""
+    """Read the settings that a run had. Raises LogError."""
     if "config.toml" not in attachments:
-        raise LogError(f"log {path} has no config.toml attached: its settings are not known")
+        raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
     try:
         return parse(Settings, renewed(tomllib.loads(attachments["config.toml"].decode())))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise LogError(f"log {path}: its config.toml can't be read: {error}") from None
+    except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
+        raise LogError(f"log {path}, attachment config.toml: {error}") from None
 
 
 def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:

@@ -7,8 +7,16 @@ from typing import Final
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.arm_drawing import Push, draw_arm
+from adacd_hil.analysis.report.bounds import CONTACTS
 from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
-from adacd_hil.analysis.report.words import contact_rows, scaled, signs_text, uncertain_text
+from adacd_hil.analysis.report.words import (
+    contact_rows,
+    left_out_text,
+    scaled,
+    shown_contacts,
+    signs_text,
+    uncertain_text,
+)
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.touches import row_at
 from adacd_hil.records import Vector
@@ -22,8 +30,9 @@ def contacts_table(metrics: Metrics) -> str:
     if not metrics.contacts:
         return '<p class="note">None.</p>'
     rows: list[Sequence[Cell]] = []
-    head, words = contact_rows(metrics)
-    for contact, row in zip(metrics.contacts, words, strict=True):
+    contacts = shown_contacts(metrics, CONTACTS)
+    head, words = contact_rows(metrics, contacts)
+    for contact, row in zip(contacts, words, strict=True):
         cells: list[Cell] = [escape(word) for word in row]
         if contact.detected_s is None:
             cells[6] = (str(cells[6]), "bad")
@@ -32,10 +41,12 @@ def contacts_table(metrics: Metrics) -> str:
         if contact.direction_ok is False:
             cells[10] = (str(cells[10]), "bad")
         rows.append(cells)
-    note = ""
+    left_out = left_out_text(metrics, CONTACTS)
+    note = f'<p class="note">{left_out}</p>' if left_out else ""
     if metrics.false_alarms_s:
-        times = ", ".join(number_text(time_s, 3) for time_s in metrics.false_alarms_s)
-        note = f'<p class="note bad">False alarms at {times} s.</p>'
+        times = ", ".join(number_text(time_s, 3) for time_s in metrics.false_alarms_s[:CONTACTS])
+        more = f" and {len(metrics.false_alarms_s) - CONTACTS} more" if len(metrics.false_alarms_s) > CONTACTS else ""
+        note += f'<p class="note bad">False alarms at {times} s{more}.</p>'
     return make_table(head, rows, left=()) + note
 
 

@@ -1,24 +1,45 @@
-"""A run out of its logs: what the report and the metrics need of them."""
+"""A run out of its logs: what the report and the metrics need of them, in bounded memory.
+
+A log is read once, and all of its cycles are kept, while they are no more than `FULL_CYCLES`. A longer one is read
+twice more: for when something begins or ends (`outline`), then for what all cycles come to and for those that are drawn
+(`long_run`). Of a stretch of a log, the outline of the whole says how far it has to be widened to cut no contact and
+no adaptation.
+"""
 
 import hashlib
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.run import CertifiedStream, Motion, PaperStream, Run, Truth
-from adacd_hil.analysis.timing import Cycles, columns_of_series
-from adacd_hil.config import Settings, parse, renewed
-from adacd_hil.device.arm import SYNC_OVERFLOW
+from adacd_hil.analysis.detections import find_detections
+from adacd_hil.analysis.metrics import Gathered
+from adacd_hil.analysis.replay.source import settings_of
+from adacd_hil.analysis.report.calm import settling_s, widen
+from adacd_hil.analysis.report.long_run import LongRun
+from adacd_hil.analysis.report.outline import Facts, Outline
+from adacd_hil.analysis.report.scheme_rows import SchemeRows, run_of_piece
+from adacd_hil.analysis.report.truth_rows import TruthRows, host_truth, read_truth
+from adacd_hil.analysis.run import Run, StretchOfRun, Truth
+from adacd_hil.analysis.timing import CycleColumns, columns_of_series
+from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import RunLog, Series, read_log
-from adacd_hil.records import JOINTS, Request, SchemeState
+from adacd_hil.log.reader import Series
+from adacd_hil.log.stream import LogStream, Piece
+from adacd_hil.log.stretch import WHOLE, Stretch, start_of_log
+from adacd_hil.records import JOINTS
 
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact", "/events")
 """Of a run's log, what a report reads."""
-_BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
+FULL_CYCLES: Final = 600_000
+"""Cycles that are kept and drawn one by one: ten minutes at 1 kHz; some 0.7 kB each."""
+_PROGRESS_CYCLES: Final = 1_000_000
+
+Progress = Callable[[str], None]
+Bounds = tuple[int, int]
+"""From when, and before when, ns of the run's clock."""
 
 
 class Source(NamedTuple):
@@ -29,121 +50,200 @@ class Source(NamedTuple):
     is_complete: bool = True
 
 
-def read_run(log_path: Path, truth_path: Path | None) -> tuple[Run, Source]:
-    """Read a log, and the emulator's truth if there is one. Raises LogError."""
-    log = read_log(log_path, RUN_TOPICS)
-    truth_log = None if truth_path is None else read_log(truth_path, ("/truth",))
-    logs = [log] if truth_log is None else [log, truth_log]
-    source = Source(
-        log_path.name,
-        problem="; ".join(entry.problem for entry in logs if entry.problem),
-        is_complete=all(entry.is_complete for entry in logs),
-    )
-    return run_from_log(log, truth_log), source
+class ReadRun(NamedTuple):
+    """A run, and what all of its cycles come to; None where it has all of them."""
+
+    run: Run
+    gathered: Gathered | None
+    source: Source
 
 
-def run_from_log(log: RunLog, truth_log: RunLog | None) -> Run:
-    """Take what the metrics need out of a log and the emulator's own log. Raises LogError."""
-    scheme, settings = log.scheme, _settings(log)
-    metadata = dict(log.metadata)
-    if "arm.dbc" in log.attachments:
-        metadata["dbc_sha256"] = hashlib.sha256(log.attachments["arm.dbc"]).hexdigest()
-    if truth_log is not None:
-        metadata |= {f"emulator_{key}": value for key, value in truth_log.metadata.items() if key not in metadata}
-    return Run(
-        cycle=scheme["cycle"].astype(np.int64),
-        t_ns=scheme.t_ns,
-        state=scheme["state"],
-        fault=scheme["fault"],
-        tau_ext_hat=scheme["tau_ext_hat"],
-        tau_ext_hat_cad=scheme["tau_ext_hat_cad"],
-        theta_hat=scheme["theta_hat"],
-        threshold=scheme["threshold"],
-        reports=tuple(entry.report for entry in log.contacts),
-        timing=columns_of_series(log.cycle),
-        finish_cycle=_finish_cycle(scheme),
-        contact_joints=scheme["contact_joints"],
-        truth=_truth(truth_log, scheme),
-        settings=settings,
-        metadata=metadata,
-        frames=_count(log.summary, "frames"),
-        dropped=_count(log.summary, "dropped"),
-        certified=_certified_stream(scheme, settings),
-        beside=_paper_stream(scheme),
-        motion=Motion(scheme["q"], scheme["dq"], scheme["tau_J"]),
-        events=tuple(log.events),
-    )
+def read_run(
+    log_path: Path,
+    truth_path: Path | None,
+    stretch: Stretch = WHOLE,
+    progress: Progress = lambda _: None,
+    full_cycles: int = FULL_CYCLES,
+) -> ReadRun:
+    """Read a log, or a stretch of it, and the emulator's truth if there is one. Raises LogError, ConfigError.
 
-
-def _certified_stream(scheme: Series, settings: Settings) -> CertifiedStream | None:
-    """Take out what only the certified scheme records; None of a log without it."""
-    if "tau_ext_bank" not in scheme.fields:
-        return None
-    shape = (-1, settings.channel_count, JOINTS)
-    return CertifiedStream(
-        tau_ext=scheme["tau_ext_bank"].reshape(shape),
-        threshold=scheme["threshold_bank"].reshape(shape),
-        theta_further=scheme["theta_further"],
-        theta_std=scheme["theta_std"],
-        promotions=scheme["promotions"],
-    )
-
-
-def _paper_stream(scheme: Series) -> PaperStream | None:
-    """Take out what the paper's scheme beside records; None of a log without it."""
-    if "paper_is_armed" not in scheme.fields:
-        return None
-    return PaperStream(
-        is_armed=scheme["paper_is_armed"] > 0.5,
-        tau_ext_hat=scheme["paper_tau_ext_hat"],
-        threshold=scheme["paper_threshold"],
-        theta_hat=scheme["paper_theta_hat"],
-    )
-
-
-def _finish_cycle(scheme: Series) -> int | None:
-    """Find the cycle in which the user asked to finish."""
-    asked = np.flatnonzero(scheme["request"] == Request.FINISH)
-    return int(scheme["cycle"][asked[0]]) if asked.size else None
-
-
-def _truth(log: RunLog | None, scheme: Series) -> Truth | None:
-    if log is None or len(log.truth) == 0:
-        return None
-    truth = log.truth
-    return Truth(
-        cycle=_host_cycles(truth["cycle"].astype(np.int64), scheme),
-        tau_ext=truth["tau_ext"],
-        contact_link=truth["contact_link"],
-        contact_index=truth["contact_index"],
-        payload_kg=truth["payload"],
-        theta=truth["theta"],
-        force_N=truth["contact_force"] if "contact_force" in truth.fields else None,
-    )
-
-
-def _host_cycles(cycle: Cycles, scheme: Series) -> Cycles:
-    """Turn the emulator's cycles into the host's.
-
-    The emulator counts by the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the
-    counter that the host had counted before.
+    full_cycles: of a log with more, some are kept.
     """
-    is_beginning = np.isin(scheme["state"], _BEGINNING)
-    first = np.flatnonzero(is_beginning & ~np.concatenate(([False], is_beginning[:-1])))
-    begins = scheme["cycle"][first].astype(np.int64) if first.size else np.zeros(1, np.int64)
-    attempt = np.cumsum(np.diff(cycle, prepend=cycle[0]) < 0)
-    shift = begins - begins % SYNC_OVERFLOW
-    return np.asarray(cycle + shift[np.minimum(attempt, len(shift) - 1)])
+    truth = None if truth_path is None else read_truth(truth_path, full_cycles)
+    reading = _Reading(log_path, truth, progress)
+    if not stretch.is_whole:
+        return reading.read_stretch(stretch, full_cycles)
+    return reading.read_whole(full_cycles) or reading.read_long(*reading.outline())
 
 
-def _settings(log: RunLog) -> Settings:
-    text = log.attachments.get("config.toml")
-    if text is None:
-        raise LogError(f"log {log.path} has no attachment config.toml")
-    try:
-        return parse(Settings, renewed(tomllib.loads(text.decode("utf-8"))))
-    except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
-        raise LogError(f"log {log.path}, attachment config.toml: {error}") from None
+class _Reading:
+    """Reads one log, as often as it takes."""
+
+    def __init__(self, path: Path, truth: TruthRows | None, progress: Progress) -> None:
+        self._path = path
+        self._truth = truth
+        self._progress = progress
+        stream = LogStream(path, RUN_TOPICS)
+        self._empty = stream.empty()
+        self._scheme = self._empty.series["/scheme"]
+        self._shell = self._begin(stream)
+        self._read = stream  # that was last read to its end
+
+    def _begin(self, stream: LogStream) -> Run:
+        """Give a run without a cycle, with what a log says of it before its first message."""
+        metadata = dict(stream.metadata)
+        if "arm.dbc" in stream.attachments:
+            metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
+        if self._truth is not None:
+            emulator = self._truth.metadata.items()
+            metadata |= {f"emulator_{key}": value for key, value in emulator if key not in metadata}
+        nothing = np.empty((0, JOINTS))
+        empty = Run(
+            cycle=np.empty(0, np.int64),
+            t_ns=np.empty(0, np.int64),
+            state=np.empty(0, np.uint8),
+            fault=np.empty(0, np.uint8),
+            tau_ext_hat=nothing,
+            tau_ext_hat_cad=nothing,
+            theta_hat=nothing,
+            threshold=nothing,
+            reports=(),
+            timing=columns_of_series(self._empty.series["/cycle"]),
+            truth=None,
+            settings=settings_of(self._path, stream.attachments),
+            metadata=metadata,
+            frames=None,
+            dropped=None,
+            log_start_ns=start_of_log(self._path),
+        )
+        return run_of_piece(self._scheme, empty)
+
+    def _pieces(self, doing: str, bounds_ns: Bounds | None = None) -> Iterator[tuple[LogStream, Piece]]:
+        """Read the log, or what of it lies between two times."""
+        stream = LogStream(self._path, RUN_TOPICS)
+        cycles = said = 0
+        for piece in stream:
+            cycles += len(piece.series["/scheme"])
+            if cycles - said >= _PROGRESS_CYCLES:
+                said = cycles
+                self._progress(f"{self._path}: {doing}, {cycles} cycles")
+            if bounds_ns is None:
+                yield stream, piece
+                continue
+            times_ns = piece.series["/scheme"].t_ns
+            if times_ns.size and times_ns[0] >= bounds_ns[1]:
+                break
+            yield stream, _within(piece, bounds_ns, stream.epoch_ns)
+        self._read = stream
+
+    def _done(self, run: Run, gathered: Gathered | None) -> ReadRun:
+        """Give what was read."""
+        stream, truth = self._read, self._truth
+        problems = [stream.problem, "" if truth is None else truth.problem]
+        is_complete = stream.is_complete and (truth is None or truth.is_complete)
+        source = Source(self._path.name, "; ".join(filter(None, problems)), is_complete)
+        if run.stretch is None:
+            run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
+        return ReadRun(run, gathered, source)
+
+    def read_whole(self, most_cycles: int, bounds_ns: Bounds | None = None, shell: Run | None = None) -> ReadRun | None:
+        """Read all cycles, or those between two times; None if they are more than so many.
+
+        shell: what is known of the run before, its truth included.
+        """
+        facts = Facts()
+        rows = SchemeRows(self._scheme, most_cycles)
+        columns = [columns_of_series(self._empty.series["/cycle"])]
+        for stream, piece in self._pieces("reading", bounds_ns):
+            facts.add(stream, piece)
+            if facts.cycles > most_cycles:
+                return None
+            rows.add(piece.series["/scheme"])
+            columns.append(columns_of_series(piece.series["/cycle"]))
+        run = facts.apply(rows.fill(shell or self._shell))
+        if shell is None and self._truth is not None:
+            run = replace(run, truth=host_truth(self._truth, facts.begins, None))
+        return self._done(replace(run, timing=CycleColumns.joined(columns)), None)
+
+    def outline(
+        self, bounds_ns: Bounds | None = None, shell: Run | None = None, until_ns: int | None = None
+    ) -> tuple[Run, Outline]:
+        """Find when something begins and ends, in all cycles or between two times.
+
+        until_ns: what comes later is not asked for, once all is calm.
+        """
+        outline = Outline(shell or self._shell, self._scheme, self._truth if shell is None else None)
+        calm_ns = round(settling_s(self._shell) * 1e9)
+        for stream, piece in self._pieces("looking for what happens", bounds_ns):
+            outline.add(stream, piece)
+            times_ns = piece.series["/scheme"].t_ns
+            if until_ns is None or not times_ns.size:
+                continue
+            before_ns = int(times_ns[-1]) - calm_ns
+            if before_ns > until_ns and outline.is_calm_since(before_ns):
+                break
+        return outline.done(), outline
+
+    def read_long(self, run: Run, outline: Outline, bounds_ns: Bounds | None = None) -> ReadRun:
+        """Read what all cycles come to, and those that are drawn."""
+        indexes = np.concatenate([np.empty(0, np.int64), *outline.indexes])
+        long_run = LongRun(run, indexes, outline.facts.cycles, self._empty)
+        for _, piece in self._pieces("adding up what all cycles come to", bounds_ns):
+            long_run.add(piece)
+        return self._done(*long_run.done())
+
+    def read_stretch(self, stretch: Stretch, most_cycles: int) -> ReadRun:
+        """Read a stretch of the log, and what of it is needed to cut nothing. Raises LogError if nothing is in it."""
+        start_ns = self._shell.log_start_ns
+        if start_ns is None:
+            raise LogError(f"log {self._path} has no message")
+        asked_ns = stretch.bounds_ns(start_ns)
+        run, _ = self.outline(until_ns=asked_ns[1])
+        zero_ns = run.zero_ns
+        asked_s = ((asked_ns[0] - zero_ns) * 1e-9, (asked_ns[1] - zero_ns) * 1e-9)
+        bounds_s = widen(run, *asked_s)
+        bounds_ns = (round(bounds_s[0] * 1e9) + zero_ns, round(bounds_s[1] * 1e9) + zero_ns)
+        found = Stretch(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns))
+        begun_s = [d.detected_s for d in find_detections(run)]
+        if run.truth is not None:
+            begun_s = [touch.onset_s for touch in true_contacts(run)]
+        shell = replace(
+            self._shell,
+            motion_start_ns=zero_ns,
+            truth=_truth_within(run.truth, bounds_s),
+            stretch=StretchOfRun(stretch, found, sum(at_s < bounds_s[0] for at_s in begun_s)),
+        )
+        whole = self.read_whole(most_cycles, bounds_ns, shell)
+        if whole is None:
+            whole = self.read_long(*self.outline(bounds_ns, shell), bounds_ns)
+        if whole.run.cycle.size == 0:
+            raise LogError(f"log {self._path} has no cycle from {stretch.start_s:g} to {stretch.end_s:g} s")
+        return whole
+
+
+def _within(piece: Piece, bounds_ns: Bounds, epoch_ns: int) -> Piece:
+    """Give what of a piece lies between two times, but for its events."""
+    series = {}
+    for name, values in piece.series.items():
+        t_ns = values.t_ns
+        series[name] = Series(values.records[(t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1])], epoch_ns)
+    return piece._replace(series=series)
+
+
+def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth | None:
+    """Give what of the truth lies between two times, s since motion start."""
+    if truth is None or truth.time_s is None:
+        return truth
+    rows = (truth.time_s >= bounds_s[0]) & (truth.time_s < bounds_s[1])
+    return replace(
+        truth,
+        cycle=truth.cycle[rows],
+        tau_ext=truth.tau_ext[rows],
+        contact_link=truth.contact_link[rows],
+        contact_index=truth.contact_index[rows],
+        force_N=None if truth.force_N is None else truth.force_N[rows],
+        time_s=truth.time_s[rows],
+    )
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:

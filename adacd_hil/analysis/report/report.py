@@ -12,16 +12,25 @@ from pathlib import Path
 from typing import Any, Final
 
 from adacd_hil.analysis.figures import draw
-from adacd_hil.analysis.metrics import Metrics, evaluate
+from adacd_hil.analysis.metrics import Gathered, Metrics, evaluate
+from adacd_hil.analysis.report.bounds import PRINTED_CONTACTS
 from adacd_hil.analysis.report.csv_tables import report_tables
 from adacd_hil.analysis.report.json_form import report_json
 from adacd_hil.analysis.report.print_form import report_pdf, report_png
-from adacd_hil.analysis.report.reading import Source, read_run
+from adacd_hil.analysis.report.reading import Progress, Source, read_run
 from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.words import align_columns, contact_rows, paper_cells, paper_head
+from adacd_hil.analysis.report.words import (
+    align_columns,
+    contact_rows,
+    left_out_text,
+    paper_cells,
+    paper_head,
+    shown_contacts,
+)
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.stretch import WHOLE, Stretch
 from adacd_hil.output_files import replace_file
 
 HTML_NAME: Final = "report.html"
@@ -60,23 +69,37 @@ def _tables(metrics: Metrics, source: Source) -> list[str]:
     lines = [f"The log is not whole: {source.problem}"] if source.problem else []
     lines += ["", *align_columns([paper_head(metrics), *paper_cells(metrics)])]
     if metrics.contacts:
-        head, rows = contact_rows(metrics)
-        lines += ["", *align_columns([head, *rows])]
+        head, rows = contact_rows(metrics, shown_contacts(metrics, PRINTED_CONTACTS))
+        left_out = left_out_text(metrics, PRINTED_CONTACTS)
+        lines += ["", *align_columns([head, *rows]), *([left_out] if left_out else [])]
     return lines
 
 
-def write_report(log_path: Path, truth_path: Path | None, out_dir: Path, *, is_printed: bool = False) -> Report:
-    """Read a log, and the emulator's truth if there is one, and write the report into `out_dir`.
+def write_report(
+    log_path: Path,
+    truth_path: Path | None,
+    out_dir: Path,
+    *,
+    is_printed: bool = False,
+    stretch: Stretch = WHOLE,
+    progress: Progress = lambda _: None,
+) -> Report:
+    """Read a log, or a stretch of it, and the emulator's truth if there is one, and write the report into `out_dir`.
 
-    Raises LogError when a log can't be read or the report can't be written.
+    Raises LogError, ConfigError when a log can't be read, and LogError when the report can't be written.
     """
-    run, source = read_run(log_path, truth_path)
-    return write_run_report(run, out_dir, source, is_printed=is_printed)
+    run, gathered, source = read_run(log_path, truth_path, stretch, progress)
+    return write_run_report(run, out_dir, source, gathered, is_printed=is_printed)
 
 
-def write_run_report(run: Run, out_dir: Path, source: Source, *, is_printed: bool = False) -> Report:
-    """Write the report of a run that is in memory. Raises LogError when it can't be written."""
-    metrics = evaluate(run)
+def write_run_report(
+    run: Run, out_dir: Path, source: Source, gathered: Gathered | None = None, *, is_printed: bool = False
+) -> Report:
+    """Write the report of a run that is in memory. Raises LogError when it can't be written.
+
+    gathered: what all of its cycles come to, where it does not have all of them.
+    """
+    metrics = evaluate(run, gathered)
     drawings = draw(run, metrics)
     timing = draw_timing(run.timing, metrics.timing, run.zero_ns, "motion start")
     pngs = {drawing.name: drawing.png() for drawing in drawings if drawing.name in _PNG_FIGURES}

@@ -23,7 +23,9 @@ from adacd_hil.analysis.report.tables import (
 from adacd_hil.analysis.report.timeline import timeline
 from adacd_hil.analysis.report.timing_page import timing_section
 from adacd_hil.analysis.report.traces_page import SCRIPTS, STYLES, traces_section
+from adacd_hil.analysis.report.words import stretch_text
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.verdict import LISTED
 
 
 def report_page(
@@ -45,7 +47,7 @@ def report_page(
         wrap_section("Model identification", adaptations, parameters_table(metrics, run), further_table(metrics)),
         traces,
         timing_section(metrics.timing, timing),
-        wrap_section("Run", run_table(metrics, run.metadata, source)),
+        wrap_section("Run", run_table(metrics, run, source)),
         definitions(run),
     ]
     title = f"{_name(run, source)} – run report"
@@ -63,6 +65,8 @@ def _header(metrics: Metrics, run: Run, source: Source) -> str:
         ("version", "version"),
     ]  # fmt: skip
     words = [f"{label} {run.metadata[key]}" for label, key in meta if run.metadata.get(key)]
+    if run.stretch is not None:
+        words.append(stretch_text(run.stretch))
     problems = [f"The log is not whole: {source.problem}"] if source.problem else []
     if not problems and metrics.dropped:
         problems = [f"{metrics.dropped} packets are not in the log."]
@@ -74,7 +78,7 @@ def _tiles(metrics: Metrics) -> str:
     """Write the handful of numbers to be read first."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
-    times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]
+    times_s = _listed([number_text(value, 2) for value in metrics.adaptation_s.values()])
     delays_ms = [contact.delay_ms for contact in seen if contact.delay_ms is not None]
     laws_ms = [contact.law_ms for contact in seen if contact.law_ms is not None]
     frozen = [max(r.identified) for r in metrics.frozen_residual_max_Nm.values() if r.identified is not None]
@@ -103,4 +107,10 @@ def _tiles(metrics: Metrics) -> str:
 def _beside_times(evidence: Evidence | None) -> str:
     if evidence is None or evidence.paper_beside is None:
         return NONE
-    return " · ".join(number_text(time_s, 2) for time_s in evidence.paper_beside.adaptation_s.values()) or NONE
+    times_s = [number_text(time_s, 2) for time_s in evidence.paper_beside.adaptation_s.values()]
+    return " · ".join(_listed(times_s)) or NONE
+
+
+def _listed(times: list[str]) -> list[str]:
+    """Leave out all but the first of many."""
+    return times if len(times) <= LISTED else [*times[:LISTED], "…"]

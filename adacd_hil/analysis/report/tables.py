@@ -1,15 +1,17 @@
 """The tables of a report's page, but that of the contacts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
+from itertools import islice
 from string import ascii_letters
 from typing import Final
 
-from adacd_hil.analysis.evidence import Evidence
+from adacd_hil.analysis.evidence import ChannelMargin, Evidence
 from adacd_hil.analysis.metrics import Metrics
+from adacd_hil.analysis.report.bounds import ADAPTATIONS, SECTIONS
 from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
 from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.report.words import pair_text, paper_cells, paper_head, signed_text
+from adacd_hil.analysis.report.words import pair_text, paper_cells, paper_head, signed_text, stretch_text
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.untouched import Residual
 from adacd_hil.records import PARAMETER_UNITS
@@ -30,7 +32,7 @@ def margins_table(evidence: Evidence | None) -> str:
         return ""
     head = ("section", "filter, rad/s", "", "largest residual, Nm", "threshold, Nm", "margin")
     rows: list[Sequence[Cell]] = []
-    for label, channels in evidence.margins.items():
+    for label, channels in _first_and_worst(evidence).items():
         for row in channels:
             cutoff = f"{row.cutoff_rad_s:g}"
             kind = "bare" if row.smoothing_rad_s is None else "smoothed"
@@ -43,14 +45,24 @@ def margins_table(evidence: Evidence | None) -> str:
         "residual of any cycle; below 1 it would have been a false alarm. In an adaptation the threshold is as high as "
         "the model is uncertain."
     )
+    if len(evidence.margins) > SECTIONS:
+        note += f" The first {SECTIONS} of {len(evidence.margins)} sections, and the one with the smallest margin."
     return make_table(head, rows, left=(0, 2)) + f'<p class="note">{note}</p>'
+
+
+def _first_and_worst(evidence: Evidence) -> dict[str, tuple[ChannelMargin, ...]]:
+    """Choose the first sections, and the one with the smallest margin."""
+    labels = list(evidence.margins)
+    worst = min(labels, key=lambda label: min(min(row.margin) for row in evidence.margins[label]))
+    shown = {*labels[:SECTIONS], worst}
+    return {label: margins for label, margins in evidence.margins.items() if label in shown}
 
 
 def further_table(metrics: Metrics) -> str:
     """Write all parameters of the certified scheme with the standard deviations that it gives them."""
     if metrics.evidence is None or not metrics.evidence.estimates:
         return ""
-    estimates = metrics.evidence.estimates
+    estimates = dict(islice(metrics.evidence.estimates.items(), ADAPTATIONS))
     head = ["", "unit"]
     for label in estimates:
         head += [f"certified ({label})", "±"]
@@ -60,8 +72,13 @@ def further_table(metrics: Metrics) -> str:
         for found in estimates.values():
             cells += [(number_text(found[name].value, 5), "strong"), number_text(found[name].std, 5)]
         rows.append(cells)
-    note = '<p class="note">±: standard deviation that the scheme gives its own estimate.</p>'
-    return make_table(head, rows, left=(0, 1)) + note
+    note = "±: standard deviation that the scheme gives its own estimate." + _first_adaptations(metrics)
+    return make_table(head, rows, left=(0, 1)) + f'<p class="note">{note}</p>'
+
+
+def _first_adaptations(metrics: Metrics) -> str:
+    count = len(metrics.adaptation_s)
+    return f" The first {ADAPTATIONS} of {count} adaptations." if count > ADAPTATIONS else ""
 
 
 _KINDS: Final = {
@@ -76,7 +93,7 @@ def sections_table(metrics: Metrics, run: Run) -> str:
     """Write a row per section, with its frozen residuals."""
     threshold = run.settings.detector.threshold_Nm
     rows = []
-    for section in metrics.sections:
+    for section in metrics.sections[:SECTIONS]:
         residual = metrics.frozen_residual_max_Nm.get(section.label, Residual(None, None, 0))
         rows.append(
             (
@@ -95,6 +112,8 @@ def sections_table(metrics: Metrics, run: Run) -> str:
         "section", "", "from, s", "to, s", "lasts, s", "largest residual, frozen, Nm", "with CAD, Nm", "over cycles",
     )  # fmt: skip
     note = "Residuals of joint 1 / joint 2 where nobody touches the arm; marked where over the threshold."
+    if len(metrics.sections) > SECTIONS:
+        note += f" The first {SECTIONS} of {len(metrics.sections)} sections; all are in report.json."
     return make_table(head, rows, left=(0, 1)) + f'<p class="note">{note}</p>'
 
 
@@ -117,27 +136,30 @@ def parameters_table(metrics: Metrics, run: Run) -> str:
         return ""
     cad = dict(zip(run.parameter_names, run.settings.arm.cad_theta, strict=True)) if run.has_cad else {}
     head = ["", "unit", "CAD"]
-    for label, payload_kg in metrics.payload_kg.items():
+    for label, payload_kg in islice(metrics.payload_kg.items(), ADAPTATIONS):
         with_payload = "" if payload_kg is None else f", {payload_kg:g} kg"
         head += [f"true ({label}{with_payload})", f"identified ({label})", "error"]
     rows = []
     for name in run.parameter_names:
         cells: list[Cell] = [_symbol(name), escape(PARAMETER_UNITS[name]), number_text(cad.get(name), 4)]
-        for found in metrics.parameters.values():
+        for found in islice(metrics.parameters.values(), ADAPTATIONS):
             true, identified = found[name]
             error = f"{signed_text(100.0 * (identified - true) / true)} %" if true else NONE
             cells += [number_text(true, 4), (number_text(identified, 4), "strong"), error]
         rows.append(cells)
     note = (
         '<p class="note">Least squares stops when the residual is small enough, not when the parameters are exact: '
-        "what the motion hardly excites is hardly identified, and hardly matters to it.</p>"
+        "what the motion hardly excites is hardly identified, and hardly matters to it."
+        f"{_first_adaptations(metrics)}</p>"
     )
     return make_table(head, rows, left=(0, 1)) + note
 
 
-def run_table(metrics: Metrics, metadata: Mapping[str, str], source: Source) -> str:
+def run_table(metrics: Metrics, run: Run, source: Source) -> str:
     """Write where the run comes from."""
     log = [("log", source.log_name), ("frames", metrics.frames), ("packets dropped", metrics.dropped)]
+    if run.stretch is not None:
+        log.append(("stretch", stretch_text(run.stretch)))
     rows = [(label, NONE if value is None else str(value)) for label, value in log]
-    rows += [(key.replace("_", " "), value or NONE) for key, value in sorted(metadata.items())]
+    rows += [(key.replace("_", " "), value or NONE) for key, value in sorted(run.metadata.items())]
     return make_table(("", ""), [(escape(key), escape(value)) for key, value in rows], left=(0, 1))

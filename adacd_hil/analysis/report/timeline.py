@@ -12,6 +12,7 @@ import numpy as np
 
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
+from adacd_hil.analysis.report.bounds import MARKS
 from adacd_hil.analysis.report.page import number_text
 from adacd_hil.analysis.run import Run
 from adacd_hil.records import SchemeState
@@ -107,6 +108,8 @@ def timeline(run: Run, metrics: Metrics) -> str:
         'below them warnings, faults and false alarms.<span class="scripted"> Choose any of them to see the traces '
         f"there.</span> {state_key(run)}"
     )
+    if max(len(stays_of(run)), len(metrics.contacts)) > MARKS:
+        caption += " What is narrower than a mark is drawn together."
     return f'<figure id="timeline">\n<div class="scroll">{svg}</div>\n<figcaption>{caption}</figcaption>\n</figure>\n'
 
 
@@ -129,8 +132,38 @@ def _mark(from_s: float, to_s: float, title: str, inner: str) -> str:
     return f'<g data-from="{from_s:.4f}" data-to="{to_s:.4f}"><title>{words}</title>{inner}</g>'
 
 
+class _Narrow(NamedTuple):
+    """Stays that are drawn as one."""
+
+    stays: list[Stay]
+
+    @property
+    def gravest(self) -> Stay:
+        """A stay from the first to the last, with the gravest state: the last one of `STATE_COLOURS`."""
+        order = list(STATE_COLOURS)
+        state = max((stay.state for stay in self.stays), key=lambda state: state in order and 1 + order.index(state))
+        return Stay(state, self.stays[0].start_s, self.stays[-1].end_s)
+
+
+def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[Stay | _Narrow]:
+    """Give the stays as they are drawn: of many, those that are narrower than a mark together."""
+    group: list[Stay] = []
+    for stay in stays:
+        is_narrow = len(stays) > MARKS and scale.x(stay.end_s) - scale.x(stay.start_s) < _NARROWEST
+        if group and (not is_narrow or scale.x(stay.end_s) - scale.x(group[0].start_s) > _NARROWEST):
+            yield _Narrow(group)
+            group = []
+        if is_narrow:
+            group.append(stay)
+        else:
+            yield stay
+    if group:
+        yield _Narrow(group)
+
+
 def _state_marks(run: Run, scale: _Scale) -> Iterator[str]:
-    for stay in stays_of(run):
+    for drawn in _drawn_stays(stays_of(run), scale):
+        stay = drawn.gravest if isinstance(drawn, _Narrow) else drawn
         left, right = scale.x(stay.start_s), scale.x(stay.end_s)
         name, width = stay.state.name, max(right - left, _NARROWEST)
         colour = STATE_COLOURS.get(stay.state, "paper")
@@ -139,15 +172,22 @@ def _state_marks(run: Run, scale: _Scale) -> Iterator[str]:
         if width > _LETTER * len(name) + 8:
             inner += f'<text x="{left + width / 2:.1f}" y="{_STATE_LANE + 16}" class="inside">{name}</text>'
         margin_s = 0.05 * (stay.end_s - stay.start_s) + 0.005
+        if isinstance(drawn, _Narrow):
+            name = f"{len(drawn.stays)} states"
         title = f"{name}, {number_text(stay.start_s, 2)} to {number_text(stay.end_s, 2, 's')}"
         yield _mark(stay.start_s - margin_s, stay.end_s + margin_s, title, inner)
 
 
 def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[str]:
-    labelled = -1e9
+    labelled = drawn = -1e9
+    is_crowded = len(metrics.contacts) > MARKS
     for contact in metrics.contacts:
         at_s = contact.at_s
         left = scale.x(at_s)
+        is_right = contact.detected_s is not None or not contact.is_armed
+        if is_crowded and is_right and left - drawn < _NARROWEST:
+            continue  # it would cover the one before
+        drawn = left
         end_s = contact.end_s if contact.end_s is not None else at_s
         width = max(scale.x(end_s) - left, 2.5)
         kind = "touch" if contact.detected_s is not None else "touch missed"

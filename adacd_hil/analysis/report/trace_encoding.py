@@ -34,15 +34,22 @@ class Packed(NamedTuple):
     text: str
 
 
-def noise_of(values: Vector) -> float:
-    """Estimate the standard deviation of a series' white noise by its third differences, which motion hardly has."""
-    differences = np.diff(values[np.isfinite(values)], 3)
+def noise_of(values: Vector, is_next: NDArray[np.bool_] | None = None) -> float:
+    """Estimate the standard deviation of a series' white noise by its third differences, which motion hardly has.
+
+    is_next (n,): samples that follow the one before at once; None: all do.
+    """
+    is_finite = np.isfinite(values)
+    differences = np.diff(values[is_finite], 3)
+    if is_next is not None:
+        follows = is_next[is_finite]
+        differences = differences[follows[3:] & follows[2:-1] & follows[1:-2]]
     return float(_NORMAL * np.median(np.abs(differences)) / _THIRD_DIFFERENCE) if differences.size else 0.0
 
 
-def step_of(values: Vector, finest: float) -> float:
-    """Choose a step: half the noise's standard deviation, but no finer than what anybody reads."""
-    return max(finest, noise_of(values) / STEPS_PER_SIGMA)
+def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
+    """Choose a step: half the noise's standard deviation, see `noise_of`, but no finer than what anybody reads."""
+    return max(finest, noise_of(values, is_next) / STEPS_PER_SIGMA)
 
 
 def pack(values: Vector, step: float) -> Packed:

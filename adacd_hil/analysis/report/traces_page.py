@@ -3,7 +3,10 @@
 from html import escape
 from typing import Any, Final
 
+import numpy as np
+
 from adacd_hil.analysis.metrics import Metrics
+from adacd_hil.analysis.report.long_run import CONTACTS
 from adacd_hil.analysis.report.page import data_block, json_block, wrap_section
 from adacd_hil.analysis.report.timeline import STATE_COLOURS, notices_of, state_key, stays_of
 from adacd_hil.analysis.report.trace_encoding import Packed, pack, step_of
@@ -22,13 +25,14 @@ def traces_section(run: Run, metrics: Metrics) -> str:
     panels = panels_of(run)
     if run.cycle.size < 2 or not panels:
         return ""
+    is_next = None if run.all_cycles is None else np.diff(run.cycle, prepend=run.cycle[0] - 2) == 1
     time = pack(run.time_s(), _TIME_STEP_S)
     blocks = [data_block("trace-t", time.text)]
     drawn = []
     for panel in panels:
         curves = []
         for number, trace in enumerate(panel.traces):
-            packed = pack(trace.values, step_of(trace.values, trace.finest))
+            packed = pack(trace.values, step_of(trace.values, trace.finest, is_next))
             name = f"trace-{panel.name}-{number}"
             blocks.append(data_block(name, packed.text))
             curves.append(
@@ -45,6 +49,7 @@ def traces_section(run: Run, metrics: Metrics) -> str:
         )
     plan = {
         "count": int(run.cycle.size),
+        "period": run.settings.bus.period_s,
         "time": _numbers("trace-t", time),
         "panels": drawn,
         "bands": [
@@ -60,7 +65,7 @@ def traces_section(run: Run, metrics: Metrics) -> str:
     }
     figures = "\n".join(map(_figure, panels))
     return wrap_section(
-        "Traces", _BAR, _key(run), figures, _note(panels, drawn), "".join(blocks), json_block("trace-plan", plan)
+        "Traces", _BAR, _key(run), figures, _note(run, panels, drawn), "".join(blocks), json_block("trace-plan", plan)
     )
 
 
@@ -96,14 +101,21 @@ def _figure(panel: Panel) -> str:
     )
 
 
-def _note(panels: tuple[Panel, ...], drawn: list[dict[str, Any]]) -> str:
-    """Say how finely the traces are written down."""
+def _note(run: Run, panels: tuple[Panel, ...], drawn: list[dict[str, Any]]) -> str:
+    """Say which cycles are there, and how finely the traces are written down."""
     steps = []
     for panel, plan in zip(panels, drawn, strict=True):
         coarsest = max(curve["step"] for curve in plan["curves"])
         steps.append(f"{panel.name} {coarsest:.2g} {panel.unit}".rstrip())
+    cycles = "Every cycle is here."
+    if run.all_cycles is not None:
+        cycles = (
+            f"Of {run.all_cycles} cycles {run.cycle.size} are here: of every {run.bucket} those in which a curve is "
+            f"smallest or largest, and all around the first {CONTACTS} contacts; <b>report --from --until</b> shows "
+            "every cycle of a stretch."
+        )
     return (
-        '<p class="note scripted">Every cycle is here. Where a pixel has more than one, the smallest and the largest '
+        f'<p class="note scripted">{cycles} Where a pixel has more than one, the smallest and the largest '
         "value are drawn. Values are rounded to half the standard deviation of their noise, but no finer than anybody "
         f"reads: {escape(', '.join(steps))}. A threshold above every residual is not drawn.</p>"
     )

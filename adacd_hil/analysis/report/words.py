@@ -1,11 +1,13 @@
 """The words of a report, for the terminal and the page: contacts, paper against measured, values with errors."""
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.page import NONE, number_text
+from adacd_hil.analysis.run import StretchOfRun
 
 
 def pair_text(values: Sequence[float] | None, digits: int) -> str:
@@ -51,14 +53,38 @@ def _contact_words(contact: Contact) -> tuple[str, ...]:
     )
 
 
-def contact_rows(metrics: Metrics) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Give head and rows of the list of contacts, where it is known with the delay of the paper's scheme beside."""
-    rows = [_contact_words(contact) for contact in metrics.contacts]
+def shown_contacts(metrics: Metrics, most: int) -> tuple[Contact, ...]:
+    """Choose the first contacts to be listed, and of the others as many that went wrong."""
+    later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
+    return (*metrics.contacts[:most], *later[:most])
+
+
+def went_wrong(contact: Contact) -> bool:
+    """Tell whether a contact was missed, or its link or direction is not the true one."""
+    is_missed = contact.is_armed and contact.detected_s is None
+    is_wrong_link = contact.link is not None and contact.link_detected not in (None, contact.link)
+    return is_missed or is_wrong_link or contact.direction_ok is False
+
+
+def left_out_text(metrics: Metrics, most: int) -> str:
+    """Say which contacts are not listed; nothing where all are."""
+    count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
+    if shown == count:
+        return ""
+    wrong = f" and {shown - most} more that went wrong" if shown > most else ""
+    return f"The first {most}{wrong} of {count} contacts; all are in contacts.csv."
+
+
+def contact_rows(metrics: Metrics, contacts: Sequence[Contact]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Give head and rows of a list of contacts, where it is known with the delay of the paper's scheme beside."""
+    rows = [_contact_words(contact) for contact in contacts]
     beside = None if metrics.evidence is None else metrics.evidence.paper_beside
     if beside is None or not beside.contacts:
         return _CONTACT_HEAD, rows
-    delays = [number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts]
-    return (*_CONTACT_HEAD, "paper's ms"), [(*row, delay) for row, delay in zip(rows, delays, strict=True)]
+    delays = {c.number: number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts}
+    return (*_CONTACT_HEAD, "paper's ms"), [
+        (*row, delays[contact.number]) for row, contact in zip(rows, contacts, strict=True)
+    ]
 
 
 def paper_head(metrics: Metrics) -> tuple[str, ...]:
@@ -73,6 +99,19 @@ def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
     if metrics.evidence is None:
         return [(row.quantity, row.paper, row.measured) for row in metrics.paper]
     return [(row.quantity, row.paper, row.beside or NONE, row.measured) for row in metrics.paper]
+
+
+def stretch_text(stretch: StretchOfRun) -> str:
+    """Say which stretch of a log was taken, and why it is not the one that was asked for."""
+    start_s, end_s = stretch.found
+    text = (
+        "the log"
+        + ("" if math.isinf(start_s) else f" from {start_s:.2f} s")
+        + ("" if math.isinf(end_s) else f" until {end_s:.2f} s")
+    )
+    if stretch.found == stretch.asked:
+        return text
+    return f"{text}, widened so that no contact and no adaptation is cut"
 
 
 def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:

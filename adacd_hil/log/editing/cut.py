@@ -18,16 +18,8 @@ from adacd_hil.log.editing.log_copy import LogCopy
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import ENDING_KEY, RUN_METADATA
 from adacd_hil.log.reader import LoggedContact, read_log
+from adacd_hil.log.stretch import Stretch
 from adacd_hil.log.summary import CUT, DROPPED_KEY, count_frames
-
-_CENTURY_S = 3.2e9
-
-
-class Stretch(NamedTuple):
-    """What is cut out: seconds since the start of the log."""
-
-    start_s: float
-    end_s: float
 
 
 class Cut(NamedTuple):
@@ -124,9 +116,5 @@ def _times(contents: Contents, is_ours: bool) -> NDArray[np.int64]:
 
 
 def _is_within(times: NDArray[np.int64], start_ns: int, stretch: Stretch) -> NDArray[np.bool_]:
-    first_ns, end_ns = (start_ns + _nanoseconds(bound_s) for bound_s in stretch)
+    first_ns, end_ns = stretch.bounds_ns(start_ns)
     return np.asarray((times >= first_ns) & (times < end_ns))
-
-
-def _nanoseconds(seconds: float) -> int:
-    return round(min(max(seconds, -_CENTURY_S), _CENTURY_S) * 1e9)

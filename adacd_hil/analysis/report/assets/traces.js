@@ -300,7 +300,7 @@
   }
 
   function show(from, to) {
-    const shortest = (SHORTEST_ROWS * (end - start)) / Math.max(count - 1, SHORTEST_ROWS);
+    const shortest = SHORTEST_ROWS * plan.period;
     const span = Math.min(Math.max(to - from, shortest), end - start);
     const middle = Math.min(Math.max(0.5 * (from + to), start + 0.5 * span), end - 0.5 * span);
     view = [middle - 0.5 * span, middle + 0.5 * span];

@@ -1,0 +1,201 @@
+"""When things begin and end in a run: what one reading of its log from front to back finds, in bounded memory.
+
+Of its cycles an outline has the first and the last of every piece, those in which the state changes with their
+neighbours, those in which the paper's scheme is armed or disarmed, and those in which a true contact begins. That is
+all that sections, detections and contacts are made of.
+"""
+
+import dataclasses
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.report.scheme_rows import SchemeRows
+from adacd_hil.analysis.report.truth_rows import TruthRows, host_cycles, host_truth
+from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.timing import Cycles
+from adacd_hil.log.reader import LoggedEvent, Series, contacts_of
+from adacd_hil.log.stream import LogStream, Piece
+from adacd_hil.records import ContactReport, Request, SchemeState
+
+_BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
+BUSY: Final = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.REACT, SchemeState.STOPPED)
+"""States that a stretch does not cut."""
+
+
+class Facts:
+    """What a reading learns of a run besides its rows."""
+
+    def __init__(self) -> None:
+        self.cycles = 0
+        self.reports: list[ContactReport] = []
+        self.events: list[LoggedEvent] = []
+        self.finish_cycle: int | None = None
+        """In which the user asked to finish."""
+        self.motion_start_ns: int | None = None
+        """The first cycle in ADAPT."""
+        self.first_ns: int | None = None
+        self._begins: list[int] = []
+        self._was_beginning = False
+
+    @property
+    def begins(self) -> Cycles:
+        """First cycle of each attempt so far; of one that began before the log, 0."""
+        return np.array(self._begins or [0], np.int64)
+
+    @property
+    def zero_ns(self) -> int:
+        """Motion start, else the first cycle."""
+        return next((t_ns for t_ns in (self.motion_start_ns, self.first_ns) if t_ns is not None), 0)
+
+    def add(self, stream: LogStream, piece: Piece) -> None:
+        """Take in the next piece."""
+        self.reports += [entry.report for entry in contacts_of(piece.series["/contact"])]
+        self.events += stream.events(piece)
+        scheme = piece.series["/scheme"]
+        if not len(scheme):
+            return
+        records = scheme.records
+        self._note_begins(records["cycle"], np.isin(records["state"], _BEGINNING))
+        if self.first_ns is None:
+            self.first_ns = int(scheme.t_ns[0])
+        adapting = np.flatnonzero(records["state"] == SchemeState.ADAPT)
+        if self.motion_start_ns is None and adapting.size:
+            self.motion_start_ns = int(scheme.t_ns[adapting[0]])
+        asked = np.flatnonzero(records["request"] == Request.FINISH)
+        if self.finish_cycle is None and asked.size:
+            self.finish_cycle = int(records["cycle"][asked[0]])
+        self.cycles += len(scheme)
+
+    def _note_begins(self, cycle: NDArray[np.uint64], is_beginning: NDArray[np.bool_]) -> None:
+        if self.first_ns is None and not is_beginning[0]:
+            self._begins.append(0)
+        before = np.concatenate(([self._was_beginning], is_beginning[:-1]))
+        self._begins += cycle[is_beginning & ~before].astype(np.int64).tolist()
+        self._was_beginning = bool(is_beginning[-1])
+
+    def apply(self, run: Run) -> Run:
+        """Give a run that knows them."""
+        return dataclasses.replace(
+            run,
+            reports=tuple(self.reports),
+            events=tuple(self.events),
+            finish_cycle=self.finish_cycle,
+            motion_start_ns=run.motion_start_ns if run.motion_start_ns is not None else self.zero_ns,
+        )
+
+
+class TruthClock:
+    """Finds the host's time of each row of the truth, as the log is read: between the cycles that it lies between."""
+
+    def __init__(self, truth: TruthRows) -> None:
+        self.t_ns = np.zeros(len(truth.cycle), np.int64)
+        self._truth = truth
+        self._pending = np.arange(len(truth.cycle))
+        self._before: tuple[int, int] | None = None  # cycle and time of the last row before the piece
+
+    def add(self, scheme: Series, begins: Cycles) -> tuple[Cycles, Cycles]:
+        """Take in a piece; return the rows of the truth whose times it tells, and their cycles.
+
+        begins: first cycle of each attempt so far.
+        """
+        cycle, t_ns = scheme.records["cycle"].astype(np.int64), scheme.t_ns
+        pending = self._pending
+        known = host_cycles(self._truth.cycle[pending], self._truth.attempt[pending], begins)
+        is_told = (self._truth.attempt[pending] < len(begins)) & (known <= cycle[-1])
+        rows, cycles = pending[is_told], known[is_told]
+        self.t_ns[rows] = self._times_ns(cycles, cycle, t_ns)
+        self._pending = pending[~is_told]
+        self._before = int(cycle[-1]), int(t_ns[-1])
+        return rows, cycles
+
+    def _times_ns(self, wanted: Cycles, cycle: Cycles, t_ns: Cycles) -> Cycles:
+        if self._before is not None:
+            cycle, t_ns = np.append(self._before[0], cycle), np.append(self._before[1], t_ns)
+        since_ns = np.interp(wanted, cycle, (t_ns - t_ns[0]).astype(np.float64))
+        return np.asarray(t_ns[0] + np.rint(since_ns).astype(np.int64))
+
+    def end(self) -> None:
+        """Let what comes after the last cycle have its time."""
+        if self._before is not None:
+            self.t_ns[self._pending] = self._before[1]
+        self._pending = self._pending[:0]
+
+
+class Outline:
+    """One reading of a log, piece by piece."""
+
+    def __init__(self, shell: Run, empty: Series, truth: TruthRows | None) -> None:
+        """`shell`: what is known of the run before, a truth on the host's cycles included; its arrays are empty.
+
+        empty: a piece of /scheme without records; truth: whose place on the host's cycles is to be found.
+        """
+        self.facts = Facts()
+        self.indexes: list[NDArray[np.int64]] = []
+        """Which of the cycles that were read the rows are, from 0."""
+        self._shell = shell
+        self._rows = SchemeRows(empty)
+        self._truth = truth
+        self._clock = None if truth is None else TruthClock(truth)
+        index = next((known.contact_index for known in (truth, shell.truth) if known is not None), np.empty(0))
+        self._is_onset = (index >= 0.0) & (np.concatenate(([-1.0], index))[:-1] != index)
+        self._last: tuple[int, bool] | None = None  # state of the row before, and whether the paper's scheme was armed
+        self._busy_ns = 0  # when something was last going on
+
+    def add(self, stream: LogStream, piece: Piece) -> None:
+        """Take in the next piece."""
+        before = self.facts.cycles
+        self.facts.add(stream, piece)
+        scheme = piece.series["/scheme"]
+        if not len(scheme):
+            return
+        rows = np.unique(np.concatenate((self._edges(scheme), self._onset_rows(scheme))))
+        rows = rows[(rows >= 0) & (rows < len(scheme))]
+        self._rows.add(scheme, rows)
+        self.indexes.append(before + rows)
+        busy = np.flatnonzero(np.isin(scheme.records["state"], BUSY))
+        if busy.size:
+            self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
+
+    def is_calm_since(self, t_ns: int) -> bool:
+        """Whether nothing has been going on since a time."""
+        return self._busy_ns < t_ns
+
+    def _edges(self, scheme: Series) -> NDArray[np.int64]:
+        """List the rows at which something changes."""
+        state = scheme.records["state"].astype(np.int64)
+        is_armed = np.zeros(len(state), np.bool_)
+        if "paper_is_armed" in scheme.fields:
+            is_armed = scheme.records["paper_is_armed"] > 0.5
+        last_state, was_armed = self._last or (int(state[0]), bool(is_armed[0]))
+        self._last = int(state[-1]), bool(is_armed[-1])
+        changes = np.flatnonzero(np.diff(state, prepend=last_state))
+        switches = np.flatnonzero(np.diff(is_armed.astype(np.int8), prepend=np.int8(was_armed)))
+        ends = np.array([0, len(state) - 1])
+        return np.concatenate((ends, changes - 1, changes, changes + 1, switches - 1, switches))
+
+    def _onset_rows(self, scheme: Series) -> NDArray[np.int64]:
+        """List the rows in which true contacts begin, and the ones before them."""
+        cycle = scheme.records["cycle"].astype(np.int64)
+        if self._clock is not None:
+            rows, cycles = self._clock.add(scheme, self.facts.begins)
+            onsets = cycles[self._is_onset[rows]]
+            if rows.size:
+                self._busy_ns = max(self._busy_ns, int(self._clock.t_ns[rows].max()))
+        elif self._shell.truth is not None:
+            onsets = self._shell.truth.cycle[self._is_onset]
+            onsets = onsets[(onsets >= cycle[0]) & (onsets <= cycle[-1])]
+        else:
+            return np.empty(0, np.int64)
+        found = np.searchsorted(cycle, onsets)
+        return np.concatenate((found - 1, found))
+
+    def done(self) -> Run:
+        """Give the outline of the run."""
+        run = self.facts.apply(self._rows.fill(self._shell))
+        if self._truth is None or self._clock is None:
+            return run
+        self._clock.end()
+        time_s = np.asarray((self._clock.t_ns - run.zero_ns) * 1e-9, np.float64)
+        return dataclasses.replace(run, truth=host_truth(self._truth, self.facts.begins, time_s))

@@ -1,0 +1,239 @@
+"""What a report needs of the emulator's log: all of its cycles, or of a long one those of contacts.
+
+Of a contact the first cycles and the last second are kept as they are. In between, of every `_BUCKET` cycles those
+with the smallest and largest torque of each joint and the largest force; that many contacts of many seconds fit in
+memory, and what is asked of them (peaks, the filtered torque at their end) stays what it was.
+"""
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.report.thinning import extreme_rows
+from adacd_hil.analysis.run import Truth
+from adacd_hil.analysis.timing import Cycles
+from adacd_hil.device.arm import SYNC_OVERFLOW
+from adacd_hil.log.reader import Series
+from adacd_hil.log.stream import LogStream
+from adacd_hil.records import PARAMETER_NAMES, Vector
+
+_BEGINNING: Final = (10_000, 1_000)
+"""Cycles kept as they are: of a contact at first, and of one once `_PLENTY` rows are kept."""
+_PLENTY: Final = 1_000_000
+_ENDING: Final = 1_000
+_BUCKET: Final = 100
+_HELD: Final = 30_000
+"""Rows of one contact that wait at most until those in the middle are chosen."""
+
+
+class TruthRows(NamedTuple):
+    """Kept rows of the truth (m,), on the emulator's own cycles; attempt (m,): of the run, from 0.
+
+    model_attempt, model_cycle (k,): from when on payload and parameters are as they are. metadata: of the log; problem:
+    what it lacks; is_complete: it is whole and nothing was dropped on the way to it.
+    """
+
+    attempt: Cycles
+    cycle: Cycles
+    tau_ext: Vector
+    contact_link: Vector
+    contact_index: Vector
+    force_N: Vector | None
+    model_attempt: Cycles
+    model_cycle: Cycles
+    payload_kg: Vector
+    theta: Vector
+    metadata: Mapping[str, str]
+    problem: str
+    is_complete: bool
+
+
+_ROW: Final = np.dtype(
+    [
+        ("attempt", "<i8"), ("cycle", "<i8"), ("tau_ext", "<f8", (2,)), ("contact_link", "<f8"),
+        ("contact_index", "<f8"), ("contact_force", "<f8"),
+    ]
+)  # fmt: skip
+_MODEL: Final = ("payload", "theta")
+
+
+def read_truth(path: Path, most_rows: int) -> TruthRows:
+    """Read the emulator's log; of one with more than `most_rows` cycles the contacts. Raises LogError."""
+    stream = LogStream(path, ("/truth",))
+    rows = _Gathering(most_rows)
+    for piece in stream:
+        rows.add(piece.series["/truth"])
+    return rows.done(stream)
+
+
+class _Gathering:
+    """Takes in the records of /truth, piece by piece."""
+
+    def __init__(self, most_rows: int) -> None:
+        self.count = 0
+        self._most_rows = most_rows
+        self._has_force = True
+        self._is_long = False
+        self._kept: list[NDArray[Any]] = []
+        self._kept_rows = 0
+        self._contact = _OneContact(_BEGINNING[0])
+        self._last: NDArray[Any] | None = None  # the row before
+        self._models: list[tuple[NDArray[Any], ...]] = []  # attempt, cycle, payload, theta
+        self._model: tuple[NDArray[Any], ...] | None = None
+
+    def add(self, truth: Series) -> None:
+        """Take in a piece."""
+        if not len(truth):
+            return
+        rows = self._rows(truth)
+        self._add_models(truth, rows)
+        self.count += len(rows)
+        if not self._is_long and self.count > self._most_rows:
+            self._is_long = True
+            held, self._kept = [*self._kept, rows], []
+            for part in held:
+                self._add_contacts(part)
+        elif self._is_long:
+            self._add_contacts(rows)
+        else:
+            self._kept.append(rows)
+        self._last = rows[-1:]
+
+    def _rows(self, truth: Series) -> NDArray[Any]:
+        records, rows = truth.records, np.zeros(len(truth), _ROW)
+        for name in _ROW.names or ():
+            if name in truth.fields:
+                rows[name] = records[name].reshape(rows[name].shape)
+        self._has_force = self._has_force and "contact_force" in truth.fields
+        before = rows[:1] if self._last is None else self._last
+        is_anew = np.diff(rows["cycle"], prepend=before["cycle"]) < 0
+        rows["attempt"] = before["attempt"] + np.cumsum(is_anew)
+        return rows
+
+    def _add_models(self, truth: Series, rows: NDArray[Any]) -> None:
+        """Keep the rows from which on payload or parameters are others, and the first of each attempt."""
+        columns = (rows["attempt"], *(truth.records[name].reshape(len(rows), -1) for name in _MODEL))
+        changes = np.zeros(len(rows), np.bool_)
+        for place, column in enumerate(columns):
+            before = column[:1] if self._model is None else self._model[place]
+            differs = np.concatenate((before, column[:-1])) != column
+            changes |= differs if differs.ndim == 1 else differs.any(axis=1)
+        changes[0] |= self._model is None
+        attempt, payload, theta = columns
+        self._models.append((attempt[changes], rows["cycle"][changes], payload[changes], theta[changes]))
+        self._model = tuple(column[-1:].copy() for column in columns)
+
+    def _add_contacts(self, rows: NDArray[Any]) -> None:
+        """Keep of these rows what belongs to contacts, and the row after each."""
+        key = np.stack((rows["attempt"].astype(np.float64), rows["contact_index"]), axis=1)
+        edges = np.flatnonzero((key[1:] != key[:-1]).any(axis=1)) + 1
+        bounds = [0, *edges.tolist(), len(rows)]
+        for start, end in pairwise(bounds):
+            spell = rows[start:end]
+            if self._contact.is_another(spell[0]):
+                self._close(spell[:1])
+            if spell["contact_index"][0] >= 0.0:
+                self._contact.add(spell)
+
+    def _close(self, after: NDArray[Any]) -> None:
+        """End the contact in progress with the row after it, unless that is the next contact's own."""
+        done = self._contact.rows()
+        if after["contact_index"][0] < 0.0:
+            done = np.concatenate((done, after))
+        self._kept.append(done)
+        self._kept_rows += len(done)
+        self._contact = _OneContact(_BEGINNING[self._kept_rows > _PLENTY])
+
+    def done(self, stream: LogStream) -> TruthRows:
+        """Give what was kept."""
+        if self._is_long:
+            self._kept.append(self._contact.rows())
+        rows = np.concatenate([np.zeros(0, _ROW), *self._kept])
+        nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
+        models = zip(nothing, *self._models, strict=True)
+        attempt, cycle, payload, theta = (np.concatenate(column) for column in models)
+        return TruthRows(
+            attempt=rows["attempt"].copy(),
+            cycle=rows["cycle"].copy(),
+            tau_ext=rows["tau_ext"].copy(),
+            contact_link=rows["contact_link"].copy(),
+            contact_index=rows["contact_index"].copy(),
+            force_N=rows["contact_force"].copy() if self._has_force else None,
+            model_attempt=attempt,
+            model_cycle=cycle,
+            payload_kg=payload[:, 0],
+            theta=theta,
+            metadata=stream.metadata,
+            problem=stream.problem,
+            is_complete=stream.is_complete,
+        )
+
+
+class _OneContact:
+    """The rows of the contact in progress, in bounded memory."""
+
+    def __init__(self, beginning: int) -> None:
+        self._beginning = beginning  # rows that are kept as they are
+        self._key: tuple[int, float] | None = None
+        self._chosen: list[NDArray[Any]] = []
+        self._count = 0
+        self._waiting = np.zeros(0, _ROW)
+
+    def is_another(self, row: NDArray[Any]) -> bool:
+        """Whether there is a contact in progress that a row is not of."""
+        return self._key is not None and self._key != (int(row["attempt"]), float(row["contact_index"]))
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Take in rows of it."""
+        self._key = (int(rows["attempt"][0]), float(rows["contact_index"][0]))
+        room = max(self._beginning - self._count, 0)
+        self._chosen.append(rows[:room])
+        self._count += len(rows)
+        self._waiting = np.concatenate((self._waiting, rows[room:]))
+        if len(self._waiting) > _HELD:
+            self._choose()
+
+    def _choose(self) -> None:
+        """Choose among the waiting rows but the last ones."""
+        middle, self._waiting = self._waiting[:-_ENDING], self._waiting[-_ENDING:].copy()
+        if len(middle):
+            series = (middle["tau_ext"][:, 0], middle["tau_ext"][:, 1], middle["contact_force"])
+            self._chosen.append(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
+
+    def rows(self) -> NDArray[Any]:
+        """Give the rows that are kept."""
+        self._choose()
+        return np.concatenate([*self._chosen, self._waiting])
+
+
+def host_truth(rows: TruthRows, begins: Cycles, time_s: Vector | None) -> Truth | None:
+    """Give the truth on the host's cycles; None where the emulator never cycled.
+
+    begins: first cycle of each attempt of the run; time_s: of the rows (m,).
+
+    The emulator counts by the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the
+    counter that the host had counted before.
+    """
+    if not rows.model_cycle.size:
+        return None
+    return Truth(
+        cycle=host_cycles(rows.cycle, rows.attempt, begins),
+        tau_ext=rows.tau_ext,
+        contact_link=rows.contact_link,
+        contact_index=rows.contact_index,
+        payload_kg=rows.payload_kg,
+        theta=rows.theta,
+        force_N=rows.force_N,
+        time_s=time_s,
+        model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
+    )
+
+
+def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
+    """Turn the emulator's cycles (m,) of attempts (m,) into the host's."""
+    shift = begins - begins % SYNC_OVERFLOW
+    return np.asarray(cycle + shift[np.minimum(attempt, len(shift) - 1)])

@@ -1,0 +1,44 @@
+"""A stretch of a log: from when until when, s since the beginning of the log, which is its first message."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from adacd_hil.log.stream import LogStream
+
+_CENTURY_S = 3.2e9
+
+
+class Stretch(NamedTuple):
+    """[start_s, end_s), s since the beginning of the log; infinite where it is not bounded."""
+
+    start_s: float = float("-inf")
+    end_s: float = float("inf")
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it bounds nothing."""
+        return self == Stretch()
+
+    def bounds_ns(self, start_ns: int) -> tuple[int, int]:
+        """Give its bounds on a clock on which the log begins at `start_ns`."""
+        first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
+        return first_ns, end_ns
+
+
+WHOLE = Stretch()
+
+
+def start_of_log(path: Path) -> int | None:
+    """Return the time of the first message of a log of ours, ns of the run's clock; None without one. Raises LogError.
+
+    The host's first frames come before its first decisions.
+    """
+    stream = LogStream(path, cycles_per_piece=1)
+    for piece in stream:
+        times = [event.t_ns for event in stream.events(piece)[:1]]
+        there = [series.records for series in piece.series.values() if len(series)]
+        times += [int(records["publish_time"][0]) - stream.epoch_ns for records in there]
+        times += piece.frames["cycle_t_ns"][:1].tolist()
+        if times:
+            return min(times)
+    return None
