@@ -20,8 +20,8 @@ from adacd_hil.analysis.histogram import (
     percentiles,
 )
 
-EXACT: Final = 600_000
-"""Values that are kept as they are: ten minutes at 1 kHz."""
+EXACT: Final = 500_000
+"""Values that are kept as they are: eight minutes at 1 kHz."""
 _BINS_PER_OCTAVE: Final = 12
 """Bits of the mantissa that tell two bins apart."""
 _SHIFT: Final = 52 - _BINS_PER_OCTAVE

@@ -78,11 +78,15 @@ class Motion:
 
 
 class StretchOfRun(NamedTuple):
-    """A stretch of a log: as asked for, as found, widened so that it cuts nothing, and the contacts before it."""
+    """A stretch of a log: as asked for, as found, widened so that it cuts nothing, and the contacts before it.
+
+    motion_start_s: s since the beginning of the log.
+    """
 
     asked: Stretch
     found: Stretch
     contacts_before: int
+    motion_start_s: float
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ def give_verdict(
 ) -> str:
     """Say in one sentence how the run went."""
     done = "identified" if evidence is None else "certified"
-    text = f"{_contacts_text(run, contacts, false_s, missed)}; {_identified_text(adaptation_s, payload_kg, done)}"
+    text = f"{_contacts_text(run, contacts, false_s, missed)}; {identified_text(adaptation_s, payload_kg, done)}"
     if evidence is not None and evidence.paper_beside is not None:
         text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     if fault is not None:
@@ -74,7 +74,7 @@ def _number(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def _identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], done: str) -> str:
+def identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], done: str) -> str:
     """Say how long the model took to be `done`, identified or certified."""
     if not adaptation_s:
         return "the arm never moved to adapt"

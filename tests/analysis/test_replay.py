@@ -10,7 +10,7 @@ from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records,
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.replay.replay import Replay, contacts_beside, replay, replay_many, replay_source
 from adacd_hil.analysis.replay.what_if import apply_settings
-from adacd_hil.analysis.report.reading import RUN_TOPICS, run_from_log
+from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
@@ -130,8 +130,7 @@ def test_a_cut_log_is_compared_as_far_as_it_goes(log: Path, whole: Replay, tmp_p
 
 
 def test_what_a_replay_says_of_contacts_is_what_the_report_says(log: Path, whole: Replay) -> None:
-    truth = read_log(log.with_name("truth.mcap"), ("/truth",))
-    metrics = evaluate(run_from_log(read_log(log, RUN_TOPICS), truth))
+    metrics = evaluate(read_run(log, log.with_name("truth.mcap")).run)
     found = whole
     assert found.true_contacts is not None
     assert [each.delay_ms for each in found.true_contacts] == pytest.approx([c.delay_ms for c in metrics.contacts])

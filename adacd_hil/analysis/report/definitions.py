@@ -25,11 +25,19 @@ _CERTIFIED_DEFINITIONS: Final = (
 )
 
 
+def _in_the_log(run: Run) -> str:
+    """Say where motion start is in the log."""
+    if run.log_start_ns is None:
+        return ""
+    since_s = (run.zero_ns - run.log_start_ns) * 1e-9
+    return f"; it is {since_s:.3f} s after the beginning of the log, from which --from and --until count"
+
+
 def definitions(run: Run) -> str:
     """Write the section."""
     settling_s = 10.0 / run.a_rad_s
     entries: tuple[tuple[str, str], ...] = (
-        ("Times", "count from motion start, the first cycle of the first adaptation."),
+        ("Times", f"count from motion start, the first cycle of the first adaptation{_in_the_log(run)}."),
         (
             "Frozen residual",
             "largest estimated external torque while detection is armed and nobody touches the arm: outside "

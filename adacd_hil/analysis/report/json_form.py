@@ -10,13 +10,16 @@ import numpy as np
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.reading import Source
+from adacd_hil.analysis.run import StretchOfRun
 
 SCHEMA: Final = 3
 """Version of report.json; goes up when a key changes its meaning or disappears."""
 _DIGITS: Final = 6
 
 
-def report_json(metrics: Metrics, metadata: Mapping[str, str], source: Source) -> dict[str, Any]:
+def report_json(
+    metrics: Metrics, metadata: Mapping[str, str], source: Source, stretch: StretchOfRun | None = None
+) -> dict[str, Any]:
     """Give the content of report.json; the keys are described in `adacd_hil.analysis.metrics`."""
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
     plain: dict[str, Any] = _plain(
@@ -50,11 +53,23 @@ def report_json(metrics: Metrics, metadata: Mapping[str, str], source: Source) -
                 "is_complete": source.is_complete,
                 "problem": source.problem,
             },
+            "stretch": None if stretch is None else _stretch_json(stretch),
             "paper": [dataclasses.asdict(row) for row in metrics.paper],
             "run": dict(sorted(metadata.items())),
         }
     )
     return plain
+
+
+def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
+    """Give a stretch, s since the beginning of the log; null where it is not bounded."""
+    return {
+        "from_s": stretch.found.start_s,
+        "until_s": stretch.found.end_s,
+        "asked_from_s": stretch.asked.start_s,
+        "asked_until_s": stretch.asked.end_s,
+        "motion_start_s": stretch.motion_start_s,
+    }
 
 
 def _evidence_json(evidence: Evidence) -> dict[str, Any]:

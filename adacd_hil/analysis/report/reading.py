@@ -33,8 +33,8 @@ from adacd_hil.records import JOINTS
 
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact", "/events")
 """Of a run's log, what a report reads."""
-FULL_CYCLES: Final = 600_000
-"""Cycles that are kept and drawn one by one: ten minutes at 1 kHz; some 0.7 kB each."""
+FULL_CYCLES: Final = 500_000
+"""Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 0.7 kB each."""
 _PROGRESS_CYCLES: Final = 1_000_000
 
 Progress = Callable[[str], None]
@@ -211,7 +211,9 @@ class _Reading:
             self._shell,
             motion_start_ns=zero_ns,
             truth=_truth_within(run.truth, bounds_s),
-            stretch=StretchOfRun(stretch, found, sum(at_s < bounds_s[0] for at_s in begun_s)),
+            stretch=StretchOfRun(
+                stretch, found, sum(at_s < bounds_s[0] for at_s in begun_s), (zero_ns - start_ns) * 1e-9
+            ),
         )
         whole = self.read_whole(most_cycles, bounds_ns, shell)
         if whole is None:

@@ -27,7 +27,7 @@ from adacd_hil.analysis.report.words import (
     paper_head,
     shown_contacts,
 )
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.run import Run, StretchOfRun
 from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import WHOLE, Stretch
@@ -48,6 +48,7 @@ class Report:
     html_path: Path
     json_path: Path
     figure_paths: tuple[Path, ...]
+    stretch: StretchOfRun | None = None
 
     @property
     def is_complete(self) -> bool:
@@ -56,7 +57,7 @@ class Report:
 
     def as_json(self) -> dict[str, Any]:
         """Give the content of report.json."""
-        return report_json(self.metrics, self.metadata, self.source)
+        return report_json(self.metrics, self.metadata, self.source, self.stretch)
 
     def as_text(self) -> str:
         """Give the verdict, what the paper had, the contacts and where the report is, for a terminal."""
@@ -110,6 +111,7 @@ def write_run_report(
         html_path=out_dir / HTML_NAME,
         json_path=out_dir / JSON_NAME,
         figure_paths=tuple(out_dir / f"{name}.png" for name in pngs),
+        stretch=run.stretch,
     )
     table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
     texts = {

@@ -35,6 +35,8 @@ _LETTER: Final = 6.4
 _NARROWEST: Final = 1.5
 _APART: Final = 15.0
 """Numbers of contacts that are nearer than this would overlap."""
+_DIGIT: Final = 8.0
+"""Width of a digit of a number, and room beside it."""
 _TICKS: Final = 12
 _MOST_NOTICES: Final = 300
 
@@ -106,10 +108,11 @@ def timeline(run: Run, metrics: Metrics) -> str:
     caption = (
         "<b>Timeline.</b> States, contacts by number (a bar as long as the touch, hollow if it was not detected), and "
         'below them warnings, faults and false alarms.<span class="scripted"> Choose any of them to see the traces '
-        f"there.</span> {state_key(run)}"
+        "there.</span>"
     )
     if max(len(stays_of(run)), len(metrics.contacts)) > MARKS:
         caption += " What is narrower than a mark is drawn together."
+    caption += f" {state_key(run)}"
     return f'<figure id="timeline">\n<div class="scroll">{svg}</div>\n<figcaption>{caption}</figcaption>\n</figure>\n'
 
 
@@ -192,7 +195,7 @@ def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[str]:
         width = max(scale.x(end_s) - left, 2.5)
         kind = "touch" if contact.detected_s is not None else "touch missed"
         inner = f'<rect x="{left:.1f}" y="{_CONTACT_LANE + 15}" width="{width:.1f}" height="8" class="{kind}"/>'
-        if left - labelled >= _APART:
+        if left - labelled >= max(_APART, _DIGIT * len(str(contact.number))):
             labelled = left
             inner += f'<text x="{left + width / 2:.1f}" y="{_CONTACT_LANE + 11}" class="number">{contact.number}</text>'
         yield _mark(at_s - 0.15, max(at_s + 0.6, end_s + 0.15), _contact_title(contact, at_s), inner)

@@ -1,0 +1,81 @@
+"""Percentiles of values that come piece by piece."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adacd_hil.analysis.distribution import Distribution
+from adacd_hil.analysis.histogram import low_percentiles, percentiles
+
+FINEST = 2.0**-12
+
+
+def distribution_of(values, exact, pieces=7):
+    found = Distribution(exact)
+    for part in np.array_split(values, pieces):
+        found.add(part)
+    return found
+
+
+def values_of(seed, count):
+    """Give values of all sizes and both signs, whole ones too."""
+    random = np.random.default_rng(seed)
+    sizes = 10.0 ** random.uniform(-6.0, 9.0, count) * random.choice([-1.0, 1.0], count)
+    return np.where(random.random(count) < 0.5, sizes, random.integers(-4096, 4097, count))
+
+
+VALUES = st.builds(values_of, st.integers(0, 2**32), st.integers(1, 300))
+
+
+@settings(max_examples=60, deadline=None)
+@given(VALUES)
+def test_few_values_have_the_percentiles_that_they_would_have_together(values):
+    found = distribution_of(values, exact=values.size)
+    assert found.percentiles() == percentiles(values)
+    assert found.low_percentiles() == low_percentiles(values)
+    assert found.median() == np.median(values)
+
+
+@settings(max_examples=60, deadline=None)
+@given(VALUES)
+def test_many_values_have_theirs_within_a_bin_toward_zero(values):
+    found = distribution_of(values, exact=values.size - 1)
+    for ours, true in (
+        (found.percentiles(), percentiles(values)),
+        (found.low_percentiles(), low_percentiles(values)),
+    ):
+        for name, value in true.items():
+            low, high = sorted((value, value * (1.0 - FINEST)))
+            assert low <= ours[name] <= high
+    middle = np.sort(np.abs(values))
+    assert abs(found.median() - np.median(values)) <= FINEST * float(middle[-1])
+
+
+@settings(max_examples=60, deadline=None)
+@given(VALUES)
+def test_the_largest_and_the_smallest_of_many_values_are_exact(values):
+    found = distribution_of(values, exact=0)
+    assert (found.percentiles()["max"], found.low_percentiles()["min"]) == (values.max(), values.min())
+
+
+def test_whole_numbers_stay_whole():
+    found = distribution_of(np.repeat([7.0, 4095.0, -3.0], 100), exact=10)
+    assert (found.median(), found.low_percentiles()["p1"], found.percentiles()["p99"]) == (7.0, -3.0, 4095.0)
+
+
+def test_values_next_to_zero_count_as_zero_and_huge_ones_as_infinite():
+    found = distribution_of(np.array([1e-12, -1e-12, 1e-12, 1e300, np.inf, 1e300, 1e300]), exact=0)
+    assert (found.low_percentiles()["p1"], found.median()) == (-1e-12, np.inf)
+
+
+def test_what_is_not_a_number_is_left_out():
+    found = distribution_of(np.array([1.0, np.nan, 3.0]), exact=100)
+    assert (found.count, found.median()) == (2, 2.0)
+
+
+@pytest.mark.parametrize("exact", [0, 100])
+def test_no_value_has_no_percentile(exact):
+    found = Distribution(exact)
+    found.add(np.empty(0))
+    assert (found.percentiles(), found.low_percentiles(), np.isnan(found.median())) == ({}, {}, True)

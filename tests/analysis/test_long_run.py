@@ -1,0 +1,366 @@
+"""Runs that are too long to be kept: what a report says of them is what it would say of all of their cycles."""
+
+import json
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hand_made_run import make_certified_run, make_run, react, touch
+from test_run_report import record_truth
+
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.report import long_run, truth_rows
+from adacd_hil.analysis.report.json_form import report_json
+from adacd_hil.analysis.report.outline import Facts, TruthClock
+from adacd_hil.analysis.report.reading import read_run
+from adacd_hil.analysis.report.report import write_run_report
+from adacd_hil.analysis.report.timeline import timeline
+from adacd_hil.analysis.report.truth_rows import TruthRows, read_truth
+from adacd_hil.analysis.report.words import left_out_text, shown_contacts
+from adacd_hil.analysis.verdict import identified_text
+from adacd_hil.cli.main import cli
+from adacd_hil.config import to_toml
+from adacd_hil.log import stream
+from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import Series
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.stretch import Stretch, start_of_log
+from adacd_hil.records import CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
+from adacd_hil.scheme.selection import layout_of
+
+PIECE = 333
+
+
+def table_of(read):
+    return report_json(evaluate(read.run, read.gathered), read.run.metadata, read.source)
+
+
+@pytest.fixture
+def few_kept(monkeypatch):
+    """Read in short pieces, and keep next to nothing."""
+    for name, value in (("BUCKETS", 4), ("TIME_BUCKETS", 4), ("CONTACTS", 0), ("ADAPTATIONS", 0), ("_NOISE_CYCLES", 4)):
+        monkeypatch.setattr(long_run, name, value)
+    monkeypatch.setattr(stream.LogStream.__init__, "__defaults__", (None, PIECE))
+
+
+def record_certified(path, run):
+    """Write a log with the topics of a hand-made run of the certified scheme."""
+    slices = layout_of(run.settings).slices
+    columns = {
+        "tau_ext_hat": run.tau_ext_hat,
+        "tau_ext_hat_cad": run.tau_ext_hat_cad,
+        "theta_hat": run.theta_hat,
+        "threshold": run.threshold,
+        "tau_ext_bank": run.certified.tau_ext,
+        "threshold_bank": run.certified.threshold,
+        "theta_further": run.certified.theta_further,
+        "theta_std": run.certified.theta_std,
+        "promotions": run.certified.promotions,
+        "paper_is_armed": run.beside.is_armed,
+        "paper_tau_ext_hat": run.beside.tau_ext_hat,
+        "paper_threshold": run.beside.threshold,
+    }
+    blocks = np.zeros((len(run.cycle), layout_of(run.settings).size))
+    for name, column in columns.items():
+        blocks[:, slices[name]] = column.reshape(len(blocks), -1)
+    with Recorder(
+        path,
+        attachments={"config.toml": to_toml(run.settings).encode()},
+        metadata={"clock": "realtime"},
+        further_count=run.settings.further_count,
+        channel_count=run.settings.channel_count,
+        blocking=True,
+    ) as recorder:
+        for row, cycle in enumerate(run.cycle.tolist()):
+            state, nothing = SchemeState(run.state[row]), np.zeros(2)
+            joints = int(state is SchemeState.REACT)
+            output = SchemeOutput(
+                cycle, state, state, FaultReason.NONE, joints, False, nothing, nothing, nothing, None, blocks[row]
+            )
+            times = CycleRecord(cycle, *(1000 * (1 + row * place % 977) for place in range(1, 6)), *[row // 4000] * 8)
+            messages = [(ChannelId.SCHEME, pack_scheme(output, Request.NONE)), (ChannelId.CYCLE, pack_cycle(times))]
+            messages += [(ChannelId.CONTACT, pack_contact(report)) for report in run.reports if report.cycle == cycle]
+            recorder.cycle(int(run.t_ns[row]), messages)
+
+
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory):
+    """Record a hand-made run in which everything happens that a report counts."""
+    random = np.random.default_rng(5)
+    run = make_certified_run()
+    count = len(run.cycle)
+    run.certified.tau_ext[:] = random.normal(0.0, 0.02, run.certified.tau_ext.shape)
+    run.certified.threshold[:] = random.uniform(0.09, 0.11, run.certified.threshold.shape)
+    run.certified.promotions[3000:] = 1.0
+    run.certified.promotions[6500:] = 3.0
+    run.tau_ext_hat[:] = run.certified.tau_ext[:, 0]
+    run.tau_ext_hat_cad[:] = random.normal(0.0, 0.3, (count, 2))
+    run.theta_hat[:] = np.linspace(0.0, 0.2, count)[:, None]
+    run.beside.tau_ext_hat[:] = random.normal(0.0, 0.02, (count, 2))
+    for row in (2600, 3100, 8200):  # alarms of the paper's scheme that nothing explains
+        run.beside.tau_ext_hat[row : row + 40, 1] = 0.2
+    run.truth.payload_kg[5300:] = 1.0
+    touch(run, 1500, 250, (5.0, 0.0), index=0)
+    touch(run, 4000, 250, (-6.0, -3.0), link=2, index=1)
+    touch(run, 7000, 700, (0.05, 0.0), index=2)
+    run.beside.tau_ext_hat[4005:4100, 0] = -3.0
+    for row, link in ((1503, 1), (4002, 2), (8600, 1)):
+        run = react(run, row, link=link, tau_ext_peak=(5.2, 0.0))
+    folder = tmp_path_factory.mktemp("certified")
+    record_certified(folder / "run.mcap", run)
+    record_truth(folder / "truth.mcap", run)
+    return folder / "run.mcap"
+
+
+@pytest.fixture(params=["paper", "certified"])
+def path(request):
+    """Give a log of the paper's scheme, with a fault and another attempt, and one of the certified scheme."""
+    return request.getfixturevalue("log" if request.param == "paper" else "certified")
+
+
+def truth_of(path):
+    return path.with_name("truth.mcap")
+
+
+@pytest.mark.parametrize("has_truth", [True, False])
+def test_a_long_run_comes_to_the_same_as_one_that_is_kept_whole(few_kept, path, has_truth):
+    truth = truth_of(path) if has_truth else None
+    whole, thinned = read_run(path, truth), read_run(path, truth, full_cycles=1000)
+    assert (whole.gathered, thinned.run.all_cycles) == (None, len(whole.run.cycle))
+    assert len(thinned.run.cycle) < len(whole.run.cycle) / 4
+    assert table_of(thinned) == table_of(whole)
+
+
+def test_the_kept_cycles_have_every_extreme_of_every_curve(few_kept, path):
+    whole, thinned = (read_run(path, truth_of(path), full_cycles=cycles).run for cycles in (10**6, 1000))
+    for ours, theirs in ((thinned.tau_ext_hat, whole.tau_ext_hat), (thinned.motion.q, whole.motion.q)):
+        assert (ours.min(axis=0).tolist(), ours.max(axis=0).tolist()) == (
+            theirs.min(axis=0).tolist(),
+            theirs.max(axis=0).tolist(),
+        )
+
+
+def test_the_kept_cycles_are_cycles_of_the_run(few_kept, path):
+    whole, thinned = (read_run(path, truth_of(path), full_cycles=cycles).run for cycles in (10**6, 1000))
+    rows = np.searchsorted(whole.cycle, thinned.cycle)
+    assert (np.diff(rows) > 0).all()
+    assert (thinned.t_ns == whole.t_ns[rows]).all()
+    assert (thinned.theta_hat == whole.theta_hat[rows]).all()
+
+
+def test_around_the_first_contacts_every_cycle_is_kept(few_kept, monkeypatch, certified):
+    monkeypatch.setattr(long_run, "CONTACTS", 1)
+    run = read_run(certified, truth_of(certified), full_cycles=1000).run
+    onset_s = 1.45
+    around = run.cycle[(run.time_s() > onset_s - 0.14) & (run.time_s() < onset_s + 0.59)]
+    assert (len(around), set(np.diff(around).tolist())) == (729, {1})
+
+
+def test_the_page_of_a_long_run_says_that_cycles_are_left_out(few_kept, certified, tmp_path):
+    read = read_run(certified, truth_of(certified), full_cycles=1000)
+    report = write_run_report(read.run, tmp_path, read.source, read.gathered)
+    assert f"Of 9050 cycles {len(read.run.cycle)} are here: of every 2263" in report.html_path.read_text()
+
+
+def test_a_log_of_just_so_many_cycles_is_kept_whole(certified):
+    assert read_run(certified, None, full_cycles=9050).gathered is None
+    assert read_run(certified, None, full_cycles=9049).gathered is not None
+
+
+def test_a_long_truth_keeps_what_is_asked_of_its_contacts(monkeypatch, certified):
+    for name, value in (("_BEGINNING", (50, 20)), ("_ENDING", 60), ("_HELD", 150), ("_BUCKET", 10)):
+        monkeypatch.setattr(truth_rows, name, value)
+    whole, thinned = (read_truth(truth_of(certified), most) for most in (10**6, 100))
+    assert len(thinned.cycle) < 450
+    for index in (0, 1, 2):
+        ours, theirs = (rows.tau_ext[rows.contact_index == index] for rows in (thinned, whole))
+        cycles = [rows.cycle[rows.contact_index == index] for rows in (thinned, whole)]
+        assert (np.abs(ours).max(axis=0) == np.abs(theirs).max(axis=0)).all()
+        assert (cycles[0][:50] == cycles[1][:50]).all()
+        assert (cycles[0][-60:] == cycles[1][-60:]).all()
+    after = thinned.cycle[thinned.contact_index < 0].tolist()
+    assert after == [350 + 1500, 350 + 4000, 800 + 7000]
+
+
+def test_a_truth_says_from_when_on_the_payload_is_another(certified):
+    truth = read_truth(truth_of(certified), 100)
+    assert list(zip(truth.model_cycle.tolist(), truth.payload_kg.tolist(), strict=True)) == [(100, 0.0), (5400, 1.0)]
+
+
+# --- stretches -------------------------------------------------------------------------------------------------------
+
+
+def stretched(path, start_s, end_s, **options):
+    return read_run(path, truth_of(path), Stretch(start_s, end_s), **options)
+
+
+def test_a_stretch_has_the_cycles_between_its_times(certified):
+    start_ns = start_of_log(certified)
+    run = stretched(certified, 2.8, 3.5).run
+    assert ((run.t_ns[[0, -1]] - start_ns) * 1e-9).tolist() == pytest.approx([2.8, 3.499])
+
+
+def test_times_of_a_stretch_count_from_motion_start_as_those_of_the_whole(certified):
+    assert stretched(certified, 2.8, 3.5).run.time_s()[0] == pytest.approx(2.75)
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ((4.1, 4.8), (3.8, 5.25 + 0.05 + 1.0)),  # in contact 2, which the adaptation follows before it is forgotten
+        ((2.8, 4.01), (2.8, 5.25)),
+        ((0.5, 2.8), (-0.15, 2.8)),
+    ],
+)
+def test_a_stretch_that_would_cut_something_is_widened(certified, asked, found):
+    run = stretched(certified, *asked).run
+    assert run.stretch.found[0] == pytest.approx(found[0])
+    assert run.stretch.found[1] <= found[1] + 1e-9
+
+
+def test_contacts_are_numbered_over_the_whole_log(certified):
+    metrics = evaluate(stretched(certified, 2.9, 4.9).run)
+    assert [(contact.number, contact.detected_s) for contact in metrics.contacts] == [(2, pytest.approx(3.952))]
+
+
+def test_without_the_truth_detections_are_numbered_over_the_whole_log(certified):
+    read = read_run(certified, None, Stretch(2.9, 4.9))
+    assert [contact.number for contact in evaluate(read.run).contacts] == [2]
+
+
+def test_a_contact_of_a_stretch_is_what_it_is_in_the_whole_log(certified):
+    whole = evaluate(read_run(certified, truth_of(certified)).run).contacts[1]
+    (part,) = evaluate(stretched(certified, 2.9, 4.9).run).contacts
+    assert replace(part, section=whole.section) == whole
+
+
+def test_a_long_stretch_comes_to_the_same_as_one_that_is_kept_whole(few_kept, path):
+    whole = stretched(path, 1.0, 2.5)
+    thinned = stretched(path, 1.0, 2.5, full_cycles=700)
+    assert (whole.gathered, thinned.gathered is None) == (None, False)
+    assert table_of(thinned) == table_of(whole)
+
+
+def test_a_stretch_beside_the_log_is_a_log_error(certified):
+    with pytest.raises(LogError, match=r"run\.mcap has no cycle from 100 to 200 s"):
+        stretched(certified, 100.0, 200.0)
+
+
+def test_a_stretch_that_begins_in_the_second_attempt_knows_the_emulators_cycles(log):
+    whole = evaluate(read_run(log, truth_of(log)).run)
+    assert whole.fault == FaultReason.DRIVE.name
+    (expected,) = (contact for contact in whole.contacts)
+    (found,) = evaluate(stretched(log, 4.0, 9.0).run).contacts
+    assert (found.onset_s, found.delay_ms) == (expected.onset_s, expected.delay_ms)
+
+
+def test_a_log_begins_with_its_first_message(log):
+    assert start_of_log(log) <= 0.2e9
+
+
+# --- where pieces meet -----------------------------------------------------------------------------------------------
+
+
+def scheme_of(cycles, state=SchemeState.MONITOR):
+    """Give records of /scheme in some cycles of 1 ms."""
+    fields = [("sec", "<u4"), ("nanosec", "<u4"), ("cycle", "<u8"), ("state", "u1"), ("request", "u1")]
+    records = np.zeros(len(cycles), np.dtype(fields))
+    records["cycle"] = cycles
+    records["nanosec"] = np.array(cycles) * 1_000_000
+    records["state"] = state
+    return Series(records, 0)
+
+
+def truth_at(cycles, attempt=0):
+    nothing = np.zeros(len(cycles))
+    cycle, attempts = np.array(cycles), np.full(len(cycles), attempt)
+    return TruthRows(attempts, cycle, np.zeros((len(cycles), 2)), nothing, nothing, None, attempts, cycle, nothing,
+                     nothing, {}, "", True)  # fmt: skip
+
+
+def test_the_truth_of_a_cycle_that_was_skipped_between_two_pieces_lies_between_them():
+    clock = TruthClock(truth_at([11, 12, 13, 20]))
+    begins = np.array([0])
+    told = [clock.add(scheme_of(cycles), begins)[0].tolist() for cycles in ([10, 11], [13, 14])]
+    clock.end()
+    assert (told, clock.t_ns.tolist()) == ([[0], [1, 2]], [11_000_000, 12_000_000, 13_000_000, 14_000_000])
+
+
+def test_the_truth_of_an_attempt_waits_for_its_first_cycle():
+    clock = TruthClock(truth_at([3, 4], attempt=1))
+    assert clock.add(scheme_of([480, 481, 482, 483, 484]), np.array([0]))[0].size == 0
+    assert clock.add(scheme_of([485, 486]), np.array([0, 482]))[1].tolist() == [483, 484]
+
+
+def test_an_attempt_that_begins_in_two_pieces_begins_once():
+    facts, shell = Facts(), SimpleNamespace(events=lambda piece: [])
+    for cycles, state in (([0, 1], SchemeState.INIT), ([2, 3], SchemeState.COMMISSION), ([4], SchemeState.ENABLE)):
+        facts.add(shell, SimpleNamespace(series={"/scheme": scheme_of(cycles, state), "/contact": NO_CONTACT}))
+    assert facts.begins.tolist() == [0]
+
+
+NO_CONTACT = Series(np.zeros(0, np.dtype([("sec", "<u4"), ("nanosec", "<u4")])), 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (("--from", "5", "--until", "3"), "--from 5 s is not before --until 3 s"),
+        (("--from", "nan"), "--from nan is not a time"),
+        (("--until", "inf"), "--until inf is not a time"),
+    ],
+)
+def test_a_stretch_that_is_none_is_refused_in_one_line(certified, options, line):
+    ran = CliRunner().invoke(cli, ["report", str(certified), *options])
+    assert (ran.exit_code, ran.stderr) == (2, f"adacd-hil: {line}\n")
+
+
+def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
+    ran = CliRunner().invoke(
+        cli, ["report", str(certified), "--from", "2.9", "--until", "3.93", "--out", str(tmp_path), "--json"]
+    )
+    (table,) = json.loads(ran.stdout)
+    assert table["stretch"] == {
+        "from_s": pytest.approx(2.9),
+        "until_s": pytest.approx(5.25),
+        "asked_from_s": 2.9,
+        "asked_until_s": 3.93,
+        "motion_start_s": pytest.approx(0.05),
+    }
+    page = (tmp_path / "report.html").read_text()
+    assert "the log from 2.90 s until 5.25 s, widened so that no contact and no adaptation is cut" in page
+
+
+# --- what is shown of many -------------------------------------------------------------------------------------------
+
+
+def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certified):
+    metrics = evaluate(read_run(certified, truth_of(certified)).run)
+    right = next(contact for contact in metrics.contacts if contact.direction_ok)
+    many = tuple(replace(right, number=number) for number in range(1, 51))
+    wrong = replace(right, number=51, link=2, link_detected=1)
+    metrics = replace(metrics, contacts=(*many, wrong), evidence=None)
+    assert [contact.number for contact in shown_contacts(metrics, 5)] == [1, 2, 3, 4, 5, 51]
+    assert left_out_text(metrics, 5) == (
+        "The first 5 and 1 more that went wrong of 51 contacts; all are in contacts.csv."
+    )
+    assert left_out_text(metrics, 51) == ""
+
+
+def test_many_adaptations_are_summed_up():
+    adaptation_s = dict(zip("ABCDEF", (2.0, 1.0, None, 1.5, 3.0, 1.0), strict=True))
+    text = identified_text(adaptation_s, dict.fromkeys(adaptation_s, None), "certified")
+    assert text == "the model was certified in 1.00 to 3.00 s, 5 times, and not certified 1 times"
+
+
+def test_of_many_stays_those_that_are_narrower_than_a_mark_are_drawn_together():
+    stays = [(SchemeState.MONITOR, 3), (SchemeState.REACT, 1)] * 800 + [(SchemeState.MONITOR, 4000)]
+    html = timeline(run := make_run(*stays), evaluate(run))
+    marks = re.findall(r"<title>(.*?)</title>", html)
+    assert 100 < len(marks) < 650  # 612 fit beside each other
+    assert sum(int(mark.split()[0]) for mark in marks if "states" in mark) == 1600
+    assert any(mark.startswith("MONITOR, 3.20 to") for mark in marks)
