@@ -5,10 +5,13 @@ looks only at the file of the function itself, and would go on using the old cod
 of an edited constant.
 """
 
+import contextlib
 import hashlib
 import os
 import re
+import stat
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -54,20 +57,46 @@ def source_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _cache_folder() -> Path:
-    """Name the folder of this source state, under NUMBA_CACHE_DIR, the user's cache or the temporary folder."""
+def cache_folder(digest: str) -> Path:
+    """Make the folder for compiled code of a source state: in NUMBA_CACHE_DIR, the user's cache or the temporary one.
+
+    What is read from it is executed. So it and the folder above it belong to this user alone, or the next place is
+    tried, at last a new folder. Raises OSError when there is none at all.
+    """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
-        return Path(given) / source_digest()
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "adacd-hil"
-    try:
-        base.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        base = Path(tempfile.gettempdir()) / f"adacd-hil-{os.getuid()}"
-    return base / source_digest()
+        with contextlib.suppress(OSError):
+            Path(given).mkdir(mode=0o700, parents=True, exist_ok=True)
+            if _is_own(Path(given).stat()) and _is_own(_make(Path(given) / digest)):
+                return Path(given) / digest
+        warnings.warn(f"NUMBA_CACHE_DIR {given} is not used: not this user's alone", stacklevel=2)
+    places = [Path(tempfile.gettempdir()) / f"adacd-hil-{os.geteuid()}"]
+    with contextlib.suppress(RuntimeError):  # a user without a home
+        places.insert(0, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "adacd-hil")
+    for place in places:
+        with contextlib.suppress(OSError):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            status = _make(place)
+            if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid():
+                place.chmod(0o700)  # somebody's umask may have left it open
+            if _is_own(place.lstat()) and _is_own(_make(place / digest)):
+                return place / digest
+    return Path(tempfile.mkdtemp(prefix="adacd-hil-"))
 
 
-numba.config.CACHE_DIR = str(_cache_folder())  # type: ignore[attr-defined]
+def _make(folder: Path) -> os.stat_result:
+    """Make a folder where there is nothing; say what is there. Raises OSError."""
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    return folder.lstat()
+
+
+def _is_own(status: os.stat_result) -> bool:
+    """Tell whether it is a folder in which nobody but this user can write."""
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
+
+
+numba.config.CACHE_DIR = str(cache_folder(source_digest()))  # type: ignore[attr-defined]
 
 
 def compiled(function: Function) -> Function:

@@ -1,10 +1,11 @@
 """The cache of compiled code is keyed by all that the code may depend on."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-from adacd_hil.compiled import compiled_sources
+from adacd_hil.compiled import cache_folder, compiled_sources
 
 CALLER = "from adacd_hil.compiled import compiled\nfrom adacd_hil.scheme import (\n    callee,\n)\n"
 CALLEE = "from adacd_hil.scheme.constants import GRAVITY\n"
@@ -28,3 +29,99 @@ def test_the_key_has_the_text_of_the_package_itself() -> None:
     assert b"def step(" in sources["adacd_hil.scheme.kernel"]
     assert b"class Layout" in sources["adacd_hil.records"]
     assert "adacd_hil.cli.main" not in sources
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's cache, the temporary folder and NUMBA_CACHE_DIR, as `user`, `temporary` and unset."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    return tmp_path
+
+
+def test_compiled_code_lies_in_the_users_cache_for_this_user_alone(places: Path) -> None:
+    for _ in range(2):
+        assert cache_folder("digest") == places / "user" / "adacd-hil" / "digest"
+    for folder in (places / "user" / "adacd-hil", places / "user" / "adacd-hil" / "digest"):
+        assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def writable_by_the_group(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    folder.chmod(0o770)
+
+
+def writable_by_all(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    folder.chmod(0o1777)
+
+
+def somebody_elses(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    os.chown(folder, 12345, -1)
+
+
+def link(folder: Path) -> None:
+    (folder.parent / "elsewhere").mkdir(parents=True)
+    folder.symlink_to(folder.parent / "elsewhere")
+
+
+def file(folder: Path) -> None:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    folder.touch()
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [
+        *(("adacd-hil", make) for make in (somebody_elses, link, file)),
+        *(("adacd-hil/digest", make) for make in (writable_by_the_group, writable_by_all, somebody_elses, link, file)),
+    ],
+)
+def test_a_cache_that_others_can_write_is_not_read(places: Path, name: str, make) -> None:
+    if make is somebody_elses and os.geteuid():
+        pytest.skip("only root can give a folder away")
+    (places / "user" / name).parent.mkdir(parents=True, mode=0o700)
+    make(places / "user" / name)
+    own = places / "temporary" / f"adacd-hil-{os.geteuid()}"
+    assert cache_folder("digest") == own / "digest"
+    assert own.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("make", [somebody_elses, link, file])
+def test_where_every_known_folder_is_somebody_elses_there_is_a_new_one(places: Path, make) -> None:
+    if make is somebody_elses and os.geteuid():
+        pytest.skip("only root can give a folder away")
+    file(places / "user")
+    make(places / "temporary" / f"adacd-hil-{os.geteuid()}")
+    first, second = cache_folder("digest"), cache_folder("digest")
+    assert first != second
+    assert first.parent == second.parent == places / "temporary"
+    assert first.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_cache_that_was_left_open_is_closed_to_others(places: Path) -> None:
+    writable_by_the_group(places / "user" / "adacd-hil")
+    assert cache_folder("digest") == places / "user" / "adacd-hil" / "digest"
+    assert (places / "user" / "adacd-hil").stat().st_mode & 0o777 == 0o700
+
+
+def test_the_folder_that_the_user_names_comes_first(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (places / "mine").mkdir(mode=0o700)
+    (places / "named").symlink_to("mine")  # their own choice
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(places / "named"))
+    assert cache_folder("digest") == places / "named" / "digest"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(places / "new" / "one"))
+    assert cache_folder("digest") == places / "new" / "one" / "digest"
+
+
+def test_a_named_folder_that_others_can_write_is_not_used_and_that_is_said(
+    places: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writable_by_all(places / "shared")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(places / "shared"))
+    with pytest.warns(UserWarning, match="NUMBA_CACHE_DIR .*/shared is not used: not this user's alone"):
+        assert cache_folder("digest") == places / "user" / "adacd-hil" / "digest"
+    assert list((places / "shared").iterdir()) == []
