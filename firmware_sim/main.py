@@ -222,9 +222,14 @@ def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: Trut
     code = ExitCode.OK
     if truth is not None:
         summary = truth.close()
-        if not summary.messages and summary.is_complete:  # no host came
+        is_empty = not summary.messages and summary.is_complete  # no host came
+        if is_empty:
             truth.discard()
-        described |= {"truth": str(summary.path), "messages": summary.messages, "dropped": summary.dropped}
+        described |= {
+            "truth": None if is_empty else str(summary.path),
+            "messages": summary.messages,
+            "dropped": summary.dropped,
+        }
         if not summary.is_complete:
             _complain(summary.error or f"{summary.path} lacks {summary.dropped} cycles: the disk was too slow")
             code = ExitCode.FAILURE

@@ -44,11 +44,16 @@ def make_room(path: Path) -> None:
 
 
 def is_taken(path: Path) -> bool:
-    """Tell whether anything, a dangling link included, is where a log or one of its parts would be. Raises LogError."""
+    """Tell whether anything, a dangling link included, is where a log or one of its parts would be.
+
+    Raises LogExistsError when a folder on the way to it is none, LogError.
+    """
     try:
         return is_there(path) or bool(find_parts(path))
     except FileNotFoundError:
         return False
+    except NotADirectoryError:  # something else is where its folder would be
+        raise LogExistsError(f"log {path} can't be created: Not a directory") from None
     except OSError as error:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None
 

@@ -88,7 +88,7 @@ def test_every_key_that_a_kind_has_not_is_refused(kind):
         (example("lose", kind="loose"), "`faults[0].kind` = 'loose' must be one of"),
         (example("lose", kind="loose"), "did you mean 'lose'?"),
         (example("lose", frame="torqe"), "did you mean 'torque'?"),
-        (example("lose", node="sensor3"), "did you mean 'sensor2'?"),
+        (example("lose", node="sensro2"), "did you mean 'sensor2'?"),
         (example("lose", probabilty=0.1), "unknown key `faults[0].probabilty`; did you mean `faults[0].probability`?"),
         (example("lose", node=None), "faults[0]: frame 'torque' lacks the key `node`"),
         (

@@ -99,7 +99,8 @@ def test_onset_and_end_lie_on_the_drives_ticks():
     ("changes", "message"),
     [
         ({"link": 3}, "`link` = 3 is above 2"),
-        ({"shape": "sine"}, "did you mean 'half_sine'"),
+        ({"shape": "sine"}, "`shape` = 'sine' must be one of step, half_sine, push"),
+        ({"shape": "halfsine"}, "did you mean 'half_sine'"),
         ({"frame": "tool"}, "`frame` = 'tool' must be one of link, world"),
         ({"force_N": 0.0}, "`force_N` = 0.0 N is below 0.01 N"),
         ({"duration_s": 0.0}, "`duration_s` = 0.0 s is below 0.0001 s"),
