@@ -27,11 +27,11 @@ beside it on the same stream: `adacd_hil.analysis.beside`.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from adacd_hil.analysis.beside import evaluate_beside
 from adacd_hil.analysis.contacts import Contact, list_contacts
+from adacd_hil.analysis.cyclic_data import CyclicData, gather_data
 from adacd_hil.analysis.detections import assign, find_detections
+from adacd_hil.analysis.endings import find_causes, find_faults
 from adacd_hil.analysis.evidence import Evidence, evaluate_certified, last_row
 from adacd_hil.analysis.paper_comparison import PaperRow, compare_with_paper
 from adacd_hil.analysis.run import Run
@@ -39,8 +39,8 @@ from adacd_hil.analysis.sections import Section, rows_of, split_sections
 from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_reactions
 from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.analysis.untouched import Residual, Untouched, gather_untouched
-from adacd_hil.analysis.verdict import give_verdict
-from adacd_hil.records import PARAMETER_NAMES, FaultReason, SchemeState
+from adacd_hil.analysis.verdict import give_verdict, is_margin_below_1
+from adacd_hil.records import PARAMETER_NAMES
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,10 @@ class CycleStatistics:
 
 @dataclass(frozen=True)
 class Metrics:
-    """Everything that the report says, see the module's first lines for the definitions."""
+    """Everything that the report says, see the module's first lines for the definitions.
+
+    fault, fault_s: the first one of the run.
+    """
 
     sections: tuple[Section, ...]
     adaptation_s: dict[str, float | None]
@@ -70,6 +73,7 @@ class Metrics:
     fault_s: float | None
     cycle: CycleStatistics
     timing: TimingEvidence
+    data: CyclicData
     frames: int | None
     dropped: int | None
     evidence: Evidence | None
@@ -83,11 +87,12 @@ class Gathered(NamedTuple):
 
     untouched: Untouched
     timing: TimingEvidence
+    data: CyclicData
 
 
 def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     """Compute all metrics of a run. gathered: of a run that does not have all of its cycles."""
-    gathered = gathered or Gathered(gather_untouched(run, [run]), timing_evidence(run))
+    gathered = gathered or Gathered(gather_untouched(run, [run]), timing_evidence(run), gather_data(run))
     touches = true_contacts(run)
     detections = find_detections(run)
     owners = assign(run, touches, detections)
@@ -103,9 +108,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     has_truth = run.truth is not None
     false_s = tuple(d.detected_s for d, owner in zip(detections, owners, strict=True) if owner is None)
     missed = sum(contact.is_armed and contact.detected_s is None for contact in contacts)
-    faults = np.flatnonzero(run.state == SchemeState.FAULT)
-    fault = FaultReason(int(run.fault[faults[0]])).name if faults.size else None
-    fault_s = float(run.time_s()[faults[0]]) if faults.size else None
+    faults, causes, data = find_faults(run), find_causes(run), gathered.data
     payload_kg = _payloads(run, sections)
     is_identified = bool(adaptation_s) and all(value is not None for value in adaptation_s.values())
     has_false = has_truth and len(false_s) > 0
@@ -119,16 +122,19 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         missed=missed if has_truth else None,
         parameters=_parameters(run, sections),
         payload_kg=payload_kg,
-        fault=fault,
-        fault_s=fault_s,
+        fault=faults[0].reason if faults else None,
+        fault_s=faults[0].at_s if faults else None,
         cycle=cycle_statistics(run, gathered.timing.cycles),
         timing=gathered.timing,
+        data=data,
         frames=run.frames,
         dropped=run.dropped,
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
-        verdict=give_verdict(run, contacts, false_s, missed, adaptation_s, payload_kg, evidence, fault, fault_s),
-        is_clean=fault is None and is_identified and missed == 0 and not has_false,
+        verdict=give_verdict(run, contacts, false_s, missed, adaptation_s, payload_kg, evidence, faults, causes, data),
+        is_clean=is_identified
+        and missed == 0
+        and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence)),
     )
 
 

@@ -77,6 +77,15 @@ class Motion:
     tau_J: Vector
 
 
+@dataclass(frozen=True)
+class CheckCounts:
+    """What the checks of the cyclic frames had counted when it was logged (k,): counts (k, devices, statuses)."""
+
+    devices: tuple[str, ...]
+    cycle: Cycles
+    counts: Cycles
+
+
 class StretchOfRun(NamedTuple):
     """A stretch of a log: as asked for, as found, widened so that it cuts nothing, and the contacts before it.
 
@@ -122,6 +131,7 @@ class Run:
     bucket: int = 1  # of a long run: of so many cycles those with extremes are kept
     log_start_ns: int | None = None  # the beginning of its log
     stretch: StretchOfRun | None = None  # None: the whole log
+    checks: CheckCounts | None = None  # None: not in the log
 
     @property
     def first_contact(self) -> int:

@@ -1,9 +1,11 @@
-"""The verdict on a run: one sentence."""
+"""The verdict on a run: one sentence, what went wrong first."""
 
 import itertools
 from typing import Final
 
 from adacd_hil.analysis.contacts import Contact
+from adacd_hil.analysis.cyclic_data import CyclicData, data_text
+from adacd_hil.analysis.endings import Fault
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.run import Run
 
@@ -19,17 +21,49 @@ def give_verdict(
     adaptation_s: dict[str, float | None],
     payload_kg: dict[str, float | None],
     evidence: Evidence | None,
-    fault: str | None,
-    fault_s: float | None,
+    faults: tuple[Fault, ...],
+    causes: tuple[str, ...],
+    data: CyclicData,
 ) -> str:
-    """Say in one sentence how the run went."""
+    """Say in one sentence how the run went. causes: what ended attempts without a fault."""
+    if run.cycle.size == 0:
+        cause = "; ".join(causes) or "the log does not say why"
+        return f"No cycle was run: {cause}."
     done = "identified" if evidence is None else "certified"
     text = f"{_contacts_text(run, contacts, false_s, missed)}; {identified_text(adaptation_s, payload_kg, done)}"
     if evidence is not None and evidence.paper_beside is not None:
         text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
-    if fault is not None:
-        text = f"the run ended in FAULT ({fault}) at {fault_s:.2f} s; {text}"
+    if is_margin_below_1(evidence):
+        text = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}; {text}"
+    broken = f"the run was broken off: {'; '.join(causes)}" if causes else ""
+    text = "; ".join(filter(None, (*_fault_texts(faults), broken, text, data_text(data))))
     return text[:1].upper() + text[1:] + "."
+
+
+def is_margin_below_1(evidence: Evidence | None) -> bool:
+    """Tell whether some residual was over its threshold while nobody touched the arm."""
+    return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
+
+
+def _margin_text(evidence: Evidence | None) -> str:
+    margin = None if evidence is None else evidence.smallest_margin
+    return "" if margin is None else f"smallest margin {margin:.2f}"
+
+
+def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:
+    """Say which faults there were: the first, and the one that the run ended in."""
+    if not faults:
+        return []
+    last = faults[-1]
+    listed = [faults[0]] if len(faults) == 1 else [faults[0], last]
+    count = f"{len(faults)} faults, the first and the last: " if len(faults) > 2 else ""
+    texts = []
+    for fault in listed:
+        how = "the run ended in FAULT" if fault.is_last else "FAULT"
+        cause = f": {fault.cause}" if fault.cause else ""
+        after = "" if fault.is_last else ", after which it began anew"
+        texts.append(f"{how} ({fault.reason}) at {fault.at_s:.2f} s{cause}{after}")
+    return [count + texts[0], *texts[1:]]
 
 
 def _beside_text(times_s: list[float | None]) -> str:
@@ -38,7 +72,9 @@ def _beside_text(times_s: list[float | None]) -> str:
     if len(times_s) > LISTED:
         return f"; the paper's scheme on the same stream took {_summary(times_s, 'did not end')}"
     took = " and ".join("did not end" if time_s is None else f"took {time_s:.2f} s" for time_s in times_s)
-    return f"; the paper's scheme on the same stream {took.replace(' and took', ' and')}"
+    if None not in times_s:
+        took = took.replace(" and took", " and")
+    return f"; the paper's scheme on the same stream {took}"
 
 
 def _contacts_text(run: Run, contacts: tuple[Contact, ...], false_s: tuple[float, ...], missed: int) -> str:
@@ -84,7 +120,8 @@ def identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str,
     if len(labels) > LISTED:
         return f"the model was {done} in {_summary(list(adaptation_s.values()), f'not {done}')}"
     if adaptation_s[labels[0]] is None:
-        return f"the model was not {done}"
+        later_s = [time_s for time_s in adaptation_s.values() if time_s is not None]
+        return f"the model was not {done} at first, then in {' and in '.join(f'{time_s:.2f} s' for time_s in later_s)}"
     text = f"the model was {done} in {adaptation_s[labels[0]]:.2f} s"
     for before, label in itertools.pairwise(labels):
         old, new, time_s = payload_kg[before], payload_kg[label], adaptation_s[label]

@@ -10,7 +10,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.records import ArmState, Event
 
 WINDOW_S = 1.0
-_SHORTEST_SHARE = 0.2
+SHORTEST_SHARE = 0.2
 """Part of a window that is judged, too, when the attempt ends in it."""
 
 
@@ -90,7 +90,7 @@ class DataWatch:
 
     def shares(self) -> DataShares:
         """Sum up the attempt."""
-        if self._cycles >= _SHORTEST_SHARE * self._window_cycles:
+        if self._cycles >= SHORTEST_SHARE * self._window_cycles:
             self._end_window()
         cycles = max(self._all_cycles, 1)
         share = [total / cycles for total in self._totals.values()]

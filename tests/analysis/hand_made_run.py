@@ -57,7 +57,14 @@ def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str
         ),
         truth=truth if has_truth else None,
         settings=parse(Settings, {"name": "hand-made", "arm": {"cad_theta": list(CAD_THETA)}}),
-        metadata={"clock": clock, "scheduler": "SCHED_FIFO 80", "config": "hand-made", "profile": "P", "seed": "7"},
+        metadata={
+            "clock": clock,
+            "scheduler": "SCHED_FIFO 80",
+            "config": "hand-made",
+            "profile": "P",
+            "seed": "7",
+            "scenario": "paper",
+        },
         frames=12,
         dropped=0,
     )

@@ -299,11 +299,12 @@ def test_the_truth_of_an_attempt_waits_for_its_first_cycle():
 def test_an_attempt_that_begins_in_two_pieces_begins_once():
     facts, shell = Facts(), SimpleNamespace(events=lambda piece: [])
     for cycles, state in (([0, 1], SchemeState.INIT), ([2, 3], SchemeState.COMMISSION), ([4], SchemeState.ENABLE)):
-        facts.add(shell, SimpleNamespace(series={"/scheme": scheme_of(cycles, state), "/contact": NO_CONTACT}))
+        series = {"/scheme": scheme_of(cycles, state), "/contact": NOTHING, "/frame_checks": NOTHING}
+        facts.add(shell, SimpleNamespace(series=series))
     assert facts.begins.tolist() == [0]
 
 
-NO_CONTACT = Series(np.zeros(0, np.dtype([("sec", "<u4"), ("nanosec", "<u4")])), 0)
+NOTHING = Series(np.zeros(0, np.dtype([("sec", "<u4"), ("nanosec", "<u4")])), 0)
 
 
 @pytest.mark.parametrize(

@@ -169,5 +169,5 @@ def test_a_log_without_its_settings_is_refused(tmp_path: Path) -> None:
     from log.recorded_run import record as write
 
     write(tmp_path / "run.mcap", make_run(3))
-    with pytest.raises(LogError, match=r"no config\.toml attached"):
+    with pytest.raises(LogError, match=r"no attachment config\.toml"):
         replay(tmp_path / "run.mcap")

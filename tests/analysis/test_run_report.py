@@ -21,11 +21,20 @@ from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.report import write_report, write_run_report
 from adacd_hil.analysis.report.timing_page import timing_section
 from adacd_hil.config import to_toml
-from adacd_hil.log.channels import ChannelId, pack_contact, pack_scheme, pack_truth
+from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.recorder import Recorder
-from adacd_hil.records import TRUTH_LAYOUT, Event, FaultReason, Request, SchemeOutput, SchemeState, scheme_layout
+from adacd_hil.records import (
+    TRUTH_LAYOUT,
+    CycleRecord,
+    Event,
+    FaultReason,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    scheme_layout,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +110,7 @@ def test_a_report_names_its_pictures(report):
 
 KEYS = {
     "": "schema verdict is_clean time_zero adaptation_s sections frozen_residual_max_Nm contacts false_alarms "
-    "false_alarms_s missed parameters payload_kg certified fault cycle timing log stretch paper run",
+    "false_alarms_s missed parameters payload_kg certified fault cycle timing data log stretch paper run",
     "sections.A": "label kind start_s end_s is_complete duration_s",
     "frozen_residual_max_Nm.B": "identified cad cycles",
     "contacts.0": "number section state link onset_s end_s is_armed detected_s delay_ms law_ms ideal_ms link_at_alarm "
@@ -120,6 +129,7 @@ KEYS = {
     "timing.counts.overruns": "total per_100000",
     "timing.histograms_us.slack": "edges counts below above",
     "log": "name frames dropped is_complete problem",
+    "data": "cycles incomplete worst_incomplete aged devices excesses",
     "paper.0": "quantity paper beside measured",
 }
 
@@ -296,7 +306,7 @@ def test_the_verdict_is_the_pages_heading(html, report):
 
 
 def test_the_heading_does_not_part_a_number_from_its_unit(html):
-    assert "1.00&nbsp;s and again in 0.80&nbsp;s after 1&nbsp;kg." in html
+    assert "1.00&nbsp;s and again in 0.80&nbsp;s after 1&nbsp;kg; no cyclic data" in html
 
 
 def test_a_run_with_a_missed_contact_looks_bad(html):
@@ -402,7 +412,9 @@ def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
 def record(path, run, attachments):
     """Write a log with the scheme's topic of a hand-made run."""
     layout = scheme_layout(7)
-    with Recorder(path, attachments=attachments, metadata={"clock": "lockstep"}, blocking=True) as recorder:
+    with Recorder(
+        path, attachments=attachments, metadata={"clock": "lockstep", "scenario": "paper"}, blocking=True
+    ) as recorder:
         for row, cycle in enumerate(run.cycle.tolist()):
             block = np.zeros(layout.size)
             block[layout.slices["tau_ext_hat"]] = run.tau_ext_hat[row]
@@ -414,7 +426,11 @@ def record(path, run, attachments):
                 cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row], run.theta_hat[row],
                 run.tau_ext_hat[row], None, block,
             )  # fmt: skip
-            messages = [(ChannelId.SCHEME, pack_scheme(output, Request.NONE))]
+            times = CycleRecord(*(int(run.timing[name][row]) for name in CycleRecord._fields))
+            messages = [
+                (ChannelId.SCHEME, pack_scheme(output, Request.NONE)),
+                (ChannelId.CYCLE, pack_cycle(times)),
+            ]
             messages += [(ChannelId.CONTACT, pack_contact(report)) for report in run.reports if report.cycle == cycle]
             recorder.cycle(int(run.t_ns[row]), messages)
 

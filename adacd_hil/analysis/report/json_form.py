@@ -46,6 +46,7 @@ def report_json(
             "fault": fault,
             "cycle": dataclasses.asdict(metrics.cycle),
             "timing": metrics.timing.as_json(),
+            "data": metrics.data.as_json(),
             "log": {
                 "name": source.log_name,
                 "frames": metrics.frames,
@@ -54,7 +55,7 @@ def report_json(
                 "problem": source.problem,
             },
             "stretch": None if stretch is None else _stretch_json(stretch),
-            "paper": [dataclasses.asdict(row) for row in metrics.paper],
+            "paper": [row._asdict() for row in metrics.paper],
             "run": dict(sorted(metadata.items())),
         }
     )

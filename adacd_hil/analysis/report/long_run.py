@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.analysis.cyclic_data import CyclicDataGatherer
 from adacd_hil.analysis.detections import find_detections
 from adacd_hil.analysis.metrics import Gathered, is_realtime
 from adacd_hil.analysis.report.bounds import ADAPTATIONS
@@ -65,6 +66,7 @@ class LongRun:
         self._rows = SchemeRows(empty.series["/scheme"], _ROOM)
         self._columns: list[CycleColumns] = [columns_of_series(empty.series["/cycle"])]
         self._untouched = UntouchedGatherer(outline)
+        self._data = CyclicDataGatherer(outline.settings)
         self._timing = TimingGatherer(outline.settings.bus.period_us, not is_realtime(outline))
         self._windows = np.array(list(_windows(outline))).reshape(-1, 2)
         self._noise_starts = np.linspace(0, cycles, _NOISE_STRETCHES, endpoint=False).astype(np.int64)
@@ -110,6 +112,7 @@ class LongRun:
         state = scheme.records["state"]
         cycle = scheme.records["cycle"].astype(np.int64)
         self._timing.add(columns, find_reactions(columns, cycle, state, self._state))
+        self._data.add(columns, cycle, state)
         if len(state):
             self._state = int(state[-1])
         if not len(columns):
@@ -126,7 +129,7 @@ class LongRun:
         run = self._rows.fill(self._outline)
         timing = CycleColumns.joined(self._columns)
         run = dataclasses.replace(run, timing=timing, all_cycles=self._cycles, bucket=self.bucket)
-        return run, Gathered(self._untouched.gathered(), self._timing.evidence())
+        return run, Gathered(self._untouched.gathered(), self._timing.evidence(), self._data.data(run))
 
 
 def _curves(run: Run) -> Iterator[Vector]:

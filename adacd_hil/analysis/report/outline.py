@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.report.scheme_rows import SchemeRows
 from adacd_hil.analysis.report.truth_rows import TruthRows, host_cycles, host_truth
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.run import CheckCounts, Run
 from adacd_hil.analysis.timing import Cycles
 from adacd_hil.log.reader import LoggedEvent, Series, contacts_of
 from adacd_hil.log.stream import LogStream, Piece
@@ -36,6 +36,7 @@ class Facts:
         self.motion_start_ns: int | None = None
         """The first cycle in ADAPT."""
         self.first_ns: int | None = None
+        self._checks: list[CheckCounts] = []
         self._begins: list[int] = []
         self._was_beginning = False
 
@@ -53,6 +54,7 @@ class Facts:
         """Take in the next piece."""
         self.reports += [entry.report for entry in contacts_of(piece.series["/contact"])]
         self.events += stream.events(piece)
+        self._checks += _checks_of(piece.series["/frame_checks"])
         scheme = piece.series["/scheme"]
         if not len(scheme):
             return
@@ -82,8 +84,29 @@ class Facts:
             reports=tuple(self.reports),
             events=tuple(self.events),
             finish_cycle=self.finish_cycle,
+            checks=_joined(self._checks),
             motion_start_ns=run.motion_start_ns if run.motion_start_ns is not None else self.zero_ns,
         )
+
+
+_CHECKS: Final = "_checks"
+"""How the field of a device's counts in /frame_checks ends."""
+
+
+def _checks_of(series: Series) -> list[CheckCounts]:
+    """Take the counts out of a piece of /frame_checks, if it has any."""
+    devices = tuple(name.removesuffix(_CHECKS) for name in series.fields if name.endswith(_CHECKS))
+    if not len(series) or not devices:
+        return []
+    counts = np.stack([series[device + _CHECKS].astype(np.int64) for device in devices], axis=1)
+    return [CheckCounts(devices, series["cycle"].astype(np.int64), counts)]
+
+
+def _joined(parts: list[CheckCounts]) -> CheckCounts | None:
+    if not parts:
+        return None
+    cycle = np.concatenate([part.cycle for part in parts])
+    return CheckCounts(parts[0].devices, cycle, np.concatenate([part.counts for part in parts]))
 
 
 class TruthClock:

@@ -31,7 +31,7 @@ from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.log.stretch import WHOLE, Stretch, start_of_log
 from adacd_hil.records import JOINTS
 
-RUN_TOPICS: Final = ("/scheme", "/cycle", "/contact", "/events")
+RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
 """Of a run's log, what a report reads."""
 FULL_CYCLES: Final = 500_000
 """Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 0.7 kB each."""

@@ -5,6 +5,7 @@ from html import escape
 
 import numpy as np
 
+from adacd_hil.analysis.cyclic_data import percent_text
 from adacd_hil.analysis.drawing import Drawing
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.metrics import Metrics
@@ -13,6 +14,7 @@ from adacd_hil.analysis.report.definitions import definitions
 from adacd_hil.analysis.report.page import NONE, document, embed, heading, number_text, wrap_section
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.tables import (
+    data_table,
     further_table,
     margins_table,
     paper_table,
@@ -23,7 +25,7 @@ from adacd_hil.analysis.report.tables import (
 from adacd_hil.analysis.report.timeline import timeline
 from adacd_hil.analysis.report.timing_page import timing_section
 from adacd_hil.analysis.report.traces_page import SCRIPTS, STYLES, traces_section
-from adacd_hil.analysis.report.words import stretch_text
+from adacd_hil.analysis.report.words import has_paper, stretch_text
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.verdict import LISTED
 
@@ -40,12 +42,13 @@ def report_page(
         _tiles(metrics),
         timeline(run, metrics),
         figures.get("fig5", ""),
-        wrap_section("Paper against measured", paper_table(metrics)),
+        wrap_section("Paper against measured" if has_paper(metrics) else "Measured", paper_table(metrics)),
         wrap_section("Sections", sections_table(metrics, run)),
         wrap_section("Margins", margins_table(metrics.evidence)),
         wrap_section("Contacts", figures.get("contacts", ""), contacts_table(metrics), contact_cards(metrics, run)),
         wrap_section("Model identification", adaptations, parameters_table(metrics, run), further_table(metrics)),
         traces,
+        wrap_section("Cyclic data", data_table(metrics)),
         timing_section(metrics.timing, timing),
         wrap_section("Run", run_table(metrics, run, source)),
         definitions(run),
@@ -94,6 +97,7 @@ def _tiles(metrics: Metrics) -> str:
         ("median delay", number_text(float(np.median(delays_ms)), 1) if delays_ms else NONE, "ms"),
         ("of which by law", number_text(float(np.median(laws_ms)), 1) if laws_ms else NONE, "ms"),
         ("largest frozen residual", number_text(max(frozen), 3) if frozen else NONE, "Nm"),
+        ("incomplete cycles", _share_number(metrics.data.incomplete), "%"),
         ("smallest margin", NONE if evidence is None else number_text(evidence.smallest_margin, 2), "×"),
     ]
     tiles = [tile for tile in tiles if tile[1] != NONE]
@@ -102,6 +106,10 @@ def _tiles(metrics: Metrics) -> str:
         for label, value, unit in tiles
     )
     return f'<dl class="tiles">{cells}</dl>'
+
+
+def _share_number(share: float | None) -> str:
+    return NONE if share is None else percent_text(share).removesuffix(" %")
 
 
 def _beside_times(evidence: Evidence | None) -> str:

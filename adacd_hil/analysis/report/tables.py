@@ -6,6 +6,7 @@ from itertools import islice
 from string import ascii_letters
 from typing import Final
 
+from adacd_hil.analysis.cyclic_data import percent_text
 from adacd_hil.analysis.evidence import ChannelMargin, Evidence
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import ADAPTATIONS, SECTIONS
@@ -153,6 +154,31 @@ def parameters_table(metrics: Metrics, run: Run) -> str:
         f"{_first_adaptations(metrics)}</p>"
     )
     return make_table(head, rows, left=(0, 1)) + note
+
+
+def data_table(metrics: Metrics) -> str:
+    """Write how much of the cyclic data came in time, and what is over its limit."""
+    data = metrics.data
+    if not data.cycles:
+        return ""
+    rows: list[Sequence[Cell]] = [
+        (name, _share(share), _share(worst))
+        for name, share, worst in (
+            ("cycles that lacked a frame in time", data.incomplete, data.worst_incomplete),
+            ("cycles that went by older data", data.aged, None),
+        )
+    ]
+    for name, shares in data.devices.items():
+        device = escape(name)
+        rows.append((f"{device}: no new data", _share(shares.no_new_data), _share(shares.worst_no_new_data)))
+        rows.append((f"{device}: repeated", _share(shares.repeated), _share(shares.worst_repeated)))
+    note = f"Of {data.cycles} cycles with powered drives."
+    over = "".join(f'<p class="note bad">{escape(line)}.</p>' for line in data.excesses)
+    return make_table(("", "share", "worst second"), rows) + f'<p class="note">{note}</p>{over}'
+
+
+def _share(share: float | None) -> str:
+    return NONE if share is None else percent_text(share)
 
 
 def run_table(metrics: Metrics, run: Run, source: Source) -> str:

@@ -87,18 +87,26 @@ def contact_rows(metrics: Metrics, contacts: Sequence[Contact]) -> tuple[tuple[s
     ]
 
 
+def has_paper(metrics: Metrics) -> bool:
+    """Tell whether the run is of the paper's experiment."""
+    return any(row.paper is not None for row in metrics.paper)
+
+
 def paper_head(metrics: Metrics) -> tuple[str, ...]:
-    """Name the columns of paper against measured."""
+    """Name the columns of paper against measured; the paper's own is there where its experiment was played."""
     if metrics.evidence is None:
-        return ("", "paper", "measured")
-    return ("", "paper (printed)", "paper's scheme, same stream", "certified")
+        return ("", "paper", "measured") if has_paper(metrics) else ("", "measured")
+    paper = ("paper (printed)",) if has_paper(metrics) else ()
+    return ("", *paper, "paper's scheme, same stream", "certified")
 
 
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
     """Write a row per quantity."""
-    if metrics.evidence is None:
-        return [(row.quantity, row.paper, row.measured) for row in metrics.paper]
-    return [(row.quantity, row.paper, row.beside or NONE, row.measured) for row in metrics.paper]
+    rows = []
+    for row in metrics.paper:
+        beside = () if metrics.evidence is None else (row.beside or NONE,)
+        rows.append((row.quantity, *(() if row.paper is None else (row.paper,)), *beside, row.measured))
+    return rows
 
 
 def stretch_text(stretch: StretchOfRun) -> str:

@@ -1,0 +1,190 @@
+"""How much of the cyclic data came, by the log; what a run's verdict says of it, of faults and of what broke it off."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns
+
+from adacd_hil.analysis.cyclic_data import CyclicDataGatherer, data_text, gather_data, percent_text
+from adacd_hil.analysis.endings import find_faults
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.run import CheckCounts
+from adacd_hil.analysis.timing import CycleColumns
+from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.records import Event, FaultReason, SchemeState
+
+ZERO = EPOCH_NS + 100_000_000
+"""When the first cycle of a hand-made run is, ns."""
+
+
+def missing_frames(run, rows, age=0):
+    """Let a frame be missing in some rows, and the values used be so old."""
+    missing = np.zeros(len(run.cycle), np.int64)
+    missing[rows] = 1
+    return with_columns(run, frames_missing=missing, data_age=missing * age)
+
+
+def said(t_ms, name, message, level="error"):
+    return LoggedEvent(ZERO + t_ms * 1_000_000, Event(level, name, message))
+
+
+def test_shares_are_those_of_cycles_with_powered_drives():
+    run = make_run((SchemeState.COMMISSION, 1000), (A, 1000), (M, 3000), (SchemeState.FAULT, 500))
+    rows = np.r_[0:900, 1000:1040, 5100:5400]
+    data = gather_data(missing_frames(run, rows, age=2))
+    assert (data.cycles, data.incomplete, data.aged) == (4000, 0.01, 0.01)
+
+
+def test_the_worst_second_tells_what_a_share_of_the_run_hides():
+    data = gather_data(missing_frames(make_run((A, 1000), (M, 59_000)), np.arange(30_000, 30_120)))
+    assert data.incomplete == pytest.approx(0.002)
+    assert data.worst_incomplete == 0.12
+    assert data.excesses == ("incomplete cycles: 12 % of the cycles of a second, 10 % allowed",)
+
+
+def test_a_second_within_its_limit_is_no_excess():
+    assert gather_data(missing_frames(make_run((A, 1000), (M, 1000)), np.arange(100))).excesses == ()
+
+
+def test_a_window_does_not_reach_over_a_stay_without_power():
+    run = make_run((A, 700), (SchemeState.FAULT, 500), (A, 700))
+    data = gather_data(missing_frames(run, np.arange(600, 700)))
+    assert data.worst_incomplete == pytest.approx(100 / 700)
+
+
+def test_a_few_last_cycles_are_no_second():
+    assert gather_data(missing_frames(make_run((A, 1000), (M, 100)), np.arange(1050, 1100))).worst_incomplete == 0.0
+
+
+@pytest.mark.parametrize("size", [1, 7, 333, 1000, 5000])
+def test_pieces_come_to_the_same_as_the_whole(size):
+    run = make_run((A, 700), (SchemeState.FAULT, 50), (A, 900), (M, 1700))
+    run = missing_frames(run, np.random.default_rng(1).random(len(run.cycle)) < 0.05, age=1)
+    gatherer = CyclicDataGatherer(run.settings)
+    for start in range(0, len(run.cycle), size):
+        rows = np.arange(start, min(start + size, len(run.cycle)))
+        gatherer.add(run.timing.rows(rows), run.cycle[rows], run.state[rows])
+    assert gatherer.data(run) == gather_data(run)
+
+
+def test_a_log_that_lacks_the_counts_is_not_called_free_of_losses():
+    run = make_run((A, 100))
+    older = replace(run, timing=CycleColumns(run.timing.t_ns, {"cycle": run.timing["cycle"]}))
+    assert data_text(gather_data(older)) == "whether cyclic data was late or lost is not in the log"
+    nothing = replace(run, timing=CycleColumns(run.timing.t_ns[:0], {}))
+    assert data_text(gather_data(nothing)) == "whether cyclic data was late or lost is not in the log"
+
+
+def checks(run, *logged):
+    """Let counts be logged: row, and of the two devices the cycles without new data and those repeated."""
+    counts = np.zeros((len(logged), 2, 7), np.int64)
+    for place, (_, *found) in enumerate(logged):
+        counts[place, :, 5], counts[place, :, 2] = found
+    cycle = run.cycle[[row for row, *_ in logged]]
+    return replace(run, checks=CheckCounts(("drive1", "sensor1"), cycle, counts))
+
+
+def test_shares_of_a_device_are_what_the_counts_grew_by_while_the_drives_were_powered():
+    run = make_run((SchemeState.COMMISSION, 1500), (A, 2500), (SchemeState.FAULT, 1000))
+    run = checks(
+        run, (0, (0, 0), (0, 0)), (1000, (900, 0), (0, 0)), (2000, (900, 20), (0, 0)), (3000, (900, 100), (5, 0)),
+        (4500, (900, 900), (5, 0)),
+    )  # fmt: skip
+    found = gather_data(run).devices
+    sensor = found["sensor1"]
+    assert (sensor.cycles, sensor.no_new_data, sensor.worst_no_new_data) == (2000, 0.05, 0.08)
+    assert (found["drive1"].no_new_data, found["drive1"].repeated, found["drive1"].worst_repeated) == (0, 0.0025, 0.005)
+
+
+def test_counts_that_begin_anew_are_of_another_attempt():
+    run = make_run((A, 5000))
+    run = checks(run, (1000, (0, 500), (0, 0)), (2000, (0, 3), (0, 0)), (3000, (0, 13), (0, 0)))
+    assert gather_data(run).devices["sensor1"].no_new_data == 0.01
+
+
+def test_a_device_over_its_limit_makes_a_run_unclean():
+    run = make_run()
+    assert evaluate(run).is_clean is True
+    run = checks(run, (1000, (0, 0), (0, 0)), (2000, (0, 0), (0, 51)))
+    metrics = evaluate(run)
+    assert metrics.is_clean is False
+    assert metrics.data.excesses == ("repeated frames of sensor1: 5.1 % of the cycles of a second, 1 % allowed",)
+    assert metrics.verdict.endswith("; repeated frames of sensor1 in 5.1 %, more than allowed.")
+
+
+def test_the_verdict_has_the_shares():
+    metrics = evaluate(missing_frames(make_run(), np.arange(2000, 2093), age=3))
+    assert metrics.verdict.endswith("; 1 % of the cycles lacked a frame in time, 1 % went by older data.")
+    assert metrics.is_clean is True
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.0, "0 %"), (1e-7, "less than 0.01 %"), (0.00123, "0.12 %"), (0.123, "12 %"), (0.996, "100 %"), (1.5, "150 %")],
+)
+def test_a_share_is_never_rounded_to_nothing(share, text):
+    assert percent_text(share) == text
+
+
+def test_a_margin_below_1_makes_a_run_unclean_and_stands_in_front():
+    run = make_certified_run()
+    assert evaluate(run).is_clean is True
+    run.certified.tau_ext[2000, 0, 0] = 0.244
+    metrics = evaluate(run)
+    assert metrics.verdict.startswith(
+        "A residual was over its threshold with nobody touching the arm: smallest margin 0.41; "
+    )
+    assert metrics.is_clean is False
+
+
+def faulted(*stays, events=()):
+    run = make_run(*stays, events=events)
+    run.fault[run.state == SchemeState.FAULT] = FaultReason.DRIVE
+    return run
+
+
+CAUSE = "ADAPT -> FAULT: DRIVE; Drive2: over-current"
+
+
+def test_a_fault_has_the_cause_that_was_logged():
+    run = faulted(
+        (A, 500), (SchemeState.FAULT, 10), events=(said(400, "supervisor", "no"), said(500, "supervisor", CAUSE))
+    )
+    assert evaluate(run).verdict.startswith(
+        "The run ended in FAULT (DRIVE) at 0.50 s: Drive2: over-current; no contact"
+    )
+
+
+def test_a_run_that_went_on_after_a_fault_did_not_end_in_it():
+    run = faulted((A, 500), (SchemeState.FAULT, 10), (SchemeState.INIT, 10), (A, 500), (M, 100))
+    verdict = evaluate(run).verdict
+    assert verdict.startswith("FAULT (DRIVE) at 0.50 s, after which it began anew; no contact")
+    assert "the model was not identified at first, then in 0.50 s" in verdict
+    assert evaluate(run).is_clean is False
+
+
+def test_of_many_faults_the_first_and_the_last_are_said():
+    run = faulted((A, 500), *[(SchemeState.FAULT, 10), (A, 90)] * 3, (SchemeState.FAULT, 10))
+    assert [fault.is_last for fault in find_faults(run)] == [False, False, False, True]
+    assert evaluate(run).verdict.startswith(
+        "4 faults, the first and the last: FAULT (DRIVE) at 0.50 s, after which it began anew; the run ended in FAULT "
+        "(DRIVE) at 0.80 s; "
+    )
+
+
+def test_a_run_that_never_booted_has_its_cause_as_verdict():
+    events = (said(0, "run", "no boot-up from Drive1\x1b[2J within 2 s"),) * 2
+    run = make_run((A, 1), has_truth=False, events=events)
+    run = replace(run, **{name: getattr(run, name)[:0] for name in ("cycle", "t_ns", "state", "fault", "tau_ext_hat")})
+    run = replace(run, **{name: getattr(run, name)[:0] for name in ("tau_ext_hat_cad", "theta_hat", "threshold")})
+    metrics = evaluate(run)
+    assert metrics.verdict == "No cycle was run: no boot-up from Drive1\\u001b[2J within 2 s."
+    assert metrics.is_clean is False
+    assert evaluate(replace(run, events=())).verdict == "No cycle was run: the log does not say why."
+
+
+def test_what_broke_a_run_off_makes_it_unclean():
+    metrics = evaluate(make_run(events=(said(9000, "run", "can0 went away"), said(0, "run", "hello", "info"))))
+    assert metrics.verdict.startswith("The run was broken off: can0 went away; no contact")
+    assert metrics.is_clean is False
