@@ -775,7 +775,11 @@ class SafetySettings:
     rest_torque_Nm: float = setting(1.0, unit="Nm", low=0.01, high=100.0, meaning="largest |tau_J| before enabling")
     phase_timeout_s: float = setting(5.0, unit="s", low=0.1, high=600.0, meaning="longest COMMISSION and ENABLE")
     tolerated_emergencies: tuple[int, ...] = setting(
-        (), low=0x0100, high=0xFFFF, meaning="EMCY error codes that don't stop the arm; any other does at once"
+        (0x8200, 0x8210, 0x8240),
+        low=0x0100,
+        high=0xFFFF,
+        meaning="EMCY error codes that don't stop the arm; any other does at once. Default: one odd SYNC, a PDO or a SYNC "
+        "of the wrong length",
     )
 
 

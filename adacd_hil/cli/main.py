@@ -96,10 +96,10 @@ def run(
     On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, and
     `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C stops at once.
     """
-    from adacd_hil.cli.run import run_on_bus
+    from adacd_hil.cli.run import as_text, run_on_bus
 
     result, code = run_on_bus(connection, clock, out, tare, live)
-    print(json.dumps(result, indent=2) if as_json else "\n".join(f"{key}: {value}" for key, value in result.items()))
+    print(json.dumps(result, indent=2) if as_json else as_text(result))
     return code
 
 

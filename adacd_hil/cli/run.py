@@ -119,8 +119,6 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
             "recoveries": summary.recoveries,
             "data": dataclasses.asdict(summary.result.data),
         }
-        for line in summary.result.data.excesses:
-            print(f"adacd-hil: {line}", file=sys.stderr)
     log = summary.log
     return described | {
         "frames": log.frames,
@@ -130,3 +128,15 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
         "log_parts": log.parts,
         "log_queue_peak_bytes": log.queue_peak_bytes,
     }
+
+
+def as_text(result: dict[str, Any]) -> str:
+    """Lay out what `summarise` says for people, a line each."""
+    data = result.get("data")
+    lines = [f"{key}: {value}" for key, value in result.items() if key != "data"]
+    if data is not None:
+        lines.append(f"incomplete cycles: {data['incomplete']:.2%}; samples used late: {data['late']:.2%}")
+        for what, shares in (("no frame in time", data["no_new_data"]), ("repeated frames", data["repeated"])):
+            lines += [f"{name}: {what} in {share:.2%} of the cycles" for name, share in shares.items() if share]
+        lines += [f"over its limit: {line}" for line in data["excesses"]]
+    return "\n".join(lines)

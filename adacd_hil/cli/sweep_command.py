@@ -78,10 +78,11 @@ def sweep(
     store = SweepStore(out)
     progress = Progress()
     progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
-    if scheduler and not scheduler.startswith(TLS):
+    tls = TlsFiles(tls_ca_file, tls_cert, tls_key)
+    if scheduler and not scheduler.startswith(TLS) and not any(tls):
         progress(f"{scheduler} is open: it runs whatever anybody sends who reaches it (docs/sweep.md)")
     try:
-        with connect(scheduler, workers or os.cpu_count() or 1, TlsFiles(tls_ca_file, tls_cert, tls_key)) as client:
+        with connect(scheduler, workers or os.cpu_count() or 1, tls) as client:
             outcome = run_sweep(plan, work, store, client, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)

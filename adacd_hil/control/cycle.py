@@ -47,6 +47,8 @@ from adacd_hil.wire.tap import Tap
 
 FAULT_LINGER_S = 0.5
 """How long a faulted run goes on, so that the drives' quick stop is in the log."""
+FINISH_S = 10.0
+"""How long an arm may take to park once it is to finish, three times the longest way; then it ends where it is."""
 DISABLE_CYCLES = 20
 """Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
 FRAME_CHECKS_S = 1.0
@@ -110,6 +112,7 @@ class Cycle:
         self._faulted_cycle: int | None = None
         self._interrupts = 0
         self._is_finishing = False
+        self._finish_cycle = 0
         self._carried: Request | None = None
         self._unserved = Request.NONE
 
@@ -158,6 +161,10 @@ class Cycle:
             self._look_after_devices(arm, output)
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
+        if self._is_finishing and self._state in POWERED and not self._reference.is_parked(self._arm.cycle):
+            text = f"not parked within {FINISH_S:g} s: the drives are disabled where the arm is"
+            recorder.event(tick.t_ns, Event("warning", "run", text))
+            self._progress(text)
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(
             self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0, self._data.shares()
@@ -184,6 +191,8 @@ class Cycle:
         return self._finish() if request is Request.FINISH else request
 
     def _finish(self) -> Request:
+        if not self._is_finishing:
+            self._finish_cycle = self._arm.cycle
         self._is_finishing = True
         if self._state in POWERED:
             self._reference.park()
@@ -295,7 +304,10 @@ class Cycle:
             return output.cycle - self._faulted_cycle >= FAULT_LINGER_S / self._period_s
         if self._interrupts > 1:
             return True
-        return self._is_finishing and (self._state not in POWERED or self._reference.is_parked(output.cycle))
+        if not self._is_finishing:
+            return False
+        is_overdue = output.cycle - self._finish_cycle > FINISH_S / self._period_s
+        return is_overdue or self._state not in POWERED or self._reference.is_parked(output.cycle)
 
     def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
         """Send zero torque and disabled drives for a while, without the scheme."""

@@ -46,9 +46,9 @@ _UNSEEN = int(Observation.UNSEEN)
 # Shares of the nominal period: the shortest and the longest interval of two samples that follow each other.
 _SHORTEST_SHARE = 0.5
 _LONGEST_SHARE = 1.5
-MOST_FILLED = 3
-"""Missing samples that are put on the line between their neighbours: as many as a value may be old by default. Over
-4 ms the line is within 1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
+MOST_FILLED = 4
+"""Missing samples that are put on the line between their neighbours: with one more the model is blind by default. Over
+5 ms the line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 
 
 @compiled

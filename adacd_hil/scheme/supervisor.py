@@ -351,13 +351,12 @@ class Supervisor:
         return SchemeEvent.CLEARED if has_cleared else SchemeEvent.NONE
 
     def _is_commissioned(self, arm: ArmState, observation: int) -> bool:
-        """Count this cycle if all is well in it, and tell whether enough have been counted in a row."""
-        is_good = (
-            arm.is_complete
-            and observation & _REST_UNLOADED == _REST_UNLOADED
-            and self._check(arm, observation) is FaultReason.NONE
-        )
-        self._commissioned_cycles = self._commissioned_cycles + 1 if is_good else 0
+        """Count this cycle if all is well in it, and tell whether enough have been counted in a row.
+
+        One whose data are not complete doesn't count and breaks nothing: how many may be missing, `_check` says.
+        """
+        is_good = observation & _REST_UNLOADED == _REST_UNLOADED and self._check(arm, observation) is FaultReason.NONE
+        self._commissioned_cycles = self._commissioned_cycles + arm.is_complete if is_good else 0
         return self._commissioned_cycles >= self._commission_cycles
 
     def _overdue(self) -> FaultReason:

@@ -232,7 +232,6 @@ def test_commissioning_takes_as_many_good_cycles_as_asked():
 @pytest.mark.parametrize(
     ("arm", "observation"),
     [
-        (DISABLED._replace(is_complete=False), RESTING),
         (DISABLED, Observation.AT_REST),
         (DISABLED, Observation.UNLOADED),
         (DISABLED._replace(fault=FaultReason.SENSOR), RESTING),
@@ -248,6 +247,54 @@ def test_one_bad_cycle_begins_commissioning_anew(arm, observation):
     run.step(arm, observation=observation)
     assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
     assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
+
+
+def test_a_cycle_without_all_its_data_does_not_count_and_begins_nothing_anew():
+    run = run_in(SchemeState.COMMISSION)
+    run.step(DISABLED, observation=RESTING, cycles=19)
+    missing = DISABLED._replace(is_complete=False)
+    assert run.step(missing, observation=RESTING | Observation.UNSEEN, cycles=3) is SchemeState.COMMISSION
+    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
+
+
+def test_a_blind_model_is_not_commissioned():
+    run = run_in(SchemeState.COMMISSION)
+    run.step(DISABLED, observation=RESTING, cycles=19)
+    run.step(DISABLED._replace(is_complete=False), observation=RESTING | Observation.UNSEEN, cycles=5)
+    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
+
+
+@pytest.mark.parametrize("state", sorted(POWERED))
+def test_a_model_without_a_fresh_sample_is_a_fault_in_the_fifth_cycle_and_so_is_one_with_old_ones(state):
+    unseen = Observation.UNSEEN
+    run = run_in(state)
+    assert run.step(GOOD._replace(is_complete=False), observation=unseen, cycles=4) is state
+    assert run.step(GOOD) is state
+    assert run.step(GOOD._replace(is_complete=False), observation=unseen, cycles=4) is state
+    assert run.step(GOOD._replace(is_complete=False), observation=unseen) is SchemeState.FAULT
+    assert run.supervisor.fault is FaultReason.BLIND
+    run = run_in(state)
+    old = GOOD._replace(age_q=(2, 2), age_tau_J=(2, 2))
+    assert run.step(old, cycles=5) is state
+    assert run.step(old) is SchemeState.FAULT
+    assert run.supervisor.fault is FaultReason.DATA_AGE
+
+
+@pytest.mark.parametrize(
+    ("request_", "reason"),
+    [
+        (Request.FAULT_TORQUE, FaultReason.TORQUE),
+        (Request.FAULT_FOLLOWING, FaultReason.FOLLOWING),
+        (Request.FAULT_TAMPERED, FaultReason.TAMPERED),
+    ],
+)
+def test_the_host_s_own_checks_ask_for_a_fault_of_an_arm_that_may_have_torque(request_, reason):
+    for state in POWERED:
+        run = run_in(state)
+        assert run.step(GOOD, request=request_) is SchemeState.FAULT
+        assert run.supervisor.fault is reason
+    run = run_in(SchemeState.COMMISSION)
+    assert run.step(DISABLED, request=request_) is SchemeState.COMMISSION
 
 
 @pytest.mark.parametrize(

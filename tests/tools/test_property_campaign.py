@@ -312,7 +312,7 @@ def test_seeds_draw_every_scheme_contract_profile_and_most_kinds_of_fault() -> N
 
 
 def test_what_is_asked_bounds_how_long_a_run_may_take() -> None:
-    settings = load_settings("certified")
+    settings = load_settings("demo")
     operator = dataclasses.replace(settings.operator, acknowledge_faults=2, acknowledge_fault_after_s=1.0)
     patient = dataclasses.replace(settings, operator=operator)
     assert witnessed_run.allowed_after_finish_s(settings) == 20.0

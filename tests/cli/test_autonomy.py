@@ -1,0 +1,110 @@
+"""What acts by itself, and where it may: scripts, acknowledgements, arms without data."""
+
+import dataclasses
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from adacd_hil.cli.connection import check_autonomy, on_interrupt
+from adacd_hil.cli.demo import USER, resolve
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.config import OperatorSettings, Settings, builtin_names, load_settings
+from adacd_hil.wire.bus import is_virtual
+
+
+def changed(**sections: dict[str, object]) -> Settings:
+    settings = load_settings("certified")
+    parts = {name: dataclasses.replace(getattr(settings, name), **values) for name, values in sections.items()}
+    return dataclasses.replace(settings, **parts)
+
+
+def test_only_the_demo_s_own_configurations_act_by_script() -> None:
+    acting = {name for name in builtin_names() if load_settings(name).operator != OperatorSettings()}
+    assert acting == {"demo", "demo_paper"}
+    assert load_settings("demo").operator == load_settings("demo_paper").operator
+
+
+@pytest.mark.parametrize(("config", "base"), [("demo", "certified"), ("demo_paper", "paper")])
+def test_but_for_its_user_a_configuration_of_the_demo_is_the_one_that_it_extends(config: str, base: str) -> None:
+    own, plain = load_settings(config), load_settings(base)
+    assert dataclasses.replace(own, name=base, operator=plain.operator) == plain
+
+
+def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path: Path) -> None:
+    mine = tmp_path / "my-arm.toml"
+    mine.write_text('extends = "certified"\n[operator]\nscript = []\nacknowledge_after_s = 0.0\n')
+    assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(USER).operator
+    assert resolve(str(mine), "push-link1", None, None).settings.operator.acknowledge_after_s == 0.6
+    mine.write_text('extends = "certified"\n[operator]\nscript = [{ at_s = 1.0, request = "finish" }]\n')
+    assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(str(mine)).operator
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (changed(bus={"max_age_cycles": 6}), "`bus.max_age_cycles` = 6 lets an arm move without data"),
+        (changed(data={"blind_cycles": 6}), "`data.blind_cycles` = 6 lets an arm move without data"),
+        (changed(operator={"acknowledge_after_s": 0.5}), "`operator.acknowledge_after_s` = 0.5 acknowledges by itself"),
+        (changed(operator={"acknowledge_faults": 1}), "`operator.acknowledge_faults` = 1 acknowledges by itself"),
+    ],
+)
+def test_on_what_may_be_hardware_nothing_is_driven_blind_or_acknowledged_by_itself(
+    settings: Settings, words: str
+) -> None:
+    with pytest.raises(CommandError, match=words.replace("`", ".")) as refused:
+        check_autonomy(settings, "pcan", "PCAN_USBBUS1")
+    assert refused.value.code is ExitCode.USAGE
+    check_autonomy(settings, "virtual", "x")
+
+
+def test_a_second_setting_lets_a_script_acknowledge_on_hardware() -> None:
+    check_autonomy(
+        changed(operator={"acknowledge_after_s": 0.5, "acknowledge_on_hardware": True}), "pcan", "PCAN_USBBUS1"
+    )
+    check_autonomy(load_settings("certified"), "pcan", "PCAN_USBBUS1")
+
+
+def test_a_script_that_only_ends_the_run_is_no_acknowledgement(tmp_path: Path) -> None:
+    mine = tmp_path / "short.toml"
+    mine.write_text('[operator]\nscript = [{ at_s = 1.0, request = "finish" }]\n')
+    check_autonomy(load_settings(str(mine)), "pcan", "PCAN_USBBUS1")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "expected"),
+    [("vcan", "bus", True), ("vxcan", "bus", True), ("slcan", "bus", False), ("can", "bus", False), ("", "bus", False)],
+)
+def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(
+    monkeypatch: pytest.MonkeyPatch, kind: str, name: str, expected: bool
+) -> None:
+    from adacd_hil.wire.link import Link
+
+    monkeypatch.setattr("adacd_hil.wire.link.read_link", lambda _: Link(name, True, kind, 16, 10))
+    assert is_virtual("socketcan", name) == expected
+
+
+def test_an_interface_that_is_not_there_is_not_virtual() -> None:
+    assert not is_virtual("socketcan", "no_such_can0")
+    assert not is_virtual("pcan", "PCAN_USBBUS1")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_asks_for_the_end(number: signal.Signals) -> None:
+    asked: list[int] = []
+    with on_interrupt(lambda: asked.append(1)):
+        signal.raise_signal(number)
+    assert asked == [1]
+
+
+def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang_up() -> None:
+    program = (
+        "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "from adacd_hil.cli.connection import on_interrupt\n"
+        "with on_interrupt(lambda: print('asked')):\n"
+        "    signal.raise_signal(signal.SIGHUP)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == ""

@@ -1,0 +1,74 @@
+"""The end of a run that the user has asked for: it outlives a fault, and it comes within a time."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from session_rig import Rig
+
+from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.control.cycle import FINISH_S
+from adacd_hil.log.reader import read_log
+from adacd_hil.records import FaultReason, Request, SchemeState
+
+pytestmark = pytest.mark.slow
+
+FAULT_WHILE_PARKING = """
+lasts_s = 1.0
+start_deg = [0.0, 0.0]
+acknowledge_faults = 1
+
+[[faults]]
+kind = "drive_fault"
+node = "drive1"
+code = 0x2310
+at_s = 1.05
+duration_s = 0.1
+"""
+
+
+def test_a_fault_while_parking_is_acknowledged_and_the_arm_is_parked_and_the_run_ends(tmp_path: Path) -> None:
+    scenario = tmp_path / "parking.toml"
+    scenario.write_text(FAULT_WHILE_PARKING)
+    summary, _ = run_embedded(resolve("paper", str(scenario), None, None), "lockstep", tmp_path)
+    assert summary.result is not None
+    assert (summary.recoveries, summary.result.fault) == (1, FaultReason.NONE)
+    log = read_log(summary.log.path)
+    scheme = log.scheme
+    asked = scheme["cycle"][scheme["request"] == Request.FINISH]
+    assert len(asked) == 2
+    again = int(np.flatnonzero(scheme["state"] == SchemeState.FAULT)[-1]) + 1
+    states = [SchemeState(int(state)).name for state in np.unique(scheme["state"][again:])]
+    assert states == ["COMMISSION", "ENABLE", "ADAPT"]
+    np.testing.assert_allclose(np.degrees(scheme["q"][-1]), [-30.0, -60.0], atol=1.0)
+    assert len(scheme) < 10_000
+
+
+def test_a_payload_that_was_announced_and_not_yet_served_is_announced_again(tmp_path: Path) -> None:
+    scenario = tmp_path / "announced.toml"
+    scenario.write_text(FAULT_WHILE_PARKING.replace("lasts_s = 1.0", "lasts_s = 9.0"))
+    cast = resolve("paper", str(scenario), None, None)
+    script = tuple(
+        dataclasses.replace(cast.settings.operator.script[0], at_s=at_s, request=request)
+        for at_s, request in ((0.9, "payload"), (9.0, "finish"))
+    )
+    operator = dataclasses.replace(cast.settings.operator, script=script)
+    cast = cast._replace(settings=dataclasses.replace(cast.settings, operator=operator))
+    summary, _ = run_embedded(cast, "lockstep", tmp_path)
+    log = read_log(summary.log.path)
+    asked = log.scheme["cycle"][log.scheme["request"] == Request.PAYLOAD]
+    assert len(asked) == 2
+    assert np.any(log.scheme["state"] == SchemeState.PAYLOAD)
+
+
+def test_an_arm_that_cannot_be_parked_is_disabled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("adacd_hil.control.reference.Reference.is_parked", lambda *_: False)
+    rig = Rig(tmp_path, finish_s=0.5)
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert summary.result.fault is FaultReason.NONE
+    finish = int(np.flatnonzero(log.scheme["request"] == Request.FINISH)[0])
+    assert 0 <= len(log.scheme) - finish - FINISH_S * 1000 < 5
+    (said,) = [entry.event.message for entry in log.events if entry.event.name == "run"]
+    assert said == "not parked within 10 s: the drives are disabled where the arm is"
