@@ -13,7 +13,8 @@ Two clocks:
 
 By SYNC, heartbeats and deadlines go by the given clock while no SYNC comes, and so does the braking that they cause. A
 host in lockstep says itself how much time passes (`firmware_sim.time_marks`), and hears from the bench what doesn't
-come at once.
+come at once. Once a host has died, `outlive_host` lets pass what time it takes the arm to come to rest. The truth is
+told on the way, a row per period, numbered and stamped on from the last SYNC.
 
 The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
 0 for a master that begins at 1; from there the counter 1…240 is unwrapped. SYNCs that come twice or out of order:
@@ -22,8 +23,6 @@ The first SYNC after boot-up or an NMT reset communication (of all nodes or of d
 
 from collections.abc import Callable, Sequence
 from typing import Literal, Protocol
-
-import numpy as np
 
 from adacd_hil.records import JOINTS, TRUTH_LAYOUT, Vector
 from adacd_hil.wire.bus import Frame
@@ -43,6 +42,7 @@ from firmware_sim.sync_listeners import SyncListeners
 from firmware_sim.sync_order import SyncKind, SyncOrder
 from firmware_sim.time_marks import HOST_MARK, MarkKind, unpack_mark
 from firmware_sim.torque_transducer import converter_ends
+from firmware_sim.truth_rows import OnTruth, TruthRows
 
 ClockMode = Literal["sync", "wall"]
 _TICK_NS = round(TICK_S * 1e9)
@@ -50,6 +50,13 @@ _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
 _PLANNED_PERIOD_NS = 1_000_000
 """How long a fault without length, such as a reboot, is active."""
+
+LONGEST_ORPHANAGE_NS = 5_000_000_000
+"""How long an arm is watched whose host has died; braking takes 1 s at most, what coasts with friction a few more."""
+_OVERDUE_PERIODS = 4
+"""By the clock, without SYNC for so long the truth goes on by itself; a lost SYNC or two leave a gap as ever."""
+_REST_RAD_S, _REST_NS = 0.02, 50_000_000
+"""At rest: slower than that for so long, as far as the drives can tell."""
 
 _FAULTS = TRUTH_LAYOUT.slices["faults"]
 
@@ -103,7 +110,7 @@ class Bench:
         *,
         clock_mode: ClockMode = "sync",
         seed: int | None = None,
-        on_truth: Callable[[int, int, Vector], None] | None = None,
+        on_truth: OnTruth | None = None,
         contract: Contract | None = None,
         on_event: OnEvent | None = None,
         on_answer: Callable[[], None] = lambda: None,
@@ -131,11 +138,13 @@ class Bench:
         self._scenario = scenario
         self._seed = seed
         self._is_wall = clock_mode == "wall"
-        self.on_truth = on_truth
+        self._rows = TruthRows(self._fill_truth, on_truth)
         self._on_answer = on_answer
-        self._truth = np.zeros(TRUTH_LAYOUT.size)
         self._order = SyncOrder(is_timed=self._is_wall)
         self._lost_syncs = 0  # before the last one
+        self._is_orphaned = False  # time passes that no host gives
+        self._has_outlived = False  # a host, since the last SYNC
+        self._moving_ns = 0  # when the arm last moved, or could
         self._has_moved = False
         self._is_started = False
         self._due_ns = NEVER_NS
@@ -182,6 +191,15 @@ class Bench:
             **({} if self._is_wall else {HOST_MARK: self._on_mark}),
             **{0x600 + device.node_id: self._sdo_handler(0x600 + device.node_id) for device in self.devices},
         }
+
+    @property
+    def on_truth(self) -> OnTruth | None:
+        """Called once per cycle with what is true."""
+        return self._rows.on_truth
+
+    @on_truth.setter
+    def on_truth(self, on_truth: OnTruth) -> None:
+        self._rows.on_truth = on_truth
 
     @property
     def on_event(self) -> OnEvent | None:
@@ -273,6 +291,30 @@ class Bench:
         periods = (counter - last) % self._listeners.overflow if counter and last else 1
         return periods * self._period_ns
 
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the arm has stood still for a while and no drive powers its motor."""
+        return self._has_rested(self.now_ns)
+
+    def outlive_host(self) -> None:
+        """By SYNC, let the time pass that no host gives any more, until the arm is at rest, for 5 s at most.
+
+        The drives then miss their SYNC as by the clock. Once per host; by the clock time passes anyway.
+        """
+        if self._is_wall or not self._has_moved or self._has_outlived:
+            return
+        self._has_outlived = self._is_orphaned = True
+        for drive in self.drives:
+            drive.is_free_running = True
+        end_ns = self.now_ns + LONGEST_ORPHANAGE_NS
+        self._body_ns = self.now_ns
+        self._poll(self.now_ns)
+        while not self.is_at_rest and self.now_ns < end_ns:
+            self.advance_to(self.now_ns + self._period_ns)
+        for drive in self.drives:
+            drive.is_free_running = False
+        self._is_orphaned = False
+
     def release(self) -> None:
         """Let time go by the given clock again: the host in lockstep has gone."""
         self._outbox.is_paced = False
@@ -352,7 +394,12 @@ class Bench:
         if not order.is_taken:
             return False
         self._lost_syncs = order.periods - 1
-        self.cycle = order.counter - 1 if last == 0 else self.cycle + order.periods
+        if last == 0:
+            self.cycle = order.counter - 1
+        else:
+            self.cycle += order.periods
+            if not self._is_wall:  # time that passed without SYNC has been counted
+                self.cycle = max(self.cycle, self._rows.cycle + 1)
         return True
 
     def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
@@ -404,10 +451,30 @@ class Bench:
 
     def _tell_truth(self, t_ns: int) -> None:
         """Say what is true at this SYNC, which came at `t_ns`."""
-        if self.on_truth is not None:
-            self._body.truth(self._truth)
-            self._truth[_FAULTS] = self._injector.plan.mask
-            self.on_truth(self.cycle, self.host_ns if self.is_paced else t_ns, self._truth)
+        self._rows.tell_sync(self.cycle, self.host_ns if self.is_paced else t_ns, self.now_ns)
+        self._has_outlived = False
+
+    def _fill_truth(self, block: Vector) -> None:
+        self._body.truth(block)
+        block[_FAULTS] = self._injector.plan.mask
+
+    def _tell_on(self) -> None:
+        """Without a SYNC, say what is true at the body's time once per period, as long as the arm moves."""
+        if self._has_rested(self._body_ns):
+            return
+        if not self._is_wall:
+            self._rows.tell_next(self._period_ns)
+            return
+        overdue, rest_ns = divmod(self._body_ns - self._rows.sync_ns, self._period_ns)
+        if overdue >= _OVERDUE_PERIODS and rest_ns < _TICK_NS:
+            self._rows.tell_overdue(overdue, self._period_ns)
+
+    def _has_rested(self, now_ns: int) -> bool:
+        """Whether the arm has stood still for a while, and no drive could move it; asked while it may move."""
+        is_powered = any(drive.motor_mode for drive in self.drives)
+        if is_powered or max(map(abs, self._body.drive_velocity_rad_s)) > _REST_RAD_S:
+            self._moving_ns = now_ns
+        return now_ns - self._moving_ns >= _REST_NS
 
     @property
     def _is_plain(self) -> bool:
@@ -463,20 +530,26 @@ class Bench:
             self._advance_body(self._period_ns // _TICK_NS)
 
     def _move_to(self, t_ns: int) -> None:
-        """Let the bench's time reach `t_ns`; by wall clock the body too, by SYNC only if a drive is left alone.
+        """Let the bench's time reach `t_ns`; by wall clock the body too, by SYNC only if its host has died.
 
         A host that dies sends no SYNC. What its drives do then must end, so their braking goes by time.
         """
         self.now_ns = max(self.now_ns, t_ns)
         drive1, drive2 = self.drives
-        if not self._is_wall and not (drive1.is_left_alone or drive2.is_left_alone):
+        if not (self._is_wall or self._is_orphaned or drive1.is_left_alone or drive2.is_left_alone):
             self._body_ns = self.now_ns
             return
         step_ns = _TICK_NS if self._is_wall else self._period_ns
+        rows = self._rows
+        overdue_ns = rows.sync_ns + _OVERDUE_PERIODS * self._period_ns if rows.cycle >= 0 else NEVER_NS
         while self._body_ns + step_ns <= t_ns:
             self._body_ns += step_ns
             self._has_moved = True
+            if not self._is_wall:
+                self._tell_on()  # by SYNC the body is a period ahead of the last truth
             self._advance_body(step_ns // _TICK_NS)
+            if self._is_wall and self._body_ns >= overdue_ns:
+                self._tell_on()
 
     def _listen(self) -> None:
         """Take over which PDOs the devices exchange."""

@@ -76,7 +76,8 @@ class DriveNode:
         self._clock = device.clock
         self._tripped = device.watchdogs.tripped
         self._motor = motor
-        self._is_free_running = is_free_running
+        self.is_free_running = is_free_running
+        """Whether time passes without SYNC, so that SYNC is watched."""
         self._rated_mNm = round(rated_torque_Nm * 1000)
         self._velocity_lsb_rad_s = _velocity_lsb(codec, number)
         self._position = self._velocity = 0
@@ -240,7 +241,7 @@ class DriveNode:
         self._feel_failure(t_ns)
         if self.is_enabled:
             due_ns = min(due_ns, self._watch_bus(t_ns))
-        if self._is_braking and (self._is_free_running or self.is_left_alone):
+        if self._is_braking and (self.is_free_running or self.is_left_alone):
             self._watch_standstill(t_ns)
             due_ns = min(due_ns, t_ns + _BRAKE_WATCH_NS)
         if self.has_news:
@@ -458,7 +459,7 @@ class DriveNode:
     def _watch_bus(self, t_ns: int) -> int:
         """Fault when SYNC or commands stay away for too long; return when to look again."""
         due_ns = NEVER_NS
-        if self._is_free_running:
+        if self.is_free_running:
             patience_ns = self._period_us * self._tenth_periods * 100
             if t_ns - self._sync_ns >= patience_ns:
                 self._fault(Watchdog.SYNC, t_ns, is_found_by_time=True)

@@ -103,6 +103,9 @@ class RecordedBench(Bench):
         self._first_cycle = 0
         super().__init__(scenario, codec, send, clock_mode=clock_mode, contract=contract, on_answer=on_answer)
 
+    def outlive_host(self) -> None:
+        """Do nothing: the recording moves the arm, with or without host."""
+
     def _build_body(self) -> Movable:
         return self._body_now
 

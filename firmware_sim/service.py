@@ -9,9 +9,10 @@ from adacd_hil.clock import Clock
 from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec
-from firmware_sim.bench import Bench, ClockMode
+from firmware_sim.bench import LONGEST_ORPHANAGE_NS, Bench, ClockMode
 from firmware_sim.contracts import is_fd
 from firmware_sim.departure import Departure
+from firmware_sim.object_dictionary import NEVER_NS
 from firmware_sim.pdo_record import LISTENED_IDS
 from firmware_sim.time_marks import HOST_MARK
 
@@ -59,6 +60,7 @@ class Service:
         self._has_been_operational = False
         self._time_ns = 0  # up to here the bench's time has followed the clock
         self._heard_ns = 0  # last frame
+        self._gone_ns = NEVER_NS  # when the host was found to have gone
 
     def boot(self) -> None:
         """Announce the nodes, having dropped what the bus carried before. Raises BusError."""
@@ -76,7 +78,7 @@ class Service:
             except InterfaceDownError:
                 self._await_interface()
                 continue
-            if self._is_once and frame is None and self._is_host_gone():
+            if self._is_once and frame is None and self._is_host_gone() and self._is_settled():
                 return
 
     def _serve(self) -> Frame | None:
@@ -114,11 +116,14 @@ class Service:
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
         """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when none has come for a while.
 
-        A host in lockstep says the time itself, until it has gone.
+        A host in lockstep says the time itself, until it has gone. A host that has gone is outlived.
         """
+        is_silent = now_ns - self._heard_ns > _SILENCE_NS
+        if is_silent:
+            self._bench.outlive_host()
         if self._bench.is_paced:
             self._time_ns = now_ns
-            if now_ns - self._heard_ns > _SILENCE_NS:
+            if is_silent:
                 self._bench.release()
             return
         if self._is_wall:
@@ -131,6 +136,14 @@ class Service:
     def _is_host_gone(self) -> bool:
         is_silent = self._clock.now_ns() - self._heard_ns > _SILENCE_NS
         return self._has_been_operational and (is_silent or not self._bench.is_operational)
+
+    def _is_settled(self) -> bool:
+        """Whether the arm of a host that has gone is at rest, or has been given the time for it."""
+        self._bench.outlive_host()
+        self._departure.go()
+        now_ns = self._clock.now_ns()
+        self._gone_ns = min(self._gone_ns, now_ns)
+        return not self._is_wall or self._bench.is_at_rest or now_ns - self._gone_ns > LONGEST_ORPHANAGE_NS
 
 
 @contextmanager

@@ -139,6 +139,11 @@ class TruthClock:
         since_ns = np.interp(wanted, cycle, (t_ns - t_ns[0]).astype(np.float64))
         return np.asarray(t_ns[0] + np.rint(since_ns).astype(np.int64))
 
+    @property
+    def last_cycle(self) -> int:
+        """The last cycle that was read, -1 before the first."""
+        return -1 if self._before is None else self._before[0]
+
     def end(self) -> None:
         """Let what comes after the last cycle have its time."""
         if self._before is not None:
@@ -221,4 +226,5 @@ class Outline:
             return run
         self._clock.end()
         time_s = np.asarray((self._clock.t_ns - run.zero_ns) * 1e-9, np.float64)
-        return dataclasses.replace(run, truth=host_truth(self._truth, self.facts.begins, time_s))
+        last = self._clock.last_cycle
+        return dataclasses.replace(run, truth=host_truth(self._truth, self.facts.begins, last, time_s))

@@ -210,25 +210,27 @@ class _OneContact:
         return np.concatenate([*self._chosen, self._waiting])
 
 
-def host_truth(rows: TruthRows, begins: Cycles, time_s: Vector | None) -> Truth | None:
+def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None) -> Truth | None:
     """Give the truth on the host's cycles; None where the emulator never cycled.
 
-    begins: first cycle of each attempt of the run; time_s: of the rows (m,).
+    begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
 
-    The emulator counts by the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the
+    The arm goes on when the host has died; what happens to it then is none of the host's cycles. The emulator counts by the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the
     counter that the host had counted before.
     """
     if not rows.model_cycle.size:
         return None
+    cycle = host_cycles(rows.cycle, rows.attempt, begins)
+    of_host = cycle <= last
     return Truth(
-        cycle=host_cycles(rows.cycle, rows.attempt, begins),
-        tau_ext=rows.tau_ext,
-        contact_link=rows.contact_link,
-        contact_index=rows.contact_index,
+        cycle=cycle[of_host],
+        tau_ext=rows.tau_ext[of_host],
+        contact_link=rows.contact_link[of_host],
+        contact_index=rows.contact_index[of_host],
         payload_kg=rows.payload_kg,
         theta=rows.theta,
-        force_N=rows.force_N,
-        time_s=time_s,
+        force_N=None if rows.force_N is None else rows.force_N[of_host],
+        time_s=None if time_s is None else time_s[of_host],
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
     )
 

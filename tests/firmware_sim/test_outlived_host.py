@@ -1,0 +1,210 @@
+"""A host that dies: the arm's time goes on until it is at rest, and the truth with it."""
+
+import numpy as np
+import pytest
+from bench_host import CODEC, DISABLE_VOLTAGE, ENABLE, PERIOD_NS, RESET_COMMUNICATION, BenchHost, quiet_scenario
+from test_main import MS, ScriptedBus, enabling_script
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.records import TRUTH_LAYOUT
+from firmware_sim.bench import Bench
+from firmware_sim.departure import Departure
+from firmware_sim.service import Service, StopRequest
+
+REST_RAD_S = 0.02
+FAULT, REACTION = 0x08, 0x0F
+DQ = TRUTH_LAYOUT.slices["dq"]
+PUSH = [{"at_s": 0.0, "link": 1, "point_m": 0.3, "force_N": 40.0, "duration_s": 60.0}]
+
+
+def moving(clock_mode: str = "sync", torque: int = 300, **scenario) -> BenchHost:
+    host = BenchHost(quiet_scenario(**scenario), clock_mode=clock_mode)
+    host.enable()
+    for _ in range(40):
+        host.step(ENABLE, torque)
+    return host
+
+
+def speeds(host: BenchHost, first: int) -> np.ndarray:
+    return np.array([np.abs(block[DQ]).max() for _, _, block in host.truths[first:]])
+
+
+def test_the_truth_goes_on_period_by_period_until_the_arm_is_at_rest():
+    host = moving()
+    begun = len(host.truths)
+    assert speeds(host, begun - 1)[0] > 1.0
+    host.bench.outlive_host()
+    told = host.truths[begun - 1 :]
+    assert np.diff([cycle for cycle, _, _ in told]).tolist() == [1] * (len(told) - 1)
+    assert np.diff([t_ns for _, t_ns, _ in told]).tolist() == [PERIOD_NS] * (len(told) - 1)
+    assert 0.05 < len(told) * 1e-3 < 1.0
+    assert speeds(host, begun)[-50:].max() < REST_RAD_S
+    assert speeds(host, begun)[-52:].max() >= REST_RAD_S / 2  # and no longer than that
+    assert [host.state_bits(joint) for joint in (1, 2)] == [FAULT] * 2
+    assert host.read(1, 0x603F) == 0x8700
+
+
+def test_the_drives_keep_their_torque_until_they_miss_their_sync():
+    host = moving()
+    begun = len(host.truths)
+    host.bench.outlive_host()
+    torques = [block[TRUTH_LAYOUT.slices["tau_m"]].tolist() for _, _, block in host.truths[begun - 1 : begun + 4]]
+    assert torques[:3] == [pytest.approx([3.6, 1.8])] * 3
+    assert torques[3][1] < 0.0  # it brakes: the elbow turns forwards
+    assert speeds(host, begun - 1).argmax() == 2
+
+
+def test_it_is_outlived_once_until_a_sync_comes_again():
+    host = moving(contacts=PUSH)
+    host.bench.outlive_host()
+    told = len(host.truths)
+    host.bench.outlive_host()
+    assert len(host.truths) == told
+    host.step(ENABLE)
+    assert host.truths[-1][0] == host.truths[-2][0] + 1  # numbers never run backwards
+    host.bench.outlive_host()
+    assert len(host.truths) > told + 2
+
+
+def test_an_arm_that_is_pushed_all_the_time_is_left_after_5_s():
+    host = moving(contacts=PUSH, start_deg=[-120.0, 0.0])
+    begun, begun_ns = len(host.truths), host.bench.now_ns
+    host.bench.outlive_host()
+    assert host.bench.now_ns - begun_ns <= 5_000 * MS
+    assert len(host.truths) - begun <= 5000
+
+
+def test_after_an_ordinary_end_nothing_is_added():
+    host = moving(torque=0)
+    for _ in range(20):
+        host.step(DISABLE_VOLTAGE)
+    told, now_ns = len(host.truths), host.bench.now_ns
+    frames = len(host.frames)
+    host.bench.outlive_host()
+    assert (len(host.truths), host.bench.now_ns, len(host.frames)) == (told, now_ns, frames)
+
+
+def test_an_arm_that_coasts_without_power_comes_to_rest_by_its_friction():
+    host = moving(profile="M", torque=50)
+    host.step(DISABLE_VOLTAGE)
+    begun = len(host.truths)
+    assert speeds(host, begun - 1)[0] > REST_RAD_S
+    host.bench.outlive_host()
+    assert speeds(host, begun)[-1] < REST_RAD_S
+    assert host.state_bits() == 0x40
+
+
+def test_before_the_first_sync_there_is_nothing_to_outlive():
+    host = BenchHost()
+    host.bench.outlive_host()
+    assert host.truths == []
+
+
+def test_a_second_host_finds_an_arm_at_rest_and_its_own_count():
+    host = moving()
+    host.bench.outlive_host()
+    host.nmt(RESET_COMMUNICATION)
+    host.cycle = 0
+    host.start()
+    for word in (0x80, 0x06, 0x07, ENABLE, ENABLE):
+        host.step(word)
+    assert [cycle for cycle, _, _ in host.truths[-5:]] == [0, 1, 2, 3, 4]
+    assert host.state_bits() == 0x27
+    host.bench.advance_to(host.bench.now_ns + 10_000 * MS)  # by SYNC a living host may take its time again
+    assert host.state_bits() == 0x27
+
+
+def test_a_braking_that_a_watchdog_caused_by_time_is_told_too():
+    host = BenchHost()
+    for node in (1, 2):
+        host.write(node, 0x1016, 1, 127 << 16 | 50)
+    host.enable()
+    host.put(0x77F, b"\x05")
+    for _ in range(40):
+        host.step(ENABLE, 300)
+    begun = len(host.truths)
+    host.bench.advance_to(host.bench.now_ns + 1_000 * MS)
+    assert speeds(host, begun)[-1] < REST_RAD_S
+    assert 10 < len(host.truths) - begun < 1000
+
+
+def test_by_the_clock_the_truth_goes_on_once_sync_is_overdue():
+    host = moving("wall")
+    begun = len(host.truths)
+    last_cycle, last_ns = host.truths[-1][:2]
+    host.bench.advance_to(host.t_ns + 2_000 * MS)
+    told = host.truths[begun:]
+    assert [(cycle - last_cycle) * PERIOD_NS for cycle, _, _ in told] == [t_ns - last_ns for _, t_ns, _ in told]
+    assert [cycle - last_cycle for cycle, _, _ in told[:3]] == [4, 5, 6]
+    assert speeds(host, begun)[-50:].max() < REST_RAD_S
+    assert len(told) < 1000
+    assert host.bench.is_at_rest
+
+
+def test_by_the_clock_a_lost_sync_or_two_leave_a_gap_as_ever():
+    host = BenchHost(clock_mode="wall")
+    for node in (1, 2):
+        host.write(node, 0x2201, 0, 10_000)
+        host.write(node, 0x2200, 0, 255)
+    host.enable()
+    for _ in range(40):
+        host.step(ENABLE, 300)
+    begun = len(host.truths)
+    for lost in (1, 2):
+        host.cycle += lost
+        host.t_ns += lost * PERIOD_NS
+        host.bench.advance_to(host.t_ns)
+        host.step(ENABLE)
+    assert [cycle for cycle, _, _ in host.truths[begun:]] == [begun + 1, begun + 4]
+
+
+def serve(clock_mode: str, cycles: int, is_once: bool, end_ms: int, beat: bool) -> tuple[ScriptedBus, list, Bench, int]:
+    """Enable and turn the arm from 1 ms on; the host dies after so many cycles."""
+    clock, stop = VirtualClock(), StopRequest()
+    bus = ScriptedBus(clock, stop, end_ms * MS)
+    departure = Departure(bus)
+    rows: list[tuple[int, int, float]] = []
+    bench = Bench(
+        quiet_scenario(),
+        CODEC,
+        departure.send,
+        clock_mode=clock_mode,
+        on_answer=departure.go,
+        on_truth=lambda cycle, t_ns, block: rows.append((cycle, t_ns, float(np.abs(block[DQ]).max()))),
+    )
+    service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
+    service.boot()
+    host = BenchHost()
+    script = []
+    for joint in (1, 2):
+        if beat:
+            script.append((0, 0x600 + joint, bytes([0x23, 0x16, 0x10, 1, 250, 0, 127, 0])))
+    for t_ms, can_id, data in enabling_script(cycles):
+        if can_id in (0x201, 0x202):
+            word = (0x06, 0x07, 0x0F)[min(t_ms - 1, 2)]
+            data = host.command_frame(can_id - 0x200, word, 300 if t_ms > 3 else 0)  # noqa: PLW2901
+        script.append((t_ms, can_id, data))
+        if can_id == 0x080 and beat:
+            script.append((t_ms, 0x77F, b"\x05"))
+    bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in script)
+    service.run()
+    return bus, rows, bench, clock.now_ns()
+
+
+@pytest.mark.parametrize("is_once", [False, True])
+@pytest.mark.parametrize("beat", [False, True])
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_the_emulator_outlives_its_host(clock_mode, beat, is_once):
+    _, rows, bench, end_ns = serve(clock_mode, 50, is_once, 4_000, beat)
+    assert rows[49][2] > 1.0
+    assert rows[-1][2] < REST_RAD_S
+    assert [drive.state.value for drive in bench.drives] == ["fault"] * 2
+    assert np.diff([cycle for cycle, _, _ in rows]).min() > 0
+    assert (end_ns < 2_300 * MS) == is_once
+
+
+def test_once_ends_with_an_arm_at_rest_and_no_later():
+    _, rows, bench, end_ns = serve("sync", 50, True, 10_000, True)
+    assert bench.is_at_rest
+    assert end_ns < 400 * MS  # the heartbeat's 250 ms, and what notices it
+    assert rows[-1][1] - rows[49][1] < 1_000 * MS
