@@ -16,8 +16,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from hang import HANG_S
+
 BIN = Path(sys.executable).parent
-LIMIT_S = 280
 PAPER = ("--config", "paper")
 
 
@@ -48,7 +49,7 @@ class Played:
 def adacd_hil(folder: Path, *arguments: str) -> Played:
     """Run `adacd-hil` with its output in `folder` where the command takes one."""
     done = subprocess.run(
-        [BIN / "adacd-hil", *arguments], capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=folder
+        [BIN / "adacd-hil", *arguments], capture_output=True, text=True, timeout=HANG_S, check=False, cwd=folder
     )
     return Played(folder, done.returncode, done.stdout, done.stderr)
 
@@ -71,7 +72,7 @@ def emulator(folder: Path, *arguments: str) -> Iterator["subprocess.Popen[str]"]
             yield process
         finally:
             process.terminate()
-            process.communicate(timeout=30)
+            process.communicate(timeout=HANG_S)
 
 
 STANDARD_FRAMES = "vcan0,0:80000000"
@@ -116,7 +117,7 @@ def candump(path: Path) -> Iterator[Witness]:
             _await_token(listener, path, 2)
         finally:
             listener.terminate()
-            listener.wait(LIMIT_S)
+            listener.wait(HANG_S)
 
 
 def _await_token(listener: "subprocess.Popen[bytes]", path: Path, number: int) -> None:
@@ -154,7 +155,7 @@ def run_while_killing(folder: Path, victim: "subprocess.Popen[str]", *arguments:
             lines.append(line)
             if "-> ADAPT" in line:
                 victim.kill()
-        stdout, _ = host.communicate(timeout=LIMIT_S)
+        stdout, _ = host.communicate(timeout=HANG_S)
     return Played(folder, host.returncode, stdout, "".join(lines))
 
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import pytest
 from experiment_runs import BIN, emulator
+from hang import HANG_S
 
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState
@@ -108,9 +109,9 @@ class Scene:
         self.wait_for("-> ADAPT")
         self.wait_on_wire(lambda frame: torque_of(frame) != 0, "a torque")
 
-    def wait_on_wire(self, is_it, what: str, since_s: float = 0.0, timeout_s: float = 10.0) -> Witnessed:
+    def wait_on_wire(self, is_it, what: str, since_s: float = 0.0) -> Witnessed:
         """Return the first frame that is it; the witness writes at once."""
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = time.monotonic() + HANG_S
         while time.monotonic() < deadline_s:
             for frame in self.frames(since_s):
                 if is_it(frame):
@@ -127,14 +128,14 @@ class Scene:
         """Wait for the host's end and return its exit status."""
         assert self.host.stderr is not None
         self.said.extend(self.host.stderr)
-        return self.host.wait(30)
+        return self.host.wait(HANG_S)
 
     def close(self) -> None:
         for process in (self.host, self._witness):
             if process.poll() is None:
                 process.send_signal(signal.SIGCONT)
                 process.kill()
-            process.wait(30)
+            process.wait(HANG_S)
         assert self.host.stderr is not None
         self.host.stderr.close()
 

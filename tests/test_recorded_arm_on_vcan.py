@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from experiment_runs import BIN, run_on_vcan
+from hang import HANG_S
 from lockstep_rig import play
 
 from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings
@@ -31,7 +32,7 @@ def recorded_arm(log: Path, said: list[str]) -> Iterator[None]:
             yield
         finally:
             process.terminate()
-            said.append(process.communicate(timeout=30)[0])
+            said.append(process.communicate(timeout=HANG_S)[0])
 
 
 def test_a_host_against_the_recorded_arm_logs_the_same_decisions(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
+from hang import HANG_S
 
 from adacd_hil.wire.bus import can_interfaces
 from adacd_hil.wire.codec import contract_folder
@@ -22,7 +23,6 @@ from adacd_hil.wire.codec import contract_folder
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.wallclock]
 
 PERIOD_S = 0.01
-PATIENCE_S = 30.0
 SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, DISABLE_VOLTAGE, FAULT_RESET = 0x06, 0x07, 0x0F, 0x02, 0x00, 0x80
 NMT_RESET_NODE = 129
 SENSOR_EDS = {"arm": "torque_sensor.eds", "arm_stock": "int32_sensor.eds"}
@@ -41,7 +41,7 @@ def emulator(channel: str, contract: str) -> Iterator[None]:
         yield
     finally:
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=HANG_S)
 
 
 class Bus(NamedTuple):
@@ -115,7 +115,7 @@ class Stranger:
         path = str(contract_folder() / DRIVE_EDS[contract])
         self.drives = [network.add_node(BaseNode402(node_id, path)) for node_id in (1, 2)]
         for node in self.drives:
-            node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
+            node.sdo.RESPONSE_TIMEOUT = HANG_S
 
     def remap(self, node: BaseNode402) -> None:
         """Put the command into RPDO1, state and mode into TPDO1, position and velocity into TPDO2, all on SYNC."""
@@ -150,7 +150,7 @@ class Stranger:
 
     def wait(self, is_true: Callable[[], bool], what: str) -> None:
         """Wait for what the bus has to bring."""
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + HANG_S
         while not is_true():
             assert time.monotonic() < deadline_s, (
                 f"{what}: {[(node.state, hex(node.statusword)) for node in self.drives]}"
@@ -187,7 +187,7 @@ def stranger(bus: Bus) -> Iterator[Stranger]:
 
 def test_the_scanner_finds_all_nodes(bus: Bus) -> None:
     with connection(bus) as network:
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + HANG_S
         while set(network.scanner.nodes) != {1, 2, 3, 4}:
             assert time.monotonic() < deadline_s, network.scanner.nodes
             network.scanner.search()
@@ -257,7 +257,7 @@ ABORTS = [
 def test_sdo_aborts_are_right(bus: Bus) -> None:
     with connection(bus) as network:
         node = network.add_node(1, str(contract_folder() / DRIVE_EDS[bus.contract]))
-        node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
+        node.sdo.RESPONSE_TIMEOUT = HANG_S
         for index, sub, data, code in ABORTS:
             with pytest.raises(canopen.SdoAbortedError) as aborted:
                 _ = node.sdo.download(index, sub, data) if data else node.sdo.upload(index, sub)
@@ -267,7 +267,7 @@ def test_sdo_aborts_are_right(bus: Bus) -> None:
 def test_a_sensors_mapping_is_read_and_the_stock_sensors_can_not_be_written(bus: Bus) -> None:
     with connection(bus) as network:
         sensor = network.add_node(3, str(contract_folder() / SENSOR_EDS[bus.contract]))
-        sensor.sdo.RESPONSE_TIMEOUT = PATIENCE_S
+        sensor.sdo.RESPONSE_TIMEOUT = HANG_S
         sensor.tpdo.read()
         assert [variable.index for variable in sensor.tpdo[1]][-1] == 0x9130
         if bus.contract == "arm_stock":

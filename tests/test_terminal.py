@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from experiment_runs import BIN, PAPER
+from hang import HANG_S
 
 from adacd_hil.cli.monitor import Screen
 from adacd_hil.log.reader import read_log
@@ -116,7 +117,7 @@ def test_an_output_that_blocks_ends_with_ctrl_c(command: list[str], is_both: boo
     with subprocess.Popen(command, stdout=right, stderr=said) as process:
         wait_until_full(right, process)
         process.send_signal(signal.SIGINT)
-        complaint = process.communicate(timeout=60)[1]
+        complaint = process.communicate(timeout=HANG_S)[1]
     expected = {"adacd-hil": (INTERRUPTED, b"adacd-hil: interrupted\n"), "firmware-sim": (OK, b"")}[command[0].name]
     assert process.returncode == expected[0]
     assert is_both or complaint.lstrip() == expected[1]
@@ -193,6 +194,6 @@ def test_a_stopped_terminal_ends_with_ctrl_c() -> None:
     with subprocess.Popen(command, stdout=theirs, stderr=subprocess.DEVNULL) as process:
         wait_until_full(theirs, process)
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) in (-signal.SIGINT, 1, INTERRUPTED)
+        assert process.wait(HANG_S) in (-signal.SIGINT, 1, INTERRUPTED)
     os.close(theirs)
     os.close(ours)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiment_runs import BIN, LIMIT_S, Played, Witness, adacd_hil, candump
+from experiment_runs import BIN, Played, Witness, adacd_hil, candump
+from hang import HANG_S
 from test_on_vcan import longest_stall_cycles
 
 from adacd_hil.clock import MonotonicClock
@@ -96,7 +97,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> TwoArms:
         stack.callback(first.kill)
         second = adacd_hil(folder, *on_bus, str(configs[SECOND]), "--out", str(folder / "second"))
         first.send_signal(signal.SIGINT)
-        stdout, stderr = first.communicate(timeout=LIMIT_S)
+        stdout, stderr = first.communicate(timeout=HANG_S)
     stall = max(longest_stall_cycles(folder / name / "run.mcap") for name in ("first", "second"))
     if stall > BORNE_CYCLES:
         pytest.skip(f"the machine stalled for {10 * stall} ms, longer than the arms bear")

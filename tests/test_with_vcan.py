@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hang import HANG_S
 
 WITH_VCAN = Path(__file__).resolve().parents[1] / "tools" / "with-vcan"
 STATUS_USAGE = 2
 STATUS_BUS_MISSING = 5
 STATUS_TIMEOUT = 124
 STATUS_NOT_FOUND = 127
-HANG_LIMIT_S = 90.0  # beyond the launcher's own limit for a boot
 
 EXCHANGE_A_FRAME = """
 import os, socket, struct
@@ -23,7 +23,7 @@ FRAME = struct.Struct("=IB3x8s")
 near, far = (socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) for _ in range(2))
 for end in (near, far):
     end.bind(("vcan0",))
-    end.settimeout(10.0)
+    end.settimeout(HANG_S)
 if os.fork() == 0:
     identifier, length, data = FRAME.unpack(far.recv(FRAME.size))
     far.send(FRAME.pack(identifier + 1, length, data[::-1]))
@@ -43,7 +43,7 @@ def start(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
 def run(*arguments: str, **options: Any) -> tuple[int, bytes, bytes]:
     """Run the launcher to its end; returns status, stdout and stderr."""
     process = start(*arguments, **options)
-    stdout, stderr = process.communicate(timeout=HANG_LIMIT_S)
+    stdout, stderr = process.communicate(timeout=HANG_S)
     return process.returncode, stdout, stderr
 
 
@@ -124,7 +124,7 @@ def test_a_missing_command_gives_127(bus: None) -> None:
 
 @pytest.mark.slow
 def test_a_timeout_ends_everything(endless_run: subprocess.Popen[bytes], tmp_path: Path) -> None:
-    assert endless_run.wait(HANG_LIMIT_S) == STATUS_TIMEOUT
+    assert endless_run.wait(HANG_S) == STATUS_TIMEOUT
     assert find_processes(str(tmp_path)) == []
     assert list(tmp_path.iterdir()) == []
 
@@ -132,7 +132,7 @@ def test_a_timeout_ends_everything(endless_run: subprocess.Popen[bytes], tmp_pat
 @pytest.mark.slow
 def test_a_terminated_launcher_leaves_nothing_behind(endless_run: subprocess.Popen[bytes], tmp_path: Path) -> None:
     endless_run.terminate()
-    assert endless_run.wait(HANG_LIMIT_S) == 128 + signal.SIGTERM
+    assert endless_run.wait(HANG_S) == 128 + signal.SIGTERM
     assert find_processes(str(tmp_path)) == []
     assert list(tmp_path.iterdir()) == []
 

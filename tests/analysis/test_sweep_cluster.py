@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from hang import HANG_S
 from made_certificates import Authority
 
 from adacd_hil.analysis.sweep.cluster import NO_FILES, TlsFiles, connect
@@ -15,8 +16,6 @@ from adacd_hil.log.errors import LogError
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")
-
-LIMIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +49,7 @@ def sweep(folder: Path, log: Path, *more: object) -> "subprocess.CompletedProces
     """Run the command in a process of its own, so that nothing that Dask might print is missed."""
     words = ["sweep", log, "--vary", "detector.threshold_Nm=0.1,0.4", "--out", folder / "out", *more]
     command = [sys.executable, "-c", "from adacd_hil.cli.main import main; main()", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=folder)
+    return subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False, cwd=folder)
 
 
 def files(authority: Authority, who: str, **changes: timedelta) -> list[object]:

@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+from hang import HANG_S
 from mcap.reader import make_reader
 from recorded_run import CODEC, Run
 from reference_writer import MemorySink
@@ -82,14 +83,14 @@ class Feed:
     def close(self) -> None:
         if self.live is not None:
             self.live.close()
-            self.live.process.wait(30.0)
+            self.live.process.wait(HANG_S)
 
 
 def receive_until_last(client: LiveClient) -> list[LiveMessage]:
     """Receive everything up to LAST, which no rate holds back."""
     messages: list[LiveMessage] = []
     while not (messages and messages[-1].topic == "/events" and b"last\0" in messages[-1].payload):
-        message = client.receive(10.0)
+        message = client.receive(HANG_S)
         assert message is not None, "the last event did not come"
         messages.append(message)
     return messages

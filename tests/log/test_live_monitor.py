@@ -9,6 +9,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from hang import HANG_S
 from live_rig import Feed, receive_until_last
 from recorded_run import make_run
 
@@ -164,7 +165,7 @@ def test_the_monitor_ends_with_the_run(words, monkeypatch):
             is_subscribed.set()
 
     def end() -> None:
-        is_subscribed.wait(60.0)
+        is_subscribed.wait(HANG_S)
         fed.close()
 
     monkeypatch.setattr("adacd_hil.cli.live_monitor.LiveMonitor", Seen)

@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from hang import HANG_S
 from live_rig import EPOCH_NS, LINK_LENGTH_M, SETUP, URDF, Feed, receive_until_last, setup_of
 from recorded_run import CODEC, feed, make_run, start
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -30,7 +31,6 @@ from adacd_hil.log.setup import LiveSetup
 
 SDK = "foxglove.sdk.v1"
 OLD = "foxglove.websocket.v1"
-LONGEST_S = 60.0
 CHANNEL_IDS = {channel.id: channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))}
 
 
@@ -68,8 +68,8 @@ def opened(url, *, protocols=(SDK,), origin=None, host=None, **options):
 
 
 def words_until_advertised(viewer):
-    info = json.loads(viewer.recv(timeout=LONGEST_S))
-    return info, json.loads(viewer.recv(timeout=LONGEST_S))
+    info = json.loads(viewer.recv(timeout=HANG_S))
+    return info, json.loads(viewer.recv(timeout=HANG_S))
 
 
 def ask(viewer, *topics):
@@ -83,7 +83,7 @@ def ask(viewer, *topics):
 
 def status_of(viewer):
     while True:
-        data = viewer.recv(timeout=LONGEST_S)
+        data = viewer.recv(timeout=HANG_S)
         if isinstance(data, str) and (word := json.loads(data))["op"] == "status":
             return word
 
@@ -92,7 +92,7 @@ def code_at_the_end(viewer):
     """Read until the server closes the connection; return its reason."""
     try:
         while True:
-            viewer.recv(timeout=LONGEST_S)
+            viewer.recv(timeout=HANG_S)
     except ConnectionClosed as closed:
         return closed.rcvd.code
 
@@ -247,7 +247,7 @@ def await_description(viewer, channels):
 
 def next_message(viewer):
     while True:
-        data = viewer.recv(timeout=LONGEST_S)
+        data = viewer.recv(timeout=HANG_S)
         if isinstance(data, bytes) and data[0] == 1:
             return data
 
@@ -263,7 +263,7 @@ def test_the_servers_time_is_offered_and_is_that_of_the_log(fed):
         await_description(viewer, channels)
         fed.cycles(run, 60)
         while True:
-            data = viewer.recv(timeout=LONGEST_S)
+            data = viewer.recv(timeout=HANG_S)
             if data[0] == 2:
                 times_ns.append(struct.unpack("<BQ", data)[1])
             else:
@@ -383,7 +383,7 @@ def test_nothing_that_a_peer_sends_reaches_the_runs_terminal():
         for data in NONSENSE:
             viewer.send(data)
         status_of(viewer)
-    out, complaints = run.communicate(timeout=LONGEST_S)
+    out, complaints = run.communicate(timeout=HANG_S)
     lines = complaints.decode().splitlines()
     assert run.returncode == 0
     assert out == b""
@@ -403,7 +403,7 @@ def crowd(url, count):
         assert clients.stdout.readline() == b"ready\n"
         yield
         clients.stdin.close()
-        assert clients.wait(LONGEST_S) == 0
+        assert clients.wait(HANG_S) == 0
     finally:
         clients.kill()
         clients.wait()
@@ -470,7 +470,7 @@ def test_the_live_view_ends_when_the_writer_dies(tmp_path):
 
 
 def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch):
-    monkeypatch.setattr(server_module, "LINGER_S", LONGEST_S)
+    monkeypatch.setattr(server_module, "LINGER_S", HANG_S)
     ring = Ring(2**16)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listening = listen(SETUP)

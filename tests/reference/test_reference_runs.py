@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hang import HANG_S
 from reference_runs import (
     CYCLES,
     RUNS,
@@ -67,7 +68,7 @@ def test_uncompiled_code_comes_to_the_same_bits(name: str, tmp_path: Path) -> No
         check=False,
         cwd=root,
         env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": f"{root}:{RUNS.parent}"},
-        timeout=280,
+        timeout=HANG_S,
     )
     assert done.returncode == 0, done.stderr
     uncompiled = Reference(**json.loads(done.stdout))

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 
 import pytest
+from hang import HANG_S
 
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.wire.bus import (
@@ -61,7 +62,7 @@ def raw() -> Iterator[socket.socket]:
     """A plain socket on the same interface, FD frames on."""
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as peer:
         peer.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
-        peer.settimeout(5.0)
+        peer.settimeout(HANG_S)
         peer.bind((CHANNEL,))
         yield peer
 
@@ -99,7 +100,7 @@ def error_frame(error_class: int, data: str = "0000000000000000") -> bytes:
 
 
 def received(bus: SocketCanBus, count: int) -> list[tuple[int, bytes]]:
-    frames = [bus.receive(1.0) for _ in range(count)]
+    frames = [bus.receive(HANG_S) for _ in range(count)]
     return [(frame.can_id, frame.data) for frame in frames if frame]
 
 
@@ -222,7 +223,7 @@ def test_trouble_on_the_bus_is_handed_out_though_other_identifiers_are_filtered(
 ) -> None:
     bus = open_end([0x181])
     raw.send(error_frame(error_class, data))
-    frame = bus.receive(1.0)
+    frame = bus.receive(HANG_S)
     bus.close()
     assert frame is not None
     assert frame == Frame(error_class, bytes.fromhex(data), frame.t_ns, is_error=True)
@@ -237,8 +238,8 @@ def test_bus_off_is_an_error_that_carries_its_frame_and_the_bus_goes_on_when_the
     raw.send(error_frame(0x100))
     raw.send(CLASSIC.pack(0x181, 0, b""))
     with pytest.raises(BusOffError, match=f"{CHANNEL} is bus-off: .*restart-ms 100") as caught:
-        bus.receive(1.0)
-    restarted, frame = bus.receive(1.0), bus.receive(1.0)
+        bus.receive(HANG_S)
+    restarted, frame = bus.receive(HANG_S), bus.receive(HANG_S)
     bus.close()
     assert caught.value.frame.can_id == 0x040
     assert "\n" not in str(caught.value)
@@ -257,7 +258,7 @@ def test_frames_that_the_kernel_dropped_are_counted_over_a_recovery_too(raw: soc
     while bus.receive(0.1) is not None:
         kept += 1
     raw.send(CLASSIC.pack(0x181, 0, b""))
-    assert bus.receive(1.0) is not None
+    assert bus.receive(HANG_S) is not None
     dropped = bus.frames_lost
     bus.recover()
     after = bus.frames_lost
@@ -301,7 +302,7 @@ def test_a_frame_carries_the_kernels_stamp_however_late_it_is_read(ends: tuple[S
     after_ns = clock.now_ns()
     while clock.now_ns() < after_ns + 5_000_000:
         pass
-    frame = far.receive(1.0)
+    frame = far.receive(HANG_S)
     assert frame is not None
     assert before_ns - STAMP_ERROR_NS <= frame.t_ns <= after_ns + STAMP_ERROR_NS
 
@@ -343,11 +344,11 @@ def test_a_queue_that_drains_in_time_is_no_error(ends: tuple[SocketCanBus, Socke
             near.send(0x201, OLD_DATA)
         # released from another process while `send` waits for room; it may come late, so more than once
         release = subprocess.Popen(["tc", "qdisc", "change", "dev", CHANNEL, "root", "plug", "release_indefinite"])
-        for _ in range(100):
+        while True:
             with contextlib.suppress(TransmitQueueError):
                 near.send(0x202, NEW_DATA)
                 break
-        assert release.wait(10) == 0
+        assert release.wait(HANG_S) == 0
         frames = received(far, 11)
         rest = far.receive(0.05)
     assert rest is None
@@ -423,7 +424,7 @@ def test_a_recovery_keeps_filters_error_mask_and_fd(raw: socket.socket) -> None:
     raw.send(CLASSIC.pack(0x182, 0, b""))
     raw.send(error_frame(0x020))
     raw.send(struct.pack("=IBB2x64s", 0x181, 24, 1, bytes(range(24))))
-    error, frame = bus.receive(1.0), bus.receive(1.0)
+    error, frame = bus.receive(HANG_S), bus.receive(HANG_S)
     bus.close()
     assert error is not None
     assert error.is_error
@@ -492,7 +493,7 @@ def test_an_interface_that_goes_down_is_one_line_with_a_remedy(ends: tuple[Socke
         with pytest.raises(InterfaceDownError, match=f"is down; bring it up: ip link set {CHANNEL} up") as sending:
             near.send(0x80, b"\x01")
         with pytest.raises(InterfaceDownError, match=f"receiving on {CHANNEL}: .* is down") as receiving:
-            far.receive(1.0)
+            far.receive(HANG_S)
         with pytest.raises(InterfaceDownError, match="is down; bring it up"):
             near.recover()
     assert "\n" not in str(sending.value) + str(receiving.value)
@@ -525,7 +526,7 @@ def test_an_interface_that_vanishes_and_returns_is_recovered_from() -> None:
     try:
         run("ip", "link", "del", name)
         with pytest.raises(InterfaceDownError, match=f"CAN interface {name} does not exist; present: "):
-            bus.receive(1.0)
+            bus.receive(HANG_S)
         with pytest.raises(InterfaceDownError, match=f"{name} does not exist"):
             bus.recover()
         run("ip", "link", "add", "dev", name, "type", "vcan")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cantools
 import pytest
+from hang import HANG_S
 
 from adacd_hil.wire.codec import contract_folder, load_codec
 
@@ -26,7 +27,7 @@ for arguments in json.loads(sys.argv[1]):
 def run_cantools(*commands: tuple[str, ...]) -> list[str]:
     """Run commands of the tool with warnings as errors; nothing may appear on the error output."""
     command = [sys.executable, "-W", "error", "-c", RUN_IN_TURN, json.dumps(commands)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout.split("-- done\n")[: len(commands)]
 

@@ -5,6 +5,7 @@ import struct
 from collections.abc import Iterator
 
 import pytest
+from hang import HANG_S
 
 from adacd_hil.clock import MonotonicClock, VirtualClock, wall_offset_ns
 from adacd_hil.wire.bus import Frame
@@ -107,7 +108,7 @@ def test_a_wait_ends_when_there_is_something(pair: tuple[socket.socket, socket.s
     near, far = pair
     receiver = FrameReceiver(far, MonotonicClock())
     near.send(CLASSIC.pack(0x181, 0, b""))
-    assert receiver.wait(60.0)
+    assert receiver.wait(HANG_S)
 
 
 def test_a_full_queue_takes_the_first_of_what_is_sent(pair: tuple[socket.socket, socket.socket]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from hang import HANG_S
 
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.wire.bus import Frame, open_bus
@@ -124,7 +125,7 @@ def test_the_meter_counts_the_bits_that_canbusload_counts() -> None:
             else:  # what another program makes up: random identifiers, lengths, contents
                 subprocess.run([*CANGEN, str(BURST), "vcan0"], check=True)
             for _ in range(BURST):
-                received = receiver.receive(5.0)
+                received = receiver.receive(HANG_S)
                 assert received is not None
                 meter.add(received)
             counted = 0
