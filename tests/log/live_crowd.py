@@ -63,16 +63,17 @@ def main(port: int, count: int) -> None:
     while not select.select([0], [], [], 0.005)[0]:
         for client in slow[:: max(1, quarter // 10)]:
             client.setblocking(False)
-            with contextlib.suppress(BlockingIOError):
+            with contextlib.suppress(BlockingIOError, ConnectionError):
                 client.recv(64)
         for client in restless:
             client.close()
         restless = []
         for index in range(quarter // 4):
-            client = opened(port)
-            if index % 2:
-                client.sendall(REQUEST.format(port=port).encode() + SUBSCRIBE)
-            restless.append(client)
+            with contextlib.suppress(ConnectionError):  # the run may end before this does
+                client = opened(port)
+                restless.append(client)
+                if index % 2:
+                    client.sendall(REQUEST.format(port=port).encode() + SUBSCRIBE)
     os.read(0, 1)
     for client in (*deaf, *slow, *half, *restless):
         client.close()
