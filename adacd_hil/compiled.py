@@ -6,6 +6,7 @@ of an edited constant.
 """
 
 import contextlib
+import fcntl
 import hashlib
 import os
 import re
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import FunctionCache
 
 _PACKAGES = ("adacd_hil", "firmware_sim")
 _IMPORT = re.compile(r"^\s*from\s+((?:adacd_hil|firmware_sim)[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)", re.MULTILINE)
@@ -96,14 +98,36 @@ def _is_own(status: os.stat_result) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
-numba.config.CACHE_DIR = str(cache_folder(source_digest()))  # type: ignore[attr-defined]
+_FOLDER = cache_folder(source_digest())
+numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
+
+
+class _SharedCache(FunctionCache):
+    """numba's cache on disk, for processes that compile at the same time.
+
+    numba chooses a file's name by the index that it has read before: of two processes that compile a function for
+    different types both take the same name, and the index then gives the code of one for the types of the other.
+    """
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save what was compiled, one process after the other. A disk that takes nothing costs compiling anew."""
+        with contextlib.suppress(OSError), (_FOLDER / "lock").open("wb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
 
 def compiled(function: Function) -> Function:
     """Compile `function` at its first call; division by zero gives inf or nan, as in numpy."""
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+    return _compiled(function)
 
 
 def released(function: Function) -> Function:
     """Compile `function` as `compiled` does; while it runs, other threads of Python go on. For what takes long."""
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy", nogil=True)(function))
+    return _compiled(function, nogil=True)
+
+
+def _compiled(function: Function, **options: bool) -> Function:
+    dispatcher: Any = numba.njit(fastmath=False, error_model="numpy", **options)(function)  # type: ignore[call-overload]
+    if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
+        dispatcher._cache = _SharedCache(function)  # type: ignore[no-untyped-call]
+    return cast(Function, dispatcher)

@@ -778,8 +778,8 @@ class SafetySettings:
         (0x8200, 0x8210, 0x8240),
         low=0x0100,
         high=0xFFFF,
-        meaning="EMCY error codes that don't stop the arm; any other does at once. Default: one odd SYNC, a PDO or a SYNC "
-        "of the wrong length",
+        meaning="EMCY error codes that don't stop the arm; any other does at once; default: one odd SYNC, a PDO "
+        "or a SYNC of the wrong length",
     )
 
 

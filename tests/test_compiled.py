@@ -1,11 +1,14 @@
 """The cache of compiled code is keyed by all that the code may depend on."""
 
+import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from adacd_hil.compiled import cache_folder, compiled_sources
+from adacd_hil.compiled import cache_folder, compiled, compiled_sources
 
 CALLER = "from adacd_hil.compiled import compiled\nfrom adacd_hil.scheme import (\n    callee,\n)\n"
 CALLEE = "from adacd_hil.scheme.constants import GRAVITY\n"
@@ -125,3 +128,61 @@ def test_a_named_folder_that_others_can_write_is_not_used_and_that_is_said(
     with pytest.warns(UserWarning, match="NUMBA_CACHE_DIR .*/shared is not used: not this user's alone"):
         assert cache_folder("digest") == places / "user" / "adacd-hil" / "digest"
     assert list((places / "shared").iterdir()) == []
+
+
+TOTAL_OF_RECORDS = """
+import sys, time
+import numba, numpy as np
+from numba.core.caching import IndexDataCacheFile
+from adacd_hil.compiled import compiled
+
+@compiled
+def total(records):
+    return records[0].last
+
+save = IndexDataCacheFile._save_index
+def slow_save(self, index):
+    time.sleep(0.5)
+    save(self, index)
+IndexDataCacheFile._save_index = slow_save
+
+for count in map(int, sys.argv[1:]):
+    records = np.zeros(1, [("first", "f8", (count,)), ("last", "f8")])
+    records["last"] = count
+    print("ready", flush=True)
+    sys.stdin.readline()
+    assert total(records) == count
+    print(sum(total.stats.cache_hits.values()), flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_processes_that_compile_for_different_types_at_once_take_nothing_from_each_other(tmp_path: Path) -> None:
+    program = tmp_path / "total.py"
+    program.write_text(TOTAL_OF_RECORDS)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def start(*counts: int) -> "subprocess.Popen[str]":
+        words = [sys.executable, str(program), *map(str, counts)]
+        return subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+
+    both = [start(3), start(5)]
+    for process in both:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    for process in both:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    for process in both:
+        assert process.communicate() == ("0\n", None)
+        assert process.returncode == 0
+    assert start(3, 5).communicate("\n\n") == ("ready\n1\nready\n2\n", None)
+
+
+def test_a_disk_that_takes_no_compiled_code_costs_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+    assert compiled(lambda x: 2.0 * x)(1.5) == 3.0
