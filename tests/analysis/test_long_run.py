@@ -191,6 +191,29 @@ def test_a_truth_says_from_when_on_the_payload_is_another(certified):
     assert list(zip(truth.model_cycle.tolist(), truth.payload_kg.tolist(), strict=True)) == [(100, 0.0), (5400, 1.0)]
 
 
+def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s():
+    rows = TruthRows(
+        attempt=np.zeros(5, np.int64),
+        cycle=np.arange(98, 103),
+        tau_ext=np.arange(10.0).reshape(5, 2),
+        contact_link=np.array([0.0, 0.0, 0.0, 2.0, 2.0]),
+        contact_index=np.array([-1.0, -1.0, -1.0, 0.0, 0.0]),
+        force_N=np.arange(5.0),
+        model_attempt=np.zeros(1, np.int64),
+        model_cycle=np.array([98]),
+        payload_kg=np.zeros(1),
+        theta=np.zeros((1, 7)),
+        metadata={},
+        problem="",
+        is_complete=True,
+    )
+    truth = truth_rows.host_truth(rows, np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
+    assert truth.cycle.tolist() == [98, 99, 100]
+    columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
+    assert [len(column) for column in columns] == [3] * 5
+    assert not truth.contact_link.any()
+
+
 # --- stretches -------------------------------------------------------------------------------------------------------
 
 

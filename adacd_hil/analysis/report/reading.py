@@ -162,7 +162,8 @@ class _Reading:
             columns.append(columns_of_series(piece.series["/cycle"]))
         run = facts.apply(rows.fill(shell or self._shell))
         if shell is None and self._truth is not None:
-            run = replace(run, truth=host_truth(self._truth, facts.begins, int(run.cycle[-1]), None))
+            last = int(run.cycle[-1]) if run.cycle.size else -1
+            run = replace(run, truth=host_truth(self._truth, facts.begins, last, None))
         return self._done(replace(run, timing=CycleColumns.joined(columns)), None)
 
     def outline(

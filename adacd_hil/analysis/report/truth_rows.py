@@ -215,8 +215,9 @@ def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None
 
     begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
 
-    The arm goes on when the host has died; what happens to it then is none of the host's cycles. The emulator counts by the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the
-    counter that the host had counted before.
+    The arm goes on when the host has died; what happens to it then is none of the host's cycles. The emulator counts by
+    the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the counter that the host
+    had counted before.
     """
     if not rows.model_cycle.size:
         return None
