@@ -6,6 +6,7 @@ exist only here, in fields labelled `_deg`; the properties beside them give radi
 
 import dataclasses
 import math
+import re
 import tomllib
 import types
 import typing
@@ -18,9 +19,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from adacd_hil.input_files import exists, read_input
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Reaction, Vector
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
+from adacd_hil.terminal import one_line
 
 
 class ConfigError(ValueError):
@@ -933,15 +936,54 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read one TOML file. Raises ConfigError when it is missing or not TOML."""
+    """Read one TOML file. Raises ConfigError when it is missing, no regular file, too large or not TOML."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_toml(read_input(path, _MOST_TOML_BYTES))
     except FileNotFoundError:
         raise ConfigError(f"configuration {path} does not exist") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"configuration {path}: {error}") from None
+    except (OSError, ConfigError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"configuration {path}: {reason}") from None
 
 
+def parse_toml(text: bytes | str) -> dict[str, Any]:
+    """Read TOML, tables at most 16 deep and integers of 64 bits. Raises ConfigError with what is wrong."""
+    try:
+        text = text if isinstance(text, str) else text.decode("utf-8")
+        if _TOO_DEEP.search(text):  # such a key takes its reader a time that goes by the square
+            raise RecursionError
+        table = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"more than {_DEEPEST} tables or lists within each other") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"byte {error.start} is not UTF-8") from None
+    except ValueError as error:  # of TOML, and of integers that are too long to be read
+        raise ConfigError(one_line(error)) from None
+    _check_extent(table)
+    return table
+
+
+def _check_extent(table: dict[str, Any]) -> None:
+    """Refuse what would not end well further on: very deep tables, integers that no float can hold."""
+    waiting: list[tuple[str, Any, int]] = [("", table, 0)]
+    while waiting:
+        key, value, depth = waiting.pop()
+        if depth > _DEEPEST:
+            raise ConfigError(f"`{key}`: more than {_DEEPEST} tables or lists within each other")
+        if isinstance(value, dict):
+            waiting += [(f"{key}.{name}".lstrip(".")[:_LONGEST_KEY], item, depth + 1) for name, item in value.items()]
+        elif isinstance(value, list):
+            waiting += [(key, item, depth + 1) for item in value]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ConfigError(f"`{key}` is an integer of more than 64 bits")
+
+
+_MOST_TOML_BYTES = 1 << 20
+_DEEPEST = 16
+_LONGEST_KEY = 80
+_TOO_DEEP = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){64}""")
+_LONGEST_CHAIN = 8
+"""Configurations that extend each other."""
 _MOST_NAMES = 12
 """More built-in names than this make no line that anybody reads."""
 
@@ -957,7 +999,7 @@ def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
     if name_or_file in names:
         return Path(str(folder / f"{name_or_file}.toml"))
     path = Path(name_or_file)
-    if not path.suffix and not path.exists():
+    if not path.suffix and not exists(path):
         nearest = nearest_name(name_or_file, names)
         some = ", ".join(names) if len(names) <= _MOST_NAMES else f"{len(names)}, such as {', '.join(names[:3])}"
         hint = f"; did you mean {nearest!r}?" if nearest else f"; built in: {some}"
@@ -980,24 +1022,38 @@ def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Se
     `profile` picks the `[profiles.X]` table that is laid over the rest. Raises ConfigError.
     """
     table = _load_table(name_or_file)
-    profiles = table.pop("profiles", {})
-    chosen = profile or table.get("arm", {}).get("profile", "P")
-    if chosen not in profiles:
+    profiles = _table_in(table, "profiles", "`profiles`")
+    table.pop("profiles", None)
+    chosen = profile or _table_in(table, "arm", "`arm`").get("profile", "P")
+    if not isinstance(chosen, str) or chosen not in profiles:
         raise ConfigError(f"profile {chosen!r} is not in configuration {name_or_file}; known: {', '.join(profiles)}")
+    _table_in(profiles, chosen, f"`profiles.{chosen}`")
     # What the file says of the arm outweighs the profile's own values, not the other way round.
     return parse(Settings, merge(merge(profiles[chosen], table), {"arm": {"profile": chosen}}))
+
+
+def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
+    """Return a table within a table, empty where it isn't there. Raises ConfigError when it is no table."""
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise ConfigError(f"{name} = {value!r} must be a table")
+    return value
 
 
 def _load_table(name_or_file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
     if name_or_file in seen:
         raise ConfigError(f"configuration {name_or_file} extends itself")
+    if len(seen) > _LONGEST_CHAIN:
+        raise ConfigError(f"configuration {seen[0]} extends more than {_LONGEST_CHAIN} others, one by one")
     path = find_toml("configuration", name_or_file, _builtin_folder())
     table = read_toml(path)
     table.setdefault("name", path.stem)
     if "extends" not in table and name_or_file in builtin_names():
         return table
-    base = _load_table(str(table.pop("extends", "paper")), (*seen, name_or_file))
-    return merge(base, table)
+    extended = table.pop("extends", "paper")
+    if not isinstance(extended, str):
+        raise ConfigError(f"`extends` = {extended!r} must be the name of a configuration or a file")
+    return merge(_load_table(extended, (*seen, name_or_file)), table)
 
 
 def to_toml(settings: Any) -> str:

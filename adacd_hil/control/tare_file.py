@@ -14,6 +14,7 @@ from pathlib import Path
 from adacd_hil.config import ConfigError, Settings, parse, read_toml, setting, to_toml
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
+from adacd_hil.input_files import read_input
 from adacd_hil.output_files import replacing
 from adacd_hil.records import JOINTS, Event
 
@@ -202,4 +203,4 @@ def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
         warnings.append(f"{path} is dated {-age_h:.1f} h in the future: a clock is wrong")
     if tare.is_auto_zeroed:
         warnings.append(f"{path} counts on the zero that the sensors set themselves; a sensor that was reset forgot it")
-    return UsedTare(path, path.read_bytes(), tare, tuple(warnings))
+    return UsedTare(path, read_input(path), tare, tuple(warnings))

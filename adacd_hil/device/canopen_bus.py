@@ -5,6 +5,7 @@ concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 """
 
 import configparser
+import io
 import logging
 import struct
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
 from adacd_hil.config import ConfigError
+from adacd_hil.input_files import read_input
 from adacd_hil.wire.bus import Bus, BusError, Frame
 
 ANSWER_TIMEOUT_S = 0.5
@@ -58,9 +60,13 @@ class Variable(NamedTuple):
 def read_eds(path: Path, node_id: int) -> Any:
     """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`. Raises ConfigError."""
     try:
-        return canopen.import_od(str(path), node_id)
-    except (OSError, ValueError, KeyError, configparser.Error) as error:
-        raise ConfigError(f"EDS {path}: {' '.join(str(error).split())}") from None
+        stream = io.StringIO(read_input(path).decode("utf-8", "replace"))
+        stream.name = "object dictionary.eds"
+        return canopen.import_od(stream, node_id)
+    except OSError as error:
+        raise ConfigError(f"EDS {path}: {error.strerror}") from None
+    except (*_UNFORESEEN, configparser.Error, RecursionError) as error:
+        raise ConfigError(f"EDS {path}: {' '.join(str(error).split()) or repr(error)}") from None
 
 
 def find_variable(objects: Any, index: int, sub: int) -> Variable | None:

@@ -13,20 +13,19 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import IO, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 import zstandard
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Chunk
-from mcap.stream_reader import get_chunk_data_stream
 from numpy.typing import NDArray
 
+from adacd_hil.input_files import open_input
+from adacd_hil.log.chunk_data import MOST_BYTES, Opening, decompress
 from adacd_hil.log.compiled_records import WORD, pass_over, words_of
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_walk import MAGIC, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap_walk import MAGIC, MOST_RECORD_BYTES, RECORD_HEAD_BYTES
 
 try:
     from zlib_ng.zlib_ng import crc32  # six times as fast, which saves a sixth of the time to read a log
@@ -38,7 +37,6 @@ BLOCK_BYTES = 1 << 21
 THREADS = 2
 AHEAD = 6
 """Blocks that may wait or be in work."""
-_MAX_CHUNK = 1 << 30
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _IN_BLOCKS = (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA)
@@ -145,7 +143,7 @@ def _in_order(
 
 def _unpack(chunks: _Packed, memory: Bytes) -> Block:
     """Put the records of chunks one after the other."""
-    decompressor = zstandard.ZstdDecompressor()
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
     ends, problem, filled = [], "", 0
     for chunk in chunks:
         try:
@@ -172,8 +170,7 @@ def _unpack_chunk(chunk: _PackedChunk, decompressor: zstandard.ZstdDecompressor,
         if count != chunk.size:
             raise ValueError("a chunk isn't as long as it says")
     else:
-        stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(io.BytesIO(chunk.body))), validate_crc=False)
-        records[:] = np.frombuffer(stream.read(size), np.uint8)
+        records[:] = np.frombuffer(decompress(name.decode("ascii", "replace"), bytes(data)), np.uint8)
     _, _, _, crc, _ = _CHUNK_HEAD.unpack_from(chunk.body)
     if crc and crc32(records.data) != crc:
         raise ValueError("a chunk fails its CRC")
@@ -190,20 +187,21 @@ def _compressed(body: bytes) -> tuple[bytes, memoryview]:
     return body[_CHUNK_HEAD.size : place], data
 
 
-def _packed_chunk(body: bytes, position: int) -> _PackedChunk:
+def _packed_chunk(body: bytes, position: int, opening: Opening) -> _PackedChunk:
     """Look at a chunk. Raises one of DAMAGE."""
     _, _, size, _, _ = _CHUNK_HEAD.unpack_from(body)
     name, data = _compressed(body)
-    if size > _MAX_CHUNK or (name == b"zstd" and zstandard.frame_content_size(data) not in (-1, size)):
+    if name == b"zstd" and zstandard.frame_content_size(data) not in (-1, size):
         raise ValueError("a chunk isn't as long as it says")
+    opening.allow(len(data), size)
     return _PackedChunk(body, is_chunk=True, size=size, position=position)
 
 
 def _read_packed(path: Path, has_chunks: bool = True) -> Iterator[_Packed | Record | Problem]:
     """Read a file from front to end, chunks as they are."""
     try:
-        with path.open("rb", buffering=0) as file:
-            yield from _Reading(file, path, has_chunks).items()
+        with open_input(path) as file:
+            yield from _Reading(cast("io.FileIO", file.raw), path, has_chunks).items()
     except OSError as error:
         raise LogError(f"log {path} can't be read: {error.strerror}") from None
 
@@ -211,7 +209,7 @@ def _read_packed(path: Path, has_chunks: bool = True) -> Iterator[_Packed | Reco
 class _Reading:
     """The bytes of a file that are in memory, and how far its records have been taken from them."""
 
-    def __init__(self, file: "IO[bytes]", path: Path, has_chunks: bool) -> None:
+    def __init__(self, file: io.FileIO, path: Path, has_chunks: bool) -> None:
         self._file = file
         self._path = path
         self._size = os.fstat(file.fileno()).st_size
@@ -221,6 +219,7 @@ class _Reading:
         self._start = self._stop = 0  # of what is in memory and not yet taken
         self._crc = 0  # of all before `_summed`
         self._summed = 0
+        self._opening = Opening()
         self._packed: _Packed = []
         self._packed_size = 0
         self._is_passed = np.zeros(256, np.bool_)
@@ -239,7 +238,7 @@ class _Reading:
         self._before += self._start
         self._start, self._stop, self._summed = 0, len(rest), 0
         while self._stop < count:
-            read = self._file.readinto(self._data[self._stop : -WORD].data)  # type: ignore[attr-defined]
+            read = self._file.readinto(self._data[self._stop : -WORD].data)
             if not read:
                 return False
             self._stop += read
@@ -262,6 +261,11 @@ class _Reading:
             if not self._fill(RECORD_HEAD_BYTES):
                 break
             opcode, length = _RECORD_HEAD.unpack_from(self._data.data, self._start)
+            if length > MOST_RECORD_BYTES and not self._is_passed[opcode]:
+                position = self._before + self._start
+                yield from self._end_block()
+                yield Problem(f"the record at byte {position} has {length} bytes, more than {MOST_RECORD_BYTES}")
+                return
             is_in_file = opcode and length <= self._size - self._before - self._start - RECORD_HEAD_BYTES
             if not is_in_file or not self._fill(RECORD_HEAD_BYTES + length):
                 break
@@ -286,7 +290,7 @@ class _Reading:
         record = self._bytes(RECORD_HEAD_BYTES + length)
         if opcode == Opcode.CHUNK:
             try:
-                yield from self._add(_packed_chunk(record[RECORD_HEAD_BYTES:], position))
+                yield from self._add(_packed_chunk(record[RECORD_HEAD_BYTES:], position, self._opening))
             except DAMAGE:
                 yield Problem(f"damaged at byte {position}")
         elif opcode in _IN_BLOCKS:

@@ -14,6 +14,8 @@ MESSAGE_HEAD = 31
 """Bytes of a message record before its payload: opcode, length, channel, sequence, log time, publish time."""
 RECORD_HEAD_BYTES = 9
 """Bytes of a record that its length doesn't count: opcode, length."""
+MOST_RECORD_BYTES = 64 << 20
+"""Of a record that is read. A chunk of ours has 0.1 MB, one of others up to 16 MB; an attachment of a run 0.2 MB."""
 
 
 class Payload(NamedTuple):

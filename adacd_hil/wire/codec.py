@@ -17,6 +17,7 @@ import cantools
 from cantools.database.can import Database, Message, Signal
 from cantools.database.errors import Error as DatabaseError
 
+from adacd_hil.input_files import read_input
 from adacd_hil.wire.e2e import (
     E2eReceiver,
     E2eSender,
@@ -331,7 +332,7 @@ def load_codec(path: Path | None = None) -> Codec:
     """Generate the codec from a DBC (default: the one that comes with the package). Raises CodecError."""
     path = path or contract_folder() / "arm.dbc"
     try:
-        text = path.read_bytes()
+        text = read_input(path)
     except OSError as error:
         raise CodecError(f"DBC {path}: {error.strerror}") from None
     return parse_codec(text, path)

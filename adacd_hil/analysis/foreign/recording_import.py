@@ -5,10 +5,12 @@ the model is carried over, the filters begin anew. Values between two samples ar
 """
 
 import csv
+import io
 import warnings
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from scipy.signal import savgol_filter
 
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.config import ConfigError
+from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
@@ -126,7 +129,7 @@ def _read_columns(path: Path, described: RecordingMap) -> tuple[Vector, Vector, 
     """Return time (k,) s, positions, torques and velocities side by side (k, 2 n or 3 n), SI, and touches (k,)."""
     columns, form = described.columns, described.csv
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with _open(path, "") as file:
             for _ in range(form.skip_rows):
                 next(file, "")
             first = next(csv.reader(file, delimiter=form.delimiter), [])
@@ -136,14 +139,13 @@ def _read_columns(path: Path, described: RecordingMap) -> tuple[Vector, Vector, 
     wanted = (columns.time, *columns.q, *columns.tau_J, *columns.dq, *filter(None, (columns.contact,)))
     places = [_place(name, heads, len(first), path) for name in wanted]
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _open(path) as file:
             warnings.simplefilter("ignore", UserWarning)  # of an empty file; said below
             table = np.loadtxt(
-                path,
+                file,
                 delimiter=None if form.delimiter == " " else form.delimiter,
                 skiprows=form.skip_rows + form.has_header,
                 usecols=places,
-                encoding="utf-8-sig",
                 ndmin=2,
                 converters=_number,
             )
@@ -159,6 +161,10 @@ def _read_columns(path: Path, described: RecordingMap) -> tuple[Vector, Vector, 
     units = (*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if columns.dq else ()))
     values = table[:, 1 : 1 + len(units)] * np.array(units)
     return time_s, values, table[:, -1] != 0.0 if columns.contact else None
+
+
+def _open(path: Path, newline: str | None = None) -> TextIO:
+    return io.TextIOWrapper(open_input(path), encoding="utf-8-sig", newline=newline)
 
 
 def _number(text: str) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil.config import ConfigError, parse, read_toml, setting
+from adacd_hil.input_files import read_input
 from adacd_hil.scheme.offline import OfflineSettings
 from adacd_hil.scheme.urdf import SerialArm, UrdfError, read_urdf
 
@@ -158,7 +159,7 @@ def read_map(path: Path) -> RecordingMap:
 def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:
     file = folder / arm.urdf
     try:
-        return read_urdf(file.read_bytes(), arm.gravity_m_s2, arm.locked)
+        return read_urdf(read_input(file), arm.gravity_m_s2, arm.locked)
     except OSError as error:
         raise ConfigError(f"`arm.urdf`: {file}: {error.strerror}") from None
     except UrdfError as error:

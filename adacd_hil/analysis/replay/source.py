@@ -3,7 +3,6 @@
 Settings, contract and torque offsets are those that are attached to the log.
 """
 
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
@@ -12,7 +11,7 @@ import numpy as np
 
 from adacd_hil.analysis.replay.attempts import AttemptSplitter, Stretch
 from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
-from adacd_hil.config import Settings, parse, renewed
+from adacd_hil.config import Settings, parse, parse_toml, renewed
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.ros_types import unpack_log
 from adacd_hil.log.stream import LogStream, Piece
@@ -98,7 +97,7 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
     if "config.toml" not in attachments:
         raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
     try:
-        return parse(Settings, renewed(tomllib.loads(attachments["config.toml"].decode())))
+        return parse(Settings, renewed(parse_toml(attachments["config.toml"])))
     except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
         raise LogError(f"log {path}, attachment config.toml: {error}") from None
 

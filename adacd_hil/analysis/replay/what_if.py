@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from adacd_hil.analysis.replay.replay import Replay
-from adacd_hil.config import SUCCESSORS, ConfigError, Settings, parse, to_toml
+from adacd_hil.config import SUCCESSORS, ConfigError, Settings, parse, parse_toml, to_toml
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
 
@@ -79,8 +79,8 @@ def _unknown(key: str) -> str:
 
 def _read_value(key: str, text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parse_toml(f"value = {text}")["value"]
+    except ConfigError:
         if text and not set(text) & set("\"'[]{}=\n#"):
             return text
         raise ConfigError(f"`{key}` = {text} is not a TOML value") from None

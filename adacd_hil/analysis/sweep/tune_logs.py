@@ -20,6 +20,7 @@ from adacd_hil.analysis.replay.truth_contacts import TrueContact
 from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
 from adacd_hil.analysis.thresholds import APART_S, BLOCK_S, TOPICS, Motion, motion_from_log
 from adacd_hil.config import Settings, load_settings
+from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState
@@ -98,7 +99,7 @@ def _read(path: Path, place: int, count: int, config: str | None) -> TunedLog:
         for window in windows:
             is_free[max(window.first - apart, 0) : window.last + apart] = False
         motion = dataclasses.replace(motion, is_free=is_free)
-    with path.open("rb") as file:
+    with open_input(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     settings = own if config is None else keep_facts(own, load_settings(config, own.arm.profile))
     return TunedLog(path, digest, settings, motion, log.scheme.t_ns, windows, is_chosen_on)

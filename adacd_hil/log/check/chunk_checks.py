@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from adacd_hil.log.check.content_checks import ContentCheck
 from adacd_hil.log.check.definition_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings
+from adacd_hil.log.chunk_data import ChunkError, Opening
 from adacd_hil.log.chunked_file import INDEX_ENTRY
 from adacd_hil.log.editing.chunk_contents import Contents, message_contents, read_contents
-from adacd_hil.log.editing.record_scan import HEAD, ChunkError, RawRecord, name_of, open_chunk, parse
+from adacd_hil.log.editing.record_scan import HEAD, RawRecord, name_of, parse
 
 _CHANNEL_NUMBERS = 2**16
 
@@ -53,6 +54,7 @@ class ChunkCheck:
         self.has_outside = False
         """Whether there are messages outside of chunks."""
         self._findings = findings
+        self._opening = Opening()
         self._definitions = definitions
         self.content = ContentCheck(findings)
         self._latest: ChunkFacts | None = None  # whose indexes may follow
@@ -75,7 +77,7 @@ class ChunkCheck:
         if not chunk.uncompressed_crc:
             self._findings.add("no-crc", "a chunk has no CRC", record.offset)
         try:
-            data = open_chunk(chunk)
+            data = self._opening.open_checked(chunk)
         except ChunkError as error:
             self._findings.add("chunk-crc", f"a chunk {error}", record.offset)
             return

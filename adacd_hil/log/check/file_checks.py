@@ -7,6 +7,7 @@ from typing import IO, NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Header, Metadata
 
+from adacd_hil.input_files import open_input
 from adacd_hil.log.check.chunk_checks import ChunkCheck
 from adacd_hil.log.check.definition_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings
@@ -42,7 +43,7 @@ class FileFacts(NamedTuple):
 def check_file(path: Path) -> FileFacts:
     """Check a file by itself. Raises LogError when it can't be read."""
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             return _FileCheck(path.name, file).run()
     except OSError as error:
         raise LogError(f"log {path} can't be read: {error.strerror}") from None

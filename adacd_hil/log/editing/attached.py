@@ -3,11 +3,14 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Chunk, McapRecord, Metadata
-from mcap.stream_reader import StreamReader
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Metadata
 
+from adacd_hil.input_files import open_input
+from adacd_hil.log.editing.record_scan import RawRecord, parse, scan
+from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import RUN_METADATA
+from adacd_hil.log.mcap_walk import MAGIC
 
 
 def attachment(path: Path, name: str) -> bytes | None:
@@ -26,13 +29,16 @@ def run_metadata(path: Path) -> dict[str, str]:
     return {}
 
 
-def _records_before_chunks(path: Path) -> Iterator[McapRecord]:
+def _records_before_chunks(path: Path) -> Iterator[Attachment | Metadata]:
     """Give the records before the first chunk, as far as they are sound: who reads the log says what is wrong."""
     try:
-        with path.open("rb") as file:
-            for record in StreamReader(file, emit_chunks=True).records:
-                if isinstance(record, Chunk):
+        with open_input(path) as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                return
+            for record in scan(file):
+                if not isinstance(record, RawRecord) or record.opcode == Opcode.CHUNK:
                     return
-                yield record
-    except (McapError, OSError, ValueError):
+                if record.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
+                    yield parse(record.opcode, record.body)
+    except (OSError, LogError):
         return

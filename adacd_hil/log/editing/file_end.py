@@ -9,7 +9,7 @@ from mcap.records import Footer
 
 from adacd_hil.log.editing.record_scan import HEAD, RawRecord, parse
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_walk import MAGIC
+from adacd_hil.log.mcap_walk import MAGIC, MOST_RECORD_BYTES
 
 _BLOCK = 1 << 20
 _FOOTER = HEAD.size + 20
@@ -40,7 +40,11 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
         return None
     data_crc = int.from_bytes(data_end[HEAD.size :], "little")
     summary: list[RawRecord] = []
-    if footer.summary_crc and footer.summary_crc == crc_of(file, end, place + _FOOTER - 4):
+    if (
+        footer.summary_crc
+        and place - end <= MOST_RECORD_BYTES
+        and footer.summary_crc == crc_of(file, end, place + _FOOTER - 4)
+    ):
         summary = _split(_read(file, end, place - end), end)
     return FileEnd(end - _DATA_END, data_crc, summary)
 
@@ -63,7 +67,7 @@ def read_record(file: IO[bytes], offset: int) -> RawRecord:
         raise LogError(f"no record at byte {offset}")
     opcode, length = HEAD.unpack(head)
     size = os.fstat(file.fileno()).st_size
-    if length > size - offset - HEAD.size:
+    if length > min(size - offset - HEAD.size, MOST_RECORD_BYTES):
         raise LogError(f"no record at byte {offset}")
     return RawRecord(offset, opcode, file.read(length))
 

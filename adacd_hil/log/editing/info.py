@@ -14,12 +14,14 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Statistics
 
+from adacd_hil.input_files import open_input
 from adacd_hil.log.cdr import payload_dtype
 from adacd_hil.log.check.content_checks import payload_size
+from adacd_hil.log.chunk_data import ChunkError, Opening
 from adacd_hil.log.editing.chunk_contents import Contents, read_contents
 from adacd_hil.log.editing.definitions import Definitions
 from adacd_hil.log.editing.file_end import FileEnd, read_end, read_record
-from adacd_hil.log.editing.record_scan import ChunkError, RawRecord, open_chunk, parse
+from adacd_hil.log.editing.record_scan import RawRecord, parse
 from adacd_hil.log.editing.salvage import Salvage
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, FIELDS_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
@@ -85,7 +87,7 @@ def read_info(path: Path) -> LogInfo:
     missing = [part for part in range(max(parts)) if part not in parts]
     for part in parts.values():
         try:
-            with part.open("rb") as file:
+            with open_input(part) as file:
                 info.size_bytes += part.stat().st_size
                 view.take(part, file)
         except OSError as error:
@@ -102,6 +104,7 @@ class _View:
 
     def __init__(self, info: LogInfo) -> None:
         self._info = info
+        self._opening = Opening()
         self._channels: dict[str, tuple[str, int | None]] = {}  # by topic: type and size of payloads
         self._counts: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()  # where they were seen
@@ -154,6 +157,7 @@ class _View:
         if statistics.message_count:
             self._span(statistics.message_start_time, statistics.message_end_time)
         wanted = {number for number, channel in definitions.channels.items() if channel.topic in _READ}
+        chunks = set()
         for record in end.summary:
             if record.opcode == Opcode.ATTACHMENT_INDEX:
                 index = parse(record.opcode, record.body)
@@ -163,12 +167,13 @@ class _View:
                 self._take_metadata(parse(Opcode.METADATA, found.body))
             elif record.opcode == Opcode.CHUNK_INDEX:
                 chunk = parse(record.opcode, record.body)
-                if wanted & chunk.message_index_offsets.keys():
+                if wanted & chunk.message_index_offsets.keys() and chunk.chunk_start_offset not in chunks:
+                    chunks.add(chunk.chunk_start_offset)
                     self._read_chunk(read_record(file, chunk.chunk_start_offset), definitions)
 
     def _read_chunk(self, record: RawRecord, definitions: Definitions) -> None:
         try:
-            self._read(read_contents(open_chunk(parse(Opcode.CHUNK, record.body))), definitions)
+            self._read(read_contents(self._opening.open_checked(parse(Opcode.CHUNK, record.body))), definitions)
         except ChunkError as error:
             self._info.problems.append(f"the chunk at byte {record.offset} {error}")
 

@@ -8,10 +8,12 @@ from typing import IO
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
+from adacd_hil.input_files import open_input
+from adacd_hil.log.chunk_data import ChunkError, Opening
 from adacd_hil.log.editing.chunk_contents import Contents, message_contents, read_contents
 from adacd_hil.log.editing.definitions import Definitions
 from adacd_hil.log.editing.file_end import crc_of, read_end
-from adacd_hil.log.editing.record_scan import ChunkError, Gap, RawRecord, attachment_crc_fits, open_chunk, parse, scan
+from adacd_hil.log.editing.record_scan import Gap, RawRecord, attachment_crc_fits, parse, scan
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import PART_KEY, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.mcap_walk import MAGIC
@@ -30,6 +32,7 @@ class IntactLog:
         self.definitions = Definitions()
         self.metadata: dict[str, dict[str, str]] = {}
         """By name, the first of each name; `run` without the number of its part; without `summary`."""
+        self._opening = Opening()
         self.dropped = 0
         """Packets that the parts say are not in them."""
 
@@ -52,7 +55,7 @@ class IntactLog:
 
     def _read(self, path: Path) -> Iterator[Attachment | Contents]:
         try:
-            with path.open("rb") as file:
+            with open_input(path) as file:
                 _check_ends(path, file)
                 for item in scan(file):
                     if isinstance(item, Gap):
@@ -80,7 +83,7 @@ class IntactLog:
 
     def _open(self, path: Path, offset: int, body: bytes) -> Contents:
         try:
-            contents = read_contents(open_chunk(parse(Opcode.CHUNK, body)))
+            contents = read_contents(self._opening.open_checked(parse(Opcode.CHUNK, body)))
         except ChunkError:
             raise _damaged(path, offset) from None
         self.definitions.take(contents.definitions)

@@ -14,6 +14,7 @@ import numpy as np
 from mcap.records import Attachment, Channel, Header, Schema
 from numpy.typing import NDArray
 
+from adacd_hil.input_files import open_input
 from adacd_hil.log.chunked_file import ChunkedFile
 from adacd_hil.log.editing.chunk_contents import Contents
 from adacd_hil.log.editing.file_end import read_end
@@ -222,7 +223,7 @@ class _Target:
 def _is_copy(path: Path) -> bool:
     """Tell whether a file is a log that was made of others, so that it can be made again."""
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             return read_end(file) is not None and read_info(path).ending in COPY_ENDINGS
     except (OSError, LogError):
         return False

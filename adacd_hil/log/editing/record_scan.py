@@ -1,6 +1,6 @@
 """The records of an MCAP file in order, whole, cut or damaged: what is no record is said, and what follows is found.
 
-Constant memory: one record at a time. Chunks stay closed; `open_chunk` opens one that can be trusted.
+Constant memory: one record at a time; one of more than MOST_RECORD_BYTES is none. Chunks stay closed.
 """
 
 import io
@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -32,15 +31,13 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.stream_reader import get_chunk_data_stream
 
+from adacd_hil.input_files import open_input
 from adacd_hil.log.editing.record_shapes import fits, has_shape
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_walk import MAGIC
+from adacd_hil.log.mcap_walk import MAGIC, MOST_RECORD_BYTES
 
 HEAD = struct.Struct("<BQ")
-MOST_OPENED = 1 << 30
-"""Bytes of a chunk, before compression, that are believed."""
 _WINDOW = 1 << 20
 _READERS: dict[int, Any] = {
     Opcode.HEADER: Header.read,
@@ -88,10 +85,6 @@ class Trailer(NamedTuple):
     offset: int
 
 
-class ChunkError(Exception):
-    """A chunk that can't be trusted; the message says why."""
-
-
 def name_of(opcode: int) -> str:
     """Name a kind of record as the specification does."""
     if opcode not in set(Opcode):
@@ -103,7 +96,7 @@ def parse(opcode: int, body: bytes) -> Any:
     """Read a record with mcap's class for it. Raises LogError when it makes no sense."""
     try:
         return _READERS[opcode](ReadDataStream(io.BytesIO(body)))
-    except (McapError, struct.error, ValueError) as error:
+    except (McapError, struct.error, ValueError, OverflowError) as error:
         raise LogError(f"{name_of(opcode)} can't be read: {error or type(error).__name__}") from None
 
 
@@ -115,7 +108,7 @@ def scan(file: IO[bytes]) -> Iterator[RawRecord | Gap | Trailer]:
 def read_header(path: Path) -> Header | None:
     """Read the header of a file; None where it has none that can be trusted."""
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             first = next(scan(file), None)
         if not isinstance(first, RawRecord) or first.opcode != Opcode.HEADER:
             return None
@@ -159,7 +152,7 @@ class _Scan:
             return None
         opcode, length = HEAD.unpack(head)
         start = position + HEAD.size
-        if not opcode or length > self._size - start:
+        if not opcode or length > min(self._size - start, MOST_RECORD_BYTES):
             return None
         if opcode in set(Opcode):
             is_there = fits(opcode, length, lambda place, count: self._read(start + place, count))
@@ -174,7 +167,7 @@ class _Scan:
             return False
         opcode, length = HEAD.unpack(head)
         start = position + HEAD.size
-        return length <= self._size - start and fits(
+        return length <= min(self._size - start, MOST_RECORD_BYTES) and fits(
             opcode, length, lambda place, count: self._read(start + place, count)
         )
 
@@ -187,26 +180,6 @@ class _Scan:
                     return position + match.start()
             position += _WINDOW
         return self._size
-
-
-def open_chunk(chunk: Chunk) -> bytes:
-    """Return what a chunk holds. Raises ChunkError when it isn't what was put in, as far as that can be told."""
-    if chunk.compression not in ("", "zstd", "lz4"):
-        raise ChunkError(f"unknown compression {chunk.compression!r}")
-    if chunk.uncompressed_size > MOST_OPENED:
-        raise ChunkError(f"claims {chunk.uncompressed_size} bytes, more than {MOST_OPENED}")
-    try:
-        if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > MOST_OPENED:
-            raise ChunkError(f"claims more than {MOST_OPENED} bytes")
-        stream, size = get_chunk_data_stream(chunk)
-        data: bytes = stream.read(size)
-    except (McapError, zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
-        raise ChunkError(f"can't be decompressed: {error or type(error).__name__}") from None
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ChunkError("fails its CRC")
-    if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
-        raise ChunkError(f"holds {len(data)} bytes, not {chunk.uncompressed_size}")
-    return data
 
 
 def attachment_crc_fits(body: bytes, is_vouched: bool = True) -> bool:

@@ -16,15 +16,15 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Chunk, Metadata, Statistics
 from numpy.typing import NDArray
 
+from adacd_hil.input_files import open_input
+from adacd_hil.log.chunk_data import ChunkError, Opening
 from adacd_hil.log.editing.chunk_contents import Contents, message_contents, read_contents
 from adacd_hil.log.editing.definitions import Definitions
 from adacd_hil.log.editing.file_end import crc_of, read_end
 from adacd_hil.log.editing.record_scan import (
-    ChunkError,
     Gap,
     RawRecord,
     attachment_crc_fits,
-    open_chunk,
     parse,
     scan,
 )
@@ -97,6 +97,7 @@ class Salvage:
         self.is_vouched = False
         """Whether the CRC of the data section fits: then everything is as it was written."""
         self._path = path
+        self._opening = Opening()
         self._statistics: Statistics | None = None
         self._saved_messages = self._saved_attachments = self._saved_metadata = 0
         self._latest_ns = 0
@@ -107,7 +108,7 @@ class Salvage:
         self._data_end = RawRecord(0, Opcode.DATA_END, b"")
         self._left_out = 0  # messages for lack of what vouches for them, or of their channel
         try:
-            with path.open("rb") as file:
+            with open_input(path) as file:
                 self._look_at_end(file)
         except OSError as error:
             raise LogError(f"log {path} can't be read: {error.strerror}") from None
@@ -125,7 +126,7 @@ class Salvage:
                     self._statistics = parse(record.opcode, record.body)
 
     def __iter__(self) -> Iterator[Attachment | Metadata | Contents]:
-        with self._path.open("rb") as file:
+        with open_input(self._path) as file:
             for item in scan(file):
                 if self._has_data_end:
                     break
@@ -175,7 +176,7 @@ class Salvage:
         chunk: Chunk = parse(record.opcode, record.body)
         if not chunk.uncompressed_crc and not self.is_vouched:
             raise ChunkError("has no CRC, and that of the whole doesn't fit")
-        contents = read_contents(open_chunk(chunk))
+        contents = read_contents(self._opening.open_checked(chunk))
         self.definitions.take(contents.definitions)
         if not self.is_vouched:
             self._chunk = contents, contents.entries

@@ -6,6 +6,7 @@ Times: python-can's are float64 seconds, which stand 238 ns apart at today's dat
 the recording, so their nanoseconds are had by reading without the start, and adding it as an integer.
 """
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from can.io.generic import TextIOMessageReader
 from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
+from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
 
@@ -111,7 +113,10 @@ class PythonCanFrames:
         kind: Any = MESSAGE_READERS[path.suffix.lower()]
         try:
             # Vendors' tools write their texts in the Windows of the country; frames are ASCII.
-            file = path.open(encoding="latin-1") if issubclass(kind, TextIOMessageReader) else path.open("rb")
+            binary = open_input(path)
+            file: Any = (
+                io.TextIOWrapper(binary, encoding="latin-1") if issubclass(kind, TextIOMessageReader) else binary
+            )
         except OSError as error:
             raise LogError(f"{path} can't be read: {error.strerror}") from None
         try:

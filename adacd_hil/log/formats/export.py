@@ -5,14 +5,17 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.opcode import Opcode
 
+from adacd_hil.input_files import open_input
 from adacd_hil.log.channels import DECODED
+from adacd_hil.log.chunk_data import ChunkError, Opening
+from adacd_hil.log.editing.chunk_contents import read_contents
+from adacd_hil.log.editing.record_scan import RawRecord, parse, scan
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.log.formats.tables import Tables, event_columns, frame_columns, series_columns
+from adacd_hil.log.mcap_walk import MAGIC
 from adacd_hil.log.stream import LogStream
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.wire.codec import Codec
@@ -100,13 +103,19 @@ def _topics(path: Path) -> list[str]:
     """List the topics that the first chunk of an MCAP file defines."""
     topics: list[str] = []
     try:
-        with path.open("rb") as file:
-            for record in StreamReader(file, emit_chunks=True).records:
-                if isinstance(record, Channel):
-                    topics.append(record.topic)
-                elif isinstance(record, Chunk):
-                    topics += [inner.topic for inner in breakup_chunk(record) if isinstance(inner, Channel)]
+        with open_input(path) as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                return []
+            for record in scan(file):
+                if not isinstance(record, RawRecord):
                     break
-    except (McapError, OSError, ValueError):
+                if record.opcode == Opcode.CHANNEL:
+                    topics.append(parse(record.opcode, record.body).topic)
+                elif record.opcode == Opcode.CHUNK:
+                    contents = read_contents(Opening().open_checked(parse(record.opcode, record.body)))
+                    channels = (found for found in contents.definitions if found.opcode == Opcode.CHANNEL)
+                    topics += [parse(channel.opcode, channel.body).topic for channel in channels]
+                    break
+    except (OSError, LogError, ChunkError):
         pass  # who reads the log says what is wrong with it
     return list(dict.fromkeys(topics))

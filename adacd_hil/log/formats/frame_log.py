@@ -6,6 +6,7 @@ the run; BLF, candump, TRC, CSV and MF4 from 1970; ASC from its beginning.
 """
 
 import importlib.util
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
+from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.mcap_frames import McapFrames
@@ -77,7 +79,7 @@ class CandumpFrames:
         self.problem = ""
         self._path = path
         try:
-            path.open("rb").close()
+            open_input(path).close()
         except OSError as error:
             raise LogError(f"{path} can't be read: {error.strerror}") from None
 
@@ -86,7 +88,7 @@ class CandumpFrames:
         rows: list[tuple[Any, ...]] = []
         places: dict[str, int] = {}
         first_wrong, wrong, right = "", 0, 0
-        with self._path.open(encoding="ascii", errors="replace") as file:
+        with io.TextIOWrapper(open_input(self._path), encoding="ascii", errors="replace") as file:
             for number, line in enumerate(file, 1):
                 if not line.strip():
                     continue

@@ -19,19 +19,19 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from numpy.typing import NDArray
 
+from adacd_hil.input_files import open_input
 from adacd_hil.log.cdr import ENCAPSULATION
+from adacd_hil.log.chunk_data import Opening
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
 from adacd_hil.log.mcap_file import RUN_METADATA
-from adacd_hil.log.mcap_walk import MAGIC, MESSAGE_HEAD, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap_walk import MAGIC, MESSAGE_HEAD, MOST_RECORD_BYTES, RECORD_HEAD_BYTES
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import EPOCH_KEY
 from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, MAX_DATA
@@ -45,8 +45,7 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _FOOTER = struct.Struct("<BQQQI")
 _MESSAGE_START = struct.Struct("<BQH")
 _NAME_BYTES = struct.Struct("<I")
-_MAX_CHUNK = 1 << 30
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, MemoryError, OverflowError)
+_DAMAGE = (McapError, struct.error, ValueError, EOFError, MemoryError, OverflowError)
 _HEAD_BYTES = MESSAGE_HEAD + len(ENCAPSULATION) + 12
 """Bytes of a record up to its frame_id."""
 _HEAD_DTYPE = np.dtype(
@@ -96,11 +95,12 @@ class McapFrames:
         self._bus = ""
         self._schemas: dict[int, Schema] = {}
         self._sources: dict[int, _Source | None] = {}
+        self._opening = Opening()
         self._files = _parts(source) if isinstance(source, Path) else [source]
         first = self._files[0]
         try:
             if isinstance(first, Path):
-                with first.open("rb") as file:
+                with open_input(first) as file:
                     _check_magic(file, str(first))
             else:
                 _check_magic(first, "the file")
@@ -115,7 +115,7 @@ class McapFrames:
                 yield from self._read(source, "the file")
                 continue
             try:
-                with source.open("rb") as file:
+                with open_input(source) as file:
                     yield from self._read(file, source.name)
             except OSError as error:
                 self._note(f"{source.name} can't be read: {error.strerror or error}")
@@ -127,7 +127,7 @@ class McapFrames:
         """Walk over the records of a part."""
         size = file.seek(0, io.SEEK_END)
         file.seek(0)
-        self._schemas, self._sources = {}, {}
+        self._schemas, self._sources, self._opening = {}, {}, Opening()
         crc = zlib.crc32(file.read(len(MAGIC)))
         position = len(MAGIC)
         opcode = 0
@@ -137,6 +137,9 @@ class McapFrames:
             opcode, length = _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else (0, 0)
             if opcode == 0 or length > size - position:
                 self._note(f"{name} is cut after {size} bytes")
+                return
+            if length > MOST_RECORD_BYTES:
+                self._note(f"{name}: the record at byte {position} has {length} bytes, more than {MOST_RECORD_BYTES}")
                 return
             body = file.read(length)
             position += length
@@ -162,7 +165,7 @@ class McapFrames:
         file.seek(max(place, 0))
         footer = file.read(_FOOTER.size)
         opcode, _, position, _, _ = _FOOTER.unpack(footer) if len(footer) == _FOOTER.size else (0, 0, 0, 0, 0)
-        if opcode != Opcode.FOOTER or not 0 < position <= place:
+        if opcode != Opcode.FOOTER or not max(0, place - MOST_RECORD_BYTES) < position <= place:
             return
         file.seek(position)
         summary = file.read(place - position)
@@ -178,10 +181,7 @@ class McapFrames:
         stream = ReadDataStream(io.BytesIO(record[_RECORD_HEAD.size :]))
         if opcode == Opcode.CHUNK:
             chunk = Chunk.read(stream)
-            if chunk.uncompressed_size > _MAX_CHUNK:
-                raise ValueError("chunk too large")
-            data_stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-            return self._frames(data_stream.read(size))
+            return self._frames(self._opening.open_checked(chunk))
         if opcode in (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA):
             return self._frames(record)
         if opcode == Opcode.METADATA:
