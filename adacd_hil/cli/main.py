@@ -141,13 +141,17 @@ def tare(
 def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Stretch") -> ExitCode:
     """Report logs: HTML, PDF, PNG, CSV and JSON. The emulator's truth.mcap beside a log is joined to it.
 
+    A folder stands for the run.mcap in it, or without one for all runs in its folders: then index.html leads to their
+    reports.
+
     A stretch from --from until --until is widened so that it cuts no contact and no adaptation.
     """
+    from adacd_hil.cli.report import as_json as in_json
     from adacd_hil.cli.report import report_logs
 
     reports, code = report_logs(logs, out, stretch)
     if as_json:
-        print(json.dumps([entry.as_json() for entry in reports], indent=2))
+        print(json.dumps(in_json(reports), indent=2))
     else:
         print("\n\n".join(entry.as_text() for entry in reports))
     return code

@@ -1,6 +1,7 @@
 """Small runs made by hand: 1 kHz, a = 10 rad/s, threshold 0.15 Nm, zeros wherever a test doesn't say otherwise."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,18 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.run import CertifiedStream, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import CycleColumns
 from adacd_hil.config import Settings, parse
-from adacd_hil.records import ContactReport, CycleRecord, SchemeState
+from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.records import (
+    TRUTH_LAYOUT,
+    ContactReport,
+    CycleRecord,
+    FaultReason,
+    Request,
+    SchemeOutput,
+    SchemeState,
+    scheme_layout,
+)
 
 CAD_THETA = (0.18, 0.036, 0.019, 0.0, 0.0, 0.0, 0.0)
 THETA = (0.2, 0.04, 0.02, 0.03, 0.015, 0.0375, 0.025)
@@ -173,3 +185,43 @@ def like_an_old_log(run: Run) -> Run:
     """Take away what /cycle did not have at first."""
     names = ("cycle", "lateness_ns", "feedback_ns", "command_ns", "overruns", "frames_missing", "commands_late")
     return replace(run, timing=replace(run.timing, columns={name: run.timing[name] for name in names}))
+
+
+def record(path: Path, run: Run, attachments: dict[str, bytes]) -> None:
+    """Write a log with the scheme's topic of a hand-made run."""
+    layout = scheme_layout(7)
+    with Recorder(
+        path, attachments=attachments, metadata={"clock": "lockstep", "scenario": "paper"}, blocking=True
+    ) as recorder:
+        for row, cycle in enumerate(run.cycle.tolist()):
+            block = np.zeros(layout.size)
+            block[layout.slices["tau_ext_hat"]] = run.tau_ext_hat[row]
+            block[layout.slices["theta_hat"]] = run.theta_hat[row]
+            block[layout.slices["threshold"]] = run.threshold[row]
+            state = SchemeState(run.state[row])
+            joints = int(state is SchemeState.REACT)
+            output = SchemeOutput(
+                cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row], run.theta_hat[row],
+                run.tau_ext_hat[row], None, block,
+            )  # fmt: skip
+            times = CycleRecord(*(int(run.timing[name][row]) for name in CycleRecord._fields))
+            messages = [
+                (ChannelId.SCHEME, pack_scheme(output, Request.NONE)),
+                (ChannelId.CYCLE, pack_cycle(times)),
+            ]
+            messages += [(ChannelId.CONTACT, pack_contact(report)) for report in run.reports if report.cycle == cycle]
+            recorder.cycle(int(run.t_ns[row]), messages)
+
+
+def record_truth(path: Path, run: Run) -> None:
+    """Write the emulator's log of a hand-made run."""
+    assert run.truth is not None
+    with Recorder(path, metadata={"seed": "7"}, blocking=True, is_truth=True) as recorder:
+        for row, cycle in enumerate(run.truth.cycle.tolist()):
+            block = np.zeros(TRUTH_LAYOUT.size)
+            block[TRUTH_LAYOUT.slices["tau_ext"]] = run.truth.tau_ext[row]
+            block[TRUTH_LAYOUT.slices["contact_link"]] = run.truth.contact_link[row]
+            block[TRUTH_LAYOUT.slices["contact_index"]] = run.truth.contact_index[row]
+            block[TRUTH_LAYOUT.slices["payload"]] = run.truth.payload_kg[row]
+            block[TRUTH_LAYOUT.slices["theta"]] = run.truth.theta[row]
+            recorder.cycle(int(run.t_ns[row]), [(ChannelId.TRUTH, pack_truth(cycle, block))])

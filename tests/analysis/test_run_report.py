@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, like_an_old_log, make_run, react, touched_run
+from hand_made_run import A, M, like_an_old_log, make_run, react, record, record_truth, touched_run
 
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.json_form import report_json
@@ -21,19 +21,12 @@ from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.report import write_report, write_run_report
 from adacd_hil.analysis.report.timing_page import timing_section
 from adacd_hil.config import to_toml
-from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import (
-    TRUTH_LAYOUT,
-    CycleRecord,
     Event,
     FaultReason,
-    Request,
-    SchemeOutput,
     SchemeState,
-    scheme_layout,
 )
 
 pytestmark = pytest.mark.slow
@@ -407,44 +400,6 @@ def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(LogError, match=r"report in .*taken can't be written"):
         write_run_report(make_run((A, 10)), tmp_path / "taken", Source("run.mcap"))
-
-
-def record(path, run, attachments):
-    """Write a log with the scheme's topic of a hand-made run."""
-    layout = scheme_layout(7)
-    with Recorder(
-        path, attachments=attachments, metadata={"clock": "lockstep", "scenario": "paper"}, blocking=True
-    ) as recorder:
-        for row, cycle in enumerate(run.cycle.tolist()):
-            block = np.zeros(layout.size)
-            block[layout.slices["tau_ext_hat"]] = run.tau_ext_hat[row]
-            block[layout.slices["theta_hat"]] = run.theta_hat[row]
-            block[layout.slices["threshold"]] = run.threshold[row]
-            state = SchemeState(run.state[row])
-            joints = int(state is SchemeState.REACT)
-            output = SchemeOutput(
-                cycle, state, state, FaultReason.NONE, joints, False, run.theta_hat[row], run.theta_hat[row],
-                run.tau_ext_hat[row], None, block,
-            )  # fmt: skip
-            times = CycleRecord(*(int(run.timing[name][row]) for name in CycleRecord._fields))
-            messages = [
-                (ChannelId.SCHEME, pack_scheme(output, Request.NONE)),
-                (ChannelId.CYCLE, pack_cycle(times)),
-            ]
-            messages += [(ChannelId.CONTACT, pack_contact(report)) for report in run.reports if report.cycle == cycle]
-            recorder.cycle(int(run.t_ns[row]), messages)
-
-
-def record_truth(path, run):
-    with Recorder(path, metadata={"seed": "7"}, blocking=True, is_truth=True) as recorder:
-        for row, cycle in enumerate(run.truth.cycle.tolist()):
-            block = np.zeros(TRUTH_LAYOUT.size)
-            block[TRUTH_LAYOUT.slices["tau_ext"]] = run.truth.tau_ext[row]
-            block[TRUTH_LAYOUT.slices["contact_link"]] = run.truth.contact_link[row]
-            block[TRUTH_LAYOUT.slices["contact_index"]] = run.truth.contact_index[row]
-            block[TRUTH_LAYOUT.slices["payload"]] = run.truth.payload_kg[row]
-            block[TRUTH_LAYOUT.slices["theta"]] = run.truth.theta[row]
-            recorder.cycle(int(run.t_ns[row]), [(ChannelId.TRUTH, pack_truth(cycle, block))])
 
 
 def without_cycle_times(table):
