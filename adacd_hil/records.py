@@ -307,6 +307,12 @@ class Location(IntEnum):
     BEYOND_TIP = 5  # the lever arm ends past the tip: what the arm carries, or a force at an angle to the link
     INCONSISTENT = 6  # no single contact on link 2: more than one, as in a clamp, or friction
 
+    def force_text(self, force_N: float) -> str:
+        """Write a report's force, N: its size after "≥" where it is a lower bound, a dash where none is known."""
+        if self in (Location.KNOWN, Location.UNCERTAIN):
+            return f"{force_N:.1f}"
+        return f"≥ {abs(force_N):.1f}" if self is Location.LINK_1 else "–"
+
 
 class ContactReport(NamedTuple):
     """A contact, as first detected and then refined until the isolation window ends.

@@ -9,6 +9,7 @@ import click
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.options import explained, json_option
 from adacd_hil.log.run_folder import log_in
+from adacd_hil.records import Location
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_comparison import LogComparison
@@ -70,8 +71,8 @@ def _as_text(found: "LogComparison") -> str:
 def _contact(contact: "Detection | None") -> str:
     if contact is None:
         return "–"
-    force = f", {contact.force_N:.1f} N" if contact.force_N else ""
-    return f"{contact.time_s:.3f} s, link {contact.link}{force}"
+    force = Location(contact.location).force_text(contact.force_N)
+    return f"{contact.time_s:.3f} s, link {contact.link}" + ("" if force == "–" else f", {force} N")
 
 
 def _states(found: "LogComparison") -> list[tuple[str, str, str]]:

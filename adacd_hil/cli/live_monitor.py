@@ -216,7 +216,7 @@ def _contact_row(contact: dict[str, Any]) -> tuple[str, ...]:
         contact["level"] if contact["is_final"] else f"{contact['level']} …",
         str(contact["link"]),
         contact["kind"],
-        f"{contact['force_N']:.1f}",
+        Location[contact["location"]].force_text(contact["force_N"]),
         f"{contact['lever_m']:.2f}",
         contact["location"],
     )

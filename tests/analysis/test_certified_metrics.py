@@ -274,9 +274,26 @@ def test_the_text_puts_three_columns_side_by_side():
 def test_the_page_has_a_card_for_the_contact():
     run = reported_run()
     html = report_page(evaluate(run), run, Source("run.mcap"), [], [])
-    assert "<dt>force</dt><dd>14.2 ± 0.5 N</dd>" in html
+    assert "<dt>force</dt><dd>≥ 14.2 N</dd>" in html
     assert "<dt>truth</dt><dd>link 1, 0.0 N</dd>" in html
     assert "only the moment is known" in html
+
+
+@pytest.mark.parametrize(
+    ("location", "words"),
+    [
+        (Location.KNOWN, "force at right angles</dt><dd>−14.2 ± 0.5 N"),
+        (Location.UNCERTAIN, "force at right angles</dt><dd>−14.2 ± 0.5 N"),
+        (Location.LINK_1, "force</dt><dd>≥ 14.2 N"),
+        (Location.BEYOND_TIP, "force</dt><dd>not known"),
+        (Location.INCONSISTENT, "force</dt><dd>not known"),
+    ],
+)
+def test_a_force_is_told_as_far_as_it_is_known(location, words):
+    run = touched_beside(3000, 3005)
+    made = contact_report(int(run.cycle[3001]), location=location, force_N=-14.2, force_sigma=0.5)
+    run = replace(run, reports=(made,))
+    assert f"<dt>{words}</dd>" in report_page(evaluate(run), run, Source("run.mcap"), [], [])
 
 
 def test_the_page_marks_a_margin_below_one():

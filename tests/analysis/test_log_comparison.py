@@ -9,6 +9,7 @@ from log.recorded_run import make_run, record
 from adacd_hil.analysis.replay.log_comparison import MATCH_S, compare_logs, match_contacts
 from adacd_hil.analysis.replay.run_digest import Detection
 from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.cli.compare_command import _contact as in_words
 from adacd_hil.config import load_settings, to_toml
 
 SETTINGS = load_settings("paper")
@@ -69,6 +70,15 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> No
         (first[1], None),
         (None, second[2]),
         (first[2], None),
+    ]
+
+
+def test_a_lower_bound_reads_as_one_in_a_comparison() -> None:
+    bound, known = contact(1.0)._replace(force_N=-14.7, location=2), contact(1.0)._replace(force_N=-14.7, location=1)
+    assert [in_words(each) for each in (bound, known, contact(1.0))] == [
+        "1.000 s, link 1, ≥ 14.7 N",
+        "1.000 s, link 1, -14.7 N",
+        "1.000 s, link 1",
     ]
 
 

@@ -34,7 +34,8 @@ def blow(force_N, lever_m, q2, sigma=(0.0, 0.0), seed=0, samples=60):
 def test_force_and_lever_arm_of_one_contact_are_found(force_N, lever_m, q2):
     place = on_link2(*blow(force_N, lever_m, q2), 1e-6 * SIGMA, LENGTHS)
     assert place.location is Location.KNOWN
-    assert place.force_N == pytest.approx(force_N, rel=2e-3)
+    assert 0.98 * abs(force_N) < abs(place.force_N) < abs(force_N)  # a median over the top of a half-sine
+    assert place.force_N * force_N > 0.0
     assert place.lever_m == pytest.approx(lever_m, rel=1e-6)
 
 
@@ -44,8 +45,28 @@ def test_noise_shifts_the_lever_arm_as_its_standard_deviation_says():
     assert np.mean(lever) == pytest.approx(0.2, abs=2e-3)
     assert np.std(lever) < np.mean([place.lever_sigma for place in places])
     noise = math.hypot(*SIGMA) / (L1 * math.cos(0.6))
-    assert np.std([place.force_N for place in places]) == pytest.approx(noise, rel=0.15)
+    assert np.std([place.force_N for place in places]) < 0.5 * noise
     assert places[0].force_sigma > noise
+
+
+@pytest.mark.parametrize("samples", [40, 100, 400])
+@pytest.mark.parametrize("where", [0.05, 0.5, 0.8])
+def test_a_jump_of_the_drives_torque_does_not_make_the_force_larger(samples, where):
+    tau = np.tile(torques(10.0, 0.2, 0.6), (samples, 1))
+    jump = int(where * samples)
+    tau[jump : jump + max(samples // 10, 4)] *= (1.5, 1.1)
+    place = on_link2(tau, np.full(samples, 0.6), SIGMA, LENGTHS)
+    assert place.force_N == pytest.approx(10.0, rel=1e-6)
+
+
+def test_of_a_force_that_grows_the_strongest_part_counts():
+    tau = np.linspace(0.0, 1.0, 90)[:, None] * torques(12.0, 0.2, 0.6)
+    assert on_link2(tau, np.full(90, 0.6), SIGMA, LENGTHS).force_N == pytest.approx(11.0, rel=0.02)
+
+
+def test_one_sample_is_enough():
+    place = on_link2(torques(-12.0, 0.2, 0.6)[None], np.full(1, 0.6), SIGMA, LENGTHS)
+    assert place.force_N == pytest.approx(-12.0)
 
 
 @pytest.mark.parametrize("q2", [math.radians(89.0), math.radians(-95.0)])

@@ -29,6 +29,7 @@ class Detection(NamedTuple):
     kind: int
     tau_ext_peak: tuple[float, ...]
     force_N: float
+    location: int = 0  # records.Location: what force_N is
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,8 @@ class RunReader:
         key = int(record["cycle"])
         before = self._contacts.get(key)
         names = record.dtype.names or ()
-        level, kind, force = (record[name].item() if name in names else 0 for name in ("level", "kind", "force_N"))
+        told = ("level", "kind", "force_N", "location")
+        level, kind, force, location = (record[name].item() if name in names else 0 for name in told)
         self._contacts[key] = Detection(
             time_s if before is None else before.time_s,
             int(record["link"]),
@@ -105,6 +107,7 @@ class RunReader:
             int(kind),
             tuple(record["tau_ext_peak"].tolist()),
             float(force),
+            int(location),
         )
 
     def digest(self) -> RunDigest:

@@ -19,7 +19,7 @@ from adacd_hil.analysis.report.words import (
 )
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.touches import row_at
-from adacd_hil.records import Vector
+from adacd_hil.records import Location, Vector
 
 CARDS: Final = 48
 """Contacts with a card of their own; the table has all."""
@@ -106,11 +106,24 @@ def _found(contact: Contact) -> list[tuple[str, str]]:
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),
         ("direction", signs_text(contact.direction)),
-        ("force", uncertain_text(contact.force_N, contact.force_sigma_N, 1, "N")),
+        _force(contact),
         ("lever arm", lever),
         ("place", _PLACES.get(contact.location or "", NONE)),
         ("blind within", number_text(contact.blind_deg, 1, "°")),
     ]
+
+
+def _force(contact: Contact) -> tuple[str, str]:
+    """Give the force as far as it is known: with its deviation, as a lower bound, or not at all."""
+    location = Location[contact.location or Location.NOT_SOUGHT.name]
+    if contact.force_N is None:
+        return "force", NONE
+    text = location.force_text(contact.force_N)
+    if text == NONE:
+        return "force", "not known"
+    if location is Location.LINK_1:
+        return "force", f"{text} N"
+    return "force at right angles", uncertain_text(contact.force_N, contact.force_sigma_N, 1, "N")
 
 
 def _torques(contact: Contact) -> list[tuple[str, str]]:

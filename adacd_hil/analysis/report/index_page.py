@@ -42,12 +42,12 @@ def count_text(entries: Sequence[Entry]) -> str:
 
 def index_page(folder: Path, entries: Sequence[Entry]) -> str:
     """Write the page, which lies in `folder`."""
-    rows: list[Sequence[Cell]] = [(_link(folder, entry), *_told(entry), _verdict(entry)) for entry in entries]
-    head = ("run", "", "configuration", "profile", "interface", "lasts, s", "verdict")
+    rows: list[Sequence[Cell]] = [(_link(folder, entry), _verdict(entry), *_told(entry)) for entry in entries]
+    head = ("run", "verdict", "lasts, s", "configuration", "profile", "interface")
     title = f"{count_text(entries)}."
     parts = [
         heading("adacd-hil run reports", title, (), all(entry.is_clean for entry in entries)),
-        make_table(head, rows, left=(0, 1, 2, 3, 4, 6)),
+        make_table(head, rows, left=(0, 1, 3, 4, 5)),
     ]
     return document(f"{count_text(entries)} – run reports", parts)
 
@@ -61,13 +61,13 @@ def _link(folder: Path, entry: Entry) -> Cell:
 
 
 def _told(entry: Entry) -> Sequence[Cell]:
-    word: Cell = "good" if entry.is_clean else ("not good", "bad")
     if entry.report is None:
-        return word, NONE, NONE, NONE, NONE
+        return NONE, NONE, NONE, NONE
     metadata = entry.report.metadata
     words = [escape(metadata.get(key) or NONE) for key in ("config", "profile", "interface")]
-    return word, *words, f"{entry.report.metrics.cycle.duration_s:.1f}"
+    return f"{entry.report.metrics.cycle.duration_s:.1f}", *words
 
 
 def _verdict(entry: Entry) -> Cell:
-    return escape(entry.verdict), "wide"
+    word, tone = ("good", "strong") if entry.is_clean else ("not good", "bad")
+    return f'<b class="{tone}">{word}</b> {escape(entry.verdict)}', "wide"
