@@ -11,10 +11,13 @@ import io
 import os
 import re
 import select
+import shutil
 import signal
 import stat
 import sys
+import textwrap
 import threading
+from collections.abc import Iterable, Sequence
 from types import FrameType
 
 _CONTROL = re.compile(
@@ -40,6 +43,69 @@ def one_line(text: object) -> str:
     """Put a text into one line, free of control characters and not longer than anybody reads."""
     line = plain(" ".join(str(text).split()))
     return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"
+
+
+def terminal_columns() -> int | None:
+    """Give the width of the terminal that standard output is; None where it is none and COLUMNS is not set."""
+    try:
+        is_terminal = sys.stdout.isatty()
+    except ValueError:  # it is closed
+        is_terminal = False
+    return shutil.get_terminal_size().columns if is_terminal or "COLUMNS" in os.environ else None
+
+
+def fit_table(lines: Sequence[Sequence[str]], right: Sequence[int] = (), width: int | None = None) -> list[str]:
+    """Align lines of cells; columns in `right` to the right. A table wider than `width` is told in parts.
+
+    Each part begins with the first column and has as many of the others as there is room for. Where one alone has no
+    room its cells are parted between words, on lines of their own.
+    """
+    if not lines:
+        return []
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    if width is None or sum(widths) + len(_GAP) * (len(widths) - 1) <= width or len(widths) == 1:
+        return _aligned(lines, range(len(widths)), widths, right)
+    parts: list[list[int]] = [[0]]
+    for column in range(1, len(widths)):
+        taken = sum(widths[place] + len(_GAP) for place in parts[-1])
+        if len(parts[-1]) > 1 and taken + widths[column] > width:
+            parts.append([0])
+        parts[-1].append(column)
+    told: list[str] = []
+    for part in parts:
+        told += [""] if told else []
+        room = max(width - widths[0] - len(_GAP), _LEAST_ROOM)
+        cells = lines if len(part) > 2 or widths[part[-1]] <= room else _parted(lines, part, room)
+        told += _aligned(cells, part, widths, right)
+    return told
+
+
+_GAP = "  "
+_LEAST_ROOM = 20
+"""Letters that a cell is given, however narrow the terminal."""
+
+
+def _aligned(
+    lines: Sequence[Sequence[str]], columns: Iterable[int], widths: Sequence[int], right: Sequence[int]
+) -> list[str]:
+    return [
+        _GAP.join(
+            line[column].rjust(widths[column]) if column in right else line[column].ljust(widths[column])
+            for column in columns
+        ).rstrip()
+        for line in lines
+    ]
+
+
+def _parted(lines: Sequence[Sequence[str]], part: Sequence[int], room: int) -> list[list[str]]:
+    """Part the cells of a part's last column between words."""
+    found = []
+    for line in lines:
+        for row, text in enumerate(textwrap.wrap(line[part[-1]], room, break_long_words=False) or [""]):
+            cells = list(line) if row == 0 else [""] * len(line)
+            cells[part[-1]] = text
+            found.append(cells)
+    return found
 
 
 class Terminal(io.TextIOBase):

@@ -1,6 +1,7 @@
 """What reaches a terminal, a pipe or a full disk, and who may leave, block or fail without harm."""
 
 import fcntl
+import io
 import os
 import select
 import signal
@@ -16,7 +17,7 @@ from hang import HANG_S
 
 from adacd_hil.cli.monitor import Screen
 from adacd_hil.log.reader import read_log
-from adacd_hil.terminal import one_line, plain
+from adacd_hil.terminal import fit_table, one_line, plain, terminal_columns
 from firmware_sim.truth import TruthLog
 
 OK, USAGE, PARTIAL, INTERRUPTED = 0, 2, 3, 130
@@ -197,3 +198,48 @@ def test_a_stopped_terminal_ends_with_ctrl_c() -> None:
         assert process.wait(HANG_S) in (-signal.SIGINT, 1, INTERRUPTED)
     os.close(theirs)
     os.close(ours)
+
+
+WIDE = [("name", "count", "words", "more"), ("first", "1", "one two three four", "x" * 20), ("2nd", "22", "", "y")]
+
+
+def test_a_table_that_fits_is_one():
+    assert fit_table(WIDE, (1,), 80) == fit_table(WIDE, (1,))
+    assert fit_table(WIDE, (1,), 80) == [
+        "name   count  words               more",
+        "first      1  one two three four  xxxxxxxxxxxxxxxxxxxx",
+        "2nd       22                      y",
+    ]
+
+
+def test_a_wider_table_is_told_in_parts_that_begin_with_the_first_column():
+    assert fit_table(WIDE, (1,), 40) == [
+        "name   count  words",
+        "first      1  one two three four",
+        "2nd       22",
+        "",
+        "name   more",
+        "first  xxxxxxxxxxxxxxxxxxxx",
+        "2nd    y",
+    ]
+
+
+def test_a_cell_without_room_is_parted_between_words():
+    lines = [("", "found"), ("a", "a sentence that is longer than the terminal is wide")]
+    assert fit_table(lines, width=30) == ["   found", "a  a sentence that is longer", "   than the terminal is wide"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_no_line_of_a_table_is_wider_than_the_terminal(width):
+    rows = [tuple(f"cell {row} {column}" for column in range(30)) for row in range(4)]
+    lines = fit_table(rows, width=width)
+    assert max(map(len, lines)) <= width
+    assert {cell for row in rows for cell in row} <= set("  ".join(lines).split("  "))
+
+
+def test_columns_are_those_of_the_environment_where_there_is_no_terminal(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    monkeypatch.delenv("COLUMNS", raising=False)
+    assert terminal_columns() is None
+    monkeypatch.setenv("COLUMNS", "97")
+    assert terminal_columns() == 97

@@ -164,7 +164,8 @@ class Writer:
         part = part_path(self._path, self._number)
         self._sink = Sink(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644))
         self._part_ns: int | None = None
-        metadata = {**self._log.metadata, PART_KEY: str(self._number)}
+        # Nobody knows when a script would have asked for what in the repetitions: replay takes the requests as given.
+        metadata = {**self._log.metadata, "operator": "repeated", PART_KEY: str(self._number)}
         return McapFile(self._sink, tuple(self._log.channels), self._log.attachments, metadata)
 
     def _end(self, ending: str) -> None:

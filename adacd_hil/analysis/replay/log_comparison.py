@@ -5,6 +5,7 @@ first of the log. Contacts are matched by the time of their detection since then
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -189,16 +190,20 @@ def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
 
 def match_contacts(first: list[Detection], second: list[Detection]) -> list[ContactPair]:
     """Match detections by time, the nearest ones first; what has no counterpart stands alone. In order of time."""
-    distances = sorted(
-        (abs(a.time_s - b.time_s), i, k)
-        for i, a in enumerate(first)
-        for k, b in enumerate(second)
-        if abs(a.time_s - b.time_s) <= MATCH_S
-    )
+    order = sorted(range(len(second)), key=lambda k: second[k].time_s)
+    times_s = [second[k].time_s for k in order]
+    distances = []
+    for i, a in enumerate(first):
+        for place in range(bisect_left(times_s, a.time_s - MATCH_S), len(order)):
+            if times_s[place] - a.time_s > MATCH_S:
+                break
+            distances.append((abs(a.time_s - times_s[place]), i, order[place]))
     partner: dict[int, int] = {}
-    for _, i, k in distances:
-        if i not in partner and k not in partner.values():
+    taken: set[int] = set()
+    for distance, i, k in sorted(distances):
+        if distance <= MATCH_S and i not in partner and k not in taken:
             partner[i] = k
+            taken.add(k)
     pairs = [ContactPair(a, second[partner[i]] if i in partner else None) for i, a in enumerate(first)]
-    pairs += [ContactPair(None, b) for k, b in enumerate(second) if k not in partner.values()]
+    pairs += [ContactPair(None, b) for k, b in enumerate(second) if k not in taken]
     return sorted(pairs, key=lambda pair: min(each.time_s for each in pair if each is not None))

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.histogram import low_percentiles, percentiles
+from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.analysis.replay.source import settings_of
 from adacd_hil.config import Settings
 from adacd_hil.log.errors import LogError
@@ -59,7 +59,7 @@ class RunReader:
         self._states: list[tuple[float, str]] = []
         self._contacts: dict[int, Detection] = {}
         self._parameters: dict[str, list[float]] = {}
-        self._times: dict[str, list[NDArray[np.int32]]] = {name: [] for name in _TIMES}
+        self._times = {name: Distribution() for name in _TIMES}
 
     @property
     def zero_cycle(self) -> int:
@@ -85,8 +85,7 @@ class RunReader:
                 self._take_contact((time_ns - zero_ns) * 1e-9, record)
             for name in _TIMES:
                 if name in piece.series["/cycle"].fields:
-                    values = piece.series["/cycle"].records[name]
-                    self._times[name].append(np.clip(values, -(2**31), 2**31 - 1).astype(np.int32))
+                    self._times[name].add(piece.series["/cycle"].records[name] / 1e3)
             yield records
 
     def _keep_parameters(self, record: Any) -> None:
@@ -115,9 +114,8 @@ class RunReader:
         if not self._parameters and self.cycles:
             self._keep_parameters(self._last)
         timing = {}
-        for name, parts in self._times.items():
-            values = np.concatenate(parts) / 1e3 if parts else np.zeros(0)
-            found = low_percentiles(values) if name == "slack_ns" else percentiles(values)
+        for name, times in self._times.items():
+            found = times.low_percentiles() if name == "slack_ns" else times.percentiles()
             timing[name.removesuffix("_ns")] = found
         return RunDigest(
             self.path,

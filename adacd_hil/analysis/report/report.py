@@ -20,7 +20,6 @@ from adacd_hil.analysis.report.print_form import report_pdf, report_png
 from adacd_hil.analysis.report.reading import Progress, Source, read_run
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.report.words import (
-    align_columns,
     contact_rows,
     left_out_text,
     paper_cells,
@@ -32,6 +31,7 @@ from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import WHOLE, Stretch
 from adacd_hil.output_files import replace_file
+from adacd_hil.terminal import fit_table, terminal_columns
 
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
@@ -60,19 +60,19 @@ class Report:
         return report_json(self.metrics, self.metadata, self.source, self.stretch)
 
     def as_text(self) -> str:
-        """Give the verdict, what the paper had, the contacts and where the report is, for a terminal."""
-        lines = [self.metrics.verdict, *_tables(self.metrics, self.source)]
+        """Give the verdict, what the paper had, the contacts and where the report is, for a terminal of its width."""
+        lines = [self.metrics.verdict, *_tables(self.metrics, self.source, terminal_columns())]
         return "\n".join([*lines, "", f"Report: {self.html_path}"])
 
 
-def _tables(metrics: Metrics, source: Source) -> list[str]:
+def _tables(metrics: Metrics, source: Source, width: int | None = None) -> list[str]:
     """Give what the log lacks, what the paper had and the contacts, line by line."""
     lines = [f"The log is not whole: {source.problem}"] if source.problem else []
-    lines += ["", *align_columns([paper_head(metrics), *paper_cells(metrics)])]
+    lines += ["", *fit_table([paper_head(metrics), *paper_cells(metrics)], width=width)]
     if metrics.contacts:
         head, rows = contact_rows(metrics, shown_contacts(metrics, PRINTED_CONTACTS))
         left_out = left_out_text(metrics, PRINTED_CONTACTS)
-        lines += ["", *align_columns([head, *rows]), *([left_out] if left_out else [])]
+        lines += ["", *fit_table([head, *rows], width=width), *([left_out] if left_out else [])]
     return lines
 
 

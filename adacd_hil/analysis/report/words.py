@@ -122,12 +122,6 @@ def stretch_text(stretch: StretchOfRun) -> str:
     return f"{text}, widened so that no contact and no adaptation is cut"
 
 
-def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align rows of words for a terminal."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
 def signed_text(value: float) -> str:
     """Write a number with its sign and one decimal."""
     return f"{value:+.1f}".replace("-", "−")
