@@ -45,7 +45,7 @@ class ExitCode(IntEnum):
 
 
 EPILOG = (
-    "Exit status: 0 ended by SIGINT, SIGTERM or --once; 1 failure (the bus or the truth log failed); "
+    "Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus or the truth log failed); "
     "2 wrong usage or configuration; 5 bus missing."
 )
 

@@ -29,8 +29,8 @@ _QUIET_SCENARIO = "idle"
 
 @click.command(
     "play",
-    epilog="Exit status: 0 ended by SIGINT, SIGTERM or --once; 1 failure (the bus failed, the recording is damaged or "
-    "of another contract); 2 wrong usage; 5 bus missing.",
+    epilog="Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus failed, the recording is "
+    "damaged or of another contract); 2 wrong usage; 5 bus missing.",
 )
 @click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
 @on_bus
@@ -88,9 +88,10 @@ def play(
 def _check_contract(log: Path, codec: Codec) -> None:
     """Raise LogError when a log of ours says that it was recorded with another contract."""
     digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
-    if digest and int(digest, 16) != codec.layout_digest:
+    own = f"0x{codec.layout_digest:08X}"
+    if digest and digest.casefold() != own.casefold():
         raise LogError(
-            f"{log} was recorded with another contract: layout digest {digest}, here 0x{codec.layout_digest:08X}; "
+            f"{log} was recorded with another contract: layout digest {digest}, here {own}; "
             "see --contract, --node-offset and --host-node"
         )
 

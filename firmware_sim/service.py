@@ -148,9 +148,12 @@ class Service:
 
 @contextmanager
 def stop_by_signal() -> Iterator[StopRequest]:
-    """Let SIGINT and SIGTERM ask for the end instead of ending the process."""
+    """Let SIGINT, SIGTERM and SIGHUP ask for the end instead of ending the process; an ignored SIGHUP stays so."""
     stop = StopRequest()
-    previous = {number: signal.signal(number, stop.make) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # not started to outlive its terminal
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, stop.make) for number in numbers}
     try:
         yield stop
     finally:

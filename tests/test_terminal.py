@@ -3,6 +3,7 @@
 import fcntl
 import io
 import os
+import pty
 import select
 import signal
 import subprocess
@@ -243,3 +244,21 @@ def test_columns_are_those_of_the_environment_where_there_is_no_terminal(monkeyp
     assert terminal_columns() is None
     monkeypatch.setenv("COLUMNS", "97")
     assert terminal_columns() == 97
+
+
+@pytest.mark.slow
+def test_a_terminal_that_dies_costs_a_run_that_outlives_it_nothing(tmp_path: Path) -> None:
+    """`nohup` ignores SIGHUP: the run goes on to its end, though each of its words fails with EIO."""
+    (tmp_path / "short.toml").write_text("lasts_s = 0.5\n")
+    command = [BIN / "adacd-hil", "demo", *PAPER, "--scenario", "short.toml", "--out", "run"]
+    process, terminal = pty.fork()
+    if not process:
+        os.chdir(tmp_path)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        os.execv(command[0], command)
+    os.read(terminal, 1)  # it has begun to speak
+    os.close(terminal)
+    _, status = os.waitpid(process, 0)
+    assert os.waitstatus_to_exitcode(status) == OK
+    assert read_log(tmp_path / "run").is_complete
+    assert (tmp_path / "run" / "report.html").is_file()

@@ -140,10 +140,24 @@ def raise_interrupt() -> NoReturn:
 
 
 @contextmanager
-def on_interrupt(interrupt: Callable[[], None]) -> Iterator[None]:
+def never_stopped() -> Iterator[None]:
+    """Ignore SIGTTIN and SIGTTOU, by which a terminal stops who reads or writes from the background.
+
+    A stopped process sends no commands to an arm that moves. Reading such a terminal raises OSError instead.
+    """
+    previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTTIN, signal.SIGTTOU)}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
     """Let SIGINT, SIGTERM and SIGHUP call a function and not end the process; outside the main thread, nothing can.
 
-    SIGHUP stays ignored where it was.
+    SIGHUP stays ignored where it was. further: signals that call it, too.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -153,7 +167,7 @@ def on_interrupt(interrupt: Callable[[], None]) -> Iterator[None]:
         hurry()
         interrupt()
 
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *further)}
     if previous[signal.SIGHUP] is signal.SIG_IGN:  # started to outlive its terminal
         del previous[signal.SIGHUP]
     for number in previous:

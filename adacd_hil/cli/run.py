@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import signal
 import sys
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -13,6 +14,7 @@ from adacd_hil.cli.connection import (
     check_clock,
     check_shared,
     make_clock,
+    never_stopped,
     on_interrupt,
 )
 from adacd_hil.cli.exit_codes import ExitCode, exit_code
@@ -76,7 +78,7 @@ def run_on_bus(
     if clock_name == "realtime":
         check_budget_of(codec, settings)
     clock = make_clock(clock_name)
-    with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack:
+    with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():
         bus = connection.open(clock, codec, settings)
         stack.callback(bus.close)
         drop_old_frames(bus, interface)
@@ -99,7 +101,7 @@ def run_on_bus(
         )
         for line in () if tare is None else tare.warnings:
             progress(f"warning: {line}")
-        with on_interrupt(session.interrupt):
+        with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: an arm is not left alone
             summary = session.run()
     return summarise(summary), exit_code(summary)
 

@@ -1,11 +1,12 @@
 """A tare on a bus: opens it, lets a tare session measure, stores what it found."""
 
 import dataclasses
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, on_interrupt
+from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.commission.tare import TareRefusedError
@@ -76,7 +77,7 @@ def tare_on_bus(
     progress = Progress()
     try:
         session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
-        with on_interrupt(session.interrupt):
+        with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
             tare = session.run()
     except TareRefusedError as reason:
         raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None

@@ -1,5 +1,7 @@
 """The user of a running arm: a script, the console, or both. A request is what the scheme is asked in one cycle."""
 
+import contextlib
+import io
 import sys
 import threading
 from collections import deque
@@ -92,10 +94,13 @@ class ConsoleOperator:
         self._thread.join(timeout_s)
 
     def _listen(self) -> None:
-        for line in self._stream:
-            request = CONSOLE_WORDS.get(line.strip().lower())
-            if request is not None:
-                self._asked.append(request)
+        if isinstance(self._stream, io.TextIOWrapper):
+            self._stream.reconfigure(errors="replace")  # a key that is no letter is no word, and not the end
+        with contextlib.suppress(OSError):  # the terminal has hung up, or has others in its foreground
+            for line in self._stream:
+                request = CONSOLE_WORDS.get(line.strip().lower())
+                if request is not None:
+                    self._asked.append(request)
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return what the user asked first, else what the script asks; of a faulted arm, leave it to `answer_fault`."""

@@ -41,7 +41,8 @@ _PRIMITIVES = {
     "float64": "d",
 }
 _STAMP_END = 8
-_FIELD_LINE = re.compile(r"(?P<type>[a-z0-9]+)(\[(?P<size>\d+)\])?\s+(?P<name>[a-z][a-z0-9_]*)\s*(#.*)?")
+_MOST_PAYLOAD_BYTES = 1 << 20
+_FIELD_LINE = re.compile(r"(?P<type>[a-z0-9]+)(\[(?P<size>[0-9]{1,9})\])?\s+(?P<name>[a-z][a-z0-9_]*)\s*(#.*)?")
 
 
 class Member(NamedTuple):
@@ -133,8 +134,13 @@ def payload_dtype(text: str, fields: tuple[str, ...] = ()) -> "np.dtype[Any]":
         if len(fields) != len(names) - 2:
             raise LogError(f"a schema has {len(names) - 2} fields, {len(fields)} are named")
         names[2:] = fields
+    if position > _MOST_PAYLOAD_BYTES:
+        raise LogError(f"a schema describes {position} bytes, more than {_MOST_PAYLOAD_BYTES}")
     layout = {"names": names, "formats": formats, "offsets": offsets, "itemsize": len(ENCAPSULATION) + position}
-    return np.dtype(layout)  # type: ignore[call-overload,no-any-return]
+    try:
+        return np.dtype(layout)  # type: ignore[call-overload,no-any-return]
+    except ValueError as error:
+        raise LogError(f"a schema makes no layout: {error}") from None
 
 
 def _field_lines(text: str) -> Iterator[tuple[str, int, str]]:

@@ -14,7 +14,7 @@ from adacd_hil.log import compiled_records as compiled
 from adacd_hil.log.bus_frames import FRAME_DTYPE, FRAME_TOPICS, LONG_FRAME_DTYPE, copy_frames, is_of_frames
 from adacd_hil.log.compiled_records import take, words_of
 from adacd_hil.log.mcap_walk import MESSAGE_HEAD, Topic, record_dtype
-from adacd_hil.log.ros_types import CAN_FRAME_DTYPE, FD_FRAME_DTYPE
+from adacd_hil.log.ros_types import CAN_FRAME_DTYPE, FD_FRAME_DTYPE, LOG, is_log
 
 _FIRST_ROOM = 256
 _SPARE = 16
@@ -132,7 +132,12 @@ class Gathering:
                 self._set_frames(LONG_FRAME_DTYPE, self._frame_room)
             elif reason == compiled.VARYING:
                 stop = position + compiled.RECORD_HEAD + int(words[position + 1])
-                self._payloads[state[compiled.CULPRIT]].append(data[position + MESSAGE_HEAD : stop].tobytes())
+                slot = int(state[compiled.CULPRIT])
+                payload = data[position + MESSAGE_HEAD : stop].tobytes()
+                if self.topics[slot].type_name != LOG.name or is_log(payload):
+                    self._payloads[slot].append(payload)
+                else:
+                    state[compiled.WRONG] += 1
                 state[compiled.POSITION] = stop
             elif reason == compiled.BROKEN:
                 yield Stop(reason, position, position, 0)

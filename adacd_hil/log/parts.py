@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-_DIGITS = 3
+_DIGITS, _MOST_DIGITS = 3, 5
 
 
 def part_path(path: Path, number: int) -> Path:
@@ -13,7 +13,7 @@ def part_path(path: Path, number: int) -> Path:
 
 def find_parts(path: Path) -> dict[int, Path]:
     """Find the parts of the log `path` that exist, by their numbers, in order. Raises OSError."""
-    pattern = re.compile(rf"{re.escape(path.stem)}_(\d{{{_DIGITS},}}){re.escape(path.suffix)}")
+    pattern = re.compile(rf"{re.escape(path.stem)}_(\d{{{_DIGITS},{_MOST_DIGITS}}}){re.escape(path.suffix)}")
     matches = (pattern.fullmatch(entry.name) for entry in path.parent.iterdir())
     numbers = {int(match[1]) for match in matches if match}
     if path.exists():

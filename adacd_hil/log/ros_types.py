@@ -158,6 +158,15 @@ def pack_log(stamp: bytes, event: Event) -> bytes:
     return payload + bytes(-len(payload) % 4) + struct.pack("<I", 0)
 
 
+def is_log(payload: bytes) -> bool:
+    """Tell whether `unpack_log` can unpack a payload."""
+    try:
+        unpack_log(payload)
+    except (struct.error, IndexError):
+        return False
+    return True
+
+
 def unpack_log(payload: bytes) -> Event:
     """Unpack an event. Raises struct.error or IndexError when the payload is cut."""
     level = _LEVEL_NAMES.get(payload[12], "error")

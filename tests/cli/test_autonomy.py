@@ -1,6 +1,8 @@
 """What acts by itself, and where it may: scripts, acknowledgements, arms without data."""
 
 import dataclasses
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -89,6 +91,44 @@ def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(
 def test_an_interface_that_is_not_there_is_not_virtual() -> None:
     assert not is_virtual("socketcan", "no_such_can0")
     assert not is_virtual("pcan", "PCAN_USBBUS1")
+
+
+def test_ctrl_z_asks_for_the_end_where_an_arm_would_be_left_alone() -> None:
+    asked: list[int] = []
+    with on_interrupt(lambda: asked.append(1), signal.SIGTSTP):
+        signal.raise_signal(signal.SIGTSTP)
+    assert asked == [1]
+    assert signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL
+
+
+IN_BACKGROUND = """
+import os, sys, termios
+from adacd_hil.cli.connection import never_stopped
+os.setpgid(0, 0)  # out of the terminal's foreground
+attributes = termios.tcgetattr(0)
+with never_stopped():
+    attributes[3] |= termios.TOSTOP
+    termios.tcsetattr(0, termios.TCSANOW, attributes)
+    print("written", flush=True)
+    try:
+        sys.stdin.readline()
+    except OSError:
+        os._exit(7)
+"""
+
+
+@pytest.mark.slow
+def test_a_terminal_does_not_stop_who_runs_in_its_background() -> None:
+    leader, terminal = pty.fork()
+    if not leader:
+        child = os.spawnl(os.P_NOWAIT, sys.executable, sys.executable, "-c", IN_BACKGROUND)
+        _, status = os.waitpid(child, os.WUNTRACED)
+        os._exit(100 if os.WIFSTOPPED(status) else os.waitstatus_to_exitcode(status))
+    shown = os.read(terminal, 100)
+    _, status = os.waitpid(leader, 0)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(status) == 7
+    assert shown == b"written\r\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

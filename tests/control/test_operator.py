@@ -131,3 +131,30 @@ def test_a_fault_waits_while_somebody_may_still_type() -> None:
         assert operator.answer_fault(1000.0) is FaultAnswer.WAIT
         os.close(write_end)
         operator.join(1.0)
+
+
+def typed(data: bytes) -> ConsoleOperator:
+    read_end, write_end = os.pipe()
+    os.write(write_end, data)
+    os.close(write_end)
+    with os.fdopen(read_end, encoding="utf-8") as stream:
+        operator = ConsoleOperator(script(), stream)
+        operator.join(1.0)
+    return operator
+
+
+def test_a_key_that_is_no_letter_does_not_end_the_console() -> None:
+    assert typed(b"\xff\xfe\nfinish\n").answer_fault(0.0) is FaultAnswer.END
+    assert typed(b"\xff\xfe\nack\n").answer_fault(0.0) is FaultAnswer.RECOVER
+
+
+def test_a_terminal_that_hangs_up_ends_the_console_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    failures: list[object] = []
+    monkeypatch.setattr("threading.excepthook", failures.append)
+    ours, theirs = os.openpty()
+    with os.fdopen(ours, encoding="utf-8") as stream:
+        operator = ConsoleOperator(script(), stream)
+        os.close(theirs)  # reading its other end raises EIO, as a terminal does to who is in the background
+        operator.join(1.0)
+    assert operator.answer_fault(0.0) is FaultAnswer.END
+    assert failures == []

@@ -279,7 +279,7 @@ def spawn(folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 @pytest.mark.slow
 @pytest.mark.wallclock
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_before_a_host_ends_it_with_exit_code_0_and_leaves_nothing(tmp_path, number):
     process = spawn(tmp_path / "out", "-i", "virtual", "-c", "test", "--scenario", "idle")
     try:

@@ -21,11 +21,14 @@ from adacd_hil.config import LogSettings
 from adacd_hil.log import chunks
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.formats.export import export_tables
 from adacd_hil.log.mcap_file import FIELDS_KEY
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, read_log
-from adacd_hil.log.ros_types import LOG, unpack_log
+from adacd_hil.log.ros_types import LOG, pack_log, unpack_log
 from adacd_hil.log.stream import LogStream
+from adacd_hil.records import Event
+from adacd_hil.wire.codec import load_codec
 
 COUNT = 900
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -243,6 +246,20 @@ def value(number):
     return bytes((0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, number))
 
 
+@pytest.mark.parametrize("payload", [b"", b"text", pack_log(bytes(8), Event("info", "a", "b"))[:22], b"\xff" * 40])
+def test_an_event_that_is_none_is_left_out_and_said(payload, tmp_path):
+    path = tmp_path / "theirs.mcap"
+    event = pack_log(bytes(8), Event("info", "node", "text"))
+    write_foreign(path, [("/events", 0, event), ("/events", 1, payload), ("/events", 2, event)])
+    stream = LogStream(path)
+    found = [logged.event.message for piece in stream for logged in stream.events(piece)]
+    assert found == ["text", "text"]
+    assert stream.problem == "a message is not as long as its schema says"
+    tables = export_tables(path, tmp_path / "tables", "csv", (), load_codec())
+    assert tables.rows[tmp_path / "tables" / "events.csv"] == 2
+    assert tables.problem == stream.problem
+
+
 @pytest.mark.parametrize(
     "options",
     [{"use_chunking": False}, {"compression": CompressionType.NONE}, {"chunk_size": 100}, {"enable_crcs": False}],
@@ -250,7 +267,8 @@ def value(number):
 def test_logs_that_others_wrote_are_read(options, tmp_path):
     path = tmp_path / "theirs.mcap"
     messages = [("/value", 10 * number, value(number)) for number in range(200)]
-    write_foreign(path, [*messages, ("/events", 2000, b"text")], **options)
+    event = pack_log(bytes(8), Event("info", "their node", "text"))
+    write_foreign(path, [*messages, ("/events", 2000, event)], **options)
     stream = LogStream(path, cycles_per_piece=70)
     pieces = list(stream)
     assert stream.problem == ""
@@ -259,7 +277,7 @@ def test_logs_that_others_wrote_are_read(options, tmp_path):
         list(range(70, 140)),
         list(range(140, 200)),
     ]
-    assert [piece.payloads["/events"] for piece in pieces] == [[], [], [b"text"]]
+    assert [piece.payloads["/events"] for piece in pieces] == [[], [], [event]]
 
 
 def test_a_message_that_is_too_short_or_too_long_is_left_out(tmp_path):

@@ -7,13 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
-import numpy as np
-
 from adacd_hil.analysis.replay.attempts import AttemptSplitter, Stretch
 from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
 from adacd_hil.config import Settings, parse, parse_toml, renewed
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.ros_types import unpack_log
+from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.wire.codec import Codec, parse_codec
 
@@ -62,7 +60,7 @@ class LogSource:
         """Give the parts, in order."""
         for read in self._stream:
             piece = self._piece(read)
-            margins = list(_margins(piece, self._stream.epoch_ns))
+            margins = list(_margins(self._stream.events(piece)))
             yield Part(self._splitter.split(piece), contact_records(piece.series["/contact"]), margins)
 
     def _piece(self, piece: Piece) -> Piece:
@@ -109,9 +107,7 @@ def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
     return parse_codec(attachments["arm.dbc"], path.with_name("arm.dbc"))
 
 
-def _margins(piece: Piece, epoch_ns: int) -> Iterator[tuple[int, str]]:
-    for payload in piece.payloads.get("/events", ()):
-        event = unpack_log(payload)
+def _margins(events: Iterable[LoggedEvent]) -> Iterator[tuple[int, str]]:
+    for t_ns, event in events:
         if event.name == _MARGIN:
-            sec, nanosec = np.frombuffer(payload, "<u4", 2, 4).tolist()
-            yield sec * 1_000_000_000 + nanosec - epoch_ns, event.message
+            yield t_ns, event.message

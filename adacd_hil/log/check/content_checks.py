@@ -1,7 +1,6 @@
 """The rules on what messages hold: the order of their times, and cdr payloads as their schemas describe them."""
 
 import contextlib
-import struct
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -21,7 +20,7 @@ from adacd_hil.log.ros_types import (
     JOINT_STATE,
     JOINT_STATE_DTYPE,
     LOG,
-    unpack_log,
+    is_log,
 )
 
 _CHANNEL_NUMBERS = 2**16
@@ -101,7 +100,7 @@ class ContentCheck:
         for place in np.flatnonzero(np.isin(contents.channels, [*self._fd_frames, *self._logs]) & ~is_wrong).tolist():
             payload = contents.data[contents.starts[place] + MESSAGE_HEAD : contents.ends[place]]
             is_fd = int(contents.channels[place]) in self._fd_frames
-            is_wrong[place] = not (_is_fd_frame(payload) if is_fd else _is_log(payload))
+            is_wrong[place] = not (_is_fd_frame(payload) if is_fd else is_log(payload))
         for place in np.flatnonzero(is_wrong)[:1].tolist():
             channel = definitions.channels[int(contents.channels[place])]
             count = np.count_nonzero(is_wrong)
@@ -131,11 +130,3 @@ def _is_fd_frame(payload: bytes) -> bool:
     assert FD_FRAME_DTYPE.fields is not None
     head, place = int(FD_FRAME_DTYPE.fields["data"][1]), int(FD_FRAME_DTYPE.fields["count"][1])
     return len(payload) >= head and len(payload) == head + int.from_bytes(payload[place : place + 4], "little")
-
-
-def _is_log(payload: bytes) -> bool:
-    try:
-        unpack_log(payload)
-    except (struct.error, IndexError):
-        return False
-    return True

@@ -7,23 +7,36 @@ the recording, so their nanoseconds are had by reading without the start, and ad
 """
 
 import io
-from collections.abc import Iterator
+import zlib
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
 import can
 import numpy as np
+from can.io.blf import (
+    LOG_CONTAINER,
+    LOG_CONTAINER_STRUCT,
+    NO_COMPRESSION,
+    OBJ_HEADER_BASE_STRUCT,
+    ZLIB_DEFLATE,
+    BLFParseError,
+    BLFReader,
+)
 from can.io.generic import TextIOMessageReader
 from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
+from adacd_hil.log.chunk_data import MOST_BYTES, Opening
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
+from adacd_hil.log.formats.recorded_frames import MOST_CHANNELS, MOST_NS, RECORDED_FRAME_DTYPE
 
 _PIECE = 10_000
 """Frames that are gathered."""
 _MAX_DATA = 64
+_MOST_DIGITS = 9
+"""Of a channel that is a number."""
 
 
 class TimedMessage(can.Message):
@@ -61,6 +74,8 @@ def to_row(message: can.Message, channel: int = 0, start_ns: int = 0) -> tuple[A
     if not 0 <= message.arbitration_id < 1 << 29:
         raise LogError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")
     t_ns = time_ns(message) + start_ns
+    if abs(t_ns) > MOST_NS:
+        raise LogError(f"time {t_ns * 1e-9:g} s is beyond the year 2116")
     return (
         t_ns,
         t_ns,
@@ -80,7 +95,7 @@ def to_row(message: can.Message, channel: int = 0, start_ns: int = 0) -> tuple[A
 
 def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) -> Iterator[TimedMessage]:
     """Make a message of each row; `epoch_ns` is added to its time."""
-    names = [int(name) if name.isdecimal() else name or None for name in channels]
+    names = [int(name) if name.isdecimal() and len(name) < _MOST_DIGITS else name or None for name in channels]
     for row in frames:
         (t_ns, _, can_id, is_tx, is_error, length, _, channel, is_extended, is_remote, is_fd, has_switch, has_error) = (
             row.item()
@@ -101,6 +116,46 @@ def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) ->
         )
 
 
+class _BlfReader(BLFReader):
+    """python-can's, but for sizes that lie: it would stay for ever at an object of size 0, and open any bomb."""
+
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        opening = Opening()
+        while head := self.file.read(OBJ_HEADER_BASE_STRUCT.size):
+            signature, _, _, size, kind = OBJ_HEADER_BASE_STRUCT.unpack(head)
+            if signature != b"LOBJ" or not len(head) <= size <= MOST_BYTES:
+                raise BLFParseError(f"an object of {size} bytes")
+            body = self.file.read(size - len(head))
+            self.file.read(size % 4)  # padding
+            if kind == LOG_CONTAINER:
+                yield from self._parse_container(_open_container(body, opening))
+
+    def _parse_container(self, data: bytes) -> Iterator[can.Message]:
+        _check_objects(self._tail + data)
+        yield from super()._parse_container(data)
+
+
+def _open_container(body: bytes, opening: Opening) -> bytes:
+    """Decompress the objects of a container. Raises BLFParseError, ChunkError, zlib.error, struct.error."""
+    method, _ = LOG_CONTAINER_STRUCT.unpack_from(body)
+    packed = body[LOG_CONTAINER_STRUCT.size :]
+    if method not in (NO_COMPRESSION, ZLIB_DEFLATE):
+        raise BLFParseError(f"unknown compression {method}")
+    data = packed if method == NO_COMPRESSION else zlib.decompressobj().decompress(packed, MOST_BYTES + 1)
+    opening.allow(len(body), len(data))
+    return data
+
+
+def _check_objects(data: bytes) -> None:
+    """Raise BLFParseError for an object that can't be: shorter than its head, endless, of an unknown version."""
+    position = data.find(b"LOBJ", 0, 8)
+    while 0 <= position <= len(data) - OBJ_HEADER_BASE_STRUCT.size:
+        _, _, version, size, _ = OBJ_HEADER_BASE_STRUCT.unpack_from(data, position)
+        if version not in (1, 2) or not OBJ_HEADER_BASE_STRUCT.size <= size <= MOST_BYTES:
+            raise BLFParseError(f"an object of {size} bytes and version {version}")
+        position = data.find(b"LOBJ", position + size, position + size + 8)
+
+
 class PythonCanFrames:
     """The frames of a file that python-can reads: iterate once; `channels` and `problem` grow meanwhile."""
 
@@ -110,7 +165,7 @@ class PythonCanFrames:
         self.epoch_ns = 0
         self.problem = ""
         self._path = path
-        kind: Any = MESSAGE_READERS[path.suffix.lower()]
+        kind: Any = _BlfReader if path.suffix.lower() == ".blf" else MESSAGE_READERS[path.suffix.lower()]
         try:
             # Vendors' tools write their texts in the Windows of the country; frames are ASCII.
             binary = open_input(path)
@@ -148,6 +203,8 @@ class PythonCanFrames:
     def _channel(self, message: can.Message) -> int:
         name = channel_name(message.channel)
         if name not in self.channels:
+            if len(self.channels) == MOST_CHANNELS:
+                raise LogError(f"there are more than {MOST_CHANNELS} channels")
             self.channels.append(name)
         return self.channels.index(name)
 

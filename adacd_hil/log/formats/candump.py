@@ -15,11 +15,11 @@ for, because Wireshark takes no file that has them. Source: can-utils, lib.h.
 import re
 from typing import Any
 
-from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
+from adacd_hil.log.formats.recorded_frames import MOST_NS, RECORDED_FRAME_DTYPE
 
 ERROR_FLAG = 0x20000000
 _LINE = re.compile(
-    r"\((?P<s>\d+)\.(?P<fraction>\d{1,9})\)\s+(?P<channel>\S+)\s+(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+    r"\((?P<s>\d{1,20})\.(?P<fraction>\d{1,9})\)\s+(?P<channel>\S{1,255})\s+(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
     r"(?:(?P<remote>[Rr])(?P<dlc>[0-8]?)|#(?P<flags>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}\.?)*)"
     r"|(?P<data>(?:[0-9A-Fa-f]{2}\.?)*))(?:_[0-9A-Fa-f])?(?:\s+(?P<way>[RrTt]))?"
 )
@@ -33,6 +33,8 @@ def parse(line: str) -> tuple[str, tuple[Any, ...]]:
     if match is None:
         raise ValueError(f"no frame: {line.strip()[:60]}")
     t_ns = int(match["s"]) * 1_000_000_000 + int(match["fraction"].ljust(9, "0"))
+    if t_ns > MOST_NS:
+        raise ValueError(f"time {match['s']} s is beyond the year 2116")
     can_id = int(match["id"], 16)
     is_wide = len(match["id"]) == 8
     is_error = is_wide and bool(can_id & ERROR_FLAG)

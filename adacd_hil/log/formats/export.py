@@ -78,8 +78,8 @@ def _export_topics(
             for topic, series in piece.series.items():
                 if topic in topics:
                     tables.write(topic, series_columns(series, stream.epoch_ns))
-            if payloads := piece.payloads.get(_EVENTS):
-                tables.write(_EVENTS, event_columns(payloads, stream.epoch_ns))
+            if events := stream.events(piece):
+                tables.write(_EVENTS, event_columns(events))
             progress(sum(tables.rows.values()))
     return TableSummary(tables.rows, stream.problem)
 

@@ -19,12 +19,13 @@ from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.mcap_frames import McapFrames
-from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE, FrameLog
+from adacd_hil.log.formats.recorded_frames import MOST_CHANNELS, RECORDED_FRAME_DTYPE, FrameLog
 from adacd_hil.nearest_name import nearest_name
 
 PYTHON_CAN_SUFFIXES = (".blf", ".asc", ".mf4", ".trc", ".csv")
 SUFFIXES = (".mcap", ".log", *PYTHON_CAN_SUFFIXES)
 _PIECE = 10_000
+_LONGEST_LINE = 1 << 16
 
 
 class FrameSource(Protocol):
@@ -89,11 +90,13 @@ class CandumpFrames:
         places: dict[str, int] = {}
         first_wrong, wrong, right = "", 0, 0
         with io.TextIOWrapper(open_input(self._path), encoding="ascii", errors="replace") as file:
-            for number, line in enumerate(file, 1):
+            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), ""), 1):
                 if not line.strip():
                     continue
                 try:
                     name, row = candump.parse(line)
+                    if name not in places and len(places) == MOST_CHANNELS:
+                        raise ValueError(f"there are more than {MOST_CHANNELS} channels")
                 except ValueError as error:
                     wrong += 1
                     first_wrong = first_wrong or f"line {number}: {error}"

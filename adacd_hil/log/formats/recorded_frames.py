@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from adacd_hil.log.bus_frames import LONG_FRAME_DTYPE
 from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, MAX_STANDARD_ID
 
+MOST_NS = 1 << 62
+"""Of a time, either way: the year 2116."""
+MOST_CHANNELS = 256
 RECORDED_FRAME_DTYPE = np.dtype(
     [
         *LONG_FRAME_DTYPE.descr,  # `length` of a remote frame is its DLC, and its data are zero

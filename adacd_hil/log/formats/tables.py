@@ -6,7 +6,8 @@ and reasons are the numbers that the schemas name.
 """
 
 import csv
-import struct
+import itertools
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -17,15 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
-from adacd_hil.log.cdr import ENCAPSULATION
 from adacd_hil.log.decoding import Decoder
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import Series
-from adacd_hil.log.ros_types import unpack_log
+from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.output_files import replacing
 from adacd_hil.wire.codec import Codec
 
-_STAMP = struct.Struct("<II")
+_LONGEST_STEM = 60
+"""Letters of the name of a file, so that it has room in 255 bytes."""
 
 Columns = Mapping[str, Any]
 """Columns of a table by name, of equal length: arrays or lists."""
@@ -46,12 +46,9 @@ def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
     return columns
 
 
-def event_columns(payloads: Iterable[bytes], epoch_ns: int) -> dict[str, Any]:
+def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
     """Make the columns of /events."""
-    rows = []
-    for payload in payloads:
-        seconds, nanoseconds = _STAMP.unpack_from(payload, len(ENCAPSULATION))
-        rows.append((seconds * 1_000_000_000 + nanoseconds - epoch_ns, *unpack_log(payload)))
+    rows = [(t_ns, *event) for t_ns, event in events]
     return {name: [row[place] for row in rows] for place, name in enumerate(("t_ns", "level", "name", "message"))}
 
 
@@ -90,6 +87,7 @@ class Tables:
         self._folder = folder
         self._kind = kind
         self._metadata = dict(metadata)
+        self._paths: dict[str, Path] = {}
         self._tables: dict[str, _Table] = {}
         self._files = ExitStack()
         if kind == "parquet":
@@ -101,7 +99,7 @@ class Tables:
 
     def write(self, topic: str, columns: Columns) -> None:
         """Add rows to the table of a topic; none make an empty table. Raises LogError."""
-        path = self._folder / f"{topic.strip('/').replace('/', '_')}.{self._kind}"
+        path = self._paths.get(topic) or self._path(topic)
         try:
             if topic not in self._tables:
                 beside = self._files.enter_context(replacing(path))
@@ -114,6 +112,14 @@ class Tables:
         except OSError as error:
             raise LogError(f"{path} can't be written: {error.strerror or error}") from None
         self.rows[path] += len(columns["t_ns"])
+
+    def _path(self, topic: str) -> Path:
+        """Name the file of a topic: one of its own, whatever others have called their topics."""
+        stem = re.sub(r"[^\w.-]", "_", topic.strip("/"))[:_LONGEST_STEM] or "_"
+        stems = itertools.chain((stem,), (f"{stem}_{number}" for number in itertools.count(2)))
+        paths = (self._folder / f"{stem}.{self._kind}" for stem in stems)
+        self._paths[topic] = next(path for path in paths if path not in self.rows)
+        return self._paths[topic]
 
     def __enter__(self) -> "Tables":
         return self
