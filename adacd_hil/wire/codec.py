@@ -8,6 +8,7 @@ A message of more than 8 bytes is a CAN FD frame and says so in the DBC (VFrameF
 11898-1 has a data length code for.
 """
 
+import re
 import struct
 import zlib
 from dataclasses import dataclass
@@ -328,6 +329,11 @@ def contract_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "dbc"
 
 
+_SIGNAL_PLACE = re.compile(rb"\|\s*0*(?P<bits>\d+)\s*@")
+_MOST_BITS = "512"
+"""Of a frame of 64 bytes."""
+
+
 def load_codec(path: Path | None = None) -> Codec:
     """Generate the codec from a DBC (default: the one that comes with the package). Raises CodecError."""
     path = path or contract_folder() / "arm.dbc"
@@ -340,6 +346,9 @@ def load_codec(path: Path | None = None) -> Codec:
 
 def parse_codec(text: bytes, path: Path) -> Codec:
     """Generate the codec from the text of a DBC; `path` is where it is, or would be. Raises CodecError."""
+    for found in _SIGNAL_PLACE.finditer(text):  # cantools makes a character of each of its bits
+        if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):
+            raise CodecError(f"DBC {path}: a signal has {found['bits'].decode()[:20]} bits, more than {_MOST_BITS}")
     try:
         database = cantools.database.load_string(text.decode("utf-8"), "dbc")
     except (UnicodeDecodeError, DatabaseError) as error:

@@ -292,13 +292,14 @@ def test_a_message_that_is_too_short_or_too_long_is_left_out(tmp_path):
 
 def test_a_part_whose_topic_has_another_type_keeps_its_other_topics(tmp_path):
     path = tmp_path / "run.mcap"
-    write_foreign(path, [("/value", 1, value(1)), ("/events", 1, b"one")])
+    one, two = (pack_log(bytes(8), Event("info", "their node", text)) for text in ("one", "two"))
+    write_foreign(path, [("/value", 1, value(1)), ("/events", 1, one)])
     other = "builtin_interfaces/Time stamp\nuint16 value\n"
-    write_foreign(part_path(path, 1), [("/value", 2, value(2)), ("/events", 2, b"two")], other)
+    write_foreign(part_path(path, 1), [("/value", 2, value(2)), ("/events", 2, two)], other)
     stream = LogStream(path)
     (piece,) = stream
     assert piece.series["/value"]["value"].tolist() == [1]
-    assert piece.payloads["/events"] == [b"one", b"two"]
+    assert piece.payloads["/events"] == [one, two]
     # Without metadata, the second file passes for a part.
     assert stream.problem == "run_001.mcap: /value has another type than before"
 

@@ -1,5 +1,6 @@
 """The codec: written by hand, against cantools bit for bit, and what it refuses."""
 
+import re
 from pathlib import Path
 
 import cantools
@@ -7,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.wire.codec import Codec, CodecError, MessageCodec, contract_folder, load_codec
+from adacd_hil.wire.codec import Codec, CodecError, MessageCodec, contract_folder, load_codec, parse_codec
 from adacd_hil.wire.e2e import E2eStatus
 
 CODEC = load_codec()
@@ -197,3 +198,11 @@ def test_a_codec_knows_the_same_identifiers_as_the_dbc() -> None:
     assert isinstance(CODEC, Codec)
     for contract, codec in CODECS.items():
         assert sorted(codec.by_id) == sorted(message.frame_id for message in PEERS[contract].messages)
+
+
+def test_a_signal_of_gigabits_is_refused_before_it_is_laid_out() -> None:
+    text = (contract_folder() / "arm.dbc").read_bytes()
+    for bits in (b"2147483648", b"0513", b"9" * 5000):
+        hostile = re.sub(rb"\|32@1-", b"|" + bits + b"@1-", text, count=1)
+        with pytest.raises(CodecError, match=r"a signal has [0-9]{3,20} bits, more than 512$"):
+            parse_codec(hostile, Path("x.dbc"))
