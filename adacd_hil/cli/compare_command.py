@@ -1,6 +1,7 @@
 """`adacd-hil compare`: two logs beside each other."""
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ import click
 
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.cli.progress import Progress
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.records import Location
 
@@ -33,7 +35,8 @@ def compare(first: Path, second: Path, as_json: bool) -> ExitCode:
     """
     from adacd_hil.analysis.replay.log_comparison import compare_logs
 
-    found = compare_logs(log_in(first), log_in(second))
+    with closing(Progress()) as progress:
+        found = compare_logs(log_in(first), log_in(second), progress)
     print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
     if not found.is_same:
         return ExitCode.FAILURE

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from log.recorded_run import make_run, record
 
+from adacd_hil.analysis.replay import log_comparison
 from adacd_hil.analysis.replay.log_comparison import MATCH_S, compare_logs, match_contacts
 from adacd_hil.analysis.replay.run_digest import Detection
 from adacd_hil.analysis.replay.what_if import apply_settings
@@ -86,3 +87,12 @@ def test_a_contact_has_one_counterpart_at_most() -> None:
     first, second = [contact(1.0), contact(1.25)], [contact(1.125)]
     assert match_contacts(first, second) == [(first[0], second[0]), (first[1], None)]
     assert match_contacts(second, first) == [(second[0], first[0]), (None, first[1])]
+
+
+def test_a_long_comparison_says_how_far_it_is(paths: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    lines: list[str] = []
+    compare_logs(paths[0], paths[0], lines.append)
+    assert lines == []
+    monkeypatch.setattr(log_comparison, "PROGRESS_CYCLES", 10)
+    found = compare_logs(paths[0], paths[0], lines.append)
+    assert lines == [f"{found.cycles} cycles compared"]

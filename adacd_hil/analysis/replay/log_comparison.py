@@ -6,7 +6,7 @@ first of the log. Contacts are matched by the time of their detection since then
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.replay.run_digest import Detection, RunDigest, RunReader
 from adacd_hil.analysis.replay.what_if import changed_keys
 
+PROGRESS_CYCLES: Final = 1_000_000
 MATCH_S: Final = 0.5
 """Detections of one contact in two runs lie closer together than this."""
 
@@ -135,12 +136,12 @@ def _fields(records: NDArray[Any]) -> list[str]:
     return [name for name in records.dtype.names or () if name not in skipped]
 
 
-def compare_logs(first: Path, second: Path) -> LogComparison:
+def compare_logs(first: Path, second: Path, progress: Callable[[str], None] = lambda _: None) -> LogComparison:
     """Compare two logs. Raises LogError, ConfigError."""
     readers = RunReader(first), RunReader(second)
     period_s = readers[0].settings.bus.period_s
     differences = _Differences(period_s, readers[0].zero_cycle)
-    cycles, only = _walk_together(readers, differences)
+    cycles, only = _walk_together(readers, differences, progress)
     one, two = (reader.digest() for reader in readers)
     keys = [*one.metadata, *(key for key in two.metadata if key not in one.metadata)]
     metadata = {key: (one.metadata.get(key, ""), two.metadata.get(key, "")) for key in keys}
@@ -160,11 +161,13 @@ def compare_logs(first: Path, second: Path) -> LogComparison:
     )
 
 
-def _walk_together(readers: tuple[RunReader, RunReader], differences: _Differences) -> tuple[int, tuple[int, int]]:
+def _walk_together(
+    readers: tuple[RunReader, RunReader], differences: _Differences, progress: Callable[[str], None]
+) -> tuple[int, tuple[int, int]]:
     """Compare what both logs have; return how many cycles that were, and how many only one of them has."""
     streams = iter(readers[0]), iter(readers[1])
     first, second = (_next_rows(stream) for stream in streams)
-    common = 0
+    common = told = 0
     while first is not None and second is not None:
         mine, theirs = (
             rows["cycle"].astype(np.int64) - reader.zero_cycle
@@ -175,11 +178,14 @@ def _walk_together(readers: tuple[RunReader, RunReader], differences: _Differenc
         common += len(numbers)
         if len(numbers):
             differences.take(first[ours], second[others], numbers)
+        if common - told >= PROGRESS_CYCLES:
+            told = common
+            progress(f"{common} cycles compared")
         first = first[mine > end] if mine[-1] > end else _next_rows(streams[0])
         second = second[theirs > end] if theirs[-1] > end else _next_rows(streams[1])
     for stream in streams:
         for _ in stream:
-            pass
+            progress(f"{common} cycles compared")
     return common, (readers[0].cycles - common, readers[1].cycles - common)
 
 
