@@ -155,7 +155,7 @@ def test_doctor_stops_when_another_master_is_present(arm: Path, tmp_path: Path) 
         done = command(tmp_path, "doctor", "--json")
     found = {check["name"]: check for check in done.json["checks"]}
     assert done.status == 1
-    assert found["other masters"]["reason"] == "somebody else sends Sync, HostHeartbeat"
+    assert found["other masters"]["reason"] == "somebody else sends SYNC (0x080), sends this host's heartbeat (0x77F)"
     assert found["cycle"]["status"] == "skipped"
     assert not any(can_id in (0x000, 0x201, 0x202) or can_id & 0x780 == 0x600 for can_id, _ in frames)
 

@@ -31,12 +31,12 @@ ATTACK_S = 4.45
 """When an attack begins, since the drives were enabled: both joints move, joint 1 at its fastest, 95 deg/s."""
 AFTER_S = 1.5
 """How long the arm is watched after the host has gone; the attack goes on until its own end."""
-REST_RAD_S = 0.02
+REST_RAD_S = 0.05
 REST_HOLD_S = 0.1
-"""At rest is an arm that is this slow for so long."""
+"""At rest is an arm that is this slow for so long: slow as `safety.rest_velocity_rad_s` has it by default."""
 STOPS = (SchemeState.FAULT, SchemeState.REACT)
 REST_BOUND_S = 0.1
-"""At rest so soon after it was noticed: what the issue asks."""
+"""At rest so soon after it was noticed: what is promised."""
 
 
 class WatchedBench(Bench):
@@ -361,7 +361,7 @@ def verdict(case: AttackCase | None, found: Finding) -> str:
     if found.noticed_ms is None or found.noticed_ms > case.lasts_s * 1e3:
         return "ok, no effect" if case.is_harmless and found.stopped_ms is None else "UNNOTICED"
     late = found.rest_after_notice_ms is None or found.rest_after_notice_ms > REST_BOUND_S * 1e3
-    is_stopped = (case.must_stop or found.stopped_ms is not None) and not case.may_coast
+    is_stopped = (case.must_stop or found.stopped_ms is not None) and not case.may_move
     problems = [
         word for word, holds in (("NOT AT REST", late and is_stopped), ("NOT NAMED", not found.is_named)) if holds
     ]

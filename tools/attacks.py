@@ -334,7 +334,7 @@ class AttackCase:
 
     must_stop: the arm has to come to rest. named_by: a pattern of which the log's line must have something. faults: of
     the scenario, their times from the beginning of the attack. is_harmless: it may pass unnoticed if it changes
-    nothing. may_coast: it takes the power off a drive, and then nobody can brake. only: "vcan" where virtual time
+    nothing. may_move: nobody can brake, as it takes the power off a drive, or the arm evades as it does from a touch. only: "vcan" where virtual time
     can't play it, or "".
     """
 
@@ -345,12 +345,12 @@ class AttackCase:
     named_by: str = "somebody else|another host|another master|foreign|forged"
     faults: tuple[dict[str, Any], ...] = ()
     is_harmless: bool = False
-    may_coast: bool = False
+    may_move: bool = False
     only: str = ""
     lasts_s: float = field(default=1.5)
 
 
-_DATA = "REPEATED|two devices|same node id|forged|attack|more than one|twice"
+_DATA = "a second frame of|REPEATED|two devices|same node id|forged|attack|more than one|twice"
 _BOTH = DRIVES
 _WRITES = (
     ("command-patience", 0x2200, 0, 255, 1), ("sync-tolerance", 0x2201, 0, 10_000, 2), ("period", 0x1006, 0, 2000, 4),
@@ -367,7 +367,7 @@ def _writes() -> Iterator[AttackCase]:
             f"sdo-{name}",
             f"0x{index:04X}:{sub} = {value} is written to both drives",
             lambda forger, args=(index, sub, value, size): Written(forger, *args, _BOTH),
-            may_coast=index == 0x6040,
+            may_move=index == 0x6040,
         )
     yield AttackCase(
         "sdo-sensor-zero", "0x6125:1, autozero, is written to both sensors",
@@ -382,7 +382,7 @@ def _nmt() -> Iterator[AttackCase]:
                 f"nmt-{name}-{whom}",
                 f"one NMT {name} to {'all nodes' if node == 0 else f'node {node}'}",
                 lambda forger, frame=(NMT, bytes([command, node])): Repeated(forger, (frame,), MS, 1),
-                may_coast=command == 0x81 and whom != "sensor",
+                may_move=command == 0x81 and whom != "sensor",
             )
     yield AttackCase("nmt-start", "NMT start to all, every 100 ms", lambda f: Repeated(f, ((NMT, b"\1\0"),), 100 * MS))
 
@@ -501,8 +501,9 @@ ATTACKS: tuple[AttackCase, ...] = (
         "sensor 1 falls silent; its heartbeat and its last torque go on with right counters",
         KeptAlive,
         False,
-        _DATA,
+        "-> REACT",  # a value that stands still, with right counters: no check can tell it from a touch
         faults=({"kind": "silence", "node": "sensor1", "at_s": 0.2},),
+        may_move=True,
     ),
     AttackCase(
         "emcy",
@@ -522,6 +523,7 @@ ATTACKS: tuple[AttackCase, ...] = (
         "sdo-requests",
         "0x1000 of drive 1 is read every 20 ms",
         lambda f: Repeated(f, ((0x601, b"\x40\0\x10\0\0\0\0\0"),), 20 * MS),
+        False,
     ),
     AttackCase("replay", "one second of the bus once more", Replayed, lasts_s=2.5),
     AttackCase(

@@ -20,7 +20,8 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.network import Master
 from adacd_hil.device.pdo_map import contract_differences, read_pdos
-from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, message_name, survey
+from adacd_hil.device.strangers import host_frames
+from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.bus import Bus, BusError
@@ -125,14 +126,12 @@ def check_other_masters(patient: ArmExamination) -> Outcome:
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take()
-    host_ids = {message.can_id for message in patient.codec.messages.values() if "HOST" in message.senders}
+    doing = host_frames(patient.settings, patient.codec)
     if patient.settings.bus.is_shared:
-        host_ids -= {patient.codec.message("Nmt").can_id}
-    if patient.settings.bus.follows:
-        host_ids -= {patient.arm.sync_id}
-    heard = [message_name(patient.codec, can_id) for can_id in sorted(host_ids & traffic.talks.keys())]
+        del doing[patient.codec.message("Nmt").can_id]
+    heard = [f"{doing[can_id]} (0x{can_id:03X})" for can_id in sorted(doing.keys() & traffic.talks.keys())]
     if heard:
-        return failed(f"somebody else sends {', '.join(heard)}", "end the other program; an arm has one master")
+        return failed(f"somebody else {', '.join(heard)}", "end the other program; an arm has one master")
     return ok(f"none in {LISTEN_S:g} s; {len(traffic.talks)} identifiers heard, {traffic.error_frames} error frames")
 
 

@@ -3,7 +3,7 @@
 A CAN frame doesn't say who sent it. What only one sender may send gives another one away:
 
 - commands, SYNC, NMT, the host's heartbeat and SDO requests to the arm's devices come from this host alone. One that is
-  received has another sender. Who only reads objects, as a survey of the bus does, is named and does no harm.
+  received has another sender. Who only reads objects, as a survey of the bus does, is named, and stops nothing.
 - a device answers each SYNC with one cyclic frame. A second one that is right by length and CRC but not the same frame
   again has another sender: a second device with that node id, or an attack.
 
@@ -95,7 +95,7 @@ class Strangers(Notices):
             doing = f"sends NMT {word} to {f'node {node_id}' if node_id else 'all nodes'}"
         elif frame.can_id & 0x780 == SDO_REQUEST and frame.data and frame.data[0] >> 5 in _READING:
             text = f"somebody else {doing.replace('writes', 'reads')} (0x{frame.can_id:03X})"
-            self.say(frame.t_ns, (frame.can_id, "reads"), Event("info", "bus", text))
+            self.say(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
             return True
         self._complain(frame, doing, cycle)
         return True

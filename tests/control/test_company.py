@@ -66,7 +66,7 @@ def test_who_only_reads_objects_is_named_and_harmless(tmp_path: Path) -> None:
     assert summary.result.fault is FaultReason.NONE
     said = [entry.event for entry in log.events if entry.event.name == "bus"]
     assert [(event.level, event.message) for event in said] == [
-        ("info", "somebody else reads objects of drive 2 (0x602)")
+        ("warning", "somebody else reads objects of drive 2 (0x602)")
     ]
 
 

@@ -172,7 +172,7 @@ def test_rest_is_where_the_arm_begins_to_stand_for_long_enough() -> None:
     speed[400:] = 0.0
     assert attacked_run.rest_from(times_ns, speed, 100 * MS) == 400 * MS
     assert attacked_run.rest_from(times_ns, speed, 500 * MS) == 500 * MS
-    assert attacked_run.rest_from(times_ns, np.full(1000, 2.0), 0) is None
+    assert attacked_run.rest_from(times_ns, np.full(1000, 3.0), 0) is None
 
 
 def test_the_first_notice_is_a_warning_or_a_reaction_since_the_attack() -> None:
