@@ -32,7 +32,7 @@ from firmware_sim.truth import TruthLog
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 CODEC = load_codec()
-SETTINGS = '[operator]\nscript = [{ at_s = 0.36, request = "finish" }]\n'
+SETTINGS = '[safety]\ntolerated_emergencies = [0x1000]\n[operator]\nscript = [{ at_s = 0.36, request = "finish" }]\n'
 TORQUE1, TORQUE2, EMERGENCY2, FLOOD = 0x183, 0x184, 0x084, 0x7F0
 CYCLIC = (0x181, 0x182, TORQUE1, TORQUE2)
 ROWS = {
