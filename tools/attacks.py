@@ -334,8 +334,8 @@ class AttackCase:
 
     must_stop: the arm has to come to rest. named_by: a pattern of which the log's line must have something. faults: of
     the scenario, their times from the beginning of the attack. is_harmless: it may pass unnoticed if it changes
-    nothing. may_move: nobody can brake, as it takes the power off a drive, or the arm evades as it does from a touch. only: "vcan" where virtual time
-    can't play it, or "".
+    nothing. may_move: nobody can brake, as it takes the power off a drive, or the arm evades as it does from a touch.
+    only: "vcan" where virtual time can't play it, or "".
     """
 
     name: str
