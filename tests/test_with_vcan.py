@@ -23,7 +23,7 @@ FRAME = struct.Struct("=IB3x8s")
 near, far = (socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) for _ in range(2))
 for end in (near, far):
     end.bind(("vcan0",))
-    end.settimeout(HANG_S)
+    end.settimeout(1200.0)
 if os.fork() == 0:
     identifier, length, data = FRAME.unpack(far.recv(FRAME.size))
     far.send(FRAME.pack(identifier + 1, length, data[::-1]))

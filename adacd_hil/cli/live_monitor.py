@@ -18,7 +18,7 @@ from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.live.client import LiveClient, LiveMessage, live_client
-from adacd_hil.log.ros_types import is_log, unpack_log
+from adacd_hil.log.ros_types import unpack_log
 from adacd_hil.records import (
     GRAVITY_PARAMETER_NAMES,
     JOINT_NAMES,
@@ -59,8 +59,6 @@ class LiveMonitor:
         self._begin_ns = message.log_ns if self._begin_ns is None else self._begin_ns
         t_s = round((message.log_ns - self._begin_ns) * 1e-9, 3)
         if message.topic == "/events":
-            if not is_log(message.payload):
-                return
             event = unpack_log(message.payload)
             self._events.append({"t_s": t_s, **event._asdict()})
         elif message.topic == "/contact":
