@@ -15,7 +15,7 @@ from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
 NAMES = builtin_scenarios()
 GROUPS = {"experiment", "people", "mechanics", "measurement", "faults"}
 PLAYED = (
-    "clamped-hand-link2",
+    "clamped-lower-arm-link1",
     "blow-chest",
     "dropped-payload",
     "power-loss-and-return",

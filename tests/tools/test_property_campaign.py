@@ -341,11 +341,11 @@ def test_a_seed_that_the_judge_itself_cannot_bear_is_named(monkeypatch: pytest.M
     assert [violation.rule for violation in result.violations] == ["judge-crash"]
 
 
-# A dozen short runs: both schemes, three contracts, three profiles, faults of frames, values and nodes
+# Half a dozen short runs: both schemes, faults of frames, values and nodes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [6, 8, 12, 18, 23, 33, 53, 61, 64, 70, 76, 96])
+@pytest.mark.parametrize("seed", [8, 18, 23, 53, 70, 76])
 def test_a_random_run_keeps_every_rule(seed: int) -> None:
     result = property_campaign.run_seed(seed, None, is_replayed=False)
     assert result.violations == []
