@@ -3,7 +3,7 @@
     python tools/blind_grid.py -j 2                      the whole grid, some 3,300 runs of 7 s: hours
     python tools/blind_grid.py --every 20 -j 2           one row in twenty
     python tools/blind_grid.py --scheme certified --contract arm --frame torque --delay 550 --share 1.0
-    python tools/blind_grid.py --issue                   the one scenario that began it, by its own times
+    python tools/blind_grid.py --first                   the one scenario that began it, by its own times
 
 Profile P from its start corner. From 3 s on frames of one kind and node are late, in a share of the cycles that is
 drawn for each frame or lies at the beginning of each push; link 1 is pushed with 8 N for 0.5 s at 4 s, link 2 with 3 N
@@ -62,7 +62,7 @@ class Times(NamedTuple):
 
 
 SHORT = Times(3.0, (4.0, 5.8), 6.6)
-ISSUE = Times(6.0, (8.0, 9.5), 10.5)
+FIRST = Times(6.0, (8.0, 9.5), 10.5)
 PUSH_S = 0.5
 
 
@@ -273,7 +273,7 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, object]:
 
 def chosen_rows(chosen: argparse.Namespace) -> list[Row]:
     """Return the rows that the options leave."""
-    if chosen.issue:
+    if chosen.first:
         return [Row(scheme, contract, "torque", "sensor1", 550, 1.0, "random") for scheme, contract in _HOSTS]
     rows = [
         row
@@ -299,7 +299,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--share", type=float, choices=SHARES)
     parser.add_argument("--every", type=int, default=1, help="play one row in so many; default: all")
     parser.add_argument("--offset", type=int, default=0, help="beginning with this one")
-    parser.add_argument("--issue", action="store_true", help="torque of sensor 1 late by 550 µs, pushes at 8 and 9.5 s")
+    parser.add_argument("--first", action="store_true", help="torque of sensor 1 late by 550 µs, pushes at 8 and 9.5 s")
     parser.add_argument("-j", "--jobs", type=int, default=2, help="processes; default %(default)s")
     parser.add_argument("--keep", type=Path, help="folder that keeps the logs")
     parser.add_argument("--all", action="store_true", help="print every row, not only the bad ones")
@@ -311,7 +311,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not rows:
         parser.error("no row of the grid is left")
     outcomes = []
-    for outcome in play_rows(rows, ISSUE if chosen.issue else SHORT, chosen.jobs, chosen.keep):
+    for outcome in play_rows(rows, FIRST if chosen.first else SHORT, chosen.jobs, chosen.keep):
         outcomes.append(outcome)
         if outcome.is_bad:
             print(f"bad: {outcome.row}: {', '.join(outcome.pushes)}; {', '.join(outcome.rules)}", file=sys.stderr)
@@ -321,7 +321,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if chosen.json:
         print(json.dumps({**totals, "outcomes": [asdict(outcome) for outcome in outcomes]}, indent=1))
     else:
-        shown = outcomes if chosen.all or chosen.issue else [outcome for outcome in outcomes if outcome.is_bad]
+        shown = outcomes if chosen.all or chosen.first else [outcome for outcome in outcomes if outcome.is_bad]
         print(as_table(shown) if shown else "no bad row")
         print("\n".join(f"{key}: {value}" for key, value in totals.items()))
     return 1 if totals["bad"] else 0

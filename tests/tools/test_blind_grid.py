@@ -8,7 +8,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import blind_grid
-from blind_grid import ISSUE, SHORT, Outcome, Row
+from blind_grid import FIRST, SHORT, Outcome, Row
 from made_run import ENABLED, Made, states
 from run_rules import Case
 
@@ -103,7 +103,7 @@ def test_without_a_fault_both_pushes_are_found_and_nothing_is_bad(tmp_path: Path
 
 
 def test_the_issues_own_times_are_kept() -> None:
-    scenario = blind_grid.scenario_of(ROW, ISSUE)
+    scenario = blind_grid.scenario_of(ROW, FIRST)
     assert [contact.at_s for contact in scenario.contacts] == [8.0, 9.5]
     assert [contact.force_N for contact in scenario.contacts] == [8.0, 3.0]
     assert scenario.faults[0].at_s == 6.0
