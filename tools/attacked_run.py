@@ -341,7 +341,10 @@ def finding(
 
 
 def rest_from(times_ns: NDArray[np.int64], speed_deg_s: NDArray[np.float64], begin_ns: int) -> int | None:
-    """Return from when on the arm stands still for REST_HOLD_S at least, not before `begin_ns`; None: never."""
+    """Return from when on the arm stands still for REST_HOLD_S or to the end, not before `begin_ns`; None: never.
+
+    The truth of an arm whose host has died ends with the arm at rest.
+    """
     is_still = (speed_deg_s < np.degrees(REST_RAD_S)) & (times_ns >= begin_ns)
     still_since: int | None = None
     for t_ns, still in zip(times_ns.tolist(), is_still.tolist(), strict=True):
@@ -351,7 +354,7 @@ def rest_from(times_ns: NDArray[np.int64], speed_deg_s: NDArray[np.float64], beg
             still_since = t_ns
         elif t_ns - still_since >= REST_HOLD_S * 1e9:
             return still_since
-    return None
+    return still_since
 
 
 def verdict(case: AttackCase | None, found: Finding) -> str:

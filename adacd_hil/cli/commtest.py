@@ -17,6 +17,7 @@ from adacd_hil.control.realtime import prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
+from adacd_hil.device.strangers import refuse_company
 from adacd_hil.log.channels import ChannelId, pack_cycle
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.recorder import Recorder
@@ -52,6 +53,7 @@ def run_commtest(
         arm, master = Arm(settings, codec, tap), Master(settings, codec, tap)
         _progress(f"looking for the arm on {bus.channel}")
         try:
+            refuse_company(tap, clock, settings, codec)
             master.reset()
             master.identify()
             master.configure()

@@ -9,12 +9,14 @@ from typing import Any
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
+from adacd_hil.clock import VirtualClock
 from adacd_hil.commission.tare import TareRefusedError
 from adacd_hil.commission.tare_session import TareInterruptedError, TareSession
 from adacd_hil.config import Settings
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.strangers import refuse_company
 from adacd_hil.wire.bus import SilenceError
 
 
@@ -76,6 +78,8 @@ def tare_on_bus(
     bus = connection.open(clock, codec, settings)
     progress = Progress()
     try:
+        if not isinstance(clock, VirtualClock):
+            refuse_company(bus, clock, settings, codec)
         session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
         with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
             tare = session.run()

@@ -18,7 +18,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
-from adacd_hil.device.strangers import listen_for_hosts
+from adacd_hil.device.strangers import refuse_company
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.log.live.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.provenance import arithmetic
@@ -31,9 +31,6 @@ from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.tap import Tap
-
-LISTEN_S = 0.3
-"""How long a run listens for another host before it resets the arm: 30 SYNCs of the longest period, 3 heartbeats."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +180,8 @@ class Session:
         ending = Ending(None, "", is_bus_failed=False)
         try:
             self.progress(f"looking for the arm on {tap.channel}")
-            self._refuse_company(tap)
+            if not self.is_lockstep:
+                refuse_company(tap, self.clock, self.settings, self.codec)
             self._boot(master, recorder, tap)
             self.progress("running")
             ending = Ending(self._run(cycle, master, recorder, tap), "", is_bus_failed=False)
@@ -195,17 +193,6 @@ class Session:
         for line in (*arm.describe_checks(), *master.describe_checks()):
             recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
         return ending
-
-    def _refuse_company(self, tap: Tap) -> None:
-        """Raise DeviceError when somebody else runs the arm: a reset would take it out of their hands.
-
-        Not in lockstep, where time passes by this host's own frames.
-        """
-        if self.is_lockstep:
-            return
-        heard = listen_for_hosts(tap, self.clock, self.settings, self.codec, LISTEN_S)
-        if heard:
-            raise DeviceError(f"{'; '.join(heard)} on {tap.channel}: end the other program; an arm has one host")
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
         """Bring the devices from whatever they were in to pre-operational and configured. Raises DeviceError."""

@@ -14,12 +14,15 @@ from collections import deque
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
+from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.notices import Notices
 from adacd_hil.device.placement import place_devices
 from adacd_hil.records import Event
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 
+LISTEN_S = 0.3
+"""How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats."""
 HOLD_S = 1.0
 """How long after such a frame the arm counts as somebody else's, too: ten heartbeats of a host."""
 CONTRADICTIONS = 2
@@ -61,6 +64,16 @@ def listen_for_hosts(bus: Bus, clock: Clock, settings: Settings, codec: Codec, d
         if frame is not None and not frame.is_error:
             strangers.accept(frame, 0)
     return strangers.describe(0)
+
+
+def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
+    """Raise DeviceError when somebody else runs the arm: a reset would take it out of their hands. Raises BusError.
+
+    Only where time passes by itself: in lockstep it does by this host's own frames.
+    """
+    heard = listen_for_hosts(bus, clock, settings, codec, LISTEN_S)
+    if heard:
+        raise DeviceError(f"{'; '.join(heard)} on {bus.channel}: end the other program; an arm has one host")
 
 
 def _plain(name: str) -> str:

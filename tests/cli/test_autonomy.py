@@ -8,11 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import can
 import pytest
+from click.testing import CliRunner
 
 from adacd_hil.cli.connection import check_autonomy, on_interrupt
 from adacd_hil.cli.demo import USER, resolve
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.main import cli
 from adacd_hil.config import OperatorSettings, Settings, builtin_names, load_settings
 from adacd_hil.wire.bus import is_virtual
 
@@ -149,3 +152,17 @@ def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["run", "tare", "commtest"])
+def test_an_arm_that_has_a_host_is_left_to_it(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with can.Bus(command, interface="virtual") as other:
+        heartbeat = other.send_periodic(can.Message(arbitration_id=0x77F, data=[5], is_extended_id=False), 0.05)
+        refused = CliRunner().invoke(cli, [command, "-i", "virtual", "-c", command])
+        heartbeat.stop()
+        assert other.recv(0.0) is None
+    assert refused.exit_code == ExitCode.BUS_MISSING
+    line = f"somebody else sends this host's heartbeat (0x77F) on {command}: end the other program; an arm has one host"
+    assert line in refused.stderr.splitlines()[-1]
