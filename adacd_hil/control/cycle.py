@@ -268,11 +268,14 @@ class Cycle:
             return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {lateness}")
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
-        excess = self._arm.describe_excess() if output.fault is FaultReason.LIMIT else []
+        limited = (FaultReason.LIMIT, FaultReason.COMMISSION_TIMEOUT)
+        excess = self._arm.describe_excess() if output.fault in limited else []
         late = [self._watch.deadline.describe()] if output.fault is FaultReason.DEADLINE else []
         missing = self._pipeline.describe_missing() if output.fault is FaultReason.ADAPT_TIMEOUT else []
         if output.fault is FaultReason.COMMISSION_TIMEOUT:
             missing = self._commission.describe()
+        if output.fault is FaultReason.ENABLE_TIMEOUT:
+            missing = self._arm.describe_disabled()
         gaps = self._arm.describe_gaps() if output.fault in (FaultReason.BLIND, FaultReason.DATA_AGE) else []
         checked = [self._checks.line] if output.fault is self._checks.reason else []
         causes = [

@@ -418,10 +418,8 @@ class Arm:
             if drive.state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE) or drive.error_code:
                 name = f": {name_error(drive.error_code)}" if drive.error_code else ""
                 lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}{name}")
-            elif self._was_enabled and not drive.is_enabled:
-                lines.append(
-                    f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"
-                )
+            elif self._was_enabled:
+                lines += _describe_disabled(drive)
         lines += self.strangers.describe(self._cycle)
         for sensor in self.sensors:
             if sensor.status:
@@ -432,6 +430,10 @@ class Arm:
             if age.is_over
         )
         return lines
+
+    def describe_disabled(self) -> list[str]:
+        """Say which drive is not enabled, one line each; empty when both are."""
+        return [line for drive in self.drives for line in _describe_disabled(drive)]
 
     def describe_excess(self) -> list[str]:
         """Say which joint is beyond which of the arm's limits, one line each; empty when none is."""
@@ -445,6 +447,12 @@ class Arm:
                 if abs(value_deg) > bound:
                     lines.append(f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed")
         return lines
+
+
+def _describe_disabled(drive: Drive) -> list[str]:
+    if drive.is_enabled:
+        return []
+    return [f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"]
 
 
 def _make_drive(settings: Settings, codec: Codec, device: Device) -> Drive:
