@@ -17,6 +17,7 @@ from adacd_hil.cli.demo import USER, resolve
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.main import cli
 from adacd_hil.config import OperatorSettings, Settings, builtin_names, load_settings
+from adacd_hil.scheduling import RealtimeGrant, scheduler_name
 from adacd_hil.wire.bus import is_virtual
 
 
@@ -158,6 +159,8 @@ def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang
 @pytest.mark.parametrize("command", ["run", "tare", "commtest"])
 def test_an_arm_that_has_a_host_is_left_to_it(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    # The scheduler would be that of all tests that follow.
+    monkeypatch.setattr("adacd_hil.control.session.request_realtime", lambda _: RealtimeGrant(scheduler_name()))
     with can.Bus(command, interface="virtual") as other:
         heartbeat = other.send_periodic(can.Message(arbitration_id=0x77F, data=[5], is_extended_id=False), 0.05)
         refused = CliRunner().invoke(cli, [command, "-i", "virtual", "-c", command])
