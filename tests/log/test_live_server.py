@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import json
 import os
 import signal
@@ -490,6 +491,37 @@ def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch):
     serving.join()
     for end in (ours, theirs, reader, ring):
         end.close()
+
+
+@pytest.mark.parametrize("steps", range(5))
+def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps):
+    """It comes so many steps of the server's loop after the end was said."""
+    ring = Ring(2**16)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listening = listen(SETUP)
+    address = listening.getsockname()
+    reader = RingReader(ring.descriptor)
+    server = make_server(Told(setup_of(SETUP), CHANNEL_IDS, EPOCH_NS), reader, theirs)
+
+    async def meet():
+        serving = asyncio.create_task(server.run(listening))
+        silent = await asyncio.open_connection(*address)  # has its viewer accepted, and never says a word
+        refused = await asyncio.open_connection(*address)
+        refused[1].write(raw_request("elsewhere.example"))
+        assert (await refused[0].read()).startswith(b"HTTP/1.1 403")
+        ours.send(words.END)
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        with contextlib.suppress(ConnectionRefusedError), socket.create_connection(address):
+            await serving
+        await serving
+        for _, writer in (silent, refused):
+            writer.close()
+
+    asyncio.run(meet())
+    for end in (ours, theirs, reader, ring):
+        end.close()
+    gc.collect()  # whatever is still open warns, and a warning is an error
 
 
 def test_an_address_of_version_6_is_written_so_that_it_can_be_opened():

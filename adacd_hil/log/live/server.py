@@ -301,6 +301,8 @@ class LiveServer:
 
     async def _end(self, server: Server) -> None:
         """Listen no more; send what is left, for a moment, and part."""
+        for listening in server.sockets:  # before it closes: asyncio drops, unclosed, whom it accepts while it does
+            asyncio.get_running_loop().remove_reader(listening)
         server.close(close_connections=False)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LINGER_S):
