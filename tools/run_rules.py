@@ -647,11 +647,7 @@ def a_collision_waits_for_its_acknowledgement(case: Case) -> Iterator[Violation]
     stop = round(case.bounds.stop_s / case.period_s)
     for first, last in case.stays(SchemeState.STOPPED):
         after = int(case.state[last + 1]) if last + 1 < len(case.state) and attempt[last + 1] == attempt[last] else None
-        # A request for a change of payload waits in REACT: who makes it then has seen the collision.
-        began = first
-        while began > 0 and case.state[began - 1] == SchemeState.REACT:
-            began -= 1
-        asked = set(requests[began : last + 2].tolist())
+        asked = set(requests[first + 1 : last + 2].tolist())  # what was said in the cycle that stopped was said before
         if after not in (None, SchemeState.FAULT) and not asked & {Request.ACKNOWLEDGE, Request.PAYLOAD}:
             text = f"STOPPED -> {SchemeState(after).name} without the user's word" if after is not None else ""
             yield Violation("stop-not-latched", case.t_s(int(case.log.scheme.t_ns[last])), text)

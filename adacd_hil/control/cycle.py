@@ -42,7 +42,7 @@ from adacd_hil.records import (
     SchemeState,
 )
 from adacd_hil.scheme.selection import pipeline_of
-from adacd_hil.scheme.supervisor import POWERED
+from adacd_hil.scheme.supervisor import KEPT_IN, POWERED
 from adacd_hil.wire.tap import Tap
 
 FAULT_LINGER_S = 0.5
@@ -186,7 +186,8 @@ class Cycle:
             request, self._carried = self._carried, None
         else:
             request = self._operator.request(elapsed_s, self._state)
-        if request in (Request.FINISH, Request.PAYLOAD) and self._unserved is not Request.FINISH:
+        is_kept = request is Request.FINISH or (request is Request.PAYLOAD and self._state in KEPT_IN[request])
+        if is_kept and self._unserved is not Request.FINISH:
             self._unserved = request
         return self._finish() if request is Request.FINISH else request
 

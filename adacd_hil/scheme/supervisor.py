@@ -9,8 +9,9 @@ A collision is latched: REACT -> STOPPED until the user acknowledges. So are a h
 grown into a collision, and one that has lasted too long. Any other contact clears itself: REACT -> where it came from.
 From CERTIFY that is ADAPT: the fit is forgotten, and an arm that still stands would pass a test of no model at all.
 
-A request is kept until it can be served, but only in the states of `_KEPT_IN`; elsewhere it is dropped, so that an
-acknowledgement given too early can't release the next stop.
+A request is kept until it can be served, but only in the states of `KEPT_IN`; elsewhere it is dropped. No word that was
+given before a stop releases it: an acknowledgement is dropped, and a change of payload waits until the stop has been
+acknowledged, but for one that is announced in STOPPED itself.
 """
 
 from types import MappingProxyType
@@ -58,7 +59,7 @@ _LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
 _HELD_FROM = frozenset((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
 """Where a host that is late holds the arm, or does so already; elsewhere there is no way to, and it is a fault."""
 
-_KEPT_IN = MappingProxyType(
+KEPT_IN = MappingProxyType(
     {
         Request.ACKNOWLEDGE: frozenset((SchemeState.STOPPED,)),
         Request.PAYLOAD: POWERED - {SchemeState.PAYLOAD},
@@ -160,6 +161,7 @@ class Supervisor:
         self._is_latched = False
         self._fault = FaultReason.NONE
         self._pending: set[Request] = set()
+        self._is_told_here = False
         self._phase_cycles = 0
         self._learning_cycles = 0
         self._commissioned_cycles = 0
@@ -230,7 +232,7 @@ class Supervisor:
         match self._state:
             case SchemeState.COMMISSION:
                 cycles = self._commission_cycles - self._commissioned_cycles
-            case SchemeState.MONITOR | SchemeState.STOPPED if Request.PAYLOAD in self._pending:
+            case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
                 cycles = 0
             case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
                 watched |= _CONTACT
@@ -273,13 +275,19 @@ class Supervisor:
         """Keep a request if this state serves it sooner or later."""
         if self._keeps(request, self._state):
             self._pending.add(request)
+            self._is_told_here |= request is Request.PAYLOAD
+
+    @property
+    def _is_announced(self) -> bool:
+        """Whether a change of payload is to be served in MONITOR or STOPPED; a stop ends only by a word about it."""
+        return self._is_told_here or (Request.PAYLOAD in self._pending and self._state is SchemeState.MONITOR)
 
     def _keeps(self, request: Request, state: SchemeState) -> bool:
         """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
         is_interrupted = state in (SchemeState.REACT, SchemeState.STOPPED)
         if request is Request.PAYLOAD_CHANGED and is_interrupted and self._origin is SchemeState.PAYLOAD:
             return True
-        return state in _KEPT_IN[request]
+        return state in KEPT_IN[request]
 
     def _enter(self, state: SchemeState, event: SchemeEvent) -> None:
         """Go to a state, and drop the requests that it has served or that mean nothing there."""
@@ -291,6 +299,7 @@ class Supervisor:
         elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
             self._learning_cycles = 0
         self._state = state
+        self._is_told_here = False
         self._phase_cycles = 0
         self._commissioned_cycles = 0
         self._pending = {request for request in self._pending if self._keeps(request, state)}
@@ -324,7 +333,7 @@ class Supervisor:
         match self._state:
             case SchemeState.MONITOR if arm.is_late:
                 event = SchemeEvent.LATE
-            case SchemeState.MONITOR | SchemeState.STOPPED if Request.PAYLOAD in self._pending:
+            case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
                 event = SchemeEvent.PAYLOAD_ANNOUNCED
             case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
                 if not (observation & _ANY_CONTACT or arm.is_late):

@@ -9,7 +9,7 @@ from session_rig import Rig
 
 from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.control.cycle import FINISH_S
-from adacd_hil.log.reader import read_log
+from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import FaultReason, Request, SchemeState
 
 pytestmark = pytest.mark.slow
@@ -45,21 +45,36 @@ def test_a_fault_while_parking_is_acknowledged_and_the_arm_is_parked_and_the_run
     assert len(scheme) < 10_000
 
 
-def test_a_payload_that_was_announced_and_not_yet_served_is_announced_again(tmp_path: Path) -> None:
+def run_by_script(tmp_path: Path, fault_s: float, script: tuple[tuple[float, str], ...]) -> RunLog:
+    """Play the script with a fault of drive 1 that is acknowledged, and read the log."""
     scenario = tmp_path / "announced.toml"
-    scenario.write_text(FAULT_WHILE_PARKING.replace("lasts_s = 1.0", "lasts_s = 9.0"))
-    cast = resolve("paper", str(scenario), None, None)
-    script = tuple(
-        dataclasses.replace(cast.settings.operator.script[0], at_s=at_s, request=request)
-        for at_s, request in ((0.9, "payload"), (9.0, "finish"))
+    lasts_s = str(script[-1][0])
+    scenario.write_text(
+        FAULT_WHILE_PARKING.replace("lasts_s = 1.0", f"lasts_s = {lasts_s}").replace("1.05", str(fault_s))
     )
-    operator = dataclasses.replace(cast.settings.operator, script=script)
+    cast = resolve("paper", str(scenario), None, None)
+    words = tuple(
+        dataclasses.replace(cast.settings.operator.script[0], at_s=at_s, request=request) for at_s, request in script
+    )
+    operator = dataclasses.replace(cast.settings.operator, script=words)
     cast = cast._replace(settings=dataclasses.replace(cast.settings, operator=operator))
     summary, _ = run_embedded(cast, "lockstep", tmp_path)
-    log = read_log(summary.log.path)
+    return read_log(summary.log.path)
+
+
+def test_a_payload_that_was_announced_and_not_yet_served_is_announced_again(tmp_path: Path) -> None:
+    log = run_by_script(tmp_path, 1.05, ((0.9, "payload"), (9.0, "finish")))
     asked = log.scheme["cycle"][log.scheme["request"] == Request.PAYLOAD]
     assert len(asked) == 2
     assert np.any(log.scheme["state"] == SchemeState.PAYLOAD)
+
+
+def test_a_payload_announced_where_that_means_nothing_is_not_announced_again(tmp_path: Path) -> None:
+    log = run_by_script(tmp_path, 8.0, ((5.8, "payload"), (6.2, "payload"), (7.2, "payload_changed"), (11.0, "finish")))
+    asked = log.scheme["state"][log.scheme["request"] == Request.PAYLOAD]
+    assert [SchemeState(int(state)).name for state in asked] == ["PAYLOAD", "PAYLOAD"]
+    faulted = int(np.flatnonzero(log.scheme["state"] == SchemeState.FAULT)[-1])
+    assert np.any(log.scheme["state"][faulted:] == SchemeState.ADAPT)
 
 
 def test_an_arm_that_cannot_be_parked_is_disabled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

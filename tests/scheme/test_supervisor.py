@@ -623,11 +623,39 @@ def test_a_payload_announced_during_adaptation_waits_for_its_end():
     assert run.step() is SchemeState.PAYLOAD
 
 
-def test_a_payload_announced_during_the_withdrawal_waits_for_the_stop():
-    run = run_in(SchemeState.REACT)
-    run.step(request=Request.PAYLOAD)
-    assert run.step(observation=Observation.AT_REST, cycles=50) is SchemeState.STOPPED
+def stopped_after_payload_in(state):
+    run = run_in(state)
+    run.step(request=Request.PAYLOAD, observation=COLLISION)
+    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
+    return run
+
+
+ANNOUNCED_IN = [SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR, SchemeState.REACT]
+
+
+@pytest.mark.parametrize("state", ANNOUNCED_IN)
+def test_a_payload_announced_before_a_stop_does_not_release_it(state):
+    assert stopped_after_payload_in(state).step(cycles=300) is SchemeState.STOPPED
+
+
+@pytest.mark.parametrize("state", [SchemeState.MONITOR, SchemeState.REACT])
+def test_a_payload_announced_before_a_stop_is_served_once_that_is_acknowledged(state):
+    run = stopped_after_payload_in(state)
+    assert run.step(request=Request.ACKNOWLEDGE) is SchemeState.MONITOR
     assert run.step() is SchemeState.PAYLOAD
+
+
+@pytest.mark.parametrize("state", ANNOUNCED_IN)
+def test_a_payload_announced_before_a_stop_is_served_once_it_is_announced_again(state):
+    assert stopped_after_payload_in(state).step(request=Request.PAYLOAD) is SchemeState.PAYLOAD
+
+
+def test_a_payload_announced_in_one_stop_does_not_release_another():
+    run = run_in(SchemeState.STOPPED)
+    run.step(request=Request.PAYLOAD)
+    run.step(observation=COLLISION)
+    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
+    assert run.step(cycles=300) is SchemeState.STOPPED
 
 
 def test_a_changed_payload_waits_until_the_arm_rests():
