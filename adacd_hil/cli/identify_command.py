@@ -46,7 +46,7 @@ def identify(
     contacts are looked for in the recordings of --watch.
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
-    from adacd_hil.analysis.foreign.recording_import import read_recording
+    from adacd_hil.analysis.foreign.recording_import import Span, read_recording
     from adacd_hil.analysis.foreign.recording_map import read_map
     from adacd_hil.cli.progress import Progress
 
@@ -56,9 +56,10 @@ def identify(
     progress = Progress()
     try:
         read: list[Recording] = []
-        for path in (*recordings, *((test,) if test else ()), *watch):
+        for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
-            read.append(read_recording(path, described, read[0].period_s if read else 0.0))
+            span = Span(start_s, end_s) if place < len(recordings) else None
+            read.append(read_recording(path, described, read[0].period_s if read else 0.0, span))
         fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]
         tested = read[len(recordings)] if test else None
         progress(f"fitting {sum(recording.duration_s for recording in fitted):.1f} s")

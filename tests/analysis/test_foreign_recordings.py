@@ -8,8 +8,9 @@ import pytest
 from click.testing import CliRunner
 from numpy.testing import assert_allclose
 
+from adacd_hil.analysis.foreign import recording_import
 from adacd_hil.analysis.foreign.recording_identification import identify
-from adacd_hil.analysis.foreign.recording_import import read_recording
+from adacd_hil.analysis.foreign.recording_import import Span, read_recording
 from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError
@@ -182,6 +183,10 @@ def test_a_wrong_map_is_one_line(tmp_path: Path, free: Path, old: str, new: str,
     assert "\n" not in str(refusal.value)
 
 
+def rows(joints: str, count: int = 60) -> str:
+    return "".join(f"{k},{joints},4,5,0\n" for k in range(1, count + 1))
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -189,6 +194,9 @@ def test_a_wrong_map_is_one_line(tmp_path: Path, free: Path, old: str, new: str,
         (HEAD + "\n", "has 0 rows"),
         (HEAD + "\n" + "1,2,3,4,5,0\n" * 60, "time does not increase after row 2"),
         (HEAD + "\n" + "1,2,3,x,5,0\n" * 60, "could not convert"),
+        (HEAD + "\n" + rows("1e300,3"), "column 'j1_deg' is 1e+300 at 0 s, more than 1e+06 rad"),
+        (HEAD + "\n" + rows("1,3") + "100,1,-2e12,4,5,0\n", "column 'j2_deg' is -2e+12 at 0.099 s"),
+        (HEAD + "\n" + rows("inf,3"), "no 50 samples"),
     ],
 )
 def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line: str) -> None:
@@ -197,6 +205,62 @@ def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line:
         read_recording(tmp_path / "bad.csv", example)
     assert line in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+def test_a_row_is_counted_over_all_blocks_that_are_read(tmp_path: Path, example, monkeypatch) -> None:
+    monkeypatch.setattr(recording_import, "_BLOCK_ROWS", 25)
+    for text, line in (
+        (rows("1,3") + "60,1,3,4,5,0\n", "time does not increase after row 61: 0.06 s"),
+        (rows("1,3") + "61,1,x,4,5,0\n", "at row 60,"),
+    ):
+        (tmp_path / "bad.csv").write_text(f"{HEAD}\n{text}")
+        with pytest.raises(LogError) as refusal:
+            read_recording(tmp_path / "bad.csv", example)
+        assert line in str(refusal.value)
+
+
+def test_blocks_are_the_recording(free: Path, example, monkeypatch) -> None:
+    whole = read_recording(free, example)
+    monkeypatch.setattr(recording_import, "_BLOCK_ROWS", 701)
+    for mine, read in zip(read_recording(free, example).stretches, whole.stretches, strict=True):
+        np.testing.assert_array_equal(mine.record.q, read.record.q)
+        np.testing.assert_array_equal(mine.record.tau_J, read.record.tau_J)
+
+
+def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example, monkeypatch) -> None:
+    whole = read_recording(free, example).between(4.0, 7.0)
+    monkeypatch.setattr(recording_import, "_BLOCK_ROWS", 500)
+    monkeypatch.setattr(recording_import, "MOST_ROWS", 3000)
+    with pytest.raises(LogError, match=r"more than 3000 rows: cut it$"):
+        read_recording(free, example)
+    with pytest.raises(LogError, match=r"more than 3000 rows: choose a part with --from and --until$"):
+        read_recording(free, example, span=Span())
+    part = read_recording(free, example, span=Span(4.0, 7.0)).between(4.0, 7.0)
+    assert part.duration_s == pytest.approx(3.0, abs=2.0 * part.period_s)
+    (mine,), (read,) = part.stretches, whole.stretches
+    late = round((mine.start_s - read.start_s) / part.period_s)  # by a sample, as the bound falls on one
+    assert abs(late) <= 1
+    assert_allclose(mine.record.q[1 - late : -1 - late], read.record.q[1:-1], atol=1e-9)
+    assert_allclose(mine.record.dq[1 - late : -1 - late], read.record.dq[1:-1], atol=1e-6)
+    with pytest.raises(LogError, match=r"has 0 rows from 1000 to 2000 s, 50 are the least"):
+        read_recording(free, example, span=Span(1000.0, 2000.0))
+
+
+def test_a_period_that_would_make_too_many_samples_is_refused(tmp_path: Path, free: Path) -> None:
+    text = (EXAMPLE / "map.toml").read_text() + "\n[sampling]\nperiod_s = 1e-9\n"
+    (tmp_path / "map.toml").write_text(text)
+    (tmp_path / "planar-arm.urdf").write_text((EXAMPLE / "planar-arm.urdf").read_text())
+    with pytest.raises(LogError, match="more than 4000000 samples of 1e-09 s"):
+        read_recording(free, read_map(tmp_path / "map.toml"))
+
+
+def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(tmp_path: Path) -> None:
+    urdf = (EXAMPLE / "planar-arm.urdf").read_text()
+    assert '<axis xyz="0 0 1"/>' in urdf
+    (tmp_path / "planar-arm.urdf").write_text(urdf.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1e300"/>', 1))
+    (tmp_path / "map.toml").write_text((EXAMPLE / "map.toml").read_text())
+    with pytest.raises(ConfigError, match=r"planar-arm.urdf: a number is too large to reckon with"):
+        read_map(tmp_path / "map.toml")
 
 
 def test_the_command_says_by_its_status_whether_the_test_is_explained(

@@ -2,15 +2,19 @@
 
 A gap in time, a value that is missing or not finite, and where a touch begins or ends, part a recording in stretches;
 the model is carried over, the filters begin anew. Values between two samples are interpolated.
+
+A recording is held in memory, at most `MOST_ROWS` rows of it: of a longer file only the span that is asked for.
 """
 
 import csv
 import io
+import math
+import re
 import warnings
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TextIO
+from typing import Final, NamedTuple, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +28,13 @@ from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
 from adacd_hil.scheme.offline import Record
 
+MOST_ROWS: Final = 4_000_000
+"""Rows of a file that are kept, and samples that they become: an hour at 1 kHz, with a little to spare."""
+_BLOCK_ROWS = 100_000
+_SPARE_S = 1.0
+"""Kept before and after the span that is asked for: what a derived velocity and the grid of samples reach over."""
+_LARGEST = 1e6
+"""rad, rad/s or Nm: what is larger is no measurement, and its square would spoil all others."""
 _SHORTEST_SAMPLES = 50
 """A shorter stretch teaches nothing: the filters have not settled."""
 _LEAST_NOISE_NM = 1e-4
@@ -83,15 +94,23 @@ class Recording:
         return [part for part in parts if len(part.record.q) >= _SHORTEST_SAMPLES]
 
 
-def read_recording(path: Path, described: RecordingMap, period_s: float = 0.0) -> Recording:
+class Span(NamedTuple):
+    """From when until when, s since the beginning of a recording."""
+
+    start_s: float = 0.0
+    end_s: float = math.inf
+
+
+def read_recording(path: Path, described: RecordingMap, period_s: float = 0.0, span: Span | None = None) -> Recording:
     """Read a CSV file. period_s: of the samples, where neither the map nor the recording is to say.
 
-    Raises LogError when it can't be read, ConfigError when it lacks a column of the map.
+    span: what has to be read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError when
+    it can't be read or is too long, ConfigError when it lacks a column of the map.
     """
-    time_s, values, touched = _read_columns(path, described)
+    time_s, begin_s, values, touched = _read_columns(path, described, span)
     period_s = described.sampling.period_s or period_s or float(np.median(np.diff(time_s)))
     is_whole = np.isfinite(values).all(axis=1)
-    time_s, values = time_s[is_whole] - time_s[0], values[is_whole]
+    time_s, values = time_s[is_whole] - begin_s, values[is_whole]
     touched = None if touched is None else touched[is_whole]
     n = described.joints
     longest_s = max(described.sampling.longest_gap_s, 1.5 * period_s)
@@ -99,10 +118,14 @@ def read_recording(path: Path, described: RecordingMap, period_s: float = 0.0) -
     shortest = max(_SHORTEST_SAMPLES, window)
     edges = np.flatnonzero(np.diff(time_s) > longest_s) + 1
     stretches = []
-    for rows in np.split(np.arange(len(time_s)), edges):
+    room = MOST_ROWS
+    for rows in np.split(np.arange(len(time_s)), edges) if len(time_s) else ():
         count = int((time_s[rows[-1]] - time_s[rows[0]]) / period_s + 1e-6) + 1
         if count < shortest:
             continue
+        room -= count
+        if room < 0:
+            raise LogError(f"{path}: more than {MOST_ROWS} samples of {period_s:g} s")
         grid_s = time_s[rows[0]] + period_s * np.arange(count)
         columns = [np.interp(grid_s, time_s[rows], values[rows, column]) for column in range(values.shape[1])]
         q, tau_J = np.column_stack(columns[:n]), np.column_stack(columns[n : 2 * n])
@@ -125,8 +148,13 @@ def read_recording(path: Path, described: RecordingMap, period_s: float = 0.0) -
     )
 
 
-def _read_columns(path: Path, described: RecordingMap) -> tuple[Vector, Vector, NDArray[np.bool_] | None]:
-    """Return time (k,) s, positions, torques and velocities side by side (k, 2 n or 3 n), SI, and touches (k,)."""
+def _read_columns(
+    path: Path, described: RecordingMap, span: Span | None
+) -> tuple[Vector, float, Vector, NDArray[np.bool_] | None]:
+    """Return time (k,) s and that of the file's first row, values (k, 2 n or 3 n) in SI units, touches (k,).
+
+    Values: positions, torques and velocities side by side; what is missing is not finite.
+    """
     columns, form = described.columns, described.csv
     try:
         with _open(path, "") as file:
@@ -138,29 +166,77 @@ def _read_columns(path: Path, described: RecordingMap) -> tuple[Vector, Vector, 
     heads = [head.strip() for head in first] if form.has_header else []
     wanted = (columns.time, *columns.q, *columns.tau_J, *columns.dq, *filter(None, (columns.contact,)))
     places = [_place(name, heads, len(first), path) for name in wanted]
+    table, start = _read_table(path, described, places, span)
+    if len(table) < _SHORTEST_SAMPLES:
+        where = "" if span is None or span == Span() else f" from {span.start_s:g} to {span.end_s:g} s"
+        raise LogError(f"recording {path} has {len(table)} rows{where}, {_SHORTEST_SAMPLES} are the least")
+    units = np.array((*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if columns.dq else ())))
+    time_s, begin_s = table[:, 0] * described.time_s, start * described.time_s
+    with np.errstate(over="ignore"):
+        values = table[:, 1 : 1 + len(units)] * units
+    too_large = np.argwhere(np.isfinite(table[:, 1 : 1 + len(units)]) & ~(np.abs(values) <= _LARGEST))
+    if len(too_large):
+        row, column = too_large[0].tolist()
+        raise LogError(
+            f"recording {path}: column {wanted[1 + column]!r} is {table[row, 1 + column]:g} at {time_s[row] - begin_s:.9g} s, "
+            f"more than {_LARGEST:g} rad, rad/s or Nm"
+        )
+    return time_s, begin_s, values, table[:, -1] != 0.0 if columns.contact else None
+
+
+def _read_table(path: Path, described: RecordingMap, places: list[int], span: Span | None) -> tuple[Vector, float]:
+    """Return the columns at such places of all rows, or of those of a span; and the time in the first row."""
+    form = described.csv
+    head = form.skip_rows + form.has_header
+    kept: list[Vector] = []
+    rows = 0
+    start = last = math.nan
+    bounds = (-math.inf, math.inf) if span is None else (span.start_s - _SPARE_S, span.end_s + _SPARE_S)
     try:
         with warnings.catch_warnings(), _open(path) as file:
-            warnings.simplefilter("ignore", UserWarning)  # of an empty file; said below
-            table = np.loadtxt(
-                file,
-                delimiter=None if form.delimiter == " " else form.delimiter,
-                skiprows=form.skip_rows + form.has_header,
-                usecols=places,
-                ndmin=2,
-                converters=_number,
-            )
+            warnings.simplefilter("ignore", UserWarning)  # at the end of the file
+            while True:
+                block = np.loadtxt(
+                    file,
+                    delimiter=None if form.delimiter == " " else form.delimiter,
+                    skiprows=0 if rows else head,
+                    usecols=places,
+                    ndmin=2,
+                    converters=_number,
+                    max_rows=_BLOCK_ROWS,
+                )
+                if not len(block):
+                    break
+                start = float(block[0, 0]) if not rows else start
+                time_s = np.concatenate(([last] if rows else [], block[:, 0])) * described.time_s
+                _check_time(path, time_s, head + rows - bool(rows))
+                rows, last = rows + len(block), float(block[-1, 0])
+                kept.append(block)
+                if rows <= MOST_ROWS:
+                    continue
+                kept = [_within(part, start, described.time_s, bounds) for part in kept]
+                if sum(map(len, kept)) > MOST_ROWS:
+                    remedy = "cut it" if span is None else "choose a part with --from and --until"
+                    raise LogError(f"recording {path} has more than {MOST_ROWS} rows: {remedy}")
+                if (last - start) * described.time_s > bounds[1]:
+                    break
     except (OSError, ValueError) as error:
-        raise LogError(f"recording {path}: {str(error).splitlines()[0]}") from None
-    if len(table) < _SHORTEST_SAMPLES:
-        raise LogError(f"recording {path} has {len(table)} rows, {_SHORTEST_SAMPLES} are the least")
-    time_s = table[:, 0] * described.time_s
+        line = re.sub(r"(?<=at row )\d+", lambda found: str(int(found[0]) + rows), str(error).splitlines()[0])
+        raise LogError(f"recording {path}: {line}") from None
+    return np.concatenate(kept) if kept else np.empty((0, len(places))), start
+
+
+def _within(table: Vector, start: float, unit_s: float, bounds_s: tuple[float, float]) -> Vector:
+    time_s = (table[:, 0] - start) * unit_s
+    return table[(time_s >= bounds_s[0]) & (time_s <= bounds_s[1])]
+
+
+def _check_time(path: Path, time_s: Vector, row: int) -> None:
+    """Raise LogError unless the time increases. row: the one in the file before the first."""
     backward = np.flatnonzero(~(np.diff(time_s) > 0.0))
     if len(backward):
-        row = int(backward[0]) + 1 + form.skip_rows + form.has_header
-        raise LogError(f"recording {path}: time does not increase after row {row}: {time_s[backward[0]]:.9g} s")
-    units = (*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if columns.dq else ()))
-    values = table[:, 1 : 1 + len(units)] * np.array(units)
-    return time_s, values, table[:, -1] != 0.0 if columns.contact else None
+        place = int(backward[0])
+        raise LogError(f"recording {path}: time does not increase after row {row + 1 + place}: {time_s[place]:.9g} s")
 
 
 def _open(path: Path, newline: str | None = None) -> TextIO:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from adacd_hil.config import ConfigError, parse, read_toml, setting
 from adacd_hil.input_files import read_input
 from adacd_hil.scheme.offline import OfflineSettings
@@ -25,7 +27,9 @@ class ArmSection:
     """The arm that was recorded."""
 
     urdf: str = setting(meaning="file, relative to the map")
-    gravity_m_s2: tuple[float, float, float] = setting((0.0, 0.0, -9.80665), unit="m/s²", meaning="in the root's axes")
+    gravity_m_s2: tuple[float, float, float] = setting(
+        (0.0, 0.0, -9.80665), unit="m/s²", low=-1e3, high=1e3, meaning="in the root's axes"
+    )
     locked: tuple[str, ...] = setting((), meaning="joints that do not move")
     has_rotors: bool = setting(False, meaning="torques are those of geared motors, which turn their rotors too")
 
@@ -55,8 +59,8 @@ class UnitsSection:
 class ScaleSection:
     """A factor per joint, after the unit; none: 1."""
 
-    q: tuple[float, ...] = setting((), meaning="of positions and velocities")
-    tau_J: tuple[float, ...] = setting((), meaning="of torques; Nm/A of currents")
+    q: tuple[float, ...] = setting((), low=-1e9, high=1e9, meaning="of positions and velocities")
+    tau_J: tuple[float, ...] = setting((), low=-1e9, high=1e9, meaning="of torques; Nm/A of currents")
 
 
 @dataclass(frozen=True)
@@ -159,7 +163,10 @@ def read_map(path: Path) -> RecordingMap:
 def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:
     file = folder / arm.urdf
     try:
-        return read_urdf(read_input(file), arm.gravity_m_s2, arm.locked)
+        with np.errstate(over="raise"):
+            return read_urdf(read_input(file), arm.gravity_m_s2, arm.locked)
+    except FloatingPointError:
+        raise ConfigError(f"`arm.urdf`: {file}: a number is too large to reckon with") from None
     except OSError as error:
         raise ConfigError(f"`arm.urdf`: {file}: {error.strerror}") from None
     except UrdfError as error:
