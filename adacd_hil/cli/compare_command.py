@@ -74,7 +74,8 @@ def _as_text(found: "LogComparison") -> str:
 def _contact(contact: "Detection | None") -> str:
     if contact is None:
         return "–"
-    force = Location(contact.location).force_text(contact.force_N)
+    is_known = contact.location in Location.__members__.values()  # a later version may have others
+    force = Location(contact.location).force_text(contact.force_N) if is_known else f"{contact.force_N:.1f}"
     return f"{contact.time_s:.3f} s, link {contact.link}" + ("" if force == "–" else f", {force} N")
 
 

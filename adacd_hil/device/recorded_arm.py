@@ -170,7 +170,7 @@ class RecordedArm:
         for is_sent, frame in passed:
             if not is_sent:
                 self._accept(frame)
-            elif frame.can_id == NMT_ID:
+            elif frame.can_id == NMT_ID and frame.data:
                 self._command(frame.data[0])
 
     def _command(self, nmt_command: int) -> None:

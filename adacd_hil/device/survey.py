@@ -159,7 +159,7 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
         if is_sent or frame.is_error or frame.can_id > 0x7FF or node_id == 0:
             continue
         node = found.get(node_id) or Node(node_id)
-        if function == 0x580 and frame.data[1:4] == _UPLOAD_DEVICE_TYPE[1:4]:
+        if function == 0x580 and len(frame.data) == 8 and frame.data[1:4] == _UPLOAD_DEVICE_TYPE[1:4]:
             node.answers = True
             if frame.data[0] & 0xE2 == 0x42:  # expedited upload response
                 node.device_type = struct.unpack_from("<I", frame.data, 4)[0]

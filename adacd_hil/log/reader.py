@@ -6,7 +6,7 @@ Cut and damaged files are read as far as they are intact; `is_complete` and `pro
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -36,8 +36,10 @@ from adacd_hil.records import (
     ContactLevel,
     ContactReport,
     Event,
+    FaultReason,
     Location,
     Reaction,
+    SchemeState,
     Vector,
 )
 
@@ -307,11 +309,27 @@ _CONTACT_TYPES: dict[str, Callable[[Any], Any]] = {
 """What each field of a report is made of the number or list that the log has."""
 
 
+_STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": FaultReason}
+
+
+def check_states(scheme: Series) -> None:
+    """Raise LogError for a record of /scheme with a state or a fault that there is not."""
+    for name, kind in _STATES.items():
+        if name in scheme.fields:
+            odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))
+            if odd.size:
+                value, cycle = scheme.records[name][odd[0]], scheme.records["cycle"][odd[0]]
+                raise LogError(f"/scheme has {name} {value} in cycle {cycle}, which this version does not know")
+
+
 def contacts_of(series: Series) -> list[LoggedContact]:
-    """Give what /contact has."""
+    """Give what /contact has. Raises LogError for a level, kind, reaction or place that there is not."""
     contacts = []
     names = [name for name in ContactReport._fields if name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
-        report = ContactReport(**{name: _CONTACT_TYPES[name](record[name].tolist()) for name in names})
+        try:
+            report = ContactReport(**{name: _CONTACT_TYPES[name](record[name].tolist()) for name in names})
+        except (ValueError, OverflowError) as error:  # "77 is not a valid ContactLevel"
+            raise LogError(f"/contact has a report that this version does not know: {error}") from None
         contacts.append(LoggedContact(t_ns, report))
     return contacts

@@ -10,8 +10,10 @@ from adacd_hil.analysis.replay import log_comparison
 from adacd_hil.analysis.replay.log_comparison import MATCH_S, compare_logs, match_contacts
 from adacd_hil.analysis.replay.run_digest import Detection
 from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.cli.compare_command import _contact as in_words
 from adacd_hil.config import load_settings, to_toml
+from adacd_hil.log.errors import LogError
 
 SETTINGS = load_settings("paper")
 
@@ -28,6 +30,38 @@ def write(folder: Path, count: int = 40, change=None, settings=SETTINGS) -> Path
 
 def contact(time_s: float) -> Detection:
     return Detection(time_s, 1, 2, 0, (0.0, 0.0), 0.0)
+
+
+def test_a_place_that_a_later_version_may_have_is_no_trouble() -> None:
+    assert in_words(contact(1.0)._replace(force_N=5.0, location=77)) == "1.000 s, link 1, 5.0 N"
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"state": 255}, "/scheme has state 255 in cycle 7, which this version does not know"),
+        ({"previous_state": 40}, "/scheme has previous_state 40 in cycle 7"),
+        ({"fault": 99}, "/scheme has fault 99 in cycle 7"),
+    ],
+)
+def test_a_report_of_a_state_that_there_is_not_is_refused_in_one_line(tmp_path: Path, change, line: str) -> None:
+    def corrupt(run) -> None:
+        run.cycles[7].output = run.cycles[7].output._replace(**change)
+
+    path = write(tmp_path / "odd", change=corrupt)
+    with pytest.raises(LogError, match=line):
+        read_run(path, None)
+    assert not compare_logs(path, path).fields
+
+
+def test_a_report_of_a_contact_that_there_is_not_is_refused_in_one_line(tmp_path: Path) -> None:
+    def corrupt(run) -> None:
+        cycle = next(cycle for cycle in run.cycles if cycle.contact is not None)
+        cycle.contact = cycle.contact._replace(level=77)
+
+    path = write(tmp_path / "odd", change=corrupt)
+    with pytest.raises(LogError, match=r"/contact has a report .*: 77 is not a valid ContactLevel"):
+        read_run(path, None)
 
 
 @pytest.fixture(scope="module")

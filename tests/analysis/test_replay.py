@@ -67,6 +67,16 @@ def test_every_flipped_bit_is_found_and_named(log: Path) -> None:
     assert "/scheme.state" in by_field["state"].line()
 
 
+def test_an_nmt_frame_without_data_tells_nothing(log: Path, whole: Replay) -> None:
+    def change(piece):
+        frames = piece.frames.copy()
+        first = np.flatnonzero(frames["is_tx"] & (frames["can_id"] == 0))[0]
+        frames["length"][first] = 0
+        return piece._replace(frames=frames)
+
+    assert changed(log, change).states == whole.states
+
+
 @pytest.mark.parametrize("script_of", [ScriptedOperator, None])
 def test_a_request_that_nobody_can_make_is_named(log: Path, script_of) -> None:
     def change(piece):

@@ -120,6 +120,13 @@ def test_an_abort_of_0x1000_still_shows_a_node() -> None:
     assert (node.device_type, node.device_text) == (None, "?")
 
 
+@pytest.mark.parametrize("data", ["43001000", "43001000920000", ""])
+def test_an_answer_that_is_too_short_is_none(data: str) -> None:
+    rig = BenchBus()
+    rig.bus.deliver(0x58A, bytes.fromhex(data))
+    assert [node.node_id for node in look(rig).nodes if node.answers] == [1, 2, 3, 4]
+
+
 def test_an_empty_bus_has_nobody() -> None:
     rig = BenchBus()
     rig.tamper = lambda can_id, data: None

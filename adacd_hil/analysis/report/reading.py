@@ -26,7 +26,7 @@ from adacd_hil.analysis.run import Run, StretchOfRun, Truth
 from adacd_hil.analysis.timing import CycleColumns, columns_of_series
 from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import Series
+from adacd_hil.log.reader import Series, check_states
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.log.stretch import WHOLE, Stretch, start_of_log
 from adacd_hil.records import JOINTS
@@ -36,6 +36,7 @@ RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events"
 FULL_CYCLES: Final = 500_000
 """Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 0.7 kB each."""
 _PROGRESS_CYCLES: Final = 1_000_000
+_MOST_DIGITS: Final = 18
 
 Progress = Callable[[str], None]
 Bounds = tuple[int, int]
@@ -123,6 +124,7 @@ class _Reading:
         stream = LogStream(self._path, RUN_TOPICS)
         cycles = said = 0
         for piece in stream:
+            check_states(piece.series["/scheme"])
             cycles += len(piece.series["/scheme"])
             if cycles - said >= _PROGRESS_CYCLES:
                 said = cycles
@@ -250,5 +252,6 @@ def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth |
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:
-    """Give a number of the log's summary; a cut file has none."""
-    return int(summary[key]) if key in summary else None
+    """Give a number of the log's summary; a cut file has none, a damaged one something else."""
+    text = summary.get(key, "")
+    return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
