@@ -178,8 +178,8 @@ def _read_columns(
     if len(too_large):
         row, column = too_large[0].tolist()
         raise LogError(
-            f"recording {path}: column {wanted[1 + column]!r} is {table[row, 1 + column]:g} at {time_s[row] - begin_s:.9g} s, "
-            f"more than {_LARGEST:g} rad, rad/s or Nm"
+            f"recording {path}: column {wanted[1 + column]!r} is {table[row, 1 + column]:g} at "
+            f"{time_s[row] - begin_s:.9g} s, more than {_LARGEST:g} rad, rad/s or Nm"
         )
     return time_s, begin_s, values, table[:, -1] != 0.0 if columns.contact else None
 
