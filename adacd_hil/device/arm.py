@@ -5,6 +5,7 @@ The only place of sign, zero offset and torque ratio. Every value carries its ag
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -204,7 +205,9 @@ class Arm:
         device, clock, data = self.devices[place], self._clocks[place], frame.data
         offset_ns = frame.t_ns - self._sync_ns[newest % KEPT]
         step = device.end_to_end.step_of(data)
-        error = self._position_error(place, data, newest)
+        error = None
+        if place < JOINTS and clock.answered != newest - 1:  # the motion tells how many periods lie before the frame
+            error = partial(self.drives[place].position_error, data)
         ordinal = None if step == 0 else clock.find(newest, offset_ns, step, error)
         if ordinal is None:
             self._refuse(frame, take, place, step, is_second=clock.answered is not None and clock.answered >= newest)
@@ -226,13 +229,6 @@ class Arm:
             clock.pass_by(newest)  # the device has begun anew, so that its counter says nothing of before
         elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
-
-    def _position_error(self, place: int, data: bytes, newest: int) -> Callable[[int], float] | None:
-        """Return what tells by the motion how many periods lie before a drive's frame; None where that isn't needed."""
-        if place >= JOINTS or self._clocks[place].answered == newest - 1:
-            return None
-        drive = self.drives[place]
-        return lambda periods: drive.position_error(data, periods)
 
     def _refuse(self, frame: Frame, take: _Take, place: int, step: int | None, is_second: bool) -> None:
         """Judge a frame that answers no SYNC; its values are not used.

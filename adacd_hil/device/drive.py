@@ -216,6 +216,8 @@ class Drive:
         self._feedback_status = _status_places(self.feedback_message)
         self._status_places = _NO_STATUS if self.status_message is None else _status_places(self.status_message)
         self._status_receiver = None if self.status_message is None else self.status_message.receiver()
+        self.cyclic_length = self.feedback_message.length
+        """Bytes of its cyclic frame."""
         self.is_protected = self.feedback_message.header_bytes > 0
         """Whether the feedback carries an end-to-end header; else it is checked by plausibility."""
         self._command, self._controlword_at, self._torque_at = _command_template(
@@ -290,11 +292,6 @@ class Drive:
     def is_limited(self) -> bool:
         """Whether the drive says that a limit of its own keeps it from the commanded torque."""
         return bool(self.statusword & _INTERNAL_LIMIT)
-
-    @property
-    def cyclic_length(self) -> int:
-        """Bytes of its cyclic frame."""
-        return self.feedback_message.length
 
     @property
     def values(self) -> tuple[float, float]:

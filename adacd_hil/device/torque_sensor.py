@@ -58,6 +58,8 @@ class TorqueSensor:
         self.status_in_header = _STATUS_IN_HEADER[self.torque_message.header_bytes]
         self._slow_status_at = None if self.status_message is None else find_signal(self.status_message, "status")
         self._status_receiver = None if self.status_message is None else self.status_message.receiver()
+        self.cyclic_length = self.torque_message.length
+        """Bytes of its cyclic frame."""
         self.is_protected = self.torque_message.header_bytes > 0
         """Whether the torque carries an end-to-end header; else it is checked by plausibility."""
         self._received_torque_Nm: float | None = None
@@ -107,11 +109,6 @@ class TorqueSensor:
             self.status = _STATUSES[data[byte] >> shift & _STATUS_BITS]
         elif self.torque_range_Nm:
             self.status = _judge_range(torque, self.torque_range_Nm)
-
-    @property
-    def cyclic_length(self) -> int:
-        """Bytes of its cyclic frame."""
-        return self.torque_message.length
 
     @property
     def values(self) -> tuple[float]:
