@@ -299,7 +299,10 @@ class DataSettings:
     """How much of the cyclic data may be missing. Shares are of the cycles of any second with enabled drives."""
 
     blind_cycles: int = setting(
-        5, low=2, high=1000, meaning="cycles in a row without a fresh sample for the model; then the run faults"
+        5,
+        low=2,
+        high=1000,
+        meaning="cycles in a row without a fresh sample for the model that fault the run; bus.max_age_cycles if more",
     )
     incomplete_share: float = setting(
         0.1, low=0.0, high=1.0, meaning="cycles in which some frame is missing or late; more is said and judged"

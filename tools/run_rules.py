@@ -53,7 +53,8 @@ class Bounds:
     old_cycles: int = 2
     """Feedback of this age is older than a cycle: torque must not grow on it."""
     blind_cycles: int = 6
-    """Cycles in a row in which the armed model had no fresh sample: 5 are allowed, and the one that says so."""
+    """Cycles in a row in which the armed model had no fresh sample: 5 are allowed, and the one that says so. Where a
+    setting lets a value be older than that, so many more."""
     contact_share: float = 3.0
     """A true contact is clear when it is so many times over the threshold in force..."""
     contact_s: float = 0.1
@@ -533,11 +534,12 @@ def an_armed_model_sees(case: Case) -> Iterator[Violation]:
     q = case.truth["q"][case.truth_row]
     tau = case.truth["tau_J"][case.truth_row]
     worst: dict[SchemeState, tuple[int, int, int]] = {}
+    allowed = max(case.bounds.blind_cycles, case.played.settings.bus.max_age_cycles + 1)
     attempt = case.wire.attempt(case.wire.sync_place[case.scheme_sync])
     for first, last in runs(stands & is_armed, attempt):
         elapsed = int(case.scheme_sync[last] - case.scheme_sync[first]) + 1
         moved = np.abs(q[last] - q[first]).max() > 1e-6 or np.abs(tau[last] - tau[first]).max() > 1e-3
-        if elapsed > case.bounds.blind_cycles and moved:
+        if elapsed > allowed and moved:
             state = SchemeState(int(case.state[last]))
             longest, total, _ = worst.get(state, (0, 0, first))
             worst[state] = (max(longest, elapsed), total + elapsed, first if elapsed > longest else worst[state][2])
