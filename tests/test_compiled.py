@@ -1,6 +1,7 @@
 """The cache of compiled code is keyed by all that the code may depend on."""
 
 import errno
+import fcntl
 import os
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.compiled import cache_folder, compiled, compiled_sources
+from adacd_hil.compiled import cache_folder, compiled, compiled_sources, source_digest
 
 CALLER = "from adacd_hil.compiled import compiled\nfrom adacd_hil.scheme import (\n    callee,\n)\n"
 CALLEE = "from adacd_hil.scheme.constants import GRAVITY\n"
@@ -131,26 +132,28 @@ def test_a_named_folder_that_others_can_write_is_not_used_and_that_is_said(
 
 
 TOTAL_OF_RECORDS = """
-import sys, time
-import numba, numpy as np
+import sys
+import numpy as np
 from numba.core.caching import IndexDataCacheFile
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import _SharedCache, compiled
 
 @compiled
 def total(records):
     return records[0].last
 
-save = IndexDataCacheFile._save_index
-def slow_save(self, index):
-    time.sleep(0.5)
-    save(self, index)
-IndexDataCacheFile._save_index = slow_save
+def saying(word, function):
+    def step(self, *arguments):
+        print(word, flush=True)
+        sys.stdin.readline()
+        function(self, *arguments)
+    return step
+
+_SharedCache.save_overload = saying("compiled", _SharedCache.save_overload)
+IndexDataCacheFile._save_index = saying("saving", IndexDataCacheFile._save_index)
 
 for count in map(int, sys.argv[1:]):
     records = np.zeros(1, [("first", "f8", (count,)), ("last", "f8")])
     records["last"] = count
-    print("ready", flush=True)
-    sys.stdin.readline()
     assert total(records) == count
     print(sum(total.stats.cache_hits.values()), flush=True)
 """
@@ -166,18 +169,26 @@ def test_processes_that_compile_for_different_types_at_once_take_nothing_from_ea
         words = [sys.executable, str(program), *map(str, counts)]
         return subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
 
-    both = [start(3), start(5)]
-    for process in both:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-    for process in both:
+    def go_on(process: "subprocess.Popen[str]") -> None:
         assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()
-    for process in both:
-        assert process.communicate() == ("0\n", None)
-        assert process.returncode == 0
-    assert start(3, 5).communicate("\n\n") == ("ready\n1\nready\n2\n", None)
+
+    def said(process: "subprocess.Popen[str]") -> str:
+        assert process.stdout is not None
+        return process.stdout.readline()
+
+    with start(3) as first, start(5) as second:
+        assert (said(first), said(second)) == ("compiled\n", "compiled\n")
+        go_on(first)
+        assert said(first) == "saving\n"  # it has read the index, and has not written it yet
+        with (tmp_path / "cache" / source_digest() / "lock").open("ab") as lock, pytest.raises(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        go_on(second)
+        assert first.communicate("\n") == ("0\n", None)
+        assert second.communicate("\n") == ("saving\n0\n", None)
+        assert (first.returncode, second.returncode) == (0, 0)
+    assert start(3, 5).communicate() == ("1\n2\n", None)
 
 
 def test_a_disk_that_takes_no_compiled_code_costs_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
