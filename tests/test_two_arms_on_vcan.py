@@ -152,7 +152,7 @@ class _Adapter(CanInterface):
     """Says that a controller is there, and counts how often it is taken down."""
 
     restarts = 0
-    is_hardware = True
+    is_virtual = False
 
     def restart(self) -> None:
         self.restarts += 1

@@ -15,7 +15,7 @@ from adacd_hil.config import Settings, load_settings
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.terminal import hurry
-from adacd_hil.wire.bus import Bus, BusError, BusMissingError, is_hardware, is_virtual, open_bus
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError, can_interfaces, is_virtual, open_bus
 from adacd_hil.wire.codec import Codec
 
 MOST_BLIND_CYCLES = 5
@@ -28,10 +28,14 @@ def make_clock(name: str) -> Clock:
 
 
 def check_clock(name: str, interface: str, channel: str) -> None:
-    """Raise CommandError for lockstep on hardware, which has no time for it."""
-    if name == "lockstep" and is_hardware(interface, channel):
+    """Raise CommandError for lockstep on what may be hardware, which has no time for it.
+
+    An interface that is not there is nothing yet; opening it says so.
+    """
+    is_there = interface != "socketcan" or channel in can_interfaces()
+    if name == "lockstep" and is_there and not is_virtual(interface, channel):
         raise CommandError(
-            f"--clock lockstep is for emulated arms; {interface} {channel} is hardware and needs --clock realtime",
+            f"--clock lockstep is for emulated arms; {interface} {channel} may be hardware: it needs --clock realtime",
             ExitCode.USAGE,
         )
 

@@ -19,7 +19,7 @@ from adacd_hil.log.formats.frame_choice import FrameChoice
 from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.log.formats.recorded_frames import is_sendable
 from adacd_hil.scheduling import freeze_garbage, request_realtime
-from adacd_hil.wire.bus import Bus, BusError, is_hardware, open_bus
+from adacd_hil.wire.bus import Bus, BusError, is_virtual, open_bus
 from adacd_hil.wire.playback import PlayedFrame, play, repeat
 
 _PIECES_AHEAD = 4
@@ -139,7 +139,7 @@ def as_text(described: dict[str, Any]) -> str:
 
 def may_move_an_arm(interface: str, channel: str) -> bool:
     """Tell whether real drives may hear what is sent."""
-    return is_hardware(interface, channel)
+    return not is_virtual(interface, channel)
 
 
 def _ahead(pieces: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:

@@ -210,10 +210,3 @@ def is_virtual(interface: str, channel: str) -> bool:
 
     link = read_link(channel)
     return link is not None and link.is_virtual
-
-
-def is_hardware(interface: str, channel: str) -> bool:
-    """Tell whether a channel may have a real bus behind it: everything but vcan and python-can's own virtual bus."""
-    if interface == "socketcan":
-        return (_INTERFACES / channel / "device").exists()
-    return interface != "virtual"

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from adacd_hil.nearest_name import nearest_name
-from adacd_hil.wire.bus import BusError, InterfaceDownError, can_interfaces, is_hardware
+from adacd_hil.wire.bus import BusError, InterfaceDownError, can_interfaces, is_virtual
 
 CANFD_MTU = 72
 """Size of an FD frame in SocketCAN, bytes."""
@@ -43,9 +43,9 @@ class CanInterface:
         return bool(self._number("flags", 16) & _IFF_UP)
 
     @property
-    def is_hardware(self) -> bool:
-        """Whether a controller is behind it, which may hold frames of its own."""
-        return is_hardware("socketcan", self.name)
+    def is_virtual(self) -> bool:
+        """Whether surely no controller is behind it, which could hold frames of its own."""
+        return is_virtual("socketcan", self.name)
 
     def _number(self, file: str, base: int) -> int:
         try:
@@ -65,7 +65,7 @@ class CanInterface:
             return f"CAN interface {self.name} is down; bring it up: ip link set {self.name} up"
         mtu = self._number("mtu", 10)
         if is_fd and mtu < CANFD_MTU:
-            bit_rates = "type can bitrate 1000000 dbitrate 5000000 fd on" if self.is_hardware else f"mtu {CANFD_MTU}"
+            bit_rates = f"mtu {CANFD_MTU}" if self.is_virtual else "type can bitrate 1000000 dbitrate 5000000 fd on"
             return (
                 f"CAN interface {self.name} carries classic frames only (MTU {mtu}, CAN FD needs {CANFD_MTU}): "
                 f"ip link set {self.name} down && ip link set {self.name} {bit_rates} && ip link set {self.name} up"

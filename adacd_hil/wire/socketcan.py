@@ -223,7 +223,7 @@ class SocketCanBus(Bus):
             raise InterfaceDownError(problem)
         if not self._is_down and self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) in _DOWN:
             self._is_down = True  # unheard of, so nothing was sent since
-        may_hold = self._interface.waiting_frames() > 0 or (self._interface.is_hardware and not self._is_down)
+        may_hold = self._interface.waiting_frames() > 0 or not (self._is_down or self._interface.is_virtual)
         if may_hold and not (self._is_shared and self._carries_frames()):
             self._interface.restart()
         self._retire_socket()

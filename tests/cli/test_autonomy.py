@@ -12,10 +12,11 @@ import can
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.cli.connection import check_autonomy, on_interrupt
+from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
 from adacd_hil.cli.demo import USER, resolve
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.main import cli
+from adacd_hil.cli.play import may_move_an_arm
 from adacd_hil.config import OperatorSettings, Settings, builtin_names, load_settings
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
 from adacd_hil.wire.bus import is_virtual
@@ -89,12 +90,31 @@ def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(
     from adacd_hil.wire.link import Link
 
     monkeypatch.setattr("adacd_hil.wire.link.read_link", lambda _: Link(name, True, kind, 16, 10))
+    monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: [name])
     assert is_virtual("socketcan", name) == expected
+    assert may_move_an_arm("socketcan", name) != expected
+    assert is_refused("lockstep", "socketcan", name) != expected
+    assert not is_refused("realtime", "socketcan", name)
+
+
+def is_refused(clock: str, interface: str, channel: str) -> bool:
+    """Tell whether a run by this clock is refused on this channel."""
+    try:
+        check_clock(clock, interface, channel)
+    except CommandError as refused:
+        return refused.code is ExitCode.USAGE
+    return False
 
 
 def test_an_interface_that_is_not_there_is_not_virtual() -> None:
     assert not is_virtual("socketcan", "no_such_can0")
     assert not is_virtual("pcan", "PCAN_USBBUS1")
+
+
+def test_lockstep_is_refused_on_an_adapter_and_a_name_that_is_not_there_is_left_to_who_opens_it() -> None:
+    assert is_refused("lockstep", "pcan", "PCAN_USBBUS1")
+    assert not is_refused("lockstep", "socketcan", "no_such_can0")
+    assert not is_refused("lockstep", "virtual", "any")
 
 
 def test_ctrl_z_asks_for_the_end_where_an_arm_would_be_left_alone() -> None:

@@ -72,7 +72,7 @@ def test_frames_are_chosen(log, listener, options, expected):
 
 
 def test_a_real_bus_gets_what_devices_send_and_no_more(log, listener, monkeypatch):
-    monkeypatch.setattr(play_module, "is_hardware", lambda *_: True)
+    monkeypatch.setattr(play_module, "is_virtual", lambda *_: False)
     done = run(log)
     assert [m.arbitration_id for m in heard(listener)] == [0x181]
     assert "5 frames withheld: they could move an arm on this bus; --commands sends them, too" in done.stdout
@@ -80,7 +80,7 @@ def test_a_real_bus_gets_what_devices_send_and_no_more(log, listener, monkeypatc
 
 
 def test_commands_go_to_a_real_bus_when_asked_for(log, listener, monkeypatch):
-    monkeypatch.setattr(play_module, "is_hardware", lambda *_: True)
+    monkeypatch.setattr(play_module, "is_virtual", lambda *_: False)
     assert "withheld" not in run(log, "--commands").stdout
     assert len(heard(listener)) == 6
 
