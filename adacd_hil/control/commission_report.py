@@ -1,6 +1,7 @@
 """Why an arm does not get through INIT and COMMISSION: what kept it from being ready, and in how many cycles."""
 
 from collections import Counter
+from typing import NamedTuple
 
 from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
@@ -9,16 +10,33 @@ from adacd_hil.records import JOINTS, ArmState, FaultReason, SchemeState
 _STATES = (SchemeState.INIT, SchemeState.COMMISSION)
 
 
+class _RestBound(NamedTuple):
+    """What every joint of an arm at rest stays below. `says`: of a joint that doesn't."""
+
+    says: str
+    setting: str
+    bound: float
+    unit: str
+
+
+class _Unrest(NamedTuple):
+    """A joint over a bound."""
+
+    joint: int
+    over: _RestBound
+
+
 class CommissionReport:
     """Counts causes while the arm is in these states."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         self._arm = arm
-        self._rest_velocity_rad_s = settings.safety.rest_velocity_rad_s
-        self._rest_torque_Nm = settings.safety.rest_torque_Nm
+        speed, torque = settings.safety.rest_velocity_rad_s, settings.safety.rest_torque_Nm
+        self._speed = _RestBound("moves: |dq|", "safety.rest_velocity_rad_s", speed, "rad/s")
+        self._torque = _RestBound("is loaded: |tau_J|", "safety.rest_torque_Nm", torque, "Nm")
         self._cycles = 0
-        self._causes: Counter[str] = Counter()
-        self._worst = [0.0] * (2 * JOINTS)
+        self._causes: Counter[str | _Unrest] = Counter()
+        self._worst: dict[_Unrest, float] = {}
 
     def note(self, state: SchemeState, arm: ArmState) -> None:
         """Take in a cycle; `state`: that of the scheme after the cycle before."""
@@ -30,13 +48,11 @@ class CommissionReport:
         if arm.fault is not FaultReason.NONE:
             self._causes[f"fault {arm.fault.name}"] += 1
         for joint in range(JOINTS):
-            for kind, (value, bound) in enumerate(
-                ((arm.dq[joint], self._rest_velocity_rad_s), (arm.tau_J[joint], self._rest_torque_Nm))
-            ):
-                if not abs(value) < bound:
-                    place = JOINTS * kind + joint
-                    self._worst[place] = max(self._worst[place], abs(float(value)))
-                    self._causes[f"{kind}{joint}"] += 1
+            for over, value in ((self._speed, arm.dq[joint]), (self._torque, arm.tau_J[joint])):
+                if not abs(value) < over.bound:
+                    cause = _Unrest(joint, over)
+                    self._causes[cause] += 1
+                    self._worst[cause] = max(self._worst.get(cause, 0.0), abs(float(value)))
 
     def describe(self) -> list[str]:
         """Name the causes, the most frequent first, one line each; empty when nothing was wrong in any cycle."""
@@ -44,17 +60,8 @@ class CommissionReport:
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]
 
-    def _text(self, cause: str) -> str:
-        if not cause.isdecimal():
+    def _text(self, cause: str | _Unrest) -> str:
+        if isinstance(cause, str):
             return cause
-        kind, joint = int(cause[0]), int(cause[1])
-        worst = self._worst[JOINTS * kind + joint]
-        if kind == 0:
-            return (
-                f"joint {joint + 1} moves: |dq| up to {worst:.3g} rad/s, "
-                f"safety.rest_velocity_rad_s = {self._rest_velocity_rad_s:g} rad/s,"
-            )
-        return (
-            f"joint {joint + 1} is loaded: |tau_J| up to {worst:.3g} Nm, "
-            f"safety.rest_torque_Nm = {self._rest_torque_Nm:g} Nm,"
-        )
+        says, setting, bound, unit = cause.over
+        return f"joint {cause.joint + 1} {says} up to {self._worst[cause]:.3g} {unit}, {setting} = {bound:g} {unit},"

@@ -12,10 +12,10 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
-from adacd_hil.control.commission_report import CommissionReport
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.evidence import Evidence
 from adacd_hil.control.exchange import Exchange
+from adacd_hil.control.fault_report import FaultReport
 from adacd_hil.control.floating import Floating
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
@@ -94,7 +94,6 @@ class Cycle:
         self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
         self._watch = ArmWatch(settings, master.watch)
         self._data = DataWatch(settings, arm)
-        self._commission = CommissionReport(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = pipeline_of(settings)
         self._controller = Controller(settings)
@@ -106,6 +105,7 @@ class Cycle:
         self._tau_d, self._tau_c = fields["tau_d"], fields["tau_c"]
         self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)
         self._checks = SelfChecks(settings, arm, master.parameters, self._q_d)
+        self._faults = FaultReport(settings, arm, self._watch, self._pipeline, self._checks, master)
         self._escalation = StopEscalation(arm, master)
         self._state = SchemeState.INIT
         self._enabled_cycle: int | None = None
@@ -147,7 +147,7 @@ class Cycle:
             tick = self._pacer.next()
             arm = self._watch.judge(self._exchange.read(tick))
             self._data.note(arm)
-            self._commission.note(self._state, arm)
+            self._faults.note(self._state, arm)
             request = self._checks.judge(arm, self._state) or self._request(tick)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
@@ -269,27 +269,7 @@ class Cycle:
             return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {lateness}")
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
-        limited = (FaultReason.LIMIT, FaultReason.COMMISSION_TIMEOUT)
-        excess = self._arm.describe_excess() if output.fault in limited else []
-        late = [self._watch.deadline.describe()] if output.fault is FaultReason.DEADLINE else []
-        missing = self._pipeline.describe_missing() if output.fault is FaultReason.ADAPT_TIMEOUT else []
-        if output.fault is FaultReason.COMMISSION_TIMEOUT:
-            missing = self._commission.describe()
-        if output.fault is FaultReason.ENABLE_TIMEOUT:
-            missing = self._arm.describe_disabled()
-        gaps = self._arm.describe_gaps() if output.fault in (FaultReason.BLIND, FaultReason.DATA_AGE) else []
-        checked = [self._checks.line] if output.fault is self._checks.reason else []
-        causes = [
-            *late,
-            *checked,
-            *missing,
-            *gaps,
-            *excess,
-            *self._arm.describe_faults(),
-            *self._watch.lost,
-            *self._master.describe_emergencies(),
-        ]
-        details = "; ".join([output.fault.name, *causes])
+        details = "; ".join([output.fault.name, *self._faults.describe(output.fault)])
         return Event("error", "supervisor", f"{text}: {details}")
 
     def _follow_state(self, state: SchemeState, cycle: int) -> None:
