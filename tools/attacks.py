@@ -375,16 +375,26 @@ def _writes() -> Iterator[AttackCase]:
     )  # fmt: skip
 
 
+def _once(can_id: int, data: bytes) -> Callable[[Forger], Attack]:
+    """Send one frame, at the beginning."""
+    return lambda forger: Repeated(forger, ((can_id, data),), MS, 1)
+
+
+def _every(interval_ns: int, can_id: int, data: bytes) -> Callable[[Forger], Attack]:
+    """Send the same frame at a fixed interval."""
+    return lambda forger: Repeated(forger, ((can_id, data),), interval_ns)
+
+
 def _nmt() -> Iterator[AttackCase]:
     for name, command in (("stop", 2), ("pre-operational", 0x80), ("reset-node", 0x81), ("reset-communication", 0x82)):
         for whom, node in (("all", 0), ("drive", 1), ("sensor", 4)):
             yield AttackCase(
                 f"nmt-{name}-{whom}",
                 f"one NMT {name} to {'all nodes' if node == 0 else f'node {node}'}",
-                lambda forger, frame=(NMT, bytes([command, node])): Repeated(forger, (frame,), MS, 1),
+                _once(NMT, bytes([command, node])),
                 may_move=command == 0x81 and whom != "sensor",
             )
-    yield AttackCase("nmt-start", "NMT start to all, every 100 ms", lambda f: Repeated(f, ((NMT, b"\1\0"),), 100 * MS))
+    yield AttackCase("nmt-start", "NMT start to all, every 100 ms", _every(100 * MS, NMT, b"\1\0"))
 
 
 ATTACKS: tuple[AttackCase, ...] = (
@@ -481,11 +491,11 @@ ATTACKS: tuple[AttackCase, ...] = (
         "sync-between", "a SYNC with the next counter half a period after each", lambda f: ForgedSync(f, 1, 500_000)
     ),
     *_nmt(),
-    AttackCase("heartbeat-of-host", "0x77F every 50 ms", lambda f: Repeated(f, ((HOST_HEARTBEAT, b"\5"),), 50 * MS)),
+    AttackCase("heartbeat-of-host", "0x77F every 50 ms", _every(50 * MS, HOST_HEARTBEAT, b"\5")),
     AttackCase(
         "heartbeat-of-drive",
         "drive 1 says Operational every 20 ms, besides its own",
-        lambda f: Repeated(f, ((0x701, b"\5"),), 20 * MS),
+        _every(20 * MS, 0x701, b"\5"),
         False,
         _DATA + "|heartbeat",
         is_harmless=True,
@@ -493,7 +503,7 @@ ATTACKS: tuple[AttackCase, ...] = (
     AttackCase(
         "heartbeat-pre-operational",
         "sensor 2 says Pre-operational once",
-        lambda f: Repeated(f, ((0x704, b"\x7f"),), MS, 1),
+        _once(0x704, b"\x7f"),
         named_by="PRE-OPERATIONAL|heartbeat",
     ),
     AttackCase(
@@ -508,13 +518,13 @@ ATTACKS: tuple[AttackCase, ...] = (
     AttackCase(
         "emcy",
         "drive 1 says EMCY 0x2310",
-        lambda f: Repeated(f, ((0x081, b"\x10\x23\x03\0\0\0\0\0"),), MS, 1),
+        _once(0x081, b"\x10\x23\x03\0\0\0\0\0"),
         named_by="EMCY|2310",
     ),
     AttackCase(
         "sdo-answers",
         "answers of drive 1 that nobody asked for, every 20 ms",
-        lambda f: Repeated(f, ((0x581, b"\x80\x41\x60\0\0\0\2\6"),), 20 * MS),
+        _every(20 * MS, 0x581, b"\x80\x41\x60\0\0\0\2\6"),
         False,
         "SDO|answer|nobody asked|unexpected",
         is_harmless=True,
@@ -522,14 +532,14 @@ ATTACKS: tuple[AttackCase, ...] = (
     AttackCase(
         "sdo-requests",
         "0x1000 of drive 1 is read every 20 ms",
-        lambda f: Repeated(f, ((0x601, b"\x40\0\x10\0\0\0\0\0"),), 20 * MS),
+        _every(20 * MS, 0x601, b"\x40\0\x10\0\0\0\0\0"),
         False,
     ),
     AttackCase("replay", "one second of the bus once more", Replayed, lasts_s=2.5),
     AttackCase(
         "flood",
         "identifier 0x001 every 60 us",
-        lambda f: Repeated(f, ((0x001, bytes(8)),), 60_000),
+        _every(60_000, 0x001, bytes(8)),
         False,
         "0x001|flood|load|full|late|missing|old",
         is_harmless=True,

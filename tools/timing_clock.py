@@ -1,9 +1,6 @@
 """The wall clock is set while a run goes on: forward, back, and back to 1970. Nobody may notice."""
 
 import argparse
-import json
-import sys
-import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,11 +11,12 @@ from side_by_side import (
     CHANNEL,
     TimingError,
     emulator,
-    head,
     host_run,
     patient_config,
+    play_each,
     row,
     running,
+    show_each,
     time_percentiles_us,
 )
 
@@ -39,20 +37,16 @@ def set_clock(step_s: float) -> None:
 
 def run_clock(chosen: argparse.Namespace) -> dict[str, Any]:
     """Play every step: undisturbed for some seconds, then the clock is set, then on for as long."""
-    result: dict[str, Any] = {}
-    for name in chosen.step or STEPS_S:
-        step_s = STEPS_S[name]
-        print(name, file=sys.stderr, flush=True)
+
+    def play(name: str, folder: Path) -> dict[str, Any]:
         before_s, began_s = time.time(), time.monotonic()
-        with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
-            try:
-                result[name] = run_step(step_s, chosen, Path(folder))
-            except TimingError as error:
-                result[name] = {"problem": str(error)}
-            finally:
-                if step_s:
-                    time.clock_settime(time.CLOCK_REALTIME, before_s + time.monotonic() - began_s)
-    return result
+        try:
+            return run_step(STEPS_S[name], chosen, folder)
+        finally:
+            if STEPS_S[name]:
+                time.clock_settime(time.CLOCK_REALTIME, before_s + time.monotonic() - began_s)
+
+    return play_each(chosen.step or STEPS_S, play)
 
 
 def run_step(step_s: float, chosen: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -68,7 +62,7 @@ def run_step(step_s: float, chosen: argparse.Namespace, folder: Path) -> dict[st
             set_clock(step_s)
         time.sleep(chosen.seconds)
         status = begun.end()
-    said = json.loads(begun.said) if begun.said.strip() else {}
+    said = begun.told
     log = read_log(folder / "host" / LOG_NAME)
     cycle = log.cycle
     frames_ns = log.frames["t_ns"]
@@ -105,16 +99,14 @@ def violations_of(status: int, said: dict[str, Any], problem: str, times_ns: Any
 
 def show_clock(result: dict[str, Any]) -> str:
     """Lay out what `run_clock` found."""
-    lines = [head("µs, SYNC out to last frame read")]
-    for name, each in result.items():
-        if "problem" in each:
-            lines.append(f"{name}: {each['problem']}")
-            continue
-        lines += [row(f"clock {name}, {span}", each["feedback_us"][span]) for span in ("before", "after")]
-        lines.append(
-            f"  exit status {each['status']}, fault {each['fault']}, dropped {each['dropped']}, overruns "
-            f"{each['overruns']}, incomplete {each['incomplete']}, frames at most {each['frames_off_s']:.3f} s from "
-            f"their cycle; {'; '.join(each['violations']) or 'nothing noticed'}"
-        )
-        lines += [f"  {text}" for text in each["faults"]]
-    return "\n".join(lines)
+    return show_each("µs, SYNC out to last frame read", result, _clock_lines)
+
+
+def _clock_lines(name: str, each: dict[str, Any]) -> list[str]:
+    return [
+        *(row(f"clock {name}, {span}", each["feedback_us"][span]) for span in ("before", "after")),
+        f"  exit status {each['status']}, fault {each['fault']}, dropped {each['dropped']}, overruns "
+        f"{each['overruns']}, incomplete {each['incomplete']}, frames at most {each['frames_off_s']:.3f} s from "
+        f"their cycle; {'; '.join(each['violations']) or 'nothing noticed'}",
+        *(f"  {text}" for text in each["faults"]),
+    ]

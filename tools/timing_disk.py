@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,11 +19,12 @@ from side_by_side import (
     Running,
     TimingError,
     emulator,
-    head,
     host_run,
     patient_config,
+    play_each,
     row,
     running,
+    show_each,
     time_percentiles_us,
 )
 from witness import Seen, read_witness, times_after, witness
@@ -167,7 +167,6 @@ def run_disk_case(case: str, chosen: argparse.Namespace, folder: Path) -> dict[s
         problem = log_problem(log)
     seen = read_witness(seen_path)
     offset_ns = time.time_ns() - time.monotonic_ns()
-    said = json.loads(begun.said) if begun.said.strip() else {}
     devices = json.loads((folder / "emulator.json").read_text() or "{}")
     last_status = seen.of(STATUS_ID).data[-1:]
     return {
@@ -175,7 +174,7 @@ def run_disk_case(case: str, chosen: argparse.Namespace, folder: Path) -> dict[s
         "during": describe_span(seen, marks_ns[1], marks_ns[2], 1000, offset_ns),
         "witness": counts,
         "status": status,
-        "said": said,
+        "said": begun.told,
         "log_problem": problem,
         "drive_states": devices.get("drive_states"),
         "error_codes": devices.get("error_codes"),
@@ -196,32 +195,25 @@ def log_problem(path: Path) -> str:
 
 def run_disk(chosen: argparse.Namespace) -> dict[str, Any]:
     """Run every case of a log that can't be written."""
-    result: dict[str, Any] = {}
-    for case in chosen.case or DISK_CASES:
-        print(case, file=sys.stderr, flush=True)
-        with tempfile.TemporaryDirectory(dir="/dev/shm") as name:
-            try:
-                result[case] = run_disk_case(case, chosen, Path(name))
-            except TimingError as error:
-                result[case] = {"problem": str(error)}
-    return result
+    return play_each(chosen.case or DISK_CASES, lambda case, folder: run_disk_case(case, chosen, folder))
 
 
 def show_disk(result: dict[str, Any]) -> str:
     """Lay out what `run_disk` measured."""
-    lines = [head("µs, by the frames on the bus")]
-    for case, each in result.items():
-        if "problem" in each:
-            lines.append(f"{case}: {each['problem']}")
-            continue
-        for what, title in (("command_us", "SYNC to last command"), ("lateness_us", "lateness of SYNC")):
-            lines += [row(f"{case}, {span}: {title}", each[span][what]) for span in ("before", "during")]
-        said = each["said"]
-        lines.append(
-            f"  exit status {each['status']}, fault {said.get('fault')}, dropped {said.get('dropped')}, log error "
-            f"{said.get('log_error')!r}, log {each['log_problem'] or 'whole'}; overruns {each['before']['overruns']} "
-            f"and {each['during']['overruns']}; joint 1 moved {each['during']['moved_deg']:.0f} deg meanwhile; "
-            f"drives {each['drive_states']}, errors {each['error_codes']}; the witness lost "
-            f"{each['witness'].get('lost')} frames"
-        )
-    return "\n".join(lines)
+    return show_each("µs, by the frames on the bus", result, _disk_lines)
+
+
+def _disk_lines(case: str, each: dict[str, Any]) -> list[str]:
+    said = each["said"]
+    return [
+        *(
+            row(f"{case}, {span}: {title}", each[span][what])
+            for what, title in (("command_us", "SYNC to last command"), ("lateness_us", "lateness of SYNC"))
+            for span in ("before", "during")
+        ),
+        f"  exit status {each['status']}, fault {said.get('fault')}, dropped {said.get('dropped')}, log error "
+        f"{said.get('log_error')!r}, log {each['log_problem'] or 'whole'}; overruns {each['before']['overruns']} "
+        f"and {each['during']['overruns']}; joint 1 moved {each['during']['moved_deg']:.0f} deg meanwhile; "
+        f"drives {each['drive_states']}, errors {each['error_codes']}; the witness lost "
+        f"{each['witness'].get('lost')} frames",
+    ]

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import json
 import os
 import subprocess
 import sys
@@ -83,8 +82,7 @@ def run_hogs(chosen: argparse.Namespace) -> dict[str, Any]:
             while time.monotonic() < end_s and begun.process.poll() is None:
                 time.sleep(0.2)
             status = begun.end() if begun.process.poll() is None else begun.process.returncode
-        said = json.loads(begun.said) if begun.said.strip() else {}
-        return {**describe(folder, config, scenario_path), "contacts": contacts, "status": status, "said": said}
+        return {**describe(folder, config, scenario_path), "contacts": contacts, "status": status, "said": begun.told}
 
 
 def describe(folder: Path, config: Path, scenario_path: Path) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """A long run with contacts: memory of the processes, every part of the log, and how soon the arm reacts."""
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -88,8 +87,7 @@ def run_hour(chosen: argparse.Namespace) -> dict[str, Any]:
                 print(f"{elapsed_s:6.0f} s of {total_s:.0f}, MB of host, logger, emulator: {shown}", file=sys.stderr)
             time.sleep(min(MEMORY_EVERY_S, max(0.1, total_s - elapsed_s)))
         status = begun.end()
-    described = json.loads(begun.said) if begun.said.strip() else {}
-    return {"status": status, "said": described, "contacts_planned": contacts, "memory_MB": memory, "witness": counts}
+    return {"status": status, "said": begun.told, "contacts_planned": contacts, "memory_MB": memory, "witness": counts}
 
 
 def read_parts(folder: Path) -> list[dict[str, Any]]:

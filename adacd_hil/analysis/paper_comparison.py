@@ -3,6 +3,7 @@
 The paper's numbers are those of its experiment: of a run that played anything else they are left out.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -59,27 +60,6 @@ def compare_with_paper(
     evidence: Evidence | None,
 ) -> tuple[PaperRow, ...]:
     """Set what was measured beside what the paper printed, where it is the same experiment."""
-    rows = _all_rows(run, sections, adaptation_s, residuals, contacts, false_alarms, payload_kg, evidence)
-    if is_papers_experiment(run):
-        return rows
-    return tuple(
-        row._replace(quantity=_ELSEWHERE.get(row.quantity, row.quantity), paper=None)
-        for row in rows
-        if {row.beside, row.measured} - {None, _NONE}
-    )
-
-
-def _all_rows(
-    run: Run,
-    sections: tuple[Section, ...],
-    adaptation_s: dict[str, float | None],
-    residuals: dict[str, Residual],
-    contacts: tuple[Contact, ...],
-    false_alarms: int,
-    payload_kg: dict[str, float | None],
-    evidence: Evidence | None,
-) -> tuple[PaperRow, ...]:
-    """Write all lines, with the paper's numbers."""
     settings = run.settings
     times_s = list(adaptation_s.values())
     detections = [section.label for section in sections if section.kind == "detection"]
@@ -124,7 +104,7 @@ def _all_rows(
     if evidence is None:
         plain = [(*name, value) for name, value in zip(names, measured, strict=True)]
         plain += [*settled, ("Control rate", "1 kHz", rate)]
-        return tuple(PaperRow(quantity, paper, None, value) for quantity, paper, value in plain)
+        return _of_what_was_played(run, [PaperRow(quantity, paper, None, value) for quantity, paper, value in plain])
     beside = _beside_values(evidence.paper_beside, detections, (kilograms, *measured[5:7]))
     rows = [(*name, theirs, value) for name, theirs, value in zip(names, beside[:8], measured, strict=True)]
     armed = [contact for contact in contacts if contact.is_armed]
@@ -146,7 +126,18 @@ def _all_rows(
     margin = evidence.smallest_margin
     rows.append(("Smallest threshold / residual", "–", "–", "–" if margin is None else f"{margin:.2f}"))
     rows.append(("Control rate", "1 kHz", rate, rate))
-    return tuple(PaperRow(*row) for row in rows)
+    return _of_what_was_played(run, [PaperRow(*row) for row in rows])
+
+
+def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
+    """Leave out the paper's numbers, and lines that then say nothing, where anything else was played."""
+    if is_papers_experiment(run):
+        return tuple(rows)
+    return tuple(
+        row._replace(quantity=_ELSEWHERE.get(row.quantity, row.quantity), paper=None)
+        for row in rows
+        if {row.beside, row.measured} - {None, _NONE}
+    )
 
 
 def _tests_text(times_s: list[float | None]) -> str:
