@@ -187,3 +187,13 @@ def remap_mode(host: BenchHost) -> None:
 def set_mode(host: BenchHost, mode: int) -> None:
     """Send the mode of operation to drive 1."""
     host.put(0x301, bytes([mode]))
+
+
+def patient_host() -> BenchHost:
+    """Enable an arm that goes by the clock and forgives every gap in SYNC and in commands."""
+    host = BenchHost(clock_mode="wall")
+    for node in (1, 2):
+        host.write(node, 0x2200, 0, 255)
+        host.write(node, 0x2201, 0, 10_000)
+    host.enable()
+    return host

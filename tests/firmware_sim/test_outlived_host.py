@@ -2,7 +2,16 @@
 
 import numpy as np
 import pytest
-from bench_host import CODEC, DISABLE_VOLTAGE, ENABLE, PERIOD_NS, RESET_COMMUNICATION, BenchHost, quiet_scenario
+from bench_host import (
+    CODEC,
+    DISABLE_VOLTAGE,
+    ENABLE,
+    PERIOD_NS,
+    RESET_COMMUNICATION,
+    BenchHost,
+    patient_host,
+    quiet_scenario,
+)
 from test_main import MS, ScriptedBus, enabling_script
 
 from adacd_hil.clock import VirtualClock
@@ -142,11 +151,7 @@ def test_by_the_clock_the_truth_goes_on_once_sync_is_overdue():
 
 
 def test_by_the_clock_a_lost_sync_or_two_leave_a_gap_as_ever():
-    host = BenchHost(clock_mode="wall")
-    for node in (1, 2):
-        host.write(node, 0x2201, 0, 10_000)
-        host.write(node, 0x2200, 0, 255)
-    host.enable()
+    host = patient_host()
     for _ in range(40):
         host.step(ENABLE, 300)
     begun = len(host.truths)

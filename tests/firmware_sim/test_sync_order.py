@@ -3,7 +3,17 @@
 import struct
 
 import pytest
-from bench_host import ENABLE, PERIOD_NS, RESET_COMMUNICATION, RESET_NODE, SHUTDOWN, START, BenchHost, quiet_scenario
+from bench_host import (
+    ENABLE,
+    PERIOD_NS,
+    RESET_COMMUNICATION,
+    RESET_NODE,
+    SHUTDOWN,
+    START,
+    BenchHost,
+    patient_host,
+    quiet_scenario,
+)
 
 from firmware_sim.sync_order import SyncKind, SyncOrder
 
@@ -317,11 +327,7 @@ def test_by_the_clock_a_counter_that_is_ahead_of_time_is_odd(steps, periods, is_
 
 
 def test_by_the_clock_a_gap_that_took_its_time_is_lost_syncs():
-    host = BenchHost(clock_mode="wall")
-    for node in (1, 2):
-        host.write(node, 0x2200, 0, 255)
-        host.write(node, 0x2201, 0, 10_000)
-    host.enable()
+    host = patient_host()
     for _ in range(5):
         wall_sync(host, 3.0, 3)
     assert counts(host) == [0, 0, 0, 0, 10]
