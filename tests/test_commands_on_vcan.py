@@ -37,7 +37,10 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def other_program(source: str) -> Iterator[None]:
-    """Run a program with a raw socket `can` on vcan0 while the block lasts."""
+    """Run a program with a raw socket `can` on vcan0 while the block lasts.
+
+    It plays a sender at a rate, and sleeps between its frames: no test waits for it to have slept.
+    """
     opening = (
         "import socket, struct, time\n"
         "can = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)\n"

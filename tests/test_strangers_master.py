@@ -187,11 +187,23 @@ def stranger(bus: Bus) -> Iterator[Stranger]:
 
 def test_the_scanner_finds_all_nodes(bus: Bus) -> None:
     with connection(bus) as network:
+        nodes = {1, 2, 3, 4}
+        answered: set[int] = set()
+        news = threading.Condition()
+
+        def hear(can_id: int, *_: object) -> None:
+            with news:
+                answered.add(can_id - 0x580)
+                news.notify()
+
+        for node in nodes:
+            network.subscribe(0x580 + node, hear)
         deadline_s = time.monotonic() + HANG_S
-        while set(network.scanner.nodes) != {1, 2, 3, 4}:
+        while set(network.scanner.nodes) != nodes:
             assert time.monotonic() < deadline_s, network.scanner.nodes
             network.scanner.search()
-            time.sleep(0.05)
+            with news:  # a node that still boots hears nothing, and is asked again
+                news.wait_for(lambda: answered == nodes, 0.5)
 
 
 def test_it_remaps_enables_and_moves_the_arm(stranger: Stranger) -> None:

@@ -19,13 +19,11 @@ from typing import Any
 import numpy as np
 from attacked_run import ATTACK_S, STOPS, Finding, expected_lines, finding, first_notice, scenario_of
 from attacks import ATTACKS, MS, AttackCase, Forger, Repeated, find_attack
+from side_by_side import BIN, ROOT, TimingError, emulator
 
 from adacd_hil.config import to_toml
 from adacd_hil.log.reader import read_log
-from firmware_sim.scenario import Scenario
 
-ROOT = Path(__file__).resolve().parent.parent
-BIN = Path(sys.executable).parent
 START_S = 600.0
 """Longest until the arm moves: everything is compiled before, the first time for minutes on a busy machine."""
 END_S = 30.0
@@ -88,46 +86,39 @@ class Host:
 
     process: "subprocess.Popen[str]"
     lines: list[tuple[float, str]] = field(default_factory=list)
+    has_ended: bool = False
+    _news: threading.Condition = field(default_factory=threading.Condition)
 
     def listen(self) -> None:
         """Read stderr until it ends."""
         assert self.process.stderr is not None
         for line in self.process.stderr:
-            self.lines.append((time.monotonic(), line.rstrip()))
+            with self._news:
+                self.lines.append((time.monotonic(), line.rstrip()))
+                self._news.notify_all()
+        with self._news:
+            self.has_ended = True
+            self._news.notify_all()
 
     def await_line(self, text: str, timeout_s: float) -> float:
         """Wait until a line has `text`; return when it came. Raises VoidError."""
-        end_s = time.monotonic() + timeout_s
-        while time.monotonic() < end_s:
-            for at_s, line in list(self.lines):
-                if text in line:
-                    return at_s
-            if self.process.poll() is not None:
-                last = self.lines[-1][1] if self.lines else "nothing"
-                raise VoidError(f"the host ended with status {self.process.returncode}, its last line: {last}")
-            time.sleep(0.01)
-        raise VoidError(f"no {text!r} within {timeout_s:g} s")
+        with self._news:
+            self._news.wait_for(lambda: self.has_ended or self._said(text), timeout_s)
+            said = self._said(text)
+        if said:
+            return said[0]
+        if not self.has_ended:
+            raise VoidError(f"no {text!r} within {timeout_s:g} s")
+        last = self.lines[-1][1] if self.lines else "nothing"
+        raise VoidError(f"the host ended with status {self.process.wait(END_S)}, its last line: {last}")
 
+    def _said(self, text: str) -> list[float]:
+        return [at_s for at_s, line in self.lines if text in line]
 
-@contextlib.contextmanager
-def emulator(channel: str, scenario: Scenario, folder: Path) -> Iterator["subprocess.Popen[str]"]:
-    """Run the emulated arm while the block lasts."""
-    path = folder / "scenario.toml"
-    path.write_text(to_toml(scenario))
-    command = [BIN / "firmware-sim", "run", "-i", "socketcan", "-c", channel, "--clock", "wall", "--scenario", path]
-    with subprocess.Popen([*command, "--out", folder], stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stderr is not None
-            for line in process.stderr:
-                if line.strip() == "ready":
-                    break
-            yield process
-        finally:
-            process.terminate()
-            try:
-                process.communicate(timeout=END_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
+    def lives_until(self, at_s: float) -> bool:
+        """Wait until a time on the monotonic clock; false, and at once, where the host ends before."""
+        with self._news:
+            return not self._news.wait_for(lambda: self.has_ended, max(0.0, at_s - time.monotonic()))
 
 
 @contextlib.contextmanager
@@ -157,7 +148,7 @@ def play_on_vcan(name: str, channel: str, period_us: int, folder: Path) -> Findi
         place.mkdir(parents=True, exist_ok=True)
         try:
             return _attempt(name, channel, period_us, place)
-        except VoidError as reason:
+        except (VoidError, TimingError) as reason:
             print(f"{name}: {reason}", file=sys.stderr)
     return _void(name)
 
@@ -190,12 +181,14 @@ def _attempt(name: str, channel: str, period_us: int, folder: Path) -> Finding:
     status, second = None, ""
     with contextlib.ExitStack() as stack:
         attacker = stack.enter_context(_attacker(name, channel, case.lasts_s))
-        stack.enter_context(emulator(channel, scenario_of(case), folder))
+        scenario = folder / "scenario.toml"
+        scenario.write_text(to_toml(scenario_of(case)))
+        options = ("--clock", "wall", "--scenario", str(scenario), "--out", str(folder))
+        arm = stack.enter_context(emulator(channel, *options, folder=folder))
         running = stack.enter_context(host(channel, config, folder))
         enabled_s = running.await_line("ENABLE -> ADAPT", START_S)
         armed_s = running.await_line("-> MONITOR", 60.0)
-        _sleep_until(max(enabled_s + ATTACK_S, armed_s + ARMED_TO_ATTACK_S))
-        if running.process.poll() is not None:
+        if not running.lives_until(max(enabled_s + ATTACK_S, armed_s + ARMED_TO_ATTACK_S)):
             raise VoidError("the host ended before the attack")
         begin_ns = time.time_ns()
         if attacker is not None:
@@ -207,11 +200,12 @@ def _attempt(name: str, channel: str, period_us: int, folder: Path) -> Finding:
             running.process.kill()
             told = _go(stack.enter_context(_heartbeats(channel)), case.lasts_s)
         else:
-            time.sleep(case.lasts_s)
+            running.lives_until(time.monotonic() + case.lasts_s)
             told = {"forged": 0}
         forged = 0 if name in SECOND_USERS else int(told["forged"])
         ended = _end(running)
-        time.sleep(AFTER_S)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            arm.wait(AFTER_S)
     return _judge(case, folder, begin_ns, forged, ended, status, second)
 
 
@@ -277,10 +271,6 @@ def _second_user(name: str, channel: str, config: Path, folder: Path) -> tuple[i
         return -1, "still running after 60 s"
     said = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
     return done.returncode, " / ".join(said[-2:])
-
-
-def _sleep_until(at_s: float) -> None:
-    time.sleep(max(0.0, at_s - time.monotonic()))
 
 
 def _end(running: Host) -> str:

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -204,7 +204,12 @@ def emulator(channel: str, *options: str, folder: Path) -> Iterator["subprocess.
             yield process
         finally:
             process.terminate()
-            process.wait(END_LIMIT_S)
+            try:
+                process.wait(END_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                raise TimingError(f"firmware-sim did not end within {END_LIMIT_S:g} s of SIGTERM") from None
 
 
 def wait_for(word: str, process: "subprocess.Popen[Any]", complaints: Path) -> None:
@@ -243,6 +248,11 @@ class Running:
         self.complaints = complaints
         self.logger_pid = children_of(process.pid)[0] if has_logger else None
         self.said = ""
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What it printed as JSON; empty without a word."""
+        return json.loads(self.said) if self.said.strip() else {}
 
     def end(self) -> int:
         """Send SIGINT, wait and return the exit status; what was printed is in `said`."""
@@ -412,6 +422,27 @@ def measure(
                 flush=True,
             )
     return blocks
+
+
+def play_each(names: Iterable[str], play: Callable[[str, Path], dict[str, Any]]) -> dict[str, Any]:
+    """Play cases one after the other, each in a folder of its own in memory; a TimingError costs its case only."""
+    result: dict[str, Any] = {}
+    for name in names:
+        print(name, file=sys.stderr, flush=True)
+        with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+            try:
+                result[name] = play(name, Path(folder))
+            except TimingError as error:
+                result[name] = {"problem": str(error)}
+    return result
+
+
+def show_each(title: str, result: dict[str, Any], lines_of: Callable[[str, dict[str, Any]], list[str]]) -> str:
+    """Lay out what `play_each` returned, below a head of this title."""
+    lines = [head(title)]
+    for name, each in result.items():
+        lines += [f"{name}: {each['problem']}"] if "problem" in each else lines_of(name, each)
+    return "\n".join(lines)
 
 
 def time_percentiles_us(times_ns: NDArray[np.int64]) -> list[float]:

@@ -79,6 +79,7 @@ def test_waits_of_a_process_are_noted(tmp_path: Path) -> None:
     if library is None:
         pytest.skip(reason)
     path = tmp_path / "waits.noted"
+    # The two sleeps are what is measured; they order nothing.
     program = "import select, time; time.sleep(1e-4); select.select([], [], [], 1e-4)"
     environment = {**os.environ, "LD_PRELOAD": str(library), "WAITS": str(path)}
     subprocess.run([sys.executable, "-c", program], env=environment, check=True)
