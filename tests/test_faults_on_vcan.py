@@ -6,12 +6,13 @@ measured doing so, and what fails then is skipped with the reason.
 """
 
 import contextlib
+import itertools
 import os
 import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,17 +82,61 @@ class StallMeter:
         self._thread.join()
 
 
+class Witness:
+    """candump on vcan0; a thread takes what it writes, and tells who waits."""
+
+    def __init__(self) -> None:
+        command = ["candump", "-D", "-L", "-r", "16777216", "vcan0"]
+        self._candump = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self._seen: list[Witnessed] = []
+        self._news = threading.Condition()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+
+    def _listen(self) -> None:
+        assert self._candump.stdout is not None
+        for line in self._candump.stdout:
+            frame = parse(line)
+            if frame is not None:
+                with self._news:
+                    self._seen.append(frame)
+                    self._news.notify_all()
+
+    def frames(self, since_s: float = 0.0) -> list[Witnessed]:
+        """Return what was seen since a time."""
+        with self._news:
+            return [frame for frame in self._seen if frame.t_s >= since_s]
+
+    def wait_for(self, is_it: Callable[[Witnessed], bool], what: str, since_s: float = 0.0) -> Witnessed:
+        """Return the first frame since a time that is it; wait until there is one."""
+        deadline_s = time.monotonic() + HANG_S
+        looked_at = 0
+        with self._news:
+            while True:
+                for frame in itertools.islice(self._seen, looked_at, None):
+                    if frame.t_s >= since_s and is_it(frame):
+                        return frame
+                looked_at = len(self._seen)
+                if not self._news.wait(max(0.0, deadline_s - time.monotonic())):
+                    raise AssertionError(f"never saw {what}")
+
+    def close(self) -> None:
+        self._candump.kill()
+        self._listener.join(HANG_S)
+        self._candump.communicate()
+
+
 class Scene:
     """Host, emulator and witness on vcan0, with the arm moving."""
 
     def __init__(self, folder: Path, emulator_process: "subprocess.Popen[str]", extra: str) -> None:
         self.emulator = emulator_process
         self.folder = folder
-        self._dump = folder / "candump.log"
         config = folder / "campaign.toml"
         config.write_text(CONFIG + extra)
-        with self._dump.open("w") as sink:
-            self._witness = subprocess.Popen(["candump", "-D", "-L", "-r", "16777216", "vcan0"], stdout=sink)
+        self.witness = Witness()
+        self.frames = self.witness.frames
+        self.wait_on_wire = self.witness.wait_for
         command = [BIN / "adacd-hil", "run", "-i", "socketcan", "-c", "vcan0", "--config", config, "--out", folder]
         self.host = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         self.said: list[str] = []
@@ -109,21 +154,6 @@ class Scene:
         self.wait_for("-> ADAPT")
         self.wait_on_wire(lambda frame: torque_of(frame) != 0, "a torque")
 
-    def wait_on_wire(self, is_it, what: str, since_s: float = 0.0) -> Witnessed:
-        """Return the first frame that is it; the witness writes at once."""
-        deadline_s = time.monotonic() + HANG_S
-        while time.monotonic() < deadline_s:
-            for frame in self.frames(since_s):
-                if is_it(frame):
-                    return frame
-            time.sleep(0.05)
-        raise AssertionError(f"never saw {what}")
-
-    def frames(self, since_s: float = 0.0) -> list[Witnessed]:
-        """Return what the witness has written down since a time."""
-        lines = self._dump.read_text().splitlines()
-        return [frame for line in lines if (frame := parse(line)) is not None and frame.t_s >= since_s]
-
     def finish(self) -> int:
         """Wait for the host's end and return its exit status."""
         assert self.host.stderr is not None
@@ -131,17 +161,17 @@ class Scene:
         return self.host.wait(HANG_S)
 
     def close(self) -> None:
-        for process in (self.host, self._witness):
-            if process.poll() is None:
-                process.send_signal(signal.SIGCONT)
-                process.kill()
-            process.wait(HANG_S)
+        if self.host.poll() is None:
+            self.host.send_signal(signal.SIGCONT)
+            self.host.kill()
+        self.host.wait(HANG_S)
+        self.witness.close()
         assert self.host.stderr is not None
         self.host.stderr.close()
 
 
 def parse(line: str) -> Witnessed | None:
-    """Read a line of candump -L; None for one that is still being written."""
+    """Read a line of candump -L; None for anything but a frame."""
     parts = line.split()
     if len(parts) < 3 or "#" not in parts[2]:
         return None
@@ -191,15 +221,19 @@ def assert_drives_stop_by_themselves(played: Scene, number: signal.Signals) -> W
 
 
 @contextlib.contextmanager
-def scene(folder: Path, extra: str = "") -> Iterator[Scene]:
-    with emulator(folder, "--clock", "wall", "--scenario", "idle") as process:
+def scene(folder: Path, extra: str = "", faults: str = "") -> Iterator[Scene]:
+    """Let the arm move while the block lasts; `extra` ends the host's settings, `faults` the emulator's scenario."""
+    scenario = folder / "scenario.toml"
+    scenario.write_text(f"start_deg = [-30.0, -60.0]\n{faults}")
+    with emulator(folder, "--clock", "wall", "--scenario", str(scenario)) as process:
         played = Scene(folder, process, extra)
         meter = StallMeter()
         try:
             yield played
-        except AssertionError:
+        except AssertionError as error:
             if meter.longest_s > WATCHDOG_S:
-                pytest.skip(f"the machine stalled for {meter.longest_s * 1000:.0f} ms")
+                failed = (str(error).splitlines() or ["an assertion"])[0]
+                pytest.skip(f"the machine stalled for {meter.longest_s * 1000:.0f} ms; what failed: {failed}")
             raise
         finally:
             meter.stop()
@@ -234,12 +268,21 @@ def test_the_host_sends_no_torque_to_an_arm_that_went_away(tmp_path: Path) -> No
 
 
 def test_a_node_that_falls_silent_is_named_and_torque_ends(tmp_path: Path) -> None:
+    with scene(tmp_path, faults='[[faults]]\nkind = "silence"\nnode = "sensor1"\nat_s = 0.5\n') as played:
+        played.wait_until_moving()
+        assert played.finish() == 4
+        assert_torque_ends_with(played, 0x183)
+        assert any("FAULT: " in line and "Sensor1" in line for line in played.said), played.said
+
+
+def test_a_node_that_somebody_else_stops_ends_torque_and_it_is_said_who(tmp_path: Path) -> None:
     with scene(tmp_path) as played:
         played.wait_until_moving()
         subprocess.run(["cansend", "vcan0", "000#0203"], check=True)  # NMT stop, node 3: sensor 1
         assert played.finish() == 4
         assert_torque_ends_with(played, 0x183)
-        assert any("FAULT: " in line and "Sensor1" in line for line in played.said), played.said
+        said = "FAULT: FOREIGN_FRAMES; somebody else sends NMT stop to node 3 (0x000)"
+        assert any(said in line for line in played.said), played.said
 
 
 def test_an_interface_that_goes_down_and_comes_back_needs_an_acknowledgement(tmp_path: Path) -> None:
