@@ -1,9 +1,10 @@
 """Thresholds from logs: the recorded motion that nobody touched, each detector's statistics on it, what they allow.
 
-Of a log counts what lies in MONITOR at least `APART_S` after its beginning, after a gap and after a contact, and at
-least as long before one. A touch that no detector flagged counts as motion, and raises the thresholds.
+Which motion counts: see `adacd_hil.analysis.motion`. A touch that no detector flagged counts, and raises thresholds.
 
-The velocity's lag is identified from the same motion: what the filtered slope of the torque explains of the stream.
+The detectors run over all of it, and thresholds come from all that they show. The velocity's lag (what the filtered
+slope of the torque explains of the stream), the stream's covariance and the sources of a threshold are found from the
+same motion, of more than `MOST_SAMPLES` from some windows.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adacd_hil.analysis.false_alarms import (
     Limits,
@@ -29,73 +29,28 @@ from adacd_hil.analysis.false_alarms import (
     resolution,
     white_noise,
 )
+from adacd_hil.analysis.motion import (
+    LoggedMotion,
+    Mask,
+    Motion,
+    Progress,
+    TorqueStream,
+    read_motion,
+    sample_of,
+)
 from adacd_hil.config import setting
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.log.stretch import WHOLE, Stretch
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme import detectors
 from adacd_hil.scheme.regressor import mass_matrix
 
-APART_S: Final = 0.6
-"""Six time constants of the slowest filter."""
 BLOCK_S: Final = 0.1
-TOPICS: Final = ("/scheme",)
-_NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
+_PROGRESS_SAMPLES: Final = 1_000_000
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
 """Below this the model's errors stand out of the noise."""
 _CHECKED_ALARMS: Final = 20.0  # of the held-out half: so many are counted well enough to compare with the prediction
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A recording of N samples; `is_free` (N,) where nobody touched the arm and the model was frozen."""
-
-    q: Vector
-    dq: Vector
-    tau_J: Vector
-    theta: Vector  # (N, p)
-    interval_s: Vector  # (N,), 0 after a gap
-    is_free: NDArray[np.bool_]
-    period_s: float
-
-
-def motion_from_log(log: RunLog) -> Motion:
-    """Take the contact-free motion out of a log. Raises LogError when there is none."""
-    scheme = log.scheme
-    if len(scheme) == 0:
-        raise LogError(f"log {log.path} has no /scheme")
-    cycle = scheme["cycle"].astype(np.int64)
-    interval_s = scheme["period_s"].reshape(-1).copy()
-    measured = interval_s[interval_s > 0.0]
-    if measured.size == 0:
-        raise LogError(f"log {log.path} has no measured period")
-    period_s = float(np.median(measured))
-    is_near = (interval_s >= _NEAR[0] * period_s) & (interval_s <= _NEAR[1] * period_s)
-    interval_s[~is_near | (np.diff(cycle, prepend=cycle[0] - 2) != 1)] = 0.0
-    finite = np.isfinite(scheme["q"]).all(axis=1) & np.isfinite(scheme["tau_J"]).all(axis=1)
-    finite &= np.isfinite(scheme["dq"]).all(axis=1) & np.isfinite(scheme["theta_hat"]).all(axis=1)
-    is_free = finite & (scheme["state"] == SchemeState.MONITOR) & (scheme["contact_joints"] == 0) & (interval_s > 0.0)
-    motion = Motion(
-        q=scheme["q"],
-        dq=scheme["dq"],
-        tau_J=scheme["tau_J"],
-        theta=scheme["theta_hat"],
-        interval_s=interval_s,
-        is_free=_away_from(~is_free, round(APART_S / period_s)),
-        period_s=period_s,
-    )
-    if not motion.is_free.any():
-        raise LogError(f"log {log.path} has no motion in MONITOR that is free of contact")
-    return motion
-
-
-def _away_from(is_bad: NDArray[np.bool_], samples: int) -> NDArray[np.bool_]:
-    """Tell which samples have no bad one within so many samples."""
-    counted = np.r_[0, np.cumsum(is_bad)]
-    places = np.arange(is_bad.size)
-    first, last = np.maximum(places - samples, 0), np.minimum(places + samples + 1, is_bad.size)
-    return np.asarray(counted[last] == counted[first])
 
 
 def find_lag(motion: Motion) -> tuple[float, Vector]:
@@ -125,14 +80,14 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
 
 @dataclass(frozen=True)
 class Statistics:
-    """The detectors' statistics on contact-free motion, and the stream that they come from."""
+    """The detectors' statistics on contact-free motion, and N samples of it with the stream that they come from."""
 
     settings: detectors.DetectorSettings
-    weights: Vector  # (n, N, L), of the likelihood channels
-    peaks: Vector  # (B, channels, n), NaN where not all samples of a block are free
+    weights: Vector  # (n, ages, L), of the likelihood channels
+    peaks: Vector  # (B, channels, n), of all motion; NaN where not all samples of a block are free
     z: Vector  # (N, n), 0 where not free
     held_Nm: Vector
-    is_free: NDArray[np.bool_]
+    is_free: Mask
     motion: Motion
     lag_s: float
     lag_of_joint_s: Vector  # (n,)
@@ -143,33 +98,13 @@ class Statistics:
         return counted_hours(self.peaks[:, 0, 0], BLOCK_S)
 
 
-def join_motions(motions: Sequence[Motion]) -> Motion:
-    """Put recordings one after the other; raises LogError unless their periods and parameters fit together."""
-    first = motions[0]
-    for other in motions[1:]:
-        if abs(other.period_s - first.period_s) > 0.02 * first.period_s:
-            raise LogError(f"periods of {1e3 * first.period_s:.3f} and {1e3 * other.period_s:.3f} ms don't go together")
-        if other.theta.shape[1] != first.theta.shape[1]:
-            raise LogError(f"{first.theta.shape[1]} and {other.theta.shape[1]} parameters don't go together")
-    is_free = np.concatenate([motion.is_free for motion in motions])
-    interval_s = np.concatenate([np.r_[0.0, motion.interval_s[1:]] for motion in motions])
-    return Motion(
-        q=np.concatenate([motion.q for motion in motions]),
-        dq=np.concatenate([motion.dq for motion in motions]),
-        tau_J=np.concatenate([motion.tau_J for motion in motions]),
-        theta=np.concatenate([motion.theta for motion in motions]),
-        interval_s=interval_s,
-        is_free=is_free,
-        period_s=first.period_s,
-    )
-
-
-def run_detectors(motion: Motion, settings: detectors.DetectorSettings) -> Statistics:
-    """Run every detector over a recording. Raises TooLittleMotionError."""
+def run_detectors(
+    logs: Sequence[LoggedMotion], settings: detectors.DetectorSettings, progress: Progress = lambda _: None
+) -> Statistics:
+    """Run every detector over the motion of logs. Raises LogError, TooLittleMotionError."""
+    motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
-    z, held_Nm = detectors.make_stream(
-        motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s, settings.standstill_rad_s
-    )
+    z, held_Nm = TorqueStream(lag_s, settings.standstill_rad_s).add(motion)
     free = motion.is_free
     z[~free] = 0.0
     held_Nm[~free] = 0.0
@@ -178,12 +113,41 @@ def run_detectors(motion: Motion, settings: detectors.DetectorSettings) -> Stati
     except ValueError as error:
         raise TooLittleMotionError(f"{free.sum()} contact-free samples: {error}") from None
     constants = detectors.constants_of(settings, weights, motion.period_s)
-    block = round(BLOCK_S / motion.period_s)
-    peaks = np.zeros((-(-len(z) // block), len(settings.channels), JOINTS))
-    detectors.record(constants, detectors.new_memory(constants), z, held_Nm, block, peaks)
-    whole = np.logical_and.reduceat(free, np.arange(0, len(free), block))
-    peaks[~whole] = np.nan
+    peaks = _peaks(logs, constants, lag_s, settings, progress)
     return Statistics(settings, weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
+
+
+def _peaks(
+    logs: Sequence[LoggedMotion],
+    constants: detectors.Structured,
+    lag_s: float,
+    settings: detectors.DetectorSettings,
+    progress: Progress,
+) -> Vector:
+    """Run the detectors over all motion, the logs one after the other (B, channels, n); NaN unless a block is free."""
+    block = round(BLOCK_S / logs[0].period_s)
+    free = np.concatenate([log.is_free for log in logs])
+    peaks = np.zeros((-(-len(free) // block), len(settings.channels), JOINTS))
+    memory = detectors.new_memory(constants)
+    rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
+    place = told = 0
+    for log in logs:
+        stream = TorqueStream(lag_s, settings.standstill_rad_s)
+        for motion in log.pieces():
+            new = stream.add(motion)
+            for column in new:
+                column[~motion.is_free] = 0.0
+            z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
+            end = place + len(z) // block
+            whole = (end - place) * block
+            detectors.record(constants, memory, z[:whole], held_Nm[:whole], block, peaks[place:end])
+            rest, place = (z[whole:], held_Nm[whole:]), end
+            if place * block - told >= _PROGRESS_SAMPLES:
+                told = place * block
+                progress(f"{log.path}: running the detectors, {told} of {len(free)} cycles")
+    detectors.record(constants, memory, *rest, block, peaks[place:])
+    peaks[~np.logical_and.reduceat(free, np.arange(0, len(free), block))] = np.nan
+    return peaks
 
 
 @dataclass(frozen=True)
@@ -345,16 +309,18 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
     }
 
 
-def thresholds_of_logs(paths: Sequence[Path], rate_per_h: float) -> tuple[Thresholds, Statistics]:
-    """Read logs and calibrate all detectors on what nobody touched.
+def thresholds_of_logs(
+    paths: Sequence[Path], rate_per_h: float, stretch: Stretch = WHOLE, progress: Progress = lambda _: None
+) -> tuple[Thresholds, Statistics]:
+    """Read logs, or a stretch of each, and calibrate all detectors on what nobody touched.
 
     Raises LogError for a log that can't be used, TooLittleMotionError when all together are too short.
     """
-    motions = []
+    logs = []
     for path in paths:
-        motion = motion_from_log(read_log(path, TOPICS))
-        if motion.theta.shape[1] < len(PARAMETER_NAMES):
-            raise LogError(f"log {path} has {motion.theta.shape[1]} parameters")
-        motions.append(motion)
-    statistics = run_detectors(join_motions(motions), detectors.DetectorSettings())
+        log = read_motion(path, stretch, progress)
+        if log.parameters < len(PARAMETER_NAMES):
+            raise LogError(f"log {path} has {log.parameters} parameters")
+        logs.append(log)
+    statistics = run_detectors(logs, detectors.DetectorSettings(), progress)
     return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.cli.options import explained, json_option
+from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.cli.progress import Progress
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.records import Location
@@ -16,6 +16,7 @@ from adacd_hil.records import Location
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_comparison import LogComparison
     from adacd_hil.analysis.replay.run_digest import Detection
+    from adacd_hil.log.stretch import Stretch
 
 _EPILOG = (
     "Exit status: 0 both decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
@@ -28,15 +29,19 @@ _EPILOG = (
 @click.argument("second", type=click.Path(path_type=Path))
 @json_option
 @explained
-def compare(first: Path, second: Path, as_json: bool) -> ExitCode:
+@stretch_options
+def compare(first: Path, second: Path, as_json: bool, stretch: "Stretch") -> ExitCode:
     """Compare two runs: settings, every field of /scheme, states, contacts, parameters, timing.
 
     Times count from motion start, the first cycle in ADAPT. A folder stands for the run log in it.
+
+    --from and --until choose a stretch of the first log; of the second the cycles that lie equally long after motion
+    start are compared with it.
     """
     from adacd_hil.analysis.replay.log_comparison import compare_logs
 
     with closing(Progress()) as progress:
-        found = compare_logs(log_in(first), log_in(second), progress)
+        found = compare_logs(log_in(first), log_in(second), progress, stretch)
     print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
     if not found.is_same:
         return ExitCode.FAILURE
@@ -48,6 +53,8 @@ def _as_text(found: "LogComparison") -> str:
 
     names = [str(found.first.path), str(found.second.path)]
     lines = [f"1: {names[0]}", f"2: {names[1]}", "", *found.notes]
+    if not found.stretch.is_whole:
+        lines.append(f"of 1 {found.stretch.text}; of 2 as long after motion start")
     if found.is_same:
         lines.append(f"the same in all {found.cycles} cycles")
     else:

@@ -174,16 +174,23 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "St
 )
 @json_option
 @explained
+@stretch_options
 def thresholds(
-    logs: tuple[Path, ...], rate_per_h: float, out: Path | None, report: Path | None, as_json: bool
+    logs: tuple[Path, ...],
+    rate_per_h: float,
+    out: Path | None,
+    report: Path | None,
+    as_json: bool,
+    stretch: "Stretch",
 ) -> ExitCode:
     """Find every detector's thresholds for a rate of false alarms, from what nobody touched in these logs.
 
-    Each comes with what limits it, and with the rate that half of the motion predicts for the other half.
+    Each comes with what limits it, and with the rate that half of the motion predicts for the other half. --from and
+    --until choose a stretch of each log.
     """
     from adacd_hil.cli import thresholds as command
 
-    found, comparison = command.find(logs, rate_per_h, out, report)
+    found, comparison = command.find(logs, rate_per_h, out, report, stretch)
     print(command.as_json(found, comparison) if as_json else command.as_text(found, comparison))
     return ExitCode.OK
 

@@ -1,19 +1,21 @@
 """`adacd-hil replay`: a log once more through arm and scheme, compared with itself or set beside other settings."""
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option, profile_option
+from adacd_hil.cli.options import explained, json_option, profile_option, stretch_options
 from adacd_hil.log.run_folder import log_in
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.replay import Replay
     from adacd_hil.analysis.replay.source import Source
     from adacd_hil.config import Settings
+    from adacd_hil.log.stretch import Stretch
 
 _EPILOG = (
     "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
@@ -39,6 +41,7 @@ _MOST_COLUMNS = 6
 @click.option("--shown", type=click.IntRange(min=0), default=20, show_default=True, help="Mismatches to print.")
 @json_option
 @explained
+@stretch_options
 def replay(
     logs: tuple[Path, ...],
     changes: tuple[str, ...],
@@ -50,6 +53,7 @@ def replay(
     tolerance: float | None,
     shown: int,
     as_json: bool,
+    stretch: "Stretch",
 ) -> ExitCode:
     """Replay logs: the raw frames once more through codec, arm and scheme.
 
@@ -59,21 +63,24 @@ def replay(
 
     Frames that others recorded (candump .log, BLF, ASC, MF4, TRC) are replayed --against the log of their run, or with
     --config alone, where the configuration's script plays the user.
+
+    With --from and --until, only that stretch is compared and told. The replay begins with the log all the same: its
+    filters and its model know what came before.
     """
     from adacd_hil.cli.progress import Progress
 
     progress = Progress()
     try:
         results = [
-            _replay_one(path, changes, vary, (config, profile, dbc), against, tolerance, shown, progress)
+            _replay_one(path, changes, vary, (config, profile, dbc), against, tolerance, shown, stretch, progress)
             for path in logs
         ]
     finally:
         progress.close()
     if as_json:
-        print(json.dumps([_as_json(*result, shown) for result in results], indent=2, allow_nan=False))
+        print(json.dumps([_as_json(*result, shown, stretch) for result in results], indent=2, allow_nan=False))
     else:
-        print("\n\n".join(_as_text(*result, shown) for result in results))
+        print("\n\n".join(_as_text(*result, shown, stretch) for result in results))
     codes = [_code(replays) for _, replays, _ in results]
     return max(codes, key=[ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE].index)
 
@@ -90,6 +97,7 @@ def _replay_one(
     against: Path | None,
     tolerance: float | None,
     shown: int,
+    stretch: "Stretch",
     progress: Any,
 ) -> _Result:
     from adacd_hil.analysis.replay.replay import contacts_beside, replay_source
@@ -110,7 +118,8 @@ def _replay_one(
     progress(f"replaying {given}" + (f" with {len(variants)} other settings" if variants else ""))
     truth = contacts_beside(log_in(against or given))
     settings: list[Settings] = [own, *variants.values()]
-    return given, replay_source(source, settings, truth, progress, tolerance, ScriptedOperator, shown), list(variants)
+    replays = replay_source(source, settings, truth, progress, tolerance, ScriptedOperator, shown, stretch=stretch)
+    return given, replays, list(variants)
 
 
 def _open(
@@ -157,13 +166,14 @@ def _verdict(own: "Replay") -> str:
     return f"identical, {exact}"
 
 
-def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int) -> str:
+def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "Stretch") -> str:
     from adacd_hil.analysis.replay.what_if import NOTE, side_by_side
     from adacd_hil.cli.table import format_table
 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""
-    lines = [f"{path}: {_verdict(own)}: {own.compared} of {own.cycles} cycles{attempts} compared"]
+    where = "" if stretch.is_whole else f", {stretch.text}; replayed from the beginning of the log"
+    lines = [f"{path}: {_verdict(own)}: {own.compared} of {own.cycles} cycles{attempts} compared{where}"]
     lines += [f"  {mismatch.line(own.zero_ns)}" for mismatch in own.mismatches[:shown]]
     if own.mismatch_count > shown:
         lines.append(f"  … {own.mismatch_count} in all: " + _counts(own))
@@ -182,12 +192,15 @@ def _counts(own: "Replay") -> str:
     return ", ".join(f"{count} of {field}" for field, count in own.mismatched_fields.items())
 
 
-def _as_json(path: Path, replays: "list[Replay]", names: list[str], shown: int) -> dict[str, Any]:
+def _as_json(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "Stretch") -> dict[str, Any]:
     from adacd_hil.analysis.replay.what_if import as_json, changed_keys
 
     own = replays[0]
+    bounds_s = [bound_s if math.isfinite(bound_s) else None for bound_s in stretch]
     return {
         "log": str(path),
+        "from_s": bounds_s[0],
+        "until_s": bounds_s[1],
         "identical": own.is_identical,
         "cycles": own.cycles,
         "compared": own.compared,

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option
+from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.output_files import replace_file
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.tune import Candidate, Tuning
     from adacd_hil.analysis.sweep.tune_roc import Found
+    from adacd_hil.log.stretch import Stretch
 
 
 @click.command(
@@ -35,13 +36,22 @@ if TYPE_CHECKING:
 )
 @json_option
 @explained
+@stretch_options
 def tune(
-    logs: tuple[Path, ...], rate_per_h: float, config: str | None, out: Path | None, report: Path | None, as_json: bool
+    logs: tuple[Path, ...],
+    rate_per_h: float,
+    config: str | None,
+    out: Path | None,
+    report: Path | None,
+    as_json: bool,
+    stretch: "Stretch",
 ) -> ExitCode:
     """Find thresholds, filter and gain from LOGS; a folder stands for the run log in it.
 
     Thresholds are chosen on half of the logs, or of one log's time, and checked on the rest. With the truth.mcap beside
     the logs: contacts found, delays, and a small grid of filters and gains, replayed. Without: thresholds only.
+
+    With --from and --until, motion and contacts of that stretch of each log count. The replays begin with the log.
     """
     from adacd_hil.analysis.false_alarms import TooLittleMotionError
     from adacd_hil.analysis.replay.source import LogSource
@@ -55,7 +65,7 @@ def tune(
     base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
     progress = Progress()
     try:
-        found = find(paths, rate_per_h, config, progress)
+        found = find(paths, rate_per_h, config, progress, stretch)
     except TooLittleMotionError as error:
         raise CommandError(str(error), ExitCode.FAILURE) from None
     finally:

@@ -108,6 +108,10 @@ class Series:
         stamp_ns = self.records["sec"].astype(np.int64) * 1_000_000_000 + self.records["nanosec"]
         return np.asarray(stamp_ns - self._epoch_ns, np.int64)
 
+    def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
+        """Give some of the messages."""
+        return Series(self.records[rows], self._epoch_ns)
+
     @property
     def block(self) -> Vector:
         """All float64 values of each message (n, k), in order: for our own topics the block as it was logged."""

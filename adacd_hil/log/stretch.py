@@ -1,8 +1,10 @@
 """A stretch of a log: from when until when, s since the beginning of the log, which is its first message."""
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
+from adacd_hil.log.errors import LogError
 from adacd_hil.log.stream import LogStream
 
 _CENTURY_S = 3.2e9
@@ -18,6 +20,12 @@ class Stretch(NamedTuple):
     def is_whole(self) -> bool:
         """Whether it bounds nothing."""
         return self == Stretch()
+
+    @property
+    def text(self) -> str:
+        """Say it as a command is asked for it; nothing of the whole log."""
+        words = (("from", self.start_s), ("until", self.end_s))
+        return " ".join(f"{word} {bound_s:g} s" for word, bound_s in words if math.isfinite(bound_s))
 
     def bounds_ns(self, start_ns: int) -> tuple[int, int]:
         """Give its bounds on a clock on which the log begins at `start_ns`."""
@@ -42,3 +50,11 @@ def start_of_log(path: Path) -> int | None:
         if times:
             return min(times)
     return None
+
+
+def begin_of_log(path: Path) -> int:
+    """Return the time of the first message as `start_of_log`. Raises LogError also when there is none."""
+    start_ns = start_of_log(path)
+    if start_ns is None:
+        raise LogError(f"log {path} has no message")
+    return start_ns

@@ -9,11 +9,13 @@ from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records,
 
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.replay.replay import Replay, contacts_beside, replay, replay_many, replay_source
-from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.replay.source import LogSource
+from adacd_hil.analysis.replay.what_if import apply_settings, side_by_side
 from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.stretch import Stretch, begin_of_log
 from adacd_hil.records import FaultReason, SchemeState
 
 pytestmark = pytest.mark.slow
@@ -75,6 +77,64 @@ def test_an_nmt_frame_without_data_tells_nothing(log: Path, whole: Replay) -> No
         return piece._replace(frames=frames)
 
     assert changed(log, change).states == whole.states
+
+
+def at_s(log: Path, t_ns: int) -> float:
+    return (t_ns - begin_of_log(log)) * 1e-9
+
+
+def stretched(log: Path, stretch: Stretch, change=lambda piece: piece, cycles_per_piece: int = 20_000) -> Replay:
+    source = ChangedLog(log, change, cycles_per_piece)
+    settings = [source.settings]
+    return replay_source(source, settings, contacts_beside(log), script_of=ScriptedOperator, stretch=stretch)[0]
+
+
+@pytest.mark.parametrize("cycles_per_piece", [20_000, 333])
+def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piece: int) -> None:
+    whole = replay_source(LogSource(log), [LogSource(log).settings], contacts_beside(log))[0]
+    contact = whole.true_contacts[0]
+    stretch = Stretch(at_s(log, contact.onset_ns) - 0.2004, at_s(log, contact.onset_ns) + 0.3)
+    found = stretched(log, stretch, cycles_per_piece=cycles_per_piece)
+    bounds_ns = stretch.bounds_ns(begin_of_log(log))
+    t_ns = read_log(log, ("/scheme",)).scheme.t_ns
+    assert found.compared == found.cycles == ((t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1])).sum() == 500
+    assert found.is_identical
+    assert found.zero_ns == whole.zero_ns
+    assert found.true_contacts == whole.true_contacts
+    assert found.states == tuple(each for each in whole.states if bounds_ns[0] <= each.t_ns < bounds_ns[1])
+    assert found.ending == found.states[-1]
+    assert found.contacts == tuple(each for each in whole.contacts if bounds_ns[0] <= each.t_ns < bounds_ns[1])
+    assert 0 < len(found.contacts) <= len(whole.contacts)
+    assert found.adaptations == ()
+    assert 0.0 < found.monitored_s < 0.5
+    after = stretched(log, Stretch(stretch.end_s), cycles_per_piece=cycles_per_piece)
+    assert (after.true_contacts, after.detections_ns, after.false_alarms_ns) == ((), (), ())
+    before = stretched(log, Stretch(end_s=stretch.start_s), cycles_per_piece=cycles_per_piece)
+    assert before.cycles + found.cycles + after.cycles == whole.cycles
+    assert (before.attempts, before.true_contacts) == (2, ())
+    assert [each.took_s for each in before.adaptations] == [each.took_s for each in whole.adaptations]
+
+
+@pytest.mark.parametrize(("row", "count"), [(899, 0), (900, 1), (1099, 1), (1100, 0)])
+def test_only_what_differs_in_the_stretch_is_named(log: Path, row: int, count: int) -> None:
+    scheme = read_log(log, ("/scheme",)).scheme
+
+    def change(piece):
+        records = writable(piece.series["/scheme"])
+        flip(records, row, "tau_J")
+        return with_records(piece, "/scheme", records)
+
+    stretch = Stretch(at_s(log, scheme.t_ns[900] - 400_000), at_s(log, scheme.t_ns[1100] - 400_000))
+    found = stretched(log, stretch, change)
+    assert (found.compared, found.mismatch_count) == (200, count)
+
+
+def test_a_stretch_in_which_nothing_changes_says_what_state_it_is_in(log: Path, whole: Replay) -> None:
+    last = whole.states[-1]
+    found = stretched(log, Stretch(at_s(log, last.t_ns) + 0.0014))
+    assert found.states == ()
+    assert found.ending == last
+    assert ("ends in", f"{last.state.name} since {whole.time_s(last.t_ns):.2f} s") in side_by_side([found])
 
 
 @pytest.mark.parametrize("script_of", [ScriptedOperator, None])

@@ -10,6 +10,7 @@ from click.testing import CliRunner, Result
 
 from adacd_hil.cli.main import cli
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.stretch import begin_of_log
 
 pytestmark = pytest.mark.slow
 OK, FAILURE, USAGE, PARTIAL = 0, 1, 2, 3
@@ -51,6 +52,57 @@ def test_a_cut_log_ends_with_status_3(log: Path, tmp_path: Path) -> None:
     assert done.exit_code == PARTIAL
     assert "identical, bit for bit" in done.stdout
     assert "the log is not whole" in done.stdout
+
+
+def test_a_stretch_is_replayed_from_the_beginning_and_told_so(log: Path) -> None:
+    done = run("replay", log, "--from", "2.2", "--until", "2.7")
+    assert done.exit_code == OK
+    assert (
+        "500 of 500 cycles in 2 attempts compared, from 2.2 s until 2.7 s; replayed from the beginning of the log"
+        in (done.stdout)
+    )
+    (result,) = json.loads(run("replay", log, "--from", "0.7", "--json").stdout)
+    assert (result["from_s"], result["until_s"], result["identical"]) == (0.7, None, True)
+    whole = read_log(log, ("/scheme",)).scheme
+    assert 0 < result["compared"] < len(whole)
+
+
+def test_a_stretch_of_two_runs_is_compared(log: Path, tmp_path: Path) -> None:
+    scheme = read_log(log, ("/scheme",)).scheme
+    record = scheme.records[1700:1701]
+    offset = record.dtype.fields["theta_hat"][1] - record.dtype.fields["sec"][1]
+    begin = record.tobytes()[record.dtype.fields["sec"][1] :][: offset + 8]
+    flip_in_file(log, tmp_path / "run.mcap", begin, offset)
+    at_s = (int(scheme.t_ns[1700]) - begin_of_log(log)) * 1e-9
+    for start_s, end_s, code, fields in (
+        (at_s - 0.3004, at_s - 0.0004, OK, []),
+        (at_s - 0.0004, at_s + 0.2996, FAILURE, ["theta_hat"]),
+        (at_s + 0.0006, at_s + 0.3006, OK, []),
+    ):
+        done = run("compare", log, tmp_path, "--from", start_s, "--until", end_s, "--json")
+        found = json.loads(done.stdout)
+        assert (done.exit_code, [field["field"] for field in found["fields"]]) == (code, fields)
+        assert (found["cycles"], found["only"], found["runs"][0]["cycles"]) == (300, [0, 0], 300)
+        assert found["from_s"] == pytest.approx(start_s)
+    text = run("compare", log, tmp_path, "--until", at_s - 0.0004).stdout
+    assert f"of 1 until {at_s - 0.0004:g} s; of 2 as long after motion start" in text
+    assert "the same in all 1700 cycles" in text
+
+
+@pytest.mark.parametrize("command", ["replay", "compare", "thresholds", "tune"])
+def test_a_stretch_that_holds_nothing_is_one_line(log: Path, command: str) -> None:
+    logs = [log, log] if command == "compare" else [log]
+    for bounds, code, line in (
+        (("--from", "2000"), FAILURE, "from 2000 s"),
+        (("--until", "-5"), FAILURE, "until -5 s"),
+        (("--from", "5", "--until", "5"), USAGE, "--from 5 s is not before --until 5 s"),
+        (("--from", "nan"), USAGE, "--from nan is not a time"),
+        (("--until", "inf"), USAGE, "--until inf is not a time"),
+    ):
+        done = run(command, *logs, *bounds)
+        said = [each for each in done.stderr.splitlines() if each.startswith("adacd-hil: ")]
+        assert (done.exit_code, done.stdout, len(said)) == (code, "", 1), done.output
+        assert line in said[0]
 
 
 def test_other_settings_stand_beside_the_original(log: Path) -> None:

@@ -3,14 +3,14 @@
 import json
 import math
 import os
+from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.analysis import thresholds as module
+from adacd_hil.analysis import motion as module
 from adacd_hil.analysis.detector_comparison import (
     STEPS_NM,
     Comparison,
@@ -19,14 +19,8 @@ from adacd_hil.analysis.detector_comparison import (
     step_shape,
     write_comparison,
 )
-from adacd_hil.analysis.thresholds import (
-    Thresholds,
-    compute_thresholds,
-    find_lag,
-    join_motions,
-    motion_from_log,
-    run_detectors,
-)
+from adacd_hil.analysis.motion import read_motion, sample_of
+from adacd_hil.analysis.thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
 from adacd_hil.cli.main import cli
 from adacd_hil.config import parse, read_toml
 from adacd_hil.log.errors import LogError
@@ -81,21 +75,52 @@ def log_of(seconds, seed=1, **changes):
     for name, value in changes.items():
         scheme[name] = value(scheme[name].copy())
 
-    class Series(dict):
-        def __len__(self):
-            return count
+    return Series(scheme)
 
-    return SimpleNamespace(scheme=Series(scheme), path=Path("run.mcap"))
+
+class Series(dict):
+    """Columns of /scheme."""
+
+    def __len__(self):
+        return len(self["cycle"])
+
+    @property
+    def t_ns(self):
+        return np.round(np.asarray(self["cycle"]) * T * 1e9).astype(np.int64)
+
+    def pieces(self, count):
+        for first in range(0, len(self), count):
+            yield Series({name: column[first : first + count] for name, column in self.items()})
+
+
+@contextmanager
+def logs_of(logs, count=20_000):
+    """Let logs be read that are in memory, by their names, so many cycles at a time."""
+    before, module.schemes = module.schemes, lambda path, bounds_ns: logs[path.name].pieces(count)
+    try:
+        yield [Path(name) for name in logs]
+    finally:
+        module.schemes = before
+
+
+def motion_of(log, count=20_000):
+    with logs_of({"run.mcap": log}, count) as (path,):
+        return sample_of([read_motion(path)])
+
+
+def statistics_of(logs, count=20_000):
+    with logs_of(logs, count) as paths:
+        return run_detectors([read_motion(path) for path in paths], SETTINGS)
 
 
 @pytest.fixture(scope="module")
 def statistics():
-    return run_detectors(motion_from_log(log_of(120.0)), SETTINGS)
+    return statistics_of({"run.mcap": log_of(120.0)})
 
 
 @compiled_only
 def test_the_lag_of_the_velocity_is_identified():
-    lag_s, of_joint_s = find_lag(motion_from_log(log_of(30.0)))
+    lag_s, of_joint_s = find_lag(motion_of(log_of(30.0)))
     np.testing.assert_allclose(lag_s, LAG_S, rtol=0.1)
     np.testing.assert_allclose(of_joint_s, LAG_S, rtol=0.2)
 
@@ -119,7 +144,7 @@ def between(first, last, value):
     ],
 )
 def test_what_is_near_a_contact_a_gap_or_another_state_does_not_count(changes, bad):
-    is_free = motion_from_log(log_of(10.0, **changes)).is_free
+    is_free = motion_of(log_of(10.0, **changes), 700).is_free
     expected = np.ones(10_000, bool)
     expected[:601] = False  # nobody knows what was before the first sample
     expected[list(bad)] = False
@@ -135,13 +160,41 @@ def test_what_is_near_a_contact_a_gap_or_another_state_does_not_count(changes, b
 )
 def test_a_log_that_can_not_be_used_is_named(changes, words):
     with pytest.raises(LogError, match=rf"run.mcap.*{words}"):
-        motion_from_log(log_of(2.0, **changes))
+        motion_of(log_of(2.0, **changes))
 
 
 def test_logs_of_different_periods_do_not_go_together():
-    slow = motion_from_log(log_of(2.0, period_s=lambda period: 2.0 * period))
+    logs = {"a.mcap": log_of(2.0), "b.mcap": log_of(2.0, period_s=lambda period: 2.0 * period)}
     with pytest.raises(LogError, match=r"1\.000 and 2\.000 ms"):
-        join_motions([motion_from_log(log_of(2.0)), slow])
+        statistics_of(logs)
+
+
+@compiled_only
+def test_where_a_log_is_cut_into_pieces_does_not_matter():
+    logs = {"a.mcap": log_of(30.0, tau_J=between(9_000, 9_001, np.nan)), "b.mcap": log_of(25.05, 2)}
+    one, other = statistics_of(logs, 10**6), statistics_of(logs, 777)
+    np.testing.assert_array_equal(other.peaks, one.peaks)
+    np.testing.assert_array_equal(other.z, one.z)
+    assert (one.lag_s, one.hours) == (other.lag_s, other.hours)
+    assert len(one.peaks) == 551
+
+
+@compiled_only
+def test_of_long_motion_some_windows_tell_the_lag_and_all_of_it_the_peaks(monkeypatch):
+    log = log_of(120.0, contact_joints=between(30_000, 70_000, 1))
+    whole = statistics_of({"run.mcap": log})
+    monkeypatch.setattr(module, "MOST_SAMPLES", 40_000)
+    thinned = statistics_of({"run.mcap": log})
+    assert len(whole.z) == 120_000
+    assert len(thinned.z) == 40_000
+    assert thinned.is_free.sum() > 36_000, "windows are where nobody touched the arm"
+    np.testing.assert_allclose(thinned.lag_s, whole.lag_s, rtol=0.1)
+    assert (thinned.hours, thinned.peaks.shape) == (whole.hours, whole.peaks.shape)
+    first_order = slice(0, 3)  # the likelihood's weights, and what the lag leaves, are those of the windows
+    seen = ~np.isnan(whole.peaks[:, 0, 0])
+    np.testing.assert_array_equal(~np.isnan(thinned.peaks[:, 0, 0]), seen)
+    largest = [found.peaks[seen, first_order].max(axis=0) for found in (thinned, whole)]
+    np.testing.assert_allclose(largest[0], largest[1], rtol=0.1)
 
 
 @pytest.mark.slow
@@ -203,19 +256,16 @@ def test_never_is_a_dash_and_null_and_the_worst_rank():
     assert comparison.as_json()["rows"][0]["delay_ms"][0] is None
 
 
-def run(monkeypatch, logs, *arguments):
-    known = dict(logs)
-    monkeypatch.setattr(module, "read_log", lambda path, topics: known[path.name])
-    return CliRunner().invoke(cli, ["thresholds", *known, *arguments])
+def run(logs, *arguments):
+    with logs_of(logs):
+        return CliRunner().invoke(cli, ["thresholds", *logs, *arguments])
 
 
 @pytest.mark.slow
 @compiled_only
-def test_the_command_prints_a_table_and_writes_toml(monkeypatch, tmp_path):
+def test_the_command_prints_a_table_and_writes_toml(tmp_path):
     out = tmp_path / "new" / "thresholds.toml"
-    played = run(
-        monkeypatch, {"a.mcap": log_of(40.0), "b.mcap": log_of(30.0, 2)}, "--rate-per-h", "5", "--out", str(out)
-    )
+    played = run({"a.mcap": log_of(40.0), "b.mcap": log_of(30.0, 2)}, "--rate-per-h", "5", "--out", str(out))
     assert played.exit_code == 0, played.output
     assert "5 false alarms per hour, from 0.02 h of contact-free motion, extrapolated" in played.output
     assert "smoothed 200" in played.output
@@ -227,8 +277,8 @@ def test_the_command_prints_a_table_and_writes_toml(monkeypatch, tmp_path):
 
 
 @compiled_only
-def test_the_command_refuses_what_is_too_short(monkeypatch):
-    played = run(monkeypatch, {"a.mcap": log_of(20.0)})
+def test_the_command_refuses_what_is_too_short():
+    played = run({"a.mcap": log_of(20.0)})
     assert played.exit_code == 1
     assert played.stdout == ""
     assert played.stderr.splitlines() == [

@@ -23,13 +23,14 @@ from adacd_hil.analysis.sweep.tune_bounds import least_rate_per_h, rate_bound_pe
 from adacd_hil.analysis.sweep.tune_config import base_of, suggested_toml
 from adacd_hil.analysis.sweep.tune_figures import write_tuning
 from adacd_hil.analysis.sweep.tune_logs import Window, read_logs
-from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, choose
+from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, choose, delay_ms, rising
 from adacd_hil.analysis.sweep.tune_scheme import _Shown, candidates, observe_candidates, thresholds_as_changes
 from adacd_hil.cli.demo import Cast, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, load_settings, to_toml
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.stretch import Stretch, begin_of_log
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.selection import layout_of
 from firmware_sim.scenario import load_scenario
@@ -118,6 +119,19 @@ def test_a_delay_is_that_of_the_first_sample_over_a_threshold_and_what_was_not_a
     assert choice.checked.delays_ms == pytest.approx((10.0,))
     exact = choose(observed(touches=(touched(choice.thresholds[0, 1] / 5.0),)), 1.0)
     assert exact.checked.delays_ms == pytest.approx((60.0,)), "over, not equal"
+
+
+def test_what_is_left_out_of_a_contact_changes_no_delay():
+    generator = np.random.default_rng(3)
+    statistic = np.cumsum(generator.normal(0.0, 1.0, (500, 3, 2)), axis=0)
+    statistic[100:110, 1] = np.nan
+    whole = Touched(np.arange(500) * 1e-3, statistic, True)
+    kept = rising(whole)
+    assert len(kept.since_s) < 250
+    for _ in range(200):
+        thresholds = generator.uniform(-5.0, 40.0, (3, 2))
+        assert delay_ms(kept, thresholds) == delay_ms(whole, thresholds)
+    assert rising(NOTHING) == NOTHING
 
 
 def test_along_a_roc_fewer_alarms_are_paid_with_fewer_contacts():
@@ -407,6 +421,35 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     assert read.digest == hashlib.sha256(log.read_bytes()).hexdigest()
 
 
+def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
+    (first,) = contacts_beside(log)
+    later = [first, dataclasses.replace(first, attempt=1), dataclasses.replace(first, attempt=2)]
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda _: tuple(later))
+    monkeypatch.setattr(tune_logs, "_begins", lambda *_: [0, 241])
+    (read,) = read_logs([log])
+    cycle = read_log(log, ("/scheme",)).scheme["cycle"]
+    assert [(window.number, cycle[window.first] - first.onset) for window in read.windows] == [(1, 0), (2, 240)]
+
+
+def test_of_a_stretch_its_motion_and_its_contacts_count(log):
+    (whole,) = read_logs([log])
+    (window,) = whole.windows
+    at_s = (whole.t_ns[window.first] - begin_of_log(log)) * 1e-9
+    (with_it,) = read_logs([log], stretch=Stretch(at_s - 0.0504, at_s + 1.9))
+    assert len(with_it.t_ns) < len(whole.t_ns)
+    assert with_it.t_ns[with_it.windows[0].first] == whole.t_ns[window.first]
+    assert with_it.windows[0].number == 1
+    (after,) = read_logs([log], stretch=Stretch(at_s + 0.001))
+    assert after.windows == ()
+    assert after.t_ns[-1] == whole.t_ns[-1]
+    done = CliRunner().invoke(cli, ["tune", str(log), "--from", str(at_s - 1.0), "--until", str(at_s), "--json"])
+    found = json.loads(done.stdout)
+    assert done.exit_code == 3, done.output
+    assert (found["logs"][0]["contacts"], found["own"]["adaptations"]) == (0, 0)
+    assert 0.0 < found["logs"][0]["free_h"] * 3600.0 < 1.0
+    assert found["own"]["monitored_h"] * 3600.0 == pytest.approx(1.0, abs=0.002)
+
+
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
     contacts = contacts_beside(log)
     monkeypatch.setattr(tune_logs, "contacts_beside", lambda _: contacts * 3)
@@ -431,8 +474,12 @@ def test_the_candidate_without_changes_shows_the_logged_residual(log):
         allowance = scheme["threshold"][rows] - read.settings.detector.threshold_Nm
         known = np.isfinite(allowance).all(axis=1)
         logged = (np.abs(scheme["tau_ext_hat"][rows]) - allowance)[known]
-        np.testing.assert_allclose(contact.statistic[known, 0], logged, atol=1e-12)
-        assert known.sum() > 50
+        since_s = (scheme.t_ns[rows] - scheme.t_ns[window.first])[known] * 1e-9
+        rises = rising(Touched(since_s, logged[:, None, :], True))
+        np.testing.assert_allclose(contact.statistic, rises.statistic, atol=1e-12)
+        np.testing.assert_array_equal(contact.since_s, rises.since_s)
+        assert known.all()
+        assert 20 < len(rises.since_s) < known.sum()
 
 
 def test_tune_says_that_so_little_motion_shows_nothing(log, tmp_path):

@@ -224,14 +224,23 @@ class RecordingAlone:
             self.settings = replace(settings, realtime=replace(settings.realtime, sample_period="nominal"))
         self._is_headless = False
 
+    @property
+    def start_ns(self) -> int:
+        """When the first SYNC was, ns of the clock of the cycles."""
+        return int(self._t_ns()[0])
+
+    def _t_ns(self) -> Places:
+        """Give the time of each cycle (n,): of its SYNC, or where the bus was in lockstep by its number."""
+        recording = self._recording
+        return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
+
     def __iter__(self) -> Iterator[Part]:
         """Give one part."""
         yield Part(list(self._stretches()), {}, ())
 
     def _stretches(self) -> Iterator[Stretch]:
         recording = self._recording
-        number, period_ns = recording.number, self.settings.bus.period_ns
-        t_ns = recording.t_ns if recording.is_realtime else number * period_ns
+        number, t_ns = recording.number, self._t_ns()
         frames = recording.in_time(number, t_ns, slice(None))
         resets = np.flatnonzero(_is_reset(frames))
         rows = np.searchsorted(number, recording.owner[resets], side="right")

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.replay.run_digest import Detection, RunDigest, RunReader
 from adacd_hil.analysis.replay.what_if import changed_keys
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.stretch import WHOLE, Stretch, begin_of_log
 
 PROGRESS_CYCLES: Final = 1_000_000
 MATCH_S: Final = 0.5
@@ -48,7 +50,10 @@ class ContactPair(NamedTuple):
 
 @dataclass(frozen=True)
 class LogComparison:
-    """How two runs differ. settings, metadata: by key, both values. cycles: compared, of `only` in one of them."""
+    """How two runs differ. settings, metadata: by key, both values. cycles: compared, of `only` in one of them.
+
+    stretch: of the first log, to which all but settings and metadata is limited.
+    """
 
     first: RunDigest
     second: RunDigest
@@ -59,6 +64,7 @@ class LogComparison:
     cycles: int
     only: tuple[int, int]
     notes: tuple[str, ...]
+    stretch: Stretch = WHOLE
 
     @property
     def is_same(self) -> bool:
@@ -78,7 +84,10 @@ class LogComparison:
             }
             for run in (self.first, self.second)
         ]
+        bounds_s = [bound_s if math.isfinite(bound_s) else None for bound_s in self.stretch]
         return {
+            "from_s": bounds_s[0],
+            "until_s": bounds_s[1],
             "runs": runs,
             "is_same": self.is_same,
             "settings": self.settings,
@@ -136,13 +145,27 @@ def _fields(records: NDArray[Any]) -> list[str]:
     return [name for name in records.dtype.names or () if name not in skipped]
 
 
-def compare_logs(first: Path, second: Path, progress: Callable[[str], None] = lambda _: None) -> LogComparison:
-    """Compare two logs. Raises LogError, ConfigError."""
+def compare_logs(
+    first: Path, second: Path, progress: Callable[[str], None] = lambda _: None, stretch: Stretch = WHOLE
+) -> LogComparison:
+    """Compare two logs. Raises LogError, ConfigError.
+
+    stretch: of the first log; of the second the cycles that lie equally long after its motion start. LogError is also
+    raised when one of them has none.
+    """
     readers = RunReader(first), RunReader(second)
     period_s = readers[0].settings.bus.period_s
+    if not stretch.is_whole:
+        since_ns = [bound_ns - readers[0].zero_ns for bound_ns in stretch.bounds_ns(begin_of_log(first))]
+        bounds = [math.ceil(bound_ns * 1e-9 / period_s - 1e-6) for bound_ns in since_ns]
+        for reader in readers:
+            reader.only(*bounds)
     differences = _Differences(period_s, readers[0].zero_cycle)
     cycles, only = _walk_together(readers, differences, progress)
     one, two = (reader.digest() for reader in readers)
+    for run in (one, two):
+        if not stretch.is_whole and not run.cycles:
+            raise LogError(f"log {run.path} has no cycle {stretch.text}")
     keys = [*one.metadata, *(key for key in two.metadata if key not in one.metadata)]
     metadata = {key: (one.metadata.get(key, ""), two.metadata.get(key, "")) for key in keys}
     notes = [f"{run.path}: {run.problem}" for run in (one, two) if run.problem]
@@ -158,6 +181,7 @@ def compare_logs(first: Path, second: Path, progress: Callable[[str], None] = la
         cycles,
         only,
         tuple(notes),
+        stretch,
     )
 
 

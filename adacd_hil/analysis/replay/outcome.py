@@ -68,8 +68,6 @@ class OutcomeGatherer:
     """Takes in the decisions of one replay. `contacts`: the true ones, None where nobody knows them."""
 
     def __init__(self, settings: Settings, contacts: tuple[TrueContact, ...] | None) -> None:
-        self.cycles = 0
-        self.monitored = 0  # cycles in MONITOR
         self.transitions: list[Transition] = []
         self.reports: list[LoggedContact] = []
         self.adaptations: list[Adaptation] = []
@@ -91,8 +89,6 @@ class OutcomeGatherer:
         count = len(batch.cycle)
         if count == 0:
             return
-        self.cycles += count
-        self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
         over = batch.contact_joints != 0
         self._mark_onsets(ticks, batch)
         rises = np.flatnonzero(over & ~np.concatenate(([self._was_over], over[:-1])))

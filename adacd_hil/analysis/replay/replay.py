@@ -3,14 +3,18 @@
 The log is read in pieces, in constant memory. Each attempt of the run has an arm and a pipeline of its own, as it had
 on the arm. What the user asked for is in the log, and so is how the arm moved: a replay with other settings decides
 other things about the same motion.
+
+Of a stretch of the log, a replay begins with the log all the same, as filters and model know what came before. It ends
+with the stretch; only what lies in it is compared and told.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.replay.attempts import Stretch
@@ -22,12 +26,15 @@ from adacd_hil.analysis.replay.scheme_comparison import (
     SchemeComparison,
     different_arithmetic,
 )
-from adacd_hil.analysis.replay.source import LogSource, Source
+from adacd_hil.analysis.replay.source import LogSource, Part, Source
 from adacd_hil.analysis.replay.truth_contacts import TrueContact, read_contacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
+from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.log.run_folder import TRUTH_NAME
+from adacd_hil.log.stretch import WHOLE
+from adacd_hil.log.stretch import Stretch as LogStretch
 from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.batch import SchemeBatch, arm_at
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
@@ -38,6 +45,7 @@ from adacd_hil.wire.codec import Codec
 SCRIPTED: Final = "script"
 """Of a log's metadata `operator`: nobody could type anything."""
 _PROGRESS_CYCLES: Final = 200_000
+_EVER: Final = (-(2**62), 2**62)
 
 Progress = Callable[[str], None]
 Watch = Callable[[int, Ticks, SchemeBatch], None]
@@ -48,10 +56,11 @@ Watch = Callable[[int, Ticks, SchemeBatch], None]
 class Replay:
     """What one replay came to.
 
-    cycles: replayed, of which `compared` were compared with the log; compared is 0 where the settings are not the
-    log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
-    `mismatched_fields`. parameters: of the end of the log. true_contacts, false_alarms_ns: None where the truth is not
-    known. zero_ns: of the first ADAPT.
+    cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
+    are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
+    `mismatched_fields`. parameters: of the end. true_contacts: that begin in the stretch; with false_alarms_ns None
+    where the truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
+    ending: the last change of state, which may be before the stretch. attempts: from the beginning of the log.
     """
 
     settings: Settings
@@ -70,6 +79,8 @@ class Replay:
     mismatch_count: int
     mismatched_fields: dict[str, int]
     tolerance: float
+    zero_ns: int
+    ending: Transition | None
     notes: tuple[str, ...] = ()
     """What of the log could not be compared, a line each."""
 
@@ -100,11 +111,6 @@ class Replay:
         """Detections that no contact explains; None where the truth is not known."""
         return None if self.false_alarms_ns is None else len(self.false_alarms_ns)
 
-    @property
-    def zero_ns(self) -> int:
-        """When the arm first moved: the first ADAPT."""
-        return next((each.t_ns for each in self.states if each.state is SchemeState.ADAPT), 0)
-
     def time_s(self, t_ns: int) -> float:
         """Give a time since motion start."""
         return (t_ns - self.zero_ns) * 1e-9
@@ -130,13 +136,18 @@ def replay(
 
 
 def replay_many(
-    path: Path, variants: Sequence[Settings], progress: Progress = lambda _: None, *, watch: Watch | None = None
+    path: Path,
+    variants: Sequence[Settings],
+    progress: Progress = lambda _: None,
+    *,
+    watch: Watch | None = None,
+    stretch: LogStretch = WHOLE,
 ) -> list[Replay]:
-    """Replay a log once for each of the settings; the log is read and decoded once.
+    """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
 
     Raises LogError, ConfigError, CodecError.
     """
-    return replay_source(LogSource(path), variants, contacts_beside(path), progress, watch=watch)
+    return replay_source(LogSource(path), variants, contacts_beside(path), progress, watch=watch, stretch=stretch)
 
 
 def contacts_beside(path: Path) -> tuple[TrueContact, ...] | None:
@@ -156,6 +167,7 @@ class _Player:
         asking: Asking | None,
     ) -> None:
         self.settings = settings
+        self.cycles = self.monitored = 0  # in the stretch
         self.comparison = comparison
         self.requests = RequestCheck()
         self.gatherer = OutcomeGatherer(settings, truth)
@@ -166,8 +178,10 @@ class _Player:
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
 
-    def play(self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]]) -> SchemeBatch:
-        """Take in a stretch; return what the scheme decided."""
+    def play(
+        self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]], is_told: bool = True
+    ) -> SchemeBatch:
+        """Take in a stretch; return what the scheme decided. is_told: it is compared with the log and counted."""
         ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
@@ -175,20 +189,36 @@ class _Player:
         batch = self._run(stretch, arms)
         texts = [event.message for event in self._pipeline.take_events()]
         self.gatherer.take(ticks, batch)
+        asked = None
+        if self._asking is not None and stretch.requests is not None and stretch.is_exact:
+            asked = self._asking.requests(ticks, batch)
+        if is_told:
+            self.cycles += len(ticks.cycle)
+            self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
+            self._compare(stretch, batch, asked, margins, texts)
+        return batch
+
+    def _compare(
+        self,
+        stretch: Stretch,
+        batch: SchemeBatch,
+        asked: NDArray[np.uint8] | None,
+        margins: Sequence[tuple[int, str]],
+        texts: Sequence[str],
+    ) -> None:
+        """Compare a stretch with the log, where there is something to compare with."""
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
-            return batch
+            return
+        ticks = stretch.ticks
         self.comparison.compare(stretch.scheme, ticks, batch)
-        if self._asking is not None:
-            self.requests.compare(ticks, stretch.requests, self._asking.requests(ticks, batch))
-        else:  # whatever a user could ask is believed
-            is_known = stretch.requests <= max(Request)
-            self.requests.compare(ticks, stretch.requests, np.where(is_known, stretch.requests, 0))
+        if asked is None:  # whatever a user could ask is believed
+            asked = np.where(stretch.requests <= max(Request), stretch.requests, np.uint8(Request.NONE))
+        self.requests.compare(ticks, stretch.requests, asked)
         times = ticks.t_ns[batch.contact_places].tolist()
         self._reports |= zip(times, batch.contacts, strict=True)
         self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
         logged = [margin for margin in margins if ticks.t_ns[0] <= margin[0] <= ticks.t_ns[-1]]
         self.comparison.compare_events(logged, texts, int(ticks.cycle[0]))
-        return batch
 
     def _begin(self) -> None:
         self._pipeline = pipeline_of(self.settings)
@@ -245,11 +275,14 @@ def replay_source(
     script_of: ScriptOf | None = None,
     shown: int = SHOWN,
     watch: Watch | None = None,
+    stretch: LogStretch = WHOLE,
 ) -> list[Replay]:
     """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
 
-    Raises LogError, ConfigError, CodecError.
+    stretch: what is compared and told; watch sees all from the beginning of the log on. Raises LogError, also when
+    nothing in the stretch can be replayed, ConfigError, CodecError.
     """
+    bounds_ns = _EVER if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
         tolerance = TOLERANCE if different_arithmetic(source.metadata) else 0.0
     is_scripted = source.metadata.get("operator", SCRIPTED if not source.metadata else "") == SCRIPTED
@@ -261,21 +294,70 @@ def replay_source(
     decoders = _Decoders(source.codec, variants)
     done = announced = 0
     for part in source:
-        exact: list[tuple[int, int]] = []
-        for stretch in part.stretches:
-            for place, (player, arms) in enumerate(zip(players, decoders.read(stretch), strict=True)):
-                batch = player.play(stretch, arms, part.margins)
-                if watch is not None:
-                    watch(place, stretch.ticks, batch)
-            if stretch.is_exact:
-                exact.append((int(stretch.ticks.t_ns[0]), int(stretch.ticks.t_ns[-1])))
-            done += len(stretch.ticks.cycle)
-        for player in players:
-            player.compare_contacts(part.contacts, exact)
+        cycles, is_over = _replay_part(part, players, decoders, bounds_ns, watch)
+        done += cycles
         if done - announced >= _PROGRESS_CYCLES:
             announced = done
             progress(f"{done} cycles replayed")
-    return [_result(player, source, tolerance) for player in players]
+        if is_over:
+            break
+    if not stretch.is_whole and not players[0].cycles:
+        raise LogError(f"the log has no cycle {stretch.text} that can be replayed")
+    return [_result(player, source, tolerance, bounds_ns[0]) for player in players]
+
+
+def _replay_part(
+    part: Part,
+    players: Sequence[_Player],
+    decoders: "_Decoders",
+    bounds_ns: tuple[int, int],
+    watch: Watch | None,
+) -> tuple[int, bool]:
+    """Replay a part; return its cycles, and whether it has the end of what is told."""
+    exact: list[tuple[int, int]] = []
+    cycles, is_over = 0, False
+    for stretch in part.stretches:
+        all_arms = decoders.read(stretch)
+        for mine, rows, is_told in _split(stretch, bounds_ns):
+            for place, (player, arms) in enumerate(zip(players, all_arms, strict=True)):
+                batch = player.play(mine, _arms_of(arms, rows), part.margins, is_told)
+                if watch is not None:
+                    watch(place, mine.ticks, batch)
+            if mine.is_exact and is_told:
+                exact.append((int(mine.ticks.t_ns[0]), int(mine.ticks.t_ns[-1])))
+        cycles += len(stretch.ticks.cycle)
+        is_over = bool(stretch.ticks.t_ns[-1] >= bounds_ns[1])
+        if is_over:
+            break
+    for player in players:
+        player.compare_contacts(part.contacts, exact)
+    return cycles, is_over
+
+
+def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:
+    columns: tuple[NDArray[Any], ...] = arms
+    return ArmBatch(*(column[rows] for column in columns))
+
+
+def _split(stretch: Stretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[Stretch, slice, bool]]:
+    """Part a stretch at the beginning of what is told; also give the rows of each part and whether it is told.
+
+    What comes after the end of that is left out. The frames stay with the whole.
+    """
+    first, end = np.searchsorted(stretch.ticks.t_ns, bounds_ns).tolist()
+    for rows, is_told in ((slice(0, first), False), (slice(first, end), True)):
+        if rows.start < rows.stop:
+            yield _rows_of(stretch, rows), rows, is_told
+
+
+def _rows_of(stretch: Stretch, rows: slice) -> Stretch:
+    scheme, requests = stretch.scheme, stretch.requests
+    return stretch._replace(
+        is_begin=stretch.is_begin and rows.start == 0,
+        ticks=Ticks(*(column[rows] for column in stretch.ticks)),
+        requests=None if requests is None else requests[rows],
+        scheme=None if scheme is None else scheme.part(rows),
+    )
 
 
 class _Decoders:
@@ -302,7 +384,8 @@ def _decoding_key(settings: Settings) -> Any:
     return (*shape, settings.bus, settings.devices, settings.realtime)
 
 
-def _result(player: _Player, source: Source, tolerance: float) -> Replay:
+def _result(player: _Player, source: Source, tolerance: float, first_ns: int) -> Replay:
+    """Sum up what a player came to from a time on."""
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source.notes())
     gatherer.end()
     judged = gatherer.judge()
@@ -313,20 +396,22 @@ def _result(player: _Player, source: Source, tolerance: float) -> Replay:
             notes.append(f"/scheme lacks {', '.join(comparison.missing_fields)}, an older format")
     return Replay(
         settings=player.settings,
-        cycles=gatherer.cycles,
-        monitored_s=gatherer.monitored * player.settings.bus.period_s,
+        cycles=player.cycles,
+        monitored_s=player.monitored * player.settings.bus.period_s,
         compared=0 if comparison is None else comparison.cycles,
         attempts=player.attempts,
-        states=tuple(gatherer.transitions),
-        contacts=tuple(gatherer.reports),
-        adaptations=tuple(gatherer.adaptations),
+        states=tuple(each for each in gatherer.transitions if each.t_ns >= first_ns),
+        contacts=tuple(each for each in gatherer.reports if each.t_ns >= first_ns),
+        adaptations=tuple(each for each in gatherer.adaptations if each.t_ns >= first_ns),
         parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
-        true_contacts=None if judged is None else judged[0],
-        false_alarms_ns=None if judged is None else judged[1],
-        detections_ns=tuple(each.t_ns for each in gatherer.detections),
+        true_contacts=None if judged is None else tuple(each for each in judged[0] if each.onset_ns >= first_ns),
+        false_alarms_ns=None if judged is None else tuple(t_ns for t_ns in judged[1] if t_ns >= first_ns),
+        detections_ns=tuple(each.t_ns for each in gatherer.detections if each.t_ns >= first_ns),
         mismatches=() if comparison is None else comparison.first(),
         mismatch_count=0 if comparison is None else comparison.count,
         mismatched_fields={} if comparison is None else dict(comparison.fields),
         tolerance=tolerance,
+        zero_ns=next((each.t_ns for each in gatherer.transitions if each.state is SchemeState.ADAPT), 0),
+        ending=gatherer.transitions[-1] if gatherer.transitions else None,
         notes=tuple(notes),
     )

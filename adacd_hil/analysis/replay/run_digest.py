@@ -12,6 +12,7 @@ from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.analysis.replay.source import settings_of
 from adacd_hil.config import Settings
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import LogStream
 from adacd_hil.records import SchemeState
 
@@ -60,17 +61,40 @@ class RunReader:
         self._contacts: dict[int, Detection] = {}
         self._parameters: dict[str, list[float]] = {}
         self._times = {name: Distribution() for name in _TIMES}
+        self._bounds: tuple[int, int] | None = None
 
     @property
     def zero_cycle(self) -> int:
         """Cycle at motion start."""
         return self._zero[0]
 
+    @property
+    def zero_ns(self) -> int:
+        """Motion start, ns of the run's clock."""
+        return self._zero[1]
+
+    def only(self, first: int, end: int) -> None:
+        """Read nothing but the cycles between two numbers since motion start."""
+        self._bounds = first + self.zero_cycle, end + self.zero_cycle
+
+    def _wanted(self, series: Series) -> Series:
+        """Give the records of the cycles that are to be read."""
+        if self._bounds is None or "cycle" not in series.fields:
+            return series
+        cycle = series.records["cycle"].astype(np.int64)
+        return series.part((cycle >= self._bounds[0]) & (cycle < self._bounds[1]))
+
+    def _is_over(self, series: Series) -> bool:
+        """Tell whether all that is to be read has been."""
+        return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
+
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Give the records of /scheme, piece by piece."""
-        zero_ns = self._zero[1]
+        zero_ns = self.zero_ns
         for piece in self._stream:
-            scheme = piece.series["/scheme"]
+            if self._is_over(piece.series["/scheme"]):
+                return
+            scheme = self._wanted(piece.series["/scheme"])
             t_s = (scheme.t_ns - zero_ns) * 1e-9
             records = scheme.records
             self.cycles += len(records)
@@ -80,12 +104,13 @@ class RunReader:
                     self._keep_parameters(records[row])
             if len(records):
                 self._last = records[-1].copy()
-            contacts = piece.series["/contact"]
+            contacts = self._wanted(piece.series["/contact"])
             for time_ns, record in zip(contacts.t_ns.tolist(), contacts.records, strict=True):
                 self._take_contact((time_ns - zero_ns) * 1e-9, record)
+            cycles = self._wanted(piece.series["/cycle"])
             for name in _TIMES:
-                if name in piece.series["/cycle"].fields:
-                    self._times[name].add(piece.series["/cycle"].records[name] / 1e3)
+                if name in cycles.fields:
+                    self._times[name].add(cycles.records[name] / 1e3)
             yield records
 
     def _keep_parameters(self, record: Any) -> None:

@@ -13,6 +13,7 @@ from adacd_hil.config import Settings, parse, parse_toml, renewed
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.stream import LogStream, Piece
+from adacd_hil.log.stretch import begin_of_log
 from adacd_hil.wire.codec import Codec, parse_codec
 
 FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
@@ -31,6 +32,10 @@ class Source(Protocol):
 
     def __iter__(self) -> Iterator["Part"]:
         """Give the parts, in order."""
+
+    @property
+    def start_ns(self) -> int:
+        """When it begins, ns of the clock of its cycles."""
 
     def notes(self) -> list[str]:
         """Say what is missing."""
@@ -62,6 +67,11 @@ class LogSource:
             piece = self._piece(read)
             margins = list(_margins(self._stream.events(piece)))
             yield Part(self._splitter.split(piece), contact_records(piece.series["/contact"]), margins)
+
+    @property
+    def start_ns(self) -> int:
+        """When the log's first message was, ns of the run's clock. Raises LogError."""
+        return begin_of_log(self._path)
 
     def _piece(self, piece: Piece) -> Piece:
         """Return what is to be replayed of a piece: all of it."""

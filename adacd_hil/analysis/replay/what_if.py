@@ -233,9 +233,9 @@ def _number(value: float | None) -> str:
 
 
 def _end(found: Replay) -> str:
-    if not found.states:
+    last = found.ending
+    if last is None:
         return SchemeState.INIT.name
-    last = found.states[-1]
     fault = f" ({last.fault.name})" if last.state is SchemeState.FAULT else ""
     return f"{last.state.name}{fault} since {found.time_s(last.t_ns):.2f} s"
 

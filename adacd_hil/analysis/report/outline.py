@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.attempt_begins import AttemptBegins
 from adacd_hil.analysis.report.scheme_rows import SchemeRows
 from adacd_hil.analysis.report.truth_rows import TruthRows, host_cycles, host_truth
 from adacd_hil.analysis.run import CheckCounts, Run
@@ -19,7 +20,6 @@ from adacd_hil.log.reader import LoggedEvent, Series, contacts_of
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.records import ContactReport, Request, SchemeState
 
-_BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
 BUSY: Final = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.REACT, SchemeState.STOPPED)
 """States that a stretch does not cut."""
 
@@ -37,13 +37,12 @@ class Facts:
         """The first cycle in ADAPT."""
         self.first_ns: int | None = None
         self._checks: list[CheckCounts] = []
-        self._begins: list[int] = []
-        self._was_beginning = False
+        self._attempts = AttemptBegins()
 
     @property
     def begins(self) -> Cycles:
         """First cycle of each attempt so far; of one that began before the log, 0."""
-        return np.array(self._begins or [0], np.int64)
+        return self._attempts.begins
 
     @property
     def zero_ns(self) -> int:
@@ -59,7 +58,7 @@ class Facts:
         if not len(scheme):
             return
         records = scheme.records
-        self._note_begins(records["cycle"], np.isin(records["state"], _BEGINNING))
+        self._attempts.add(records["cycle"], records["state"])
         if self.first_ns is None:
             self.first_ns = int(scheme.t_ns[0])
         adapting = np.flatnonzero(records["state"] == SchemeState.ADAPT)
@@ -69,13 +68,6 @@ class Facts:
         if self.finish_cycle is None and asked.size:
             self.finish_cycle = int(records["cycle"][asked[0]])
         self.cycles += len(scheme)
-
-    def _note_begins(self, cycle: NDArray[np.uint64], is_beginning: NDArray[np.bool_]) -> None:
-        if self.first_ns is None and not is_beginning[0]:
-            self._begins.append(0)
-        before = np.concatenate(([self._was_beginning], is_beginning[:-1]))
-        self._begins += cycle[is_beginning & ~before].astype(np.int64).tolist()
-        self._was_beginning = bool(is_beginning[-1])
 
     def apply(self, run: Run) -> Run:
         """Give a run that knows them."""

@@ -28,6 +28,7 @@ from adacd_hil.analysis.sweep.tune_scheme import (
     observe_candidates,
     thresholds_as_changes,
 )
+from adacd_hil.log.stretch import WHOLE, Stretch
 
 LIMITS: Final = (
     "The arm in the logs moved as its own scheme had it move. After a contact it braked when that scheme found it, the "
@@ -142,19 +143,27 @@ def choice_as_json(choice: Choice) -> dict[str, Any]:
     }
 
 
-def tune(paths: Sequence[Path], rate_per_h: float, config: str | None, progress: Callable[[str], None]) -> Tuning:
+def tune(
+    paths: Sequence[Path],
+    rate_per_h: float,
+    config: str | None,
+    progress: Callable[[str], None],
+    stretch: Stretch = WHOLE,
+) -> Tuning:
     """Find thresholds, filter and gain. config: name or file of the settings to start from.
+
+    stretch: of each log; the replays begin with the log, and what comes of them in the stretch counts.
 
     Raises LogError, ConfigError, CodecError, TooLittleMotionError.
     """
     progress(f"reading {len(paths)} logs")
-    logs = read_logs(paths, config)
+    logs = read_logs(paths, config, stretch, progress)
     has_truth = any(log.windows is not None for log in logs)
     notes = [] if has_truth else ["no truth.mcap beside the logs: contacts and delays are not known, and an alarm of a "
                                   "logged run counts as a contact"]  # fmt: skip
     detectors: list[Choice] = []
     try:
-        detectors = [choose(observed, rate_per_h) for observed in observe_detectors(logs)]
+        detectors = [choose(observed, rate_per_h) for observed in observe_detectors(logs, progress)]
     except TooLittleMotionError as error:
         notes.append(f"the detectors can't be compared: {error}")
     tried = candidates(logs[0].settings) if has_truth else [{}]
@@ -198,7 +207,8 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
     results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
     for log in logs:
         progress(f"replaying {log.path} with the thresholds found")
-        replays = replay_many(log.path, [apply_settings(log.settings, changes) for changes in variants])
+        settings = [apply_settings(log.settings, changes) for changes in variants]
+        replays = replay_many(log.path, settings, progress, stretch=log.stretch)
         for gathered, found in zip(results, replays, strict=True):
             gathered.append((log, found))
     return [_outcome(gathered) for gathered in results]

@@ -1,4 +1,4 @@
-"""What tuning takes from a log: its motion that nobody touched, its true contacts, and which half it belongs to.
+"""What tuning takes from a log, or a stretch of it: motion that nobody touched, true contacts, and which half it is.
 
 Thresholds are chosen on one half and checked on the other: of several logs, on every other log; of one log, on every
 other tenth of its time, and its contacts alternate.
@@ -6,23 +6,26 @@ other tenth of its time, and its contacts alternate.
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.attempt_begins import AttemptBegins
+from adacd_hil.analysis.motion import APART_S, LoggedMotion, Progress, read_motion, schemes
 from adacd_hil.analysis.replay.replay import contacts_beside
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.truth_contacts import TrueContact
 from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
-from adacd_hil.analysis.thresholds import APART_S, BLOCK_S, TOPICS, Motion, motion_from_log
+from adacd_hil.analysis.thresholds import BLOCK_S
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import read_log
+from adacd_hil.log.reader import Series
+from adacd_hil.log.stretch import WHOLE, Stretch
 from adacd_hil.records import SchemeState
 
 _TENTHS = 10
@@ -41,15 +44,19 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class TunedLog:
-    """A log of N cycles. windows: None where the truth is not known. is_chosen_on (B,): of its blocks of 0.1 s."""
+    """A log of N cycles, or N of them. windows: of the true contacts that begin in those, None where nobody knows.
+
+    is_chosen_on (B,): of its blocks of 0.1 s.
+    """
 
     path: Path
     digest: str
     settings: Settings
-    motion: Motion
+    motion: LoggedMotion
     t_ns: NDArray[np.int64]  # (N,)
     windows: tuple[Window, ...] | None
     is_chosen_on: NDArray[np.bool_]
+    stretch: Stretch = WHOLE
 
     @property
     def block(self) -> int:
@@ -57,12 +64,17 @@ class TunedLog:
         return round(BLOCK_S / self.motion.period_s)
 
 
-def read_logs(paths: Sequence[Path], config: str | None = None) -> list[TunedLog]:
-    """Read logs. config: name or file of the settings to start from, in place of the logs' own.
+def read_logs(
+    paths: Sequence[Path],
+    config: str | None = None,
+    stretch: Stretch = WHOLE,
+    progress: Progress = lambda _: None,
+) -> list[TunedLog]:
+    """Read logs, or a stretch of each. config: name or file of the settings to start from, in place of the logs' own.
 
     Raises LogError, ConfigError, CodecError; LogError also when their settings are not the same.
     """
-    logs = [_read(path, place, len(paths), config) for place, path in enumerate(paths)]
+    logs = [_read(path, place, len(paths), config, stretch, progress) for place, path in enumerate(paths)]
     first = logs[0]
     for other in logs[1:]:
         differing = changed_keys(_tunable(first.settings), _tunable(other.settings))
@@ -80,19 +92,21 @@ def _tunable(settings: Settings) -> Settings:
     return dataclasses.replace(Settings(), **{name: getattr(settings, name) for name in names})
 
 
-def _read(path: Path, place: int, count: int, config: str | None) -> TunedLog:
+def _read(path: Path, place: int, count: int, config: str | None, stretch: Stretch, progress: Progress) -> TunedLog:
     own = LogSource(path).settings
-    log = read_log(path, TOPICS)
-    motion = motion_from_log(log)
+    parts = _Index()
+    motion = read_motion(path, stretch, progress, parts.add)
+    index = parts.joined()
     contacts = contacts_beside(path)
-    blocks = -(-len(motion.q) // round(BLOCK_S / motion.period_s))
+    blocks = -(-len(index.t_ns) // round(BLOCK_S / motion.period_s))
     tenths = np.arange(blocks) * _TENTHS // blocks
     is_chosen_on = np.full(blocks, place % 2 == 0) if count > 1 else tenths % 2 == 0
     windows = None
     if contacts is not None:
         windows = tuple(
-            _window(number, contact, log.scheme, own, None if count == 1 else place)
-            for number, contact in enumerate(contacts, start=1)
+            _window(number, contact, index, own, None if count == 1 else place)
+            for number, contact in _on_cycles(contacts, _begins(motion, index))
+            if stretch.is_whole or index.cycle[0] <= contact.onset <= index.cycle[-1]
         )
         is_free = motion.is_free.copy()
         apart = round(APART_S / motion.period_s)
@@ -102,18 +116,60 @@ def _read(path: Path, place: int, count: int, config: str | None) -> TunedLog:
     with open_input(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     settings = own if config is None else keep_facts(own, load_settings(config, own.arm.profile))
-    return TunedLog(path, digest, settings, motion, log.scheme.t_ns, windows, is_chosen_on)
+    return TunedLog(path, digest, settings, motion, index.t_ns, windows, is_chosen_on, stretch)
 
 
-def _window(number: int, contact: TrueContact, scheme: Any, settings: Settings, place: int | None) -> Window:
-    cycle = scheme["cycle"].reshape(-1)
+class _Cycles(NamedTuple):
+    """Number, time and state of N cycles (N,)."""
+
+    cycle: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    state: NDArray[np.uint8]
+
+
+class _Index:
+    """Gathers the cycles of a log."""
+
+    def __init__(self) -> None:
+        self._parts: list[_Cycles] = []
+
+    def add(self, scheme: Series) -> None:
+        """Take in the next piece of /scheme."""
+        cycle, state = scheme["cycle"].astype(np.int64).reshape(-1), scheme["state"].reshape(-1).astype(np.uint8)
+        self._parts.append(_Cycles(cycle, scheme.t_ns, state))
+
+    def joined(self) -> _Cycles:
+        """Give all of them."""
+        return _Cycles(*(np.concatenate(columns) for columns in zip(*self._parts, strict=True)))
+
+
+def _begins(motion: LoggedMotion, index: _Cycles) -> list[int]:
+    """List the first cycle of each attempt, those before the stretch included."""
+    attempts = AttemptBegins()
+    if motion.bounds_ns is None:
+        attempts.add(index.cycle, index.state)
+    else:
+        for scheme in schemes(motion.path, (-(2**62), motion.bounds_ns[1])):
+            attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+    begins: list[int] = attempts.begins.tolist()
+    return begins
+
+
+def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[tuple[int, TrueContact]]:
+    """Give the contacts, numbered from 1, on the host's cycles, but for those of attempts that the log lacks."""
+    for number, contact in enumerate(contacts, start=1):
+        if contact.attempt < len(begins):
+            yield number, contact.counted_from(begins[contact.attempt])
+
+
+def _window(number: int, contact: TrueContact, index: _Cycles, settings: Settings, place: int | None) -> Window:
+    cycle, state = index.cycle, index.state
     period_s = settings.bus.period_s
     is_certified = settings.scheme == "certified"
     slowest_rad_s = settings.certified.cutoffs_rad_s[0] if is_certified else settings.filter.a_rad_s
     forgotten_s = contact.forgotten_after_s(period_s, slowest_rad_s, np.array(settings.detector.threshold_Nm))
     first = min(int(np.searchsorted(cycle, contact.onset)), len(cycle) - 1)
     last = int(np.searchsorted(cycle, contact.end + forgotten_s / period_s, side="right")) - 1
-    state = scheme["state"].reshape(-1)
     return Window(
         number=number,
         link=contact.link,

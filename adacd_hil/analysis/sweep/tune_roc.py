@@ -32,12 +32,23 @@ _LEAST: Final = 1e-9
 class Touched(NamedTuple):
     """What a detector showed of one true contact: since_s (k,) its onset, statistic (k, channels, n).
 
-    Both are empty where the detector was not armed, which counts as missed.
+    Both are empty where the detector was not armed, which counts as missed. Samples in which no statistic is larger
+    than before may be left out: no threshold is crossed there for the first time.
     """
 
     since_s: Vector
     statistic: Vector
     is_chosen_on: bool
+
+
+def rising(touched: Touched) -> Touched:
+    """Leave out the samples in which no statistic is larger than in all before."""
+    if not len(touched.since_s):
+        return touched
+    flat = touched.statistic.reshape(len(touched.since_s), -1)
+    before = np.fmax.accumulate(flat, axis=0)[:-1]
+    is_kept = np.concatenate(([True], ~(flat[1:] <= before).all(axis=1)))
+    return touched._replace(since_s=touched.since_s[is_kept], statistic=touched.statistic[is_kept])
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adacd_hil.analysis.replay.replay import Watch, replay_many
 from adacd_hil.analysis.replay.what_if import apply_settings
-from adacd_hil.analysis.sweep.tune_logs import TunedLog
-from adacd_hil.analysis.sweep.tune_roc import Observed, Touched
+from adacd_hil.analysis.sweep.tune_logs import TunedLog, Window
+from adacd_hil.analysis.sweep.tune_roc import Observed, Touched, rising
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import JOINTS, SchemeState, Vector
@@ -28,6 +29,7 @@ _NOTHING_EXCEEDS_Nm: Final = 100.0
 """The largest threshold that a configuration may have."""
 
 Changes = dict[str, str]
+Places = NDArray[np.int64]
 
 
 def candidates(settings: Settings) -> list[Changes]:
@@ -90,7 +92,7 @@ def observe_candidates(
         progress(f"replaying {log.path} with {len(tried)} filters and gains")
         variants = [_monitoring(apply_settings(log.settings, changes)) for changes in tried]
         shown = [_Shown(log, settings) for settings in variants]
-        replay_many(log.path, variants, watch=_show_to(shown))
+        replay_many(log.path, variants, progress, watch=_show_to(shown), stretch=log.stretch)
         for place, one in enumerate(shown):
             gathered[place].append(one)
     has_truth = any(log.windows is not None for log in logs)
@@ -129,15 +131,12 @@ class _Shown:
         self._log = log
         self._is_certified = settings.scheme == "certified"
         self._slices = layout_of(settings).slices
-        channels = 1 if self._is_certified else JOINTS
-        self._peaks = np.full((len(log.is_chosen_on), 1, channels), -np.inf)
-        self._is_armed = np.zeros(len(log.t_ns), dtype=np.bool_)
+        self._channels = 1 if self._is_certified else JOINTS
+        self._peaks = np.full((len(log.is_chosen_on), 1, self._channels), -np.inf)
         self._windows = [window for window in log.windows or () if window.is_armed]
-        self._kept = np.zeros(len(log.t_ns), dtype=np.bool_)
-        for window in self._windows:
-            self._kept[window.first : window.last + 1] = True
-        self._place = np.cumsum(self._kept) - 1
-        self._statistic = np.zeros((int(self._kept.sum()), 1, channels))
+        self._open = sorted(self._windows, key=lambda window: window.first)  # whose last cycle is yet to come
+        self._parts: dict[int, list[tuple[Vector, Vector]]] = {}  # by number of a window: since_s and statistic
+        self._touches: dict[int, Touched] = {}
 
     def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Take in a stretch; of cycles that the log knows nothing of, nothing is taken."""
@@ -146,15 +145,35 @@ class _Shown:
         if known.size == 0:
             return
         rows, statistic = rows[known], self._statistic_of(batch.block[known])
-        self._is_armed[rows] = batch.previous_state[known] == SchemeState.MONITOR
-        counted = np.flatnonzero(self._is_armed[rows] & self._log.motion.is_free[rows])
+        is_armed = batch.previous_state[known] == SchemeState.MONITOR
+        counted = np.flatnonzero(is_armed & self._log.motion.is_free[rows])
         if counted.size:
             blocks = rows[counted] // self._log.block
             starts = np.flatnonzero(np.diff(blocks, prepend=-1))
             largest = np.maximum.reduceat(statistic[counted], starts, axis=0)
             self._peaks[blocks[starts]] = np.maximum(self._peaks[blocks[starts]], largest)
-        kept = self._kept[rows]
-        self._statistic[self._place[rows[kept]]] = statistic[kept]
+        for window in self._open:
+            if window.first > rows[-1]:
+                break
+            self._take_window(window, rows, statistic, is_armed)
+        for window in [window for window in self._open if window.last <= rows[-1]]:
+            self._close(window)
+
+    def _take_window(self, window: Window, rows: Places, statistic: Vector, is_armed: NDArray[np.bool_]) -> None:
+        """Take in what cycles show of a contact; of one for which it is not armed, nothing."""
+        first, end = np.searchsorted(rows, (window.first, window.last + 1)).tolist()
+        if first < len(rows) and rows[first] == window.first and is_armed[first]:
+            self._parts[window.number] = []
+        if window.number in self._parts:
+            since_s = (self._log.t_ns[rows[first:end]] - self._log.t_ns[window.first]) * 1e-9
+            self._parts[window.number].append((since_s, statistic[first:end].copy()))
+
+    def _close(self, window: Window) -> None:
+        """Keep of a contact what has been shown."""
+        self._open.remove(window)
+        parts = self._parts.pop(window.number, None) or [(np.zeros(0), np.zeros((0, 1, self._channels)))]
+        since_s, statistic = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        self._touches[window.number] = rising(Touched(since_s, statistic, window.is_chosen_on))
 
     def _statistic_of(self, block: Vector) -> Vector:
         """Return what is compared with the thresholds that are to be chosen (k, 1, channels)."""
@@ -173,12 +192,6 @@ class _Shown:
 
     def touches(self) -> list[Touched]:
         """Return what was shown of the contacts that the log's scheme was armed for."""
-        touches = []
-        for window in self._windows:
-            rows = slice(window.first, window.last + 1)
-            since_s = (self._log.t_ns[rows] - self._log.t_ns[window.first]) * 1e-9
-            statistic = self._statistic[self._place[rows]]
-            if not self._is_armed[window.first]:
-                since_s, statistic = since_s[:0], statistic[:0]
-            touches.append(Touched(since_s, statistic, window.is_chosen_on))
-        return touches
+        for window in list(self._open):
+            self._close(window)
+        return [self._touches[window.number] for window in self._windows]
