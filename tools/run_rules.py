@@ -55,6 +55,8 @@ class Bounds:
     blind_cycles: int = 6
     """Cycles in a row in which the armed model had no fresh sample: 5 are allowed, and the one that says so. Where a
     setting lets a value be older than that, so many more."""
+    deaf_cycles: int = 2
+    """Cycles without feedback after which a drive has gone: where all have, nobody acknowledges what stops them."""
     contact_share: float = 3.0
     """A true contact is clear when it is so many times over the threshold in force..."""
     contact_s: float = 0.1
@@ -686,7 +688,9 @@ def the_run_ends(case: Case) -> Iterator[Violation]:
         yield Violation("unending", case.t_s(played.end_ns), f"{played.overdue}; asked to end {asked}")
         return
     for joint, commands in enumerate(case.commands):
-        if len(commands.torque) and commands.torque[-1] != 0:
+        answers = case.wire[f"Drive{joint + 1}Feedback"].cycle
+        is_deaf = len(answers) and len(commands.cycle) and commands.cycle[-1] - answers[-1] > case.bounds.deaf_cycles
+        if len(commands.torque) and commands.torque[-1] != 0 and not is_deaf:
             text = f"the last command to drive {joint + 1} has {commands.torque[-1]:g} per mille"
             yield Violation("torque-at-the-end", case.t_s(played.end_ns), text)
     has_bus = played.summary is not None and not played.summary.error
