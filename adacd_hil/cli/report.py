@@ -38,24 +38,26 @@ Reported = Report | Index
 
 
 def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: Stretch) -> tuple[list[Reported], ExitCode]:
-    """Report each log, or a stretch of it, beside it or in `out`.
+    """Report each log, or a stretch of it, beside it or in `out`; of several logs in folders of `out`.
 
     A folder stands for the run log in it, or without one for the runs in its folders; of those one that can't be read
     does not keep the others from being reported. Raises LogError, ConfigError, CommandError.
     """
+    places: dict[Path, tuple[Path, tuple[Path, ...]]] = {}  # by folder of the report
+    for given in logs:
+        runs = runs_in(given)
+        if given.is_dir() and not runs and not (given / LOG_NAME).exists():
+            raise LogError(f"{given} has no {LOG_NAME}, nor has any folder in it")
+        own = given if runs else log_in(given).parent
+        folder = own if out is None else out if len(logs) == 1 else out / own.name
+        if folder in places:
+            raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
+        places[folder] = given, runs
     progress = Progress()
     reported: list[Reported] = []
     codes = []
-    names: set[Path] = set()
     try:
-        for given in logs:
-            runs = runs_in(given)
-            if given.is_dir() and not runs and not (given / LOG_NAME).exists():
-                raise LogError(f"{given} has no {LOG_NAME}, nor has any folder in it")
-            folder = out or (given if runs else log_in(given).parent)
-            if folder in names:
-                raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
-            names.add(folder)
+        for folder, (given, runs) in places.items():
             if runs:
                 index = _report_runs(given, runs, folder, stretch, progress)
                 reported.append(index)
@@ -97,6 +99,7 @@ def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: Stretch,
             entries.append(Entry(name.as_posix(), None, one_line(error)))
     index = Index(out / INDEX_NAME, tuple(entries))
     try:
+        out.mkdir(parents=True, exist_ok=True)  # as after no run could be reported
         replace_file(index.path, index_page(out, entries))
     except OSError as error:
         raise LogError(f"{index.path} can't be written: {error.strerror}") from error

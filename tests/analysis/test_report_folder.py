@@ -71,3 +71,26 @@ def test_a_folder_with_a_run_is_that_run(folder: Path, tmp_path: Path) -> None:
     found = report(folder / "b" / "deep", "--out", tmp_path)
     assert found.exit_code == 0
     assert not (tmp_path / "index.html").exists()
+
+
+def test_several_logs_are_reported_in_folders_of_their_names(folder: Path, tmp_path: Path) -> None:
+    found = report(folder / "b" / "deep", folder / "a c#1" / "run.mcap", "--out", tmp_path)
+    assert found.exit_code == 0, found.output
+    assert sorted(path.parent.name for path in tmp_path.rglob("report.html")) == ["a c#1", "deep"]
+
+
+def test_two_reports_in_one_folder_are_refused_before_the_first(folder: Path, tmp_path: Path) -> None:
+    run = folder / "b" / "deep"
+    found = report(run, run, "--out", tmp_path)
+    line = f"adacd-hil: two reports would go to {tmp_path / 'deep'}; report these logs one by one\n"
+    assert (found.exit_code, found.stderr) == (2, line)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_index_is_written_though_no_run_can_be_reported(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "runs" / "d").mkdir(parents=True)
+    (tmp_path / "runs" / "d" / "run.mcap").write_bytes(b"nothing of a log")
+    found = report(tmp_path / "runs", "--out", tmp_path / "new" / "reports")
+    assert found.exit_code == 3, found.output
+    assert found.stdout.splitlines()[0] == "1 run, 1 not good"
+    assert "1 run, 1 not good" in (tmp_path / "new" / "reports" / "index.html").read_text(encoding="utf-8")
