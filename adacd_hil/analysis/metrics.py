@@ -131,7 +131,9 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         dropped=run.dropped,
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
-        verdict=give_verdict(run, contacts, false_s, missed, adaptation_s, payload_kg, evidence, faults, causes, data),
+        verdict=give_verdict(
+            run, sections, contacts, false_s, missed, adaptation_s, payload_kg, evidence, faults, causes, data
+        ),
         is_clean=is_identified
         and missed == 0
         and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence)),

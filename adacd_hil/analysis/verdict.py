@@ -8,6 +8,7 @@ from adacd_hil.analysis.cyclic_data import CyclicData, data_text
 from adacd_hil.analysis.endings import Fault
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.sections import Section
 
 LISTED: Final = 4
 """Adaptations that are listed one by one."""
@@ -15,6 +16,7 @@ LISTED: Final = 4
 
 def give_verdict(
     run: Run,
+    sections: tuple[Section, ...],
     contacts: tuple[Contact, ...],
     false_s: tuple[float, ...],
     missed: int,
@@ -30,7 +32,8 @@ def give_verdict(
         cause = "; ".join(causes) or "the log does not say why"
         return f"No cycle was run: {cause}."
     done = "identified" if evidence is None else "certified"
-    text = f"{_contacts_text(run, contacts, false_s, missed)}; {identified_text(adaptation_s, payload_kg, done)}"
+    identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
+    text = f"{_contacts_text(run, contacts, false_s, missed)}; {identified}"
     if evidence is not None and evidence.paper_beside is not None:
         text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     if is_margin_below_1(evidence):
@@ -110,8 +113,16 @@ def _number(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], done: str) -> str:
-    """Say how long the model took to be `done`, identified or certified."""
+def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
+    """Name the adaptations with which the arm began again after a fault, or after what broke an attempt off."""
+    pairs = itertools.pairwise(sections)
+    return frozenset(now.label for before, now in pairs if now.kind == "adaptation" and before.kind != "payload")
+
+
+def identified_text(
+    adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], anew: frozenset[str], done: str
+) -> str:
+    """Say how long the model took to be `done`, identified or certified. anew: see `begun_anew`."""
     if not adaptation_s:
         return "the arm never moved to adapt"
     labels = list(adaptation_s)
@@ -125,7 +136,7 @@ def identified_text(adaptation_s: dict[str, float | None], payload_kg: dict[str,
     text = f"the model was {done} in {adaptation_s[labels[0]]:.2f} s"
     for before, label in itertools.pairwise(labels):
         old, new, time_s = payload_kg[before], payload_kg[label], adaptation_s[label]
-        change = "the payload change"
+        change = "it began anew" if label in anew else "the payload change"
         if old is not None and new is not None and new != old:
             change = f"{new - old:g} kg" if new > old else f"taking off {old - new:g} kg"
         text += f", but not again after {change}" if time_s is None else f" and again in {time_s:.2f} s after {change}"

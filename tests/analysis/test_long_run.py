@@ -377,7 +377,7 @@ def test_of_many_contacts_the_first_are_listed_and_those_that_went_wrong(certifi
 
 def test_many_adaptations_are_summed_up():
     adaptation_s = dict(zip("ABCDEF", (2.0, 1.0, None, 1.5, 3.0, 1.0), strict=True))
-    text = identified_text(adaptation_s, dict.fromkeys(adaptation_s, None), "certified")
+    text = identified_text(adaptation_s, dict.fromkeys(adaptation_s, None), frozenset(), "certified")
     assert text == "the model was certified in 1.00 to 3.00 s, 5 times, and not certified 1 times"
 
 

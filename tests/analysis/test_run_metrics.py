@@ -448,6 +448,11 @@ def test_a_real_arm_lists_the_link_it_found():
     assert evaluate(real_arm()).contacts[0].link_detected == 2
 
 
+def test_an_adaptation_after_a_fault_is_not_said_to_follow_a_change_of_the_payload():
+    run = make_run((A, 1000), (M, 500), (SchemeState.FAULT, 5), (A, 800), (M, 500), has_truth=False)
+    assert "identified in 1.00 s and again in 0.80 s after it began anew" in evaluate(run).verdict
+
+
 @pytest.mark.parametrize(
     "field",
     ["link", "onset_s", "end_s", "delay_ms", "law_ms", "ideal_ms", "direction_ok", "tau_ext_Nm", "torque_error_ratio"],
