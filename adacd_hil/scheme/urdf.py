@@ -22,6 +22,8 @@ from adacd_hil.scheme.chain import PER_LINK, Chain
 
 MOVING = ("revolute", "continuous", "prismatic")
 STANDARD_GRAVITY_M_S2 = (0.0, 0.0, -9.80665)
+LARGEST = 1e18
+"""Of any number, in its unit: products of lengths, masses and speeds stay finite."""
 BASE = -1
 """Index of what does not move."""
 
@@ -320,13 +322,15 @@ def _numbers(element: Element, key: str, where: str, default: float | None = Non
 
 
 def _parse(word: str, where: str) -> float:
-    """Turn a word into a finite number."""
+    """Turn a word into a finite number that can be reckoned with."""
     try:
         value = float(word)
     except ValueError:
         raise UrdfError(f'{where}: "{word}" is not a number') from None
     if not math.isfinite(value):
         raise UrdfError(f"{where}: {word} is not finite")
+    if abs(value) > LARGEST:
+        raise UrdfError(f"{where}: {word} is more than {LARGEST:g}")
     return value
 
 

@@ -15,6 +15,7 @@ from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
+from adacd_hil.scheme.offline import model_of
 from adacd_hil.scheme.regressor import inverse_dynamics
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "foreign"
@@ -254,13 +255,32 @@ def test_a_period_that_would_make_too_many_samples_is_refused(tmp_path: Path, fr
         read_recording(free, read_map(tmp_path / "map.toml"))
 
 
-def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(tmp_path: Path) -> None:
+def copy_example(folder: Path, old: str, new: str) -> Path:
+    """Copy the example's map and URDF, with one text of the URDF replaced, and return the map."""
     urdf = (EXAMPLE / "planar-arm.urdf").read_text()
-    assert '<axis xyz="0 0 1"/>' in urdf
-    (tmp_path / "planar-arm.urdf").write_text(urdf.replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1e300"/>', 1))
-    (tmp_path / "map.toml").write_text((EXAMPLE / "map.toml").read_text())
-    with pytest.raises(ConfigError, match=r"planar-arm.urdf: a number is too large to reckon with"):
-        read_map(tmp_path / "map.toml")
+    assert old in urdf
+    (folder / "planar-arm.urdf").write_text(urdf.replace(old, new, 1))
+    (folder / "map.toml").write_text((EXAMPLE / "map.toml").read_text())
+    return folder / "map.toml"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1e300"/>', r"1e300 is more than 1e\+18"),
+        ('<origin xyz="0.35 0 0"/>', '<origin xyz="0.35 -1e308 0"/>', r"-1e308 is more than 1e\+18"),
+    ],
+)
+def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        read_map(copy_example(tmp_path, old, new))
+
+
+def test_the_largest_length_of_a_urdf_can_be_reckoned_with(tmp_path: Path) -> None:
+    described = read_map(copy_example(tmp_path, '<origin xyz="0.35 0 0"/>', '<origin xyz="1e18 1e18 1e18"/>'))
+    model_of(described.urdf.chain)
 
 
 def test_the_command_says_by_its_status_whether_the_test_is_explained(

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from adacd_hil.config import ConfigError, parse, read_toml, setting
 from adacd_hil.input_files import read_input
 from adacd_hil.scheme.offline import OfflineSettings
@@ -163,10 +161,7 @@ def read_map(path: Path) -> RecordingMap:
 def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:
     file = folder / arm.urdf
     try:
-        with np.errstate(over="raise"):
-            return read_urdf(read_input(file), arm.gravity_m_s2, arm.locked)
-    except FloatingPointError:
-        raise ConfigError(f"`arm.urdf`: {file}: a number is too large to reckon with") from None
+        return read_urdf(read_input(file), arm.gravity_m_s2, arm.locked)
     except OSError as error:
         raise ConfigError(f"`arm.urdf`: {file}: {error.strerror}") from None
     except UrdfError as error:
