@@ -162,7 +162,12 @@ class Cycle:
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
         if self._is_finishing and self._state in POWERED and not self._reference.is_parked(self._arm.cycle):
-            text = f"not parked within {FINISH_S:g} s: the drives are disabled where the arm is"
+            why = (
+                "interrupted again before it was parked"
+                if self._interrupts > 1
+                else f"not parked within {FINISH_S:g} s"
+            )
+            text = f"{why}: the drives are disabled where the arm is"
             recorder.event(tick.t_ns, Event("warning", "run", text))
             self._progress(text)
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)

@@ -163,6 +163,8 @@ def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
     assert summary.result is not None
     assert summary.result.cycles < TROUBLE_CYCLE + 50 + 30
     assert set(controlwords(log)[-20:].tolist()) == {QUICK_STOP}
+    (said,) = [entry.event.message for entry in log.events if entry.event.name == "run"]
+    assert said == "interrupted again before it was parked: the drives are disabled where the arm is"
 
 
 def test_an_arm_that_moves_before_it_is_enabled_is_never_enabled(tmp_path: Path) -> None:

@@ -87,7 +87,10 @@ class Asking:
 
 
 class RequestCheck:
-    """Compares the logged requests with the script's. One request to finish that isn't in it may be an interrupt."""
+    """Compares the logged requests with the script's. One request to finish that isn't in it may be an interrupt.
+
+    The script's own may follow it, while the arm parks; where it doesn't, it was the same one at another time.
+    """
 
     def __init__(self) -> None:
         self.interrupts: list[tuple[int, int]] = []  # cycle and time
@@ -103,5 +106,5 @@ class RequestCheck:
                 self.interrupts.append((cycle, t_ns))
             else:
                 self.unexplained.append((cycle, t_ns, int(logged[row]), int(asked[row])))
-        if self.interrupts and (asked == Request.FINISH).any():
+        if self.interrupts and ((asked == Request.FINISH) & (logged != Request.FINISH)).any():
             self.unexplained.append((*self.interrupts.pop(), int(Request.FINISH), int(Request.NONE)))

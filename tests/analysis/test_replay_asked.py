@@ -1,0 +1,36 @@
+"""What was asked in a run, against what its configuration's script asks."""
+
+import numpy as np
+
+from adacd_hil.analysis.replay.asked import RequestCheck
+from adacd_hil.device.recorded_arm import Ticks
+from adacd_hil.records import Request
+
+
+def unexplained(logged: dict[int, Request], asked: dict[int, Request]) -> list[tuple[int, int, int]]:
+    """Return cycle, logged and asked of what 100 cycles have that no script and no interrupt explains."""
+    cycle = np.arange(100)
+    columns = [np.array([requests.get(k, 0) for k in cycle], np.uint8) for requests in (logged, asked)]
+    check = RequestCheck()
+    check.compare(Ticks(cycle, cycle * 1_000_000, np.ones_like(cycle)), *columns)
+    return [(k, was, is_) for k, _, was, is_ in check.unexplained]
+
+
+def test_one_finish_that_is_not_in_the_script_is_an_interrupt() -> None:
+    assert unexplained({20: Request.FINISH}, {}) == []
+
+
+def test_an_interrupt_may_be_followed_by_the_finish_of_the_script() -> None:
+    assert unexplained({20: Request.FINISH, 50: Request.FINISH}, {50: Request.FINISH}) == []
+
+
+def test_the_finish_of_the_script_at_another_time_is_no_interrupt() -> None:
+    assert unexplained({20: Request.FINISH}, {50: Request.FINISH}) == [(50, 0, 4), (20, 4, 0)]
+
+
+def test_two_that_are_not_in_the_script_are_not_both_interrupts() -> None:
+    assert unexplained({20: Request.FINISH, 30: Request.FINISH}, {}) == [(30, 4, 0)]
+
+
+def test_what_the_hosts_own_checks_ask_for_is_in_no_script() -> None:
+    assert unexplained({20: Request.FAULT_TORQUE}, {}) == []
