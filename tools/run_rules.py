@@ -667,10 +667,13 @@ def a_collision_waits_for_its_acknowledgement(case: Case) -> Iterator[Violation]
 
 def _collisions_latch(case: Case) -> Iterator[Violation]:
     assert case.log is not None
+    attempt = case.wire.attempt(case.wire.sync_place[case.scheme_sync])
     for first, last in case.stays(SchemeState.REACT):
         begin_ns, end_ns = int(case.log.scheme.t_ns[first]), int(case.log.scheme.t_ns[last])
         levels = [entry.report.level for entry in case.log.contacts if begin_ns <= entry.t_ns <= end_ns]
         if ContactLevel.COLLISION not in levels or last + 1 >= len(case.state):
+            continue
+        if attempt[last + 1] != attempt[last]:  # broken off, and begun anew once the user had acknowledged that
             continue
         after = SchemeState(int(case.state[last + 1]))
         if after not in (SchemeState.STOPPED, SchemeState.FAULT, SchemeState.INIT):

@@ -80,9 +80,14 @@ def _attempt(seed: int, folder: Path) -> VcanKill:
         if begun.process.poll() is not None:
             raise TimingError(f"the host ended by itself, exit status {begun.process.returncode}")
         killed_ns = time.time_ns()
-        victims = _pids(result.victim, begun.process.pid, begun.logger_pid or 0, arm.pid)
-        for pid in victims:
-            os.kill(pid, signal.SIGKILL)
+        if begun.logger_pid is None:
+            raise TimingError("the host has no logger")
+        victims = _pids(result.victim, begun.process.pid, begun.logger_pid, arm.pid)
+        for pid in reversed(victims):  # a logger ends when its host does
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                raise TimingError(f"process {pid} ended by itself") from None
         time.sleep(WATCHED_S)
         if "host" not in result.victim:
             result.status = begun.end() if begun.process.poll() is None else begun.process.returncode
