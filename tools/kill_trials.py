@@ -4,6 +4,7 @@ The host and the emulated arm are one process, the writer of the log is another.
 its own, which nobody kills: it tells which cycle was the last.
 """
 
+import contextlib
 import os
 import select
 import signal
@@ -68,8 +69,8 @@ def _attempt(seed: int, folder: Path) -> KillResult:
         path = folder / "run.mcap"
         try:
             writer = _wait_for_cycles(process, path)
-            time.sleep(wait_s)
-            if process.poll() is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(wait_s)
                 raise RunEndedError(f"the run ended by itself, exit status {process.returncode}")
             killed_ns = time.monotonic_ns()
             _kill(victim, process.pid, writer)
@@ -94,7 +95,7 @@ def _last_cycle_ns(path: Path, killed_ns: int) -> int:
     """Return when the last cycle before the kill was, by the emulator's log, whose writer nobody killed."""
     end_s = time.monotonic() + START_S
     while (log := read_log(path)).problem and time.monotonic() < end_s:
-        time.sleep(0.1)
+        time.sleep(0.1)  # a stranger's file: there is nothing else to wait on
     times_ns = log.truth.t_ns
     return int(times_ns[times_ns <= killed_ns][-1])
 
@@ -105,7 +106,7 @@ def _wait_for_cycles(process: "subprocess.Popen[bytes]", path: Path) -> int:
     while time.monotonic() < end_s:
         if process.poll() is not None:
             raise RunEndedError(f"the run ended by itself, exit status {process.returncode}")
-        time.sleep(0.1)
+        time.sleep(0.1)  # as above
         if path.exists() and len(read_log(path, ("/cycle",)).cycle):
             return _writer_of(process.pid, path)
     raise RunEndedError(f"no cycle within {START_S:g} s")

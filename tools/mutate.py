@@ -483,7 +483,7 @@ class Pool:
                     break
                 self._start(*job)
             yield from self._collect()
-            time.sleep(0.005)
+            time.sleep(0.005)  # children end, time out or say something: no one call waits for all three
 
     def _start(self, key: object, file: str, source: bytes, tests: Sequence[str], timeout_s: float) -> None:
         self._started += 1

@@ -1,6 +1,7 @@
 """`adacd-hil identify`: a model of somebody else's arm from somebody else's recordings, and contacts in them."""
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,9 +47,10 @@ def identify(
     contacts are looked for in the recordings of --watch.
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
-    from adacd_hil.analysis.foreign.recording_import import Span, read_recording
+    from adacd_hil.analysis.foreign.recording_import import read_recording
     from adacd_hil.analysis.foreign.recording_map import read_map
     from adacd_hil.cli.progress import Progress
+    from adacd_hil.log.stretch import Stretch
 
     if not start_s < end_s:
         raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)
@@ -58,7 +60,7 @@ def identify(
         read: list[Recording] = []
         for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
-            span = Span(start_s, end_s) if place < len(recordings) else None
+            span = Stretch(start_s or -math.inf, end_s) if place < len(recordings) else None
             read.append(read_recording(path, described, read[0].period_s if read else 0.0, span))
         fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]
         tested = read[len(recordings)] if test else None

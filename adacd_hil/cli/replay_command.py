@@ -1,7 +1,6 @@
 """`adacd-hil replay`: a log once more through arm and scheme, compared with itself or set beside other settings."""
 
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,11 +195,9 @@ def _as_json(path: Path, replays: "list[Replay]", names: list[str], shown: int, 
     from adacd_hil.analysis.replay.what_if import as_json, changed_keys
 
     own = replays[0]
-    bounds_s = [bound_s if math.isfinite(bound_s) else None for bound_s in stretch]
     return {
         "log": str(path),
-        "from_s": bounds_s[0],
-        "until_s": bounds_s[1],
+        **stretch.as_json(),
         "identical": own.is_identical,
         "cycles": own.cycles,
         "compared": own.compared,

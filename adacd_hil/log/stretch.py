@@ -32,8 +32,14 @@ class Stretch(NamedTuple):
         first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
         return first_ns, end_ns
 
+    def as_json(self) -> dict[str, float | None]:
+        """Give its bounds, s; None where it is not bounded."""
+        bounds = (("from_s", self.start_s), ("until_s", self.end_s))
+        return {name: bound_s if math.isfinite(bound_s) else None for name, bound_s in bounds}
+
 
 WHOLE = Stretch()
+EVER_NS = WHOLE.bounds_ns(0)
 
 
 def start_of_log(path: Path) -> int | None:

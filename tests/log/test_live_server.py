@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from hang import HANG_S
@@ -470,38 +471,47 @@ def test_the_live_view_ends_when_the_writer_dies(tmp_path):
         os.sched_yield()
 
 
-def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch):
-    monkeypatch.setattr(server_module, "LINGER_S", HANG_S)
+class Unstarted(NamedTuple):
+    """A server that listens and has not begun to serve; `writer`: what the log's writer tells it through."""
+
+    server: server_module.LiveServer
+    listening: socket.socket
+    address: tuple[str, int]
+    writer: socket.socket
+
+
+@pytest.fixture
+def unstarted():
     ring = Ring(2**16)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    listening = listen(SETUP)
-    address = listening.getsockname()
     reader = RingReader(ring.descriptor)
     server = make_server(Told(setup_of(SETUP), CHANNEL_IDS, EPOCH_NS), reader, theirs)
+    listening = listen(SETUP)
+    yield Unstarted(server, listening, listening.getsockname(), ours)
+    for end in (ours, theirs, reader, ring):
+        end.close()
+
+
+def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch, unstarted):
+    monkeypatch.setattr(server_module, "LINGER_S", HANG_S)
+    server, listening, address, writer = unstarted
     serving = threading.Thread(target=lambda: asyncio.run(server.run(listening)))
     serving.start()
     with socket.create_connection(address) as deaf:  # for whose goodbye the server waits
         deaf.sendall(raw_request("127.0.0.1"))
         assert deaf.recv(12) == b"HTTP/1.1 101"
-        ours.send(words.END)
+        writer.send(words.END)
         with contextlib.suppress(ConnectionRefusedError):
             while True:
                 socket.create_connection(address).close()
         assert serving.is_alive()
     serving.join()
-    for end in (ours, theirs, reader, ring):
-        end.close()
 
 
 @pytest.mark.parametrize("steps", range(5))
-def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps):
+def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarted):
     """It comes so many steps of the server's loop after the end was said."""
-    ring = Ring(2**16)
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    listening = listen(SETUP)
-    address = listening.getsockname()
-    reader = RingReader(ring.descriptor)
-    server = make_server(Told(setup_of(SETUP), CHANNEL_IDS, EPOCH_NS), reader, theirs)
+    server, listening, address, writer = unstarted
 
     async def meet():
         serving = asyncio.create_task(server.run(listening))
@@ -509,18 +519,16 @@ def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps):
         refused = await asyncio.open_connection(*address)
         refused[1].write(raw_request("elsewhere.example"))
         assert (await refused[0].read()).startswith(b"HTTP/1.1 403")
-        ours.send(words.END)
+        writer.send(words.END)
         for _ in range(steps):
             await asyncio.sleep(0)
         with contextlib.suppress(ConnectionRefusedError), socket.create_connection(address):
             await serving
         await serving
-        for _, writer in (silent, refused):
-            writer.close()
+        for _, theirs in (silent, refused):
+            theirs.close()
 
     asyncio.run(meet())
-    for end in (ours, theirs, reader, ring):
-        end.close()
     gc.collect()  # whatever is still open warns, and a warning is an error
 
 

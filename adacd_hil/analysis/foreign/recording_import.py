@@ -14,7 +14,7 @@ import warnings
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple, TextIO
+from typing import Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.config import ConfigError
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.stretch import Stretch as Span
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
 from adacd_hil.scheme.offline import Record
@@ -94,13 +95,6 @@ class Recording:
         return [part for part in parts if len(part.record.q) >= _SHORTEST_SAMPLES]
 
 
-class Span(NamedTuple):
-    """From when until when, s since the beginning of a recording."""
-
-    start_s: float = 0.0
-    end_s: float = math.inf
-
-
 def read_recording(path: Path, described: RecordingMap, period_s: float = 0.0, span: Span | None = None) -> Recording:
     """Read a CSV file. period_s: of the samples, where neither the map nor the recording is to say.
 
@@ -168,7 +162,7 @@ def _read_columns(
     places = [_place(name, heads, len(first), path) for name in wanted]
     table, start = _read_table(path, described, places, span)
     if len(table) < _SHORTEST_SAMPLES:
-        where = "" if span is None or span == Span() else f" from {span.start_s:g} to {span.end_s:g} s"
+        where = "" if span is None or span.is_whole else f" {span.text}"
         raise LogError(f"recording {path} has {len(table)} rows{where}, {_SHORTEST_SAMPLES} are the least")
     units = np.array((*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if columns.dq else ())))
     time_s, begin_s = table[:, 0] * described.time_s, start * described.time_s

@@ -84,10 +84,8 @@ class LogComparison:
             }
             for run in (self.first, self.second)
         ]
-        bounds_s = [bound_s if math.isfinite(bound_s) else None for bound_s in self.stretch]
         return {
-            "from_s": bounds_s[0],
-            "until_s": bounds_s[1],
+            **self.stretch.as_json(),
             "runs": runs,
             "is_same": self.is_same,
             "settings": self.settings,

@@ -33,7 +33,7 @@ from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.log.run_folder import TRUTH_NAME
-from adacd_hil.log.stretch import WHOLE
+from adacd_hil.log.stretch import EVER_NS, WHOLE
 from adacd_hil.log.stretch import Stretch as LogStretch
 from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.batch import SchemeBatch, arm_at
@@ -45,7 +45,6 @@ from adacd_hil.wire.codec import Codec
 SCRIPTED: Final = "script"
 """Of a log's metadata `operator`: nobody could type anything."""
 _PROGRESS_CYCLES: Final = 200_000
-_EVER: Final = (-(2**62), 2**62)
 
 Progress = Callable[[str], None]
 Watch = Callable[[int, Ticks, SchemeBatch], None]
@@ -212,7 +211,7 @@ class _Player:
         ticks = stretch.ticks
         self.comparison.compare(stretch.scheme, ticks, batch)
         if asked is None:  # whatever a user could ask is believed
-            asked = np.where(stretch.requests <= max(Request), stretch.requests, np.uint8(Request.NONE))
+            asked = _known(stretch.requests)
         self.requests.compare(ticks, stretch.requests, asked)
         times = ticks.t_ns[batch.contact_places].tolist()
         self._reports |= zip(times, batch.contacts, strict=True)
@@ -230,8 +229,7 @@ class _Player:
     def _run(self, stretch: Stretch, arms: ArmBatch) -> SchemeBatch:
         """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
         if stretch.requests is not None:
-            is_known = stretch.requests <= max(Request)
-            return self._pipeline.run(arms, np.where(is_known, stretch.requests, np.uint8(Request.NONE)))
+            return self._pipeline.run(arms, _known(stretch.requests))
         outputs = []
         for row, cycle in enumerate(stretch.ticks.cycle.tolist()):
             request = Request.NONE if self._asking is None else self._asking.ask(cycle, self._state)
@@ -282,7 +280,7 @@ def replay_source(
     stretch: what is compared and told; watch sees all from the beginning of the log on. Raises LogError, also when
     nothing in the stretch can be replayed, ConfigError, CodecError.
     """
-    bounds_ns = _EVER if stretch.is_whole else stretch.bounds_ns(source.start_ns)
+    bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
         tolerance = TOLERANCE if different_arithmetic(source.metadata) else 0.0
     is_scripted = source.metadata.get("operator", SCRIPTED if not source.metadata else "") == SCRIPTED
@@ -332,6 +330,11 @@ def _replay_part(
     for player in players:
         player.compare_contacts(part.contacts, exact)
     return cycles, is_over
+
+
+def _known(requests: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Give requests (n,), with NONE for what no request has."""
+    return np.where(requests <= max(Request), requests, np.uint8(Request.NONE))
 
 
 def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:

@@ -25,7 +25,7 @@ from adacd_hil.config import Settings, load_settings
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import Series
-from adacd_hil.log.stretch import WHOLE, Stretch
+from adacd_hil.log.stretch import EVER_NS, WHOLE, Stretch
 from adacd_hil.records import SchemeState
 
 _TENTHS = 10
@@ -149,7 +149,7 @@ def _begins(motion: LoggedMotion, index: _Cycles) -> list[int]:
     if motion.bounds_ns is None:
         attempts.add(index.cycle, index.state)
     else:
-        for scheme in schemes(motion.path, (-(2**62), motion.bounds_ns[1])):
+        for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
             attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
     begins: list[int] = attempts.begins.tolist()
     return begins
