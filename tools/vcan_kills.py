@@ -44,12 +44,16 @@ ATTEMPTS = 3
 
 @dataclass
 class VcanKill:
-    """One kill. cycles: in the log. status: the host's, None where it was the victim. drives: their last states."""
+    """One kill. cycles: in the log. status, said: the host's and its last fault; None and empty of a victim.
+
+    drives: their last states.
+    """
 
     seed: int
     victim: str
     cycles: int = 0
     status: int | None = None
+    said: str = ""
     drives: list[str] = field(default_factory=list)
     rest_s: float | None = None
     violations: list[str] = field(default_factory=list)
@@ -90,7 +94,8 @@ def _attempt(seed: int, folder: Path) -> VcanKill:
                 raise TimingError(f"process {pid} ended by itself") from None
         time.sleep(WATCHED_S)
         if "host" not in result.victim:
-            result.status = begun.end() if begun.process.poll() is None else begun.process.returncode
+            result.status = begun.end()
+            result.said = str(begun.told.get("fault", ""))
         _await_closed(folder / "host" / LOG_NAME)
         if "emulator" not in result.victim:
             arm.terminate()
@@ -163,7 +168,9 @@ def _judge(result: VcanKill, folder: Path, killed_ns: int) -> None:
     lost_s = (killed_ns - log.epoch_ns - int(log.cycle.t_ns[-1])) * 1e-9
     if lost_s > LOSS_BOUND_S and "host" in result.victim:
         result.violations.append(f"lost {lost_s:.3f} s, more than {LOSS_BOUND_S:g} s")
-    result.violations += status_violations(result.victim, result.status, [e.event.message for e in log.events])
+    messages = [logged.event.message for logged in log.events]
+    told = status_violations(result.victim, result.status, messages)
+    result.violations += [f"{text}; it says {result.said or 'nothing'}" for text in told]
     if "emulator" not in result.victim:
         result.violations += drive_violations(result.drives)
         truth = read_log(folder / TRUTH_NAME, ("/truth",)).truth
