@@ -32,6 +32,9 @@ from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 VICTIMS = ("host", "logger", "emulator", "host and logger", "host and emulator")
 EARLIEST_S, LATEST_S = 1.5, 6.0
 """When somebody is killed, since the cycles began."""
+PERIOD_US = 4000
+"""Of the host's cycle. At 2 ms the one processor of a guest leaves the logger no time, and the log lags by seconds;
+stalls of 50 ms are longer then than the 25.5 periods for which a drive can be told to do without SYNC."""
 WATCHED_S = 2.0
 """How long the others go on."""
 REST_S = 1.0
@@ -75,7 +78,7 @@ def kill_on_vcan(seed: int) -> VcanKill:
 def _attempt(seed: int, folder: Path) -> VcanKill:
     result = VcanKill(seed, VICTIMS[seed % len(VICTIMS)])
     wait_s = float(np.random.default_rng(seed).uniform(EARLIEST_S, LATEST_S))
-    config = patient_config(folder, "certified", 2000, "[operator]\nacknowledge_faults = 0\n")
+    config = patient_config(folder, "certified", PERIOD_US, "[operator]\nacknowledge_faults = 0\n")
     with ExitStack() as stack:
         arm = _arm(folder)
         stack.callback(_kill, arm)
