@@ -32,9 +32,17 @@ from firmware_sim.plant import (
     GAMMA,
     LENGTH,
     MOMENT,
+    STOP_DAMPING,
+    STOP_HIGH,
+    STOP_LOW,
+    STOP_STIFFNESS,
     TORQUE_LIMIT,
     VISCOUS,
 )
+
+STOP_STIFFNESS_NM_RAD: Final = (3000.0, 1000.0)
+STOP_DAMPING_NM_S: Final = (10.0, 2.0)
+"""Of the joint stops, per rad/s."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,7 @@ class Arm:
     coulomb_Nm: tuple[float, float]
     rated_torque_Nm: tuple[float, float]  # 0x6076, also the most that the drive gives
     brake_damping_Nm_s: tuple[float, float]  # quick stop and fault: braking torque per rad/s
+    stop_deg: tuple[float, float] = (170.0, 160.0)  # joint stops at ±
 
     @property
     def link_length_m(self) -> tuple[float, float]:
@@ -87,6 +96,10 @@ class Arm:
         numbers[TORQUE_LIMIT : TORQUE_LIMIT + 2] = self.rated_torque_Nm
         numbers[BRAKE_DAMPING : BRAKE_DAMPING + 2] = self.brake_damping_Nm_s
         numbers[CURRENT_LOOP : CURRENT_LOOP + 2] = CURRENT_LOOP_RAD_S
+        numbers[STOP_HIGH : STOP_HIGH + 2] = np.radians(self.stop_deg)
+        numbers[STOP_LOW : STOP_LOW + 2] = -numbers[STOP_HIGH : STOP_HIGH + 2]
+        numbers[STOP_STIFFNESS : STOP_STIFFNESS + 2] = STOP_STIFFNESS_NM_RAD
+        numbers[STOP_DAMPING : STOP_DAMPING + 2] = STOP_DAMPING_NM_S
         first, second = self.links
         numbers[MOMENT] = first.mass_kg * first.center_m + second.mass_kg * first.length_m
         return numbers

@@ -341,7 +341,7 @@ def _fill_truth(
         contact, state[_CONTACT], elapsed_s, arm[LENGTH], touched,
     )  # fmt: skip
     if mechanics is None:
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
         torque1 = state[TAU] + ext1
         torque2 = state[TAU + 1] + ext2
         slip1, slip2 = decide_slips(state, arm, torque1, torque2, q2, dq1, dq2)
@@ -418,7 +418,7 @@ class Body:
             raise ValueError(f"period_s = {period_s} s is no multiple of {TICK_S} s")
         self.scenario = scenario
         self.period_s = period_s
-        self._arm = scenario.arm.numbers()
+        self._arm = scenario.mechanics.arm_numbers(scenario.arm)
         self._contacts = contact_table(scenario.contacts)
         self._payloads = payload_table(scenario.payloads)
         self._touch_numbers = touch_table(scenario)

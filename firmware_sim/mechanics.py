@@ -14,8 +14,7 @@ moments μ₁, μ₂ along the links and ν beside link 2 (kg m), in absolute li
 
     torque that gravity exerts:   G₁ = g' μ₁ sin(δ − φ₁)      G₂ = g' (μ₂ sin(δ − φ₂) − ν cos(δ − φ₂))
 
-so τ_gravity = −(G₁ + G₂, G₂). A joint stop is a spring with damper that only pushes, on the link side; it counts as
-external torque, because it comes from outside the link.
+so τ_gravity = −(G₁ + G₂, G₂).
 
 Dry friction truly holds: up to four slips (two links, two motors) are constant within a step, and the step is cut at
 the instant where a velocity passes zero or a holding torque passes its level, as in `firmware_sim.plant`. Bristles
@@ -89,15 +88,11 @@ from firmware_sim.transmission import (
 GRAVITY_M_S2: Final = 9.80665
 """Standard gravity, CGPM 1901."""
 
-# Places in the vector that stands for the mechanics, after those of friction and transmission; stops: two joints each.
-STOP_LOW: Final = TRANSMISSION_NUMBERS  # rad
-STOP_HIGH: Final = TRANSMISSION_NUMBERS + 2  # rad
-STOP_STIFFNESS: Final = TRANSMISSION_NUMBERS + 4  # Nm/rad; 0: no stops
-STOP_DAMPING: Final = TRANSMISSION_NUMBERS + 6  # Nm s/rad
-GRAVITY: Final = TRANSMISSION_NUMBERS + 8  # g', m/s²
-DOWNHILL: Final = TRANSMISSION_NUMBERS + 9  # δ, rad
-HOLDING_BRAKE: Final = TRANSMISSION_NUMBERS + 10  # 2: Nm, motor side, while the drive is off
-MECHANICS_NUMBERS: Final = TRANSMISSION_NUMBERS + 12
+# Places in the vector that stands for the mechanics, after those of friction and transmission.
+GRAVITY: Final = TRANSMISSION_NUMBERS  # g', m/s²
+DOWNHILL: Final = TRANSMISSION_NUMBERS + 1  # δ, rad
+HOLDING_BRAKE: Final = TRANSMISSION_NUMBERS + 2  # 2: Nm, motor side, while the drive is off
+MECHANICS_NUMBERS: Final = TRANSMISSION_NUMBERS + 4
 
 # Places in the integrated vector: link side, motor side, bristles, motor torque, two joints each.
 _Q: Final = 0
@@ -157,20 +152,6 @@ def _touch_row(row: int, work: Vector) -> int:
 
 
 @compiled
-def _stop_torque(mechanics: Vector, joint: int, q: float, dq: float) -> float:
-    """Give the torque of a joint stop, Nm."""
-    stiffness = mechanics[STOP_STIFFNESS + joint]
-    if stiffness == 0.0:
-        return 0.0
-    damping = mechanics[STOP_DAMPING + joint]
-    if q > mechanics[STOP_HIGH + joint]:
-        return float(min(0.0, -stiffness * (q - mechanics[STOP_HIGH + joint]) - damping * dq))
-    if q < mechanics[STOP_LOW + joint]:
-        return float(max(0.0, -stiffness * (q - mechanics[STOP_LOW + joint]) - damping * dq))
-    return 0.0
-
-
-@compiled
 def gravity_torque(state: Vector, arm: Vector, mechanics: Vector, q1: float, q2: float) -> tuple[float, float]:
     """Give tau_gravity of both joints in Nm, positive where it must be held along +q."""
     gravity = mechanics[GRAVITY]
@@ -209,7 +190,7 @@ def _collect(
 ) -> None:
     """Fill forces, friction levels and touch rates for the integrated vector in `row`."""
     q1, q2, dq1, dq2 = work[row + _Q], work[row + _Q + 1], work[row + _DQ], work[row + _DQ + 1]
-    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
+    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
     touch1, touch2 = 0.0, 0.0
     if touch_numbers.size != 0:
         size = _touch_size(work)
@@ -218,8 +199,8 @@ def _collect(
             touch_numbers, time_s, q1, q2, dq1, dq2, work[first : first + size], work[rates : rates + size]
         )
     held1, held2 = gravity_torque(state, arm, mechanics, q1, q2)
-    work[_EXTERNAL] = ext1 + touch1 + _stop_torque(mechanics, 0, q1, dq1)
-    work[_EXTERNAL + 1] = ext2 + touch2 + _stop_torque(mechanics, 1, q2, dq2)
+    work[_EXTERNAL] = ext1 + touch1
+    work[_EXTERNAL + 1] = ext2 + touch2
     work[_HELD], work[_HELD + 1] = held1, held2
     for joint in range(2):
         velocity = work[row + _DQ + joint]

@@ -13,7 +13,7 @@ import numpy as np
 
 from adacd_hil.config import ConfigError, setting
 from adacd_hil.records import Vector
-from firmware_sim.arms import Arm
+from firmware_sim.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, Arm
 from firmware_sim.contact import TICK_S
 from firmware_sim.friction import (
     AMBIENT,
@@ -36,12 +36,17 @@ from firmware_sim.mechanics import (
     GRAVITY_M_S2,
     HOLDING_BRAKE,
     MECHANICS_NUMBERS,
+)
+from firmware_sim.plant import (
+    MECHANICAL_STATE,
+    ROTOR,
     STOP_DAMPING,
     STOP_HIGH,
     STOP_LOW,
     STOP_STIFFNESS,
+    fit_payload,
+    mass_matrix,
 )
-from firmware_sim.plant import MECHANICAL_STATE, ROTOR, fit_payload, mass_matrix
 from firmware_sim.transmission import (
     BACKLASH,
     DAMPING,
@@ -132,13 +137,15 @@ class MechanicsSettings:
     )
     encoder_side: str = setting("motor", choices=ENCODER_SIDES, meaning="which side of the spring the encoder reads")
     stop_low_deg: Pair | None = setting(
-        None, unit="deg", low=-720.0, high=720.0, meaning="lower joint stops; absent: none"
+        None, unit="deg", low=-720.0, high=720.0, meaning="lower joint stops; absent: the profile's"
     )
     stop_high_deg: Pair | None = setting(
-        None, unit="deg", low=-720.0, high=720.0, meaning="upper joint stops; absent: none"
+        None, unit="deg", low=-720.0, high=720.0, meaning="upper joint stops; absent: the profile's"
     )
-    stop_stiffness_Nm_rad: Pair = setting((3000.0, 1000.0), unit="Nm/rad", low=1.0, high=1e7, meaning="of a joint stop")
-    stop_damping_Nm_s: Pair = setting((10.0, 2.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="of a joint stop")
+    stop_stiffness_Nm_rad: Pair = setting(
+        STOP_STIFFNESS_NM_RAD, unit="Nm/rad", low=1.0, high=1e7, meaning="of a joint stop"
+    )
+    stop_damping_Nm_s: Pair = setting(STOP_DAMPING_NM_S, unit="Nm s/rad", low=0.0, high=1e4, meaning="of a joint stop")
     tilt_deg: float = setting(0.0, unit="deg", low=0.0, high=90.0, meaning="of the base; 90: the arm moves upright")
     tilt_direction_deg: float = setting(
         0.0, unit="deg", low=-360.0, high=360.0, meaning="downhill, from the base's x axis"
@@ -180,13 +187,12 @@ class MechanicsSettings:
                 )
             if self.sigma0_Nm_rad[joint] > 0.0 and max(static_Nm, coulomb_Nm) == 0.0:
                 raise ConfigError(f"`mechanics.sigma0_Nm_rad[{joint}]` needs Coulomb or static friction above 0 Nm")
-            if self.stop_low_deg and self.stop_high_deg:
-                low_deg, high_deg = self.stop_low_deg[joint], self.stop_high_deg[joint]
-                if not low_deg <= start_deg[joint] <= high_deg:
-                    raise ConfigError(
-                        f"`start_deg[{joint}]` = {start_deg[joint]:g} deg is beyond the joint's stops at "
-                        f"{low_deg:g} and {high_deg:g} deg"
-                    )
+            low_deg, high_deg = (stops[joint] for stops in self._stops_deg(arm))
+            if not low_deg <= start_deg[joint] <= high_deg:
+                raise ConfigError(
+                    f"`start_deg[{joint}]` = {start_deg[joint]:g} deg is beyond the joint's stops at "
+                    f"{low_deg:g} and {high_deg:g} deg"
+                )
         fastest_rad_s = self.eigenvalues(arm, payloads)[1]
         bound_rad_s = LARGEST_RATE * LARGEST_SUBSTEPS / TICK_S
         if fastest_rad_s > bound_rad_s:
@@ -194,6 +200,24 @@ class MechanicsSettings:
                 f"`mechanics`: an eigenfrequency of {fastest_rad_s:.3g} rad/s is above {bound_rad_s:g} rad/s; "
                 "less stiffness or damping, or more inertia"
             )
+
+    def arm_numbers(self, arm: Arm) -> Vector:
+        """Pack the arm with its stops for compiled functions (ARM_NUMBERS,)."""
+        numbers = arm.numbers()
+        low_deg, high_deg = self._stops_deg(arm)
+        for place, pair in (
+            (STOP_LOW, np.radians(low_deg)),
+            (STOP_HIGH, np.radians(high_deg)),
+            (STOP_STIFFNESS, self.stop_stiffness_Nm_rad),
+            (STOP_DAMPING, self.stop_damping_Nm_s),
+        ):
+            numbers[place : place + 2] = pair
+        return numbers
+
+    def _stops_deg(self, arm: Arm) -> tuple[Pair, Pair]:
+        if self.stop_low_deg is None or self.stop_high_deg is None:
+            return (-arm.stop_deg[0], -arm.stop_deg[1]), arm.stop_deg
+        return self.stop_low_deg, self.stop_high_deg
 
     def numbers(self, arm: Arm) -> Vector:
         """Pack for compiled functions (MECHANICS_NUMBERS,), by the places of friction, transmission and mechanics."""
@@ -226,11 +250,6 @@ class MechanicsSettings:
         put(MOTOR_COULOMB, self.motor_coulomb_Nm)
         put(HOLDING_BRAKE, self.holding_brake_Nm)
         numbers[ENCODER_ON_LINK : ENCODER_ON_LINK + 2] = self.encoder_side == "link"
-        if self.stop_low_deg and self.stop_high_deg:
-            put(STOP_LOW, np.radians(self.stop_low_deg).tolist())
-            put(STOP_HIGH, np.radians(self.stop_high_deg).tolist())
-            put(STOP_STIFFNESS, self.stop_stiffness_Nm_rad)
-            put(STOP_DAMPING, self.stop_damping_Nm_s)
         numbers[GRAVITY] = GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
         numbers[DOWNHILL] = math.radians(self.tilt_direction_deg)
         for joint in range(2):

@@ -17,6 +17,9 @@ Coulomb friction opposes motion with F_c while the joint slips and holds with up
 `slip` is +1 or −1 while it moves and 0 while it sticks. Slips are constant within an integration step: when a
 velocity passes zero or a holding torque passes F_c, the step is cut at that instant and the slips are decided anew.
 
+A joint stop is a spring with damper that only pushes, on the link side; it counts as external torque, because it comes
+from outside the link.
+
 The motor torque follows its target with the first-order lag of the drive's current loop.
 """
 
@@ -44,7 +47,11 @@ TORQUE_LIMIT: Final = 9  # 9, 10: Nm
 BRAKE_DAMPING: Final = 11  # 11, 12: Nm s/rad
 CURRENT_LOOP: Final = 13  # 13, 14: rad/s, bandwidth of the drives' torque loops
 MOMENT: Final = 15  # kg m, first moment of all masses about joint 1 with link 2 folded into joint 2; without payload
-ARM_NUMBERS: Final = 16
+STOP_LOW: Final = 16  # 16, 17: rad
+STOP_HIGH: Final = 18  # 18, 19: rad
+STOP_STIFFNESS: Final = 20  # 20, 21: Nm/rad
+STOP_DAMPING: Final = 22  # 22, 23: Nm s/rad
+ARM_NUMBERS: Final = 24
 
 # Places in the vector of the mechanical state.
 Q: Final = 0  # 0, 1: joint position, rad
@@ -189,11 +196,27 @@ def decide_slips(
 
 
 @compiled
-def external_torque(arm: Vector, contact: Vector, elapsed_s: float, q1: float, q2: float) -> tuple[float, float]:
-    """Give the external torque of a contact row; an empty row means that nobody touches the arm."""
+def _stop_torque(arm: Vector, joint: int, q: float, dq: float) -> float:
+    """Give the torque of a joint stop, Nm."""
+    if q > arm[STOP_HIGH + joint]:
+        push = -arm[STOP_STIFFNESS + joint] * (q - arm[STOP_HIGH + joint]) - arm[STOP_DAMPING + joint] * dq
+        return float(min(0.0, push))
+    if q < arm[STOP_LOW + joint]:
+        push = -arm[STOP_STIFFNESS + joint] * (q - arm[STOP_LOW + joint]) - arm[STOP_DAMPING + joint] * dq
+        return float(max(0.0, push))
+    return 0.0
+
+
+@compiled
+def external_torque(
+    arm: Vector, contact: Vector, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
+) -> tuple[float, float]:
+    """Give the external torque of a contact row and of the joint stops; an empty row: nobody touches the arm."""
+    stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:
-        return 0.0, 0.0
-    return contact_torque(contact, contact_force(contact, elapsed_s), arm[LENGTH], q1, q2)
+        return stop1, stop2
+    ext1, ext2 = contact_torque(contact, contact_force(contact, elapsed_s), arm[LENGTH], q1, q2)
+    return ext1 + stop1, ext2 + stop2
 
 
 @compiled
@@ -241,22 +264,22 @@ def _runge_kutta(
     mid1, end1 = follow_target(tau1, target1, arm[CURRENT_LOOP] * step_s)
     mid2, end2 = follow_target(tau2, target2, arm[CURRENT_LOOP + 1] * step_s)
 
-    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
+    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
     a1, a2, _, _ = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
 
     v1, v2 = dq1 + half_s * a1, dq2 + half_s * a2
     p1, p2 = q1 + half_s * dq1, q2 + half_s * dq2
-    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2)
+    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2, v1, v2)
     b1, b2, _, _ = accelerate(state, arm, slip1, slip2, mid1 + ext1, mid2 + ext2, p2, v1, v2)
 
     w1, w2 = dq1 + half_s * b1, dq2 + half_s * b2
     p1, p2 = q1 + half_s * v1, q2 + half_s * v2
-    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2)
+    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2, w1, w2)
     c1, c2, _, _ = accelerate(state, arm, slip1, slip2, mid1 + ext1, mid2 + ext2, p2, w1, w2)
 
     x1, x2 = dq1 + step_s * c1, dq2 + step_s * c2
     p1, p2 = q1 + step_s * w1, q2 + step_s * w2
-    ext1, ext2 = external_torque(arm, contact, elapsed_s + step_s, p1, p2)
+    ext1, ext2 = external_torque(arm, contact, elapsed_s + step_s, p1, p2, x1, x2)
     d1, d2, _, _ = accelerate(state, arm, slip1, slip2, end1 + ext1, end2 + ext2, p2, x1, x2)
 
     sixth_s = step_s / 6.0
@@ -288,7 +311,7 @@ def _margin(
     if slip2 != 0:
         margin = min(margin, dq2 * slip2)
     if slip1 == 0 or slip2 == 0:
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
         _, _, friction1, friction2 = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
         if slip1 == 0:
             margin = min(margin, arm[COULOMB] - abs(friction1))
@@ -309,7 +332,7 @@ def integrate(
     left_s = step_s
     for cut in range(_LARGEST_CUTS):
         q1, q2, dq1, dq2, tau1, tau2 = state[0], state[1], state[2], state[3], state[4], state[5]
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2)
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
         slip1, slip2 = decide_slips(state, arm, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
         advanced_s = left_s
         after = _runge_kutta(

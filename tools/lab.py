@@ -156,7 +156,7 @@ def _play(
         tick = float(k * TICKS)
         contact = _contact_in_force(state, contacts)
         elapsed_s = (tick - contact[ONSET_TICK]) * TICK_S if contact.size != 0 else 0.0
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, state[Q], state[Q + 1])
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, state[Q], state[Q + 1], state[DQ], state[DQ + 1])
         push1, push2 = _push_torque(pushes, tick)
         tau_ext[k, 0], tau_ext[k, 1] = ext1 + push1, ext2 + push2
         _sample(state, transducer, torque_noise[k], none, counts)

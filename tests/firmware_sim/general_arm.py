@@ -48,13 +48,21 @@ def run_arm(
 
 
 def without_friction(name: str = "S") -> Arm:
-    return dataclasses.replace(ARMS[name], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0))
+    """Nor any stops in its way."""
+    return dataclasses.replace(ARMS[name], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0), stop_deg=(1e6, 1e6))
 
 
 def one_joint(coulomb_Nm: float = 0.0, viscous_Nm_s: float = 0.0) -> tuple[Arm, float]:
-    """An arm whose elbow is locked by friction, and the inertia about its shoulder with the elbow stretched."""
+    """An arm whose elbow is locked by friction, and the inertia about its shoulder with the elbow stretched.
+
+    It turns as far as it is driven.
+    """
     arm = dataclasses.replace(
-        ARMS["S"], viscous_Nm_s=(viscous_Nm_s, 0.0), coulomb_Nm=(coulomb_Nm, LOCKED_NM), rated_torque_Nm=(1e3, 1e3)
+        ARMS["S"],
+        viscous_Nm_s=(viscous_Nm_s, 0.0),
+        coulomb_Nm=(coulomb_Nm, LOCKED_NM),
+        rated_torque_Nm=(1e3, 1e3),
+        stop_deg=(1e6, 1e6),
     )
     alpha, beta, gamma = arm.inertia()
     return arm, alpha + gamma + 2.0 * beta
@@ -73,7 +81,7 @@ class GeneralArm:
         substeps: int | None = None,
     ) -> None:
         self.arm, self.settings = arm, settings
-        self.numbers, self.mechanics = arm.numbers(), settings.numbers(arm)
+        self.numbers, self.mechanics = settings.arm_numbers(arm), settings.numbers(arm)
         self.substeps = settings.substeps(arm, [payload]) if substeps is None else substeps
         self.state = np.zeros(MECHANICAL_STATE)
         fit_payload(self.state, self.numbers, payload[0], *payload[1], payload[2])

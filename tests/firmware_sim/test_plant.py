@@ -37,7 +37,8 @@ def state_of(arm: Arm, q=(0.0, 0.0), dq=(0.0, 0.0), payload_kg=0.0, tau=(0.0, 0.
 
 
 def without_friction(arm: Arm) -> Arm:
-    return dataclasses.replace(arm, viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0))
+    """Nor any stops in its way."""
+    return dataclasses.replace(arm, viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0), stop_deg=(1e6, 1e6))
 
 
 @compiled
@@ -180,7 +181,7 @@ def test_work_done_on_the_arm_is_kinetic_energy_plus_heat():
     step_s = 2.5e-5
     count = 12_000
     for index in range(count + 1):
-        ext1, ext2 = external_torque(numbers, contact, index * step_s, state[Q], state[Q + 1])
+        ext1, ext2 = external_torque(numbers, contact, index * step_s, *state[Q : Q + 2], *state[DQ : DQ + 2])
         slips = decide_slips(
             state, numbers, state[TAU] + ext1, state[TAU + 1] + ext2, state[Q + 1], *state[DQ : DQ + 2]
         )
@@ -360,3 +361,18 @@ def test_a_payload_taken_off_a_moving_arm_leaves_with_its_speed():
     state = state_of(arm, q=(0.4, 0.2), dq=(1.0, -2.0), payload_kg=1.0)
     fit_payload(state, arm.numbers(), 0.0)
     assert state[DQ : DQ + 2].tolist() == [1.0, -2.0]
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_an_arm_that_is_thrown_stays_between_its_stops_and_comes_to_rest(profile, way):
+    arm = ARMS[profile]
+    state = state_of(arm, dq=(way * 20.0, -way * 30.0))
+    furthest = np.zeros(2)
+    for _ in range(1_500):
+        run(state, arm.numbers(), NOBODY, 0.0, 0.0, TICK_S, 100)
+        furthest = np.maximum(furthest, np.abs(state[Q : Q + 2]))
+    stops = np.radians(arm.stop_deg)
+    assert (furthest > stops - 0.01).any()
+    assert (furthest < stops + 0.6).all()
+    assert state[DQ] == state[DQ + 1] == 0.0
