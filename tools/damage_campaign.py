@@ -99,6 +99,7 @@ def summary(logs: Sequence[DamageResult], kills: Sequence[KillResult], vcan: Seq
         "killed_runs": len(kills),
         "by_victim": dict(Counter(result.victim for result in kills)),
         "most_lost_s": max((result.lost_s for result in kills), default=0.0),
+        "most_lost_on_vcan_s": max((result.lost_s for result in vcan), default=0.0),
         "bound_s": LOSS_BOUND_S,
         "killed_on_vcan": len(vcan),
         "by_victim_on_vcan": dict(Counter(result.victim for result in vcan)),

@@ -35,7 +35,7 @@ from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 from adacd_hil.records import SchemeState
 from firmware_sim.scenario import load_scenario
 
-COUNTED = ("command-counter", "sync-counter", "log-not-whole")
+COUNTED = ("command-counter", "sync-counter", "log-not-whole", "torque-rate", "stop-not-latched")
 """Rules that a log with gaps can't be judged by."""
 BURN = "while True: pass"
 SCRUB = """

@@ -28,6 +28,7 @@ from adacd_hil.log.editing.recover import recover
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
+from adacd_hil.records import SchemeState
 
 VICTIMS = ("host", "logger", "emulator", "host and logger", "host and emulator")
 EARLIEST_S, LATEST_S = 1.5, 6.0
@@ -35,6 +36,14 @@ EARLIEST_S, LATEST_S = 1.5, 6.0
 PERIOD_US = 4000
 """Of the host's cycle. At 2 ms the one processor of a guest leaves the logger no time, and the log lags by seconds;
 stalls of 50 ms are longer then than the 25.5 periods for which a drive can be told to do without SYNC."""
+SETTINGS = """
+[operator]
+acknowledge_faults = 0
+[controller]
+Kp = [62.5, 5.0]
+Kd = [6.25, 0.375]
+"""
+"""The arm's own gains are too much for this cycle; after a fault there is nobody to be killed."""
 WATCHED_S = 2.0
 """How long the others go on."""
 REST_S = 1.0
@@ -49,7 +58,7 @@ ATTEMPTS = 3
 class VcanKill:
     """One kill. cycles: in the log. status, said: the host's and its last fault; None and empty of a victim.
 
-    drives: their last states.
+    lost_s: from the last cycle in the log to the kill, where the host was killed. drives: their last states.
     """
 
     seed: int
@@ -57,6 +66,7 @@ class VcanKill:
     cycles: int = 0
     status: int | None = None
     said: str = ""
+    lost_s: float = 0.0
     drives: list[str] = field(default_factory=list)
     rest_s: float | None = None
     violations: list[str] = field(default_factory=list)
@@ -78,7 +88,7 @@ def kill_on_vcan(seed: int) -> VcanKill:
 def _attempt(seed: int, folder: Path) -> VcanKill:
     result = VcanKill(seed, VICTIMS[seed % len(VICTIMS)])
     wait_s = float(np.random.default_rng(seed).uniform(EARLIEST_S, LATEST_S))
-    config = patient_config(folder, "certified", PERIOD_US, "[operator]\nacknowledge_faults = 0\n")
+    config = patient_config(folder, "certified", PERIOD_US, SETTINGS)
     with ExitStack() as stack:
         arm = _arm(folder)
         stack.callback(_kill, arm)
@@ -168,9 +178,14 @@ def _judge(result: VcanKill, folder: Path, killed_ns: int) -> None:
     if not result.cycles:
         result.violations.append("no cycle was saved")
         return
-    lost_s = (killed_ns - log.epoch_ns - int(log.cycle.t_ns[-1])) * 1e-9
-    if lost_s > LOSS_BOUND_S and "host" in result.victim:
-        result.violations.append(f"lost {lost_s:.3f} s, more than {LOSS_BOUND_S:g} s")
+    faults_ns = log.scheme.t_ns[log.scheme["state"] == SchemeState.FAULT]
+    if len(faults_ns) and log.epoch_ns + int(faults_ns[0]) < killed_ns:
+        raise TimingError("the host had stopped the arm by itself")
+    if "host" in result.victim:
+        result.lost_s = (killed_ns - log.epoch_ns - int(log.cycle.t_ns[-1])) * 1e-9
+    # With the logger goes what was in the ring: as much as it has not found the time for.
+    if result.lost_s > LOSS_BOUND_S and not is_cut:
+        result.violations.append(f"lost {result.lost_s:.3f} s, more than {LOSS_BOUND_S:g} s")
     messages = [logged.event.message for logged in log.events]
     told = status_violations(result.victim, result.status, messages)
     result.violations += [f"{text}; it says {result.said or 'nothing'}" for text in told]
