@@ -50,7 +50,7 @@ compiled: $(VENV)/.run
 
 test: $(VENV)/.dev
 	$(MAKE) --no-print-directory -j2 check compiled
-	$(BIN)/pytest -m "not vcan" -n auto --dist loadfile
+	$(BIN)/pytest -m "not vcan" -n auto --dist loadfile --no-loadscope-reorder
 	tools/test-on-vcan
 
 test-realtime: $(VENV)/.dev

@@ -3,7 +3,15 @@
 import os
 import signal
 
+import pytest
+
 os.environ.pop("COLUMNS", None)  # pytest-xdist gives its workers 80; what no terminal shows has none
 os.unsetenv("COLUMNS")  # readline, which pytest loads, sets it behind Python's back
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's job in the background: Ctrl-C would reach nobody
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that have slow tests: else one worker is left with them in the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
