@@ -275,9 +275,8 @@ class MechanicsSettings:
         for joint in range(2):
             stiffness[joint, joint] += self.sigma0_Nm_rad[joint]
             damping[joint, joint] += self.sigma1_Nm_s[joint] + max(viscous[joint], arm.viscous_Nm_s[joint])
-            if self.stop_low_deg:
-                stiffness[joint, joint] += self.stop_stiffness_Nm_rad[joint]
-                damping[joint, joint] += self.stop_damping_Nm_s[joint]
+            stiffness[joint, joint] += self.stop_stiffness_Nm_rad[joint]
+            damping[joint, joint] += self.stop_damping_Nm_s[joint]
             motor = 2 + elastic.index(joint) if joint in elastic else joint
             damping[motor, motor] += self.motor_viscous_Nm_s[joint]
             if joint in elastic:

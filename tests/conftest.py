@@ -1,4 +1,4 @@
-"""What the tests' own process hands down to the programs that they start."""
+"""The tests' own process: what it hands down to the programs that it starts, and which files it begins with."""
 
 import os
 import signal

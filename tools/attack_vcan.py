@@ -259,7 +259,7 @@ def _go(attacker: "subprocess.Popen[str]", seconds: float) -> dict[str, Any]:
 
 
 def _second_user(name: str, channel: str, config: Path, folder: Path) -> tuple[int, str]:
-    """Run another command on the same arm; return its exit status and its last line.
+    """Run another command on the same arm; return its exit status and its last two lines.
 
     It gets the time that is left: a guest has one processor, and a program that starts takes it from the emulated
     devices, which no second user of an arm does.

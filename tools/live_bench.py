@@ -53,7 +53,7 @@ def view(url: str, blocks: int, block_s: float) -> dict[str, Any]:
         if block % 2:
             found["received"].append(watch(url, left_s))
         else:
-            time.sleep(left_s)
+            time.sleep(left_s)  # nobody watches for as long
         found["watched" if block % 2 else "idle"].append((begin_ns, time.time_ns()))
     return found
 
@@ -151,7 +151,7 @@ def main() -> None:
     parser.add_argument("--view", metavar="URL", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.view:
-        time.sleep(START_S)
+        time.sleep(START_S)  # the run settles first
         print(json.dumps(view(options.view, options.blocks, options.block_s)))
         return
     with tempfile.TemporaryDirectory() as folder:

@@ -8,14 +8,14 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from judged_log import judged_log
-from run_rules import Case, clear_contacts, judge
+from run_rules import Case, Violation, clear_contacts, judge
 from side_by_side import (
     CHANNEL,
     TimingError,
@@ -30,13 +30,17 @@ from side_by_side import (
 from timing_hour import write_contacts
 
 from adacd_hil.config import load_settings
-from adacd_hil.log.reader import read_log
+from adacd_hil.log.reader import Series, read_log
 from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 from adacd_hil.records import SchemeState
 from firmware_sim.scenario import load_scenario
 
-COUNTED = ("command-counter", "sync-counter", "log-not-whole", "torque-rate", "stop-not-latched")
+COUNTED = ("command-counter", "sync-counter", "log-not-whole")
 """Rules that a log with gaps can't be judged by."""
+FOLLOWED = ("torque-rate", "stop-not-latched")
+"""Rules about what follows what; where cycles are missing in between, nobody knows."""
+STAY_S = 1.0
+"""A stay in REACT or STOPPED takes less in these runs."""
 BURN = "while True: pass"
 SCRUB = """
 import os, sys
@@ -98,7 +102,10 @@ def describe(folder: Path, config: Path, scenario_path: Path) -> dict[str, Any]:
     cycle = read_log(log_path, ("/cycle",)).cycle
     violations = judge(played)
     if not case.log.is_complete:  # where packets are missing, so are frames
-        violations = [each for each in violations if each.rule not in COUNTED]
+        known = outside_gaps(
+            violations, [(case.t_s(begin_ns), case.t_s(end_ns)) for begin_ns, end_ns in gaps_ns(cycle)]
+        )
+        violations = [each for each in known if each.rule not in COUNTED]
     speed = np.degrees(np.abs(case.truth["dq"]))
     faults = [entry.event.message for entry in case.log.events if "-> FAULT" in entry.event.message]
     return {
@@ -118,6 +125,22 @@ def describe(folder: Path, config: Path, scenario_path: Path) -> dict[str, Any]:
         "log_problem": case.log.problem or ("" if case.log.is_complete else "with gaps"),
         "processors": os.cpu_count(),
     }
+
+
+def gaps_ns(cycle: Series) -> list[tuple[int, int]]:
+    """Return from which logged cycle to which others are missing, but for those that the host skipped."""
+    lacking = np.diff(cycle["cycle"].astype(np.int64)) - 1 > np.diff(cycle["overruns"].astype(np.int64))
+    return list(zip(cycle.t_ns[:-1][lacking].tolist(), cycle.t_ns[1:][lacking].tolist(), strict=True))
+
+
+def outside_gaps(violations: Sequence[Violation], gaps_s: Sequence[tuple[float, float]]) -> list[Violation]:
+    """Leave out what follows a gap, of the rules about what follows what."""
+    return [
+        violation
+        for violation in violations
+        if violation.rule not in FOLLOWED
+        or not any(begin_s <= violation.t_s <= end_s + STAY_S for begin_s, end_s in gaps_s)
+    ]
 
 
 def show_hogs(result: dict[str, Any]) -> str:

@@ -183,8 +183,7 @@ def _judge(result: VcanKill, folder: Path, killed_ns: int) -> None:
         raise TimingError("the host had stopped the arm by itself")
     if "host" in result.victim:
         result.lost_s = (killed_ns - log.epoch_ns - int(log.cycle.t_ns[-1])) * 1e-9
-    # With the logger goes what was in the ring: as much as it has not found the time for.
-    if result.lost_s > LOSS_BOUND_S and not is_cut:
+    if result.lost_s > LOSS_BOUND_S:
         result.violations.append(f"lost {result.lost_s:.3f} s, more than {LOSS_BOUND_S:g} s")
     messages = [logged.event.message for logged in log.events]
     told = status_violations(result.victim, result.status, messages)

@@ -60,6 +60,7 @@ def identify(
         read: list[Recording] = []
         for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
+            # From 0 s on: nothing is left out before.
             span = Stretch(start_s or -math.inf, end_s) if place < len(recordings) else None
             read.append(read_recording(path, described, read[0].period_s if read else 0.0, span))
         fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]

@@ -14,10 +14,12 @@ import timing_clock
 import timing_hogs
 import vcan_kills
 from judged_log import judged_log
+from run_rules import Violation
 from vcan_kills import VcanKill
 
 from adacd_hil.cli.demo import Cast, run_embedded
 from adacd_hil.config import OperatorSettings, RequestSettings, load_settings, parse
+from adacd_hil.log.reader import Series
 from adacd_hil.records import TRUTH_LAYOUT
 from firmware_sim.scenario import Scenario
 
@@ -77,3 +79,16 @@ def test_hogs_are_gone_when_the_block_ends(tmp_path: Path) -> None:
     with timing_hogs.hogs(2, 1, tmp_path) as processes:
         assert [process.poll() for process in processes] == [None] * 3
     assert [process.returncode for process in processes] == [-9] * 3
+
+
+def test_what_follows_what_is_judged_but_for_a_second_after_missing_cycles() -> None:
+    cycle = np.zeros(5, [("sec", np.int32), ("nanosec", np.uint32), ("cycle", np.uint64), ("overruns", np.uint32)])
+    cycle["sec"] = range(5)
+    cycle["cycle"] = 0, 1, 5, 6, 12
+    cycle["overruns"] = 0, 0, 3, 3, 3  # what the host skipped, it has not lost
+    assert timing_hogs.gaps_ns(Series(cycle, 0)) == [(3 * 10**9, 4 * 10**9)]
+    found = [
+        Violation(rule, t_s, "")
+        for rule, t_s in (("torque-rate", 2.9), ("torque-rate", 4.5), ("stop-not-latched", 5.1), ("blind", 4.5))
+    ]
+    assert timing_hogs.outside_gaps(found, [(3.0, 4.0)]) == [found[0], *found[2:]]
