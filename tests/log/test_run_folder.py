@@ -47,7 +47,7 @@ def test_a_run_beside_one_that_is_going_on_is_told_its_process(tmp_path):
 def test_a_run_is_going_on_after_its_first_part(tmp_path):
     path = tmp_path / "run.mcap"
     recorder = start(path, make_run(0), settings=LogSettings(part_MiB=1, part_min=0.0))
-    feed(recorder, make_run(900).cycles)
+    feed(recorder, make_run(1500).cycles)  # more than the first part and what the writer gathers before it writes
     wait_until_taken(recorder)
     while not part_path(path, 1).exists():  # the test's time limit ends it
         os.sched_yield()

@@ -119,7 +119,8 @@ def _channels(run: Run) -> Iterator[Panel]:
 def _shares(stream: CertifiedStream) -> Vector:
     shares = np.zeros((len(stream.tau_ext), JOINTS))
     for channel in range(stream.tau_ext.shape[1]):
-        np.maximum(shares, np.abs(stream.tau_ext[:, channel]) / stream.threshold[:, channel], out=shares)
+        with np.errstate(over="ignore"):  # a damaged log's threshold of next to nothing
+            np.maximum(shares, np.abs(stream.tau_ext[:, channel]) / stream.threshold[:, channel], out=shares)
     return shares
 
 
