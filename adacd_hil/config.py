@@ -200,6 +200,16 @@ class ArmSettings:
     torque_offset_Nm: tuple[float, float] = setting(
         (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="sensor zero, subtracted after the sign"
     )
+    torque_offset_std_Nm: tuple[float, float] | None = setting(
+        None, unit="Nm", low=1e-6, high=100.0, meaning="how well that zero is known, a deviation; `--tare` says it"
+    )
+    holding_torque_Nm: tuple[float, float] | None = setting(
+        None,
+        unit="Nm",
+        low=0.0,
+        high=1000.0,
+        meaning="most that brake and friction of a motor without power hold; 0: free; absent: not known",
+    )
     torque_limit_Nm: tuple[float, float] = setting(
         (12.0, 6.0), unit="Nm", low=0.0, high=1000.0, meaning="largest commanded torque"
     )
@@ -834,6 +844,15 @@ class TareSettings:
     )
     warn_age_h: float = setting(24.0, unit="h", low=0.0, high=1e5, meaning="a run warns of a tare older than this")
     max_age_h: float = setting(0.0, unit="h", low=0.0, high=1e5, meaning="a run refuses one older than this; 0: never")
+    drift_Nm_sqrt_s: float = setting(
+        2e-5, unit="Nm/√s", low=0.0, high=1.0, meaning="random walk of a sensor's zero; take the data sheet's"
+    )
+    drift_Nm_K: float = setting(
+        1e-3, unit="Nm/K", low=0.0, high=10.0, meaning="drift of a sensor's zero with temperature; likewise"
+    )
+    temperature_K: float = setting(
+        5.0, unit="K", low=0.0, high=200.0, meaning="how far the temperature may be from that of the tare"
+    )
 
 
 @dataclass(frozen=True)

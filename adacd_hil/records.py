@@ -190,6 +190,7 @@ class Request(IntEnum):
     FAULT_TORQUE = 5
     FAULT_FOLLOWING = 6
     FAULT_TAMPERED = 7
+    ACCEPT_OFFSET = 8  # the torque that the sensors read, or the fit found, is their zero: nobody leans on the arm
 
 
 class Reaction(IntEnum):

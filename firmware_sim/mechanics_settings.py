@@ -176,6 +176,12 @@ class MechanicsSettings:
         """Whether the rigid plant is all there is."""
         return self == MechanicsSettings()
 
+    @property
+    def holding_torque_Nm(self) -> Pair:
+        """What the motors hold without power: their own friction and their brakes."""
+        first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, strict=True)
+        return sum(first), sum(second)
+
     def check(self, arm: Arm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
         """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads."""
         for joint in range(2):

@@ -41,7 +41,8 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
     """Read configuration and scenario. Raises ConfigError.
 
     The profile is the given one, else that of the scenario's file, else the configuration's. A configuration without a
-    script gets the demo's user: who only watches can't acknowledge.
+    script gets the demo's user: who only watches can't acknowledge. One that doesn't say what the motors hold gets it
+    from the emulated arm, as from a data sheet.
     """
     settings = load_settings(config, profile or named_profile(scenario_name))
     scenario = load_scenario(scenario_name, settings.arm.profile, seed)
@@ -54,7 +55,10 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
             script=(RequestSettings(at_s=scenario.lasts_s, request="finish"),),
             acknowledge_faults=scenario.acknowledge_faults,
         )
-    return Cast(dataclasses.replace(settings, operator=operator), scenario)
+    arm = settings.arm
+    if arm.holding_torque_Nm is None:
+        arm = dataclasses.replace(arm, holding_torque_Nm=scenario.mechanics.holding_torque_Nm)
+    return Cast(dataclasses.replace(settings, arm=arm, operator=operator), scenario)
 
 
 def run_embedded(

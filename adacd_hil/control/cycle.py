@@ -55,6 +55,8 @@ FRAME_CHECKS_S = 1.0
 """How often the log gets what the checks of frames have counted."""
 
 _ENABLING = POWERED | {SchemeState.ENABLE}
+_TOLD = frozenset(("anchor", "certificate"))
+"""Events that the user is told as they happen."""
 
 
 @dataclass(frozen=True)
@@ -248,6 +250,7 @@ class Cycle:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
         exchange = self._exchange
+        told: list[Event] = []
         for source in (
             self._master,
             self._arm.strangers,
@@ -261,10 +264,14 @@ class Cycle:
         ):
             for event in source.take_events():
                 recorder.event(t_ns, event)
+                if event.name in _TOLD:
+                    told.append(event)
         if output.state is not self._state:
             event = self._transition(output)
             recorder.event(t_ns, event)
             self._follow_state(output.state, arm.cycle)
+            told.insert(0, event)
+        for event in told:
             self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
 
     def _transition(self, output: SchemeOutput) -> Event:

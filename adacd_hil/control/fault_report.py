@@ -32,7 +32,11 @@ class FaultReport:
             FaultReason.BLIND: (arm.describe_gaps,),
             FaultReason.LIMIT: (arm.describe_excess,),
             FaultReason.DEADLINE: (lambda: [watch.deadline.describe()],),
-            FaultReason.COMMISSION_TIMEOUT: (self._commission.describe, arm.describe_excess),
+            FaultReason.COMMISSION_TIMEOUT: (
+                pipeline.describe_anchors,
+                self._commission.describe,
+                arm.describe_excess,
+            ),
             FaultReason.ENABLE_TIMEOUT: (arm.describe_disabled,),
             FaultReason.ADAPT_TIMEOUT: (pipeline.describe_missing,),
         }

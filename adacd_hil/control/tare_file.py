@@ -5,13 +5,14 @@ sensors that it was measured with, by their serial numbers of 0x1018:4.
 """
 
 import dataclasses
+import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from adacd_hil.config import ConfigError, Settings, parse, read_toml, setting, to_toml
+from adacd_hil.config import ConfigError, Settings, TareSettings, parse, read_toml, setting, to_toml
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.input_files import read_input
@@ -21,6 +22,8 @@ from adacd_hil.records import JOINTS, Event
 TARE_NAME = "tare.toml"
 FORMAT = 1
 _DATE = "%Y-%m-%dT%H:%M:%SZ"
+SMALLEST_STD_NM = 0.001
+"""No zero is known better than this, however long it was measured."""
 _NS_PER_H = 3_600_000_000_000
 _CLOCK_TOLERANCE_H = 0.1
 
@@ -145,12 +148,24 @@ class UsedTare:
     path: Path
     text: bytes
     tare: Tare
+    age_s: float
     warnings: tuple[str, ...]
 
     def apply(self, settings: Settings) -> Settings:
-        """Return settings whose `arm.torque_offset_Nm` is the tare's."""
-        arm = dataclasses.replace(settings.arm, torque_offset_Nm=self.tare.offset_Nm)
+        """Return settings whose `arm.torque_offset_Nm` is the tare's, and say how well it is known."""
+        arm = dataclasses.replace(
+            settings.arm, torque_offset_Nm=self.tare.offset_Nm, torque_offset_std_Nm=self.offset_std_Nm(settings.tare)
+        )
         return dataclasses.replace(settings, arm=arm)
+
+    def offset_std_Nm(self, drift: TareSettings) -> tuple[float, float]:
+        """Return the standard deviation of the offsets now: as measured, and what has drifted since."""
+        drifted = (drift.drift_Nm_K * drift.temperature_K) ** 2 + drift.drift_Nm_sqrt_s**2 * self.age_s
+        first, second = (
+            math.sqrt(error**2 + (spread / 2.0) ** 2 + drifted)
+            for error, spread in zip(self.tare.standard_error_Nm, self.tare.spread_Nm, strict=True)
+        )
+        return max(first, SMALLEST_STD_NM), max(second, SMALLEST_STD_NM)
 
     def check_sensors(self, identities: Sequence[Identity]) -> list[Event]:
         """Return what goes to the log's events. Raises DeviceError unless the sensors are those that were tared."""
@@ -203,4 +218,4 @@ def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
         warnings.append(f"{path} is dated {-age_h:.1f} h in the future: a clock is wrong")
     if tare.is_auto_zeroed:
         warnings.append(f"{path} counts on the zero that the sensors set themselves; a sensor that was reset forgot it")
-    return UsedTare(path, read_input(path), tare, tuple(warnings))
+    return UsedTare(path, read_input(path), tare, max(age_h, 0.0) * 3600.0, tuple(warnings))

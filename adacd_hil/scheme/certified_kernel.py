@@ -23,6 +23,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import FRICTION_TERMS, Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, SchemeState, Vector, certified_layout
 from adacd_hil.scheme import (
+    anchor,
     bank,
     belief,
     certificate,
@@ -38,7 +39,7 @@ from adacd_hil.scheme.kernel import Structured, block_dtype, is_filled, keep_sam
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 
 # What a cycle does, as bits.
-MEASURE = 1  # the arm is at rest: measure the torque sensors' noise
+MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero
 WATCH = 2  # compare the residuals with their thresholds
 LEARN = 4  # correct the belief and use it at once
 TEST = 8  # test the frozen model
@@ -59,6 +60,7 @@ _FITTED = int(Observation.FITTED)
 _CERTIFIED = int(Observation.CERTIFIED)
 _REFUTED = int(Observation.REFUTED)
 _UNSEEN = int(Observation.UNSEEN)
+_WITHHELD = int(Observation.WITHHELD)
 
 _EIGENVALUE_EVERY = 64
 """Samples between two looks at the eigenvalues: they take 8 µs, the rest of a step about 3 µs."""
@@ -136,6 +138,7 @@ def constants_of(settings: Settings) -> Structured:
         "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
         "smoothing": np.exp(-certified.smoothing_rad_s * period_s),
         **sensitivity.noise_constants(certified, period_s),
+        **anchor.constants_of(settings),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
         "still_rad_s": certified.still_rad_s,
@@ -224,6 +227,13 @@ def new_memory(settings: Settings) -> Structured:
         "rest_tau": joint,
         "rest_square": joint,
         "roughness": joint,
+        # anchors of the offsets
+        "rest_count": (),
+        "anchor_age_s": (),
+        "anchor_Nm": (anchor.KINDS, *joint),
+        "anchor_std": (anchor.KINDS, *joint),
+        "bound_Nm": (anchor.KINDS, *joint),
+        "judged_Nm": joint,
         "dq_old": joint,
         "ddq_old": joint,
         "velocity_roughness": joint,
@@ -249,6 +259,7 @@ def new_memory(settings: Settings) -> Structured:
     prior = prior_of(settings)
     belief.begin(prior, prior_std, state["belief"], state["P_belief"])
     belief.begin(prior, prior_std, state["theta"], state["P"])
+    anchor.begin(constants_of(settings)[0], state)
     return memory
 
 
@@ -338,14 +349,18 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
         out["period_s"][0] = max(steps, 1) * k["period_s"]
     is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
     if is_fresh:
+        m["anchor_age_s"] += out["period_s"][0]
         if mode & MEASURE:
             _measure_noise(k, m, out["tau_J"])
+            anchor.measure(k, m, out["tau_J"], observation & _AT_REST != 0)
         if _filter(k, m, out, steps):
             observation &= ~_UNSEEN
         if not (np.all(np.isfinite(m["r"])) and np.all(np.isfinite(m["theta"]))):
             observation |= _NOT_A_NUMBER
     elif is_complete != 0:
         m["has_gap"] = 1.0
+    if mode & MEASURE and anchor.is_rest_refused(k, m):
+        observation |= _WITHHELD
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
     else:
@@ -504,7 +519,9 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         return 0
     if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         _use_belief(m)
-    return _FITTED if is_free and _gather_evidence(k, m, out) else 0
+    if not (is_free and _gather_evidence(k, m, out)):
+        return 0
+    return _FITTED if anchor.is_kept(k, m, m["belief"], m["P_belief"]) else _WITHHELD
 
 
 @compiled
@@ -523,7 +540,9 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
         has_moved = has_moved and fastest >= k["velocity_rad_s"]
     is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
-    return _CERTIFIED if is_long and has_moved else 0
+    if not (is_long and has_moved):
+        return 0
+    return _CERTIFIED if anchor.is_kept(k, m, m["theta"], m["P"]) else _REFUTED | _WITHHELD
 
 
 @compiled
@@ -623,7 +642,7 @@ def step_record(
         elif found & _FITTED:
             begin_test(constants, memory)
             now = CERTIFY
-        elif found & _REFUTED:
+        elif found & (_REFUTED | _WITHHELD):
             is_payload, begins_in = False, 0
         elif found & _CERTIFIED:
             begin_refinement(memory)

@@ -19,13 +19,14 @@ from adacd_hil.records import (
     certified_layout,
 )
 from adacd_hil.scheme import certificate, certified_kernel
+from adacd_hil.scheme.anchor_watch import AnchorWatch
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.intervals import Intervals
 from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_certified
 from adacd_hil.scheme.margin import MarginWatch
-from adacd_hil.scheme.observation import CONTACT_SHIFT
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.regressor import inverse_dynamics
 from adacd_hil.scheme.supervisor import Supervisor
 from adacd_hil.scheme.touch import Touch
@@ -41,6 +42,7 @@ _MODES = {
     SchemeState.STOPPED: _WATCH,
     SchemeState.PAYLOAD: _WATCH,
 }
+_WITHHELD = int(Observation.WITHHELD)
 _LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 
 
@@ -80,6 +82,7 @@ class CertifiedPipeline(RunsBatches):
         self._monitored = 0
         self._has_warned = False
         self._events: list[Event] = []
+        self._anchors = AnchorWatch(self._constants, self._memory, self._events.append)
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
@@ -94,7 +97,12 @@ class CertifiedPipeline(RunsBatches):
 
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for, a line each."""
-        return certificate.describe_missing(self._constants[0], self._memory[0], self._names, PARAMETER_UNITS)
+        missing = certificate.describe_missing(self._constants[0], self._memory[0], self._names, PARAMETER_UNITS)
+        return [*self._anchors.describe(), *missing]
+
+    def describe_anchors(self) -> list[str]:
+        """Say which anchor is contradicted, a line each."""
+        return self._anchors.describe()
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
@@ -115,9 +123,15 @@ class CertifiedPipeline(RunsBatches):
     def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
         supervisor, touch = self._supervisor, self._touch
         previous = supervisor.state
+        if request is Request.ACCEPT_OFFSET:
+            self._anchors.accept()
+            observation &= ~_WITHHELD
         state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
+        self._anchors.step(previous, state, observation)
         if state is not previous:
             self._enter(state, previous)
+        elif observation & _WITHHELD and state is SchemeState.ADAPT:
+            certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
         if self._promotions[0] != self._refined:
             self._feed_forward()
         block = self._values.copy()
@@ -150,8 +164,9 @@ class CertifiedPipeline(RunsBatches):
         )
 
     def take_events(self) -> list[Event]:
-        """Return what is worth a line since the last call: a margin that has shrunk."""
-        events, self._events = self._events, []
+        """Return what is worth a line since the last call: a margin that has shrunk, a certificate, none."""
+        events = self._events.copy()
+        self._events.clear()
         return events
 
     def _watch_margin(self, state: SchemeState) -> None:

@@ -75,6 +75,10 @@ class Pipeline(RunsBatches):
         """Say what an adaptation that takes too long is waiting for. The paper's condition is one: eq. (15)."""
         return []
 
+    def describe_anchors(self) -> list[str]:
+        """Say which anchor is contradicted: none, the paper identifies no offsets."""
+        return []
+
     def take_events(self) -> list[Event]:
         """Return what is worth a line since the last call: nothing, the paper watches no margin."""
         return []

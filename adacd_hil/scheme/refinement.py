@@ -3,12 +3,14 @@
 The belief goes on learning where nothing touches the arm. Every so often its mean is frozen as a candidate and runs
 beside the model in use on motion that neither was fitted to. It takes over if it explains that motion better and would
 have raised no alarm. So friction that warms up, and a model that was armed early, are followed, but a touch is not:
-a contact pauses the test, and what is left below the thresholds can't move a candidate by more than that.
+a contact pauses the test, what is left below the thresholds can't move a candidate by more than that, and its offsets
+keep to their anchors (`anchor`).
 """
 
 from typing import Any
 
 from adacd_hil.compiled import compiled
+from adacd_hil.scheme import anchor
 from adacd_hil.scheme.regressor import is_positive_definite
 
 MOVING = 0.05
@@ -43,7 +45,8 @@ def test_candidate(k: Any, m: Any) -> bool:
     if m["candidate_cycles"] < k["refine_cycles"]:
         return False
     is_better = m["candidate_square"] < m["frozen_square"] and m["candidate_worst"] < 1.0
-    is_promoted = is_better and is_positive_definite(m["candidate"])
+    is_anchored = is_better and anchor.is_kept(k, m, m["candidate"], m["P_candidate"])
+    is_promoted = is_anchored and is_positive_definite(m["candidate"])
     if is_promoted:
         m["theta"][:] = m["candidate"]
         m["P"][:] = m["P_candidate"]

@@ -41,6 +41,7 @@ _CERTIFIED = int(Observation.CERTIFIED)
 _REFUTED = int(Observation.REFUTED)
 _CONTACT = int(Observation.CONTACT)
 _COLLISION = int(Observation.COLLISION)
+_WITHHELD = int(Observation.WITHHELD)
 _ANY_CONTACT = _CONTACT | _COLLISION
 
 POWERED = frozenset(
@@ -65,12 +66,14 @@ KEPT_IN = MappingProxyType(
         Request.PAYLOAD: POWERED - {SchemeState.PAYLOAD},
         Request.PAYLOAD_CHANGED: frozenset((SchemeState.PAYLOAD,)),
         Request.FINISH: frozenset[SchemeState](),
+        Request.ACCEPT_OFFSET: frozenset[SchemeState](),
         Request.FAULT_TORQUE: frozenset[SchemeState](),
         Request.FAULT_FOLLOWING: frozenset[SchemeState](),
         Request.FAULT_TAMPERED: frozenset[SchemeState](),
     }
 )
-"""Where a request waits to be served. FINISH is the control layer's; a fault is served at once, or not at all."""
+"""Where a request waits to be served. FINISH is the control layer's; ACCEPT_OFFSET and a fault are served at once, or
+not at all."""
 _FAULT_ASKED = MappingProxyType(
     {
         Request.FAULT_TORQUE: FaultReason.TORQUE,
@@ -110,6 +113,8 @@ def _calm_in(state: SchemeState) -> tuple[int, int]:
         watched |= int(ArmFinding.OLD)
     if state in POWERED:
         expected |= int(ArmFinding.ENABLED)
+    if state in (SchemeState.COMMISSION, SchemeState.ADAPT):
+        watched |= _WITHHELD
     if state is SchemeState.COMMISSION:
         expected |= int(ArmFinding.COMPLETE) | _REST_UNLOADED
     return watched | expected, expected
@@ -364,7 +369,8 @@ class Supervisor:
 
         One whose data are not complete doesn't count and breaks nothing: how many may be missing, `_check` says.
         """
-        is_good = observation & _REST_UNLOADED == _REST_UNLOADED and self._check(arm, observation) is FaultReason.NONE
+        is_resting = observation & (_REST_UNLOADED | _WITHHELD) == _REST_UNLOADED
+        is_good = is_resting and self._check(arm, observation) is FaultReason.NONE
         self._commissioned_cycles = self._commissioned_cycles + arm.is_complete if is_good else 0
         return self._commissioned_cycles >= self._commission_cycles
 

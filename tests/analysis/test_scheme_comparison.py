@@ -9,8 +9,8 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.mcap_walk import record_dtype
 from adacd_hil.log.provenance import arithmetic
-from adacd_hil.log.reader import Series
-from adacd_hil.records import scheme_layout
+from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.records import Event, scheme_layout
 from adacd_hil.scheme.batch import SchemeBatch
 
 SETTINGS = load_settings("paper")
@@ -101,15 +101,23 @@ def test_all_mismatches_are_counted_and_the_earliest_are_kept() -> None:
     assert comparison.fields["/scheme.theta_hat"] == 21
 
 
-def test_margin_events_are_compared_by_their_text() -> None:
+def test_the_schemes_events_are_compared_in_order() -> None:
     comparison = SchemeComparison(SETTINGS)
-    comparison.compare_events([(5, "half")], ["half"], 3)
+    half, third = Event("warning", "margin", "half"), Event("info", "certificate", "third")
+    comparison.compare_events([LoggedEvent(5, half)], [half], 3)
     assert comparison.count == 0
-    comparison.compare_events([(5, "half"), (9, "third")], ["half"], 3)
-    (mismatch,) = comparison.mismatches
-    assert (mismatch.topic, mismatch.t_ns, mismatch.logged, mismatch.replayed) == (
-        "/events", 9, "'third'", "'no event'",
-    )  # fmt: skip
+    comparison.compare_events([LoggedEvent(5, half), LoggedEvent(9, third)], [half], 3)
+    comparison.compare_events([LoggedEvent(5, half)], [half, third], 3)
+    comparison.compare_events([LoggedEvent(5, half)], [Event("info", "margin", "half")], 3)
+    missing, added, other = comparison.first()
+    assert (missing.field, missing.t_ns, missing.logged, missing.replayed) == (
+        "certificate",
+        9,
+        "'info: third'",
+        "'no event'",
+    )
+    assert (added.field, added.t_ns, added.logged, added.replayed) == ("certificate", 0, "'no event'", "'info: third'")
+    assert (other.field, other.logged, other.replayed) == ("margin", "'warning: half'", "'info: half'")
 
 
 def test_only_another_arithmetic_asks_for_a_tolerance() -> None:

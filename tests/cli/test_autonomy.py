@@ -49,6 +49,16 @@ def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path: Path) -
     assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(str(mine)).operator
 
 
+def test_an_emulated_arm_says_what_its_motors_hold_unless_the_configuration_does(tmp_path: Path) -> None:
+    assert resolve("certified", "idle", None, None).settings.arm.holding_torque_Nm == (0.0, 0.0)
+    geared = resolve("certified", "motor-side-friction", None, None)
+    assert geared.settings.arm.holding_torque_Nm == geared.scenario.mechanics.motor_coulomb_Nm != (0.0, 0.0)
+    mine = tmp_path / "my-arm.toml"
+    mine.write_text('extends = "certified"\n[arm]\nholding_torque_Nm = [8.0, 4.0]\n')
+    assert resolve(str(mine), "idle", None, None).settings.arm.holding_torque_Nm == (8.0, 4.0)
+    assert load_settings("certified").arm.holding_torque_Nm is None
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

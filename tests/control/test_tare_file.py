@@ -1,6 +1,7 @@
 """Stored tares: written whole or not at all, read with the rules of the configuration, used only where they belong."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
@@ -131,11 +132,35 @@ def test_a_missing_file_says_what_makes_one(tmp_path: Path) -> None:
         read_tare(tmp_path / "none.toml")
 
 
-def test_a_run_takes_over_the_offset_and_nothing_else(tmp_path: Path) -> None:
+def test_a_run_takes_over_the_offset_with_its_deviation_and_nothing_else(tmp_path: Path) -> None:
     used = use_tare(stored(tmp_path), SETTINGS, DATE_NS)
-    arm = dataclasses.replace(SETTINGS.arm, torque_offset_Nm=(0.305, -0.2))
+    arm = dataclasses.replace(
+        SETTINGS.arm, torque_offset_Nm=(0.305, -0.2), torque_offset_std_Nm=used.offset_std_Nm(SETTINGS.tare)
+    )
     assert used.apply(SETTINGS) == dataclasses.replace(SETTINGS, arm=arm)
     assert used.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("age_h", "expected_Nm"),
+    [
+        # standard error, half the spread, 5 K of 1 mNm/K, 0.02 mNm/√s
+        (0.0, (math.hypot(0.005, 0.005, 0.005), math.hypot(0.0004, 0.005))),
+        (24.0, (math.hypot(0.005, 0.005, 0.005, 2e-5 * 86400**0.5), math.hypot(0.0004, 0.005, 2e-5 * 86400**0.5))),
+        (-1.0, (math.hypot(0.005, 0.005, 0.005), math.hypot(0.0004, 0.005))),
+    ],
+)
+def test_a_tare_knows_the_zero_less_well_as_it_ages(
+    tmp_path: Path, age_h: float, expected_Nm: tuple[float, float]
+) -> None:
+    used = use_tare(stored(tmp_path), SETTINGS, DATE_NS + round(age_h * HOUR_NS))
+    assert used.offset_std_Nm(SETTINGS.tare) == pytest.approx(expected_Nm)
+
+
+def test_no_tare_knows_the_zero_to_less_than_a_millinewtonmetre(tmp_path: Path) -> None:
+    used = use_tare(stored(tmp_path), SETTINGS, DATE_NS)
+    steady = dataclasses.replace(SETTINGS.tare, drift_Nm_K=0.0, drift_Nm_sqrt_s=0.0)
+    assert used.offset_std_Nm(steady) == pytest.approx((math.hypot(0.005, 0.005), 0.001))
 
 
 def test_another_sign_than_the_one_it_was_measured_with_is_refused(tmp_path: Path) -> None:

@@ -236,7 +236,7 @@ class RecordingAlone:
 
     def __iter__(self) -> Iterator[Part]:
         """Give one part."""
-        yield Part(list(self._stretches()), {}, ())
+        yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[Stretch]:
         recording = self._recording

@@ -35,7 +35,7 @@ from adacd_hil.log.reader import LoggedContact
 from adacd_hil.log.run_folder import TRUTH_NAME
 from adacd_hil.log.stretch import EVER_NS, WHOLE
 from adacd_hil.log.stretch import Stretch as LogStretch
-from adacd_hil.records import ArmBatch, ContactReport, Request, SchemeOutput, SchemeState
+from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.batch import SchemeBatch, arm_at
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.pipeline import Pipeline
@@ -177,16 +177,14 @@ class _Player:
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
 
-    def play(
-        self, stretch: Stretch, arms: ArmBatch, margins: Sequence[tuple[int, str]], is_told: bool = True
-    ) -> SchemeBatch:
-        """Take in a stretch; return what the scheme decided. is_told: it is compared with the log and counted."""
+    def play(self, stretch: Stretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
+        """Take in a stretch of a part; return what the scheme decided. is_told: it is compared and counted."""
         ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
             self.gatherer.begin(stretch.attempt, int(ticks.cycle[0]))
         batch = self._run(stretch, arms)
-        texts = [event.message for event in self._pipeline.take_events()]
+        events = self._pipeline.take_events()
         self.gatherer.take(ticks, batch)
         asked = None
         if self._asking is not None and stretch.requests is not None and stretch.is_exact:
@@ -194,7 +192,7 @@ class _Player:
         if is_told:
             self.cycles += len(ticks.cycle)
             self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
-            self._compare(stretch, batch, asked, margins, texts)
+            self._compare(stretch, batch, asked, part, events)
         return batch
 
     def _compare(
@@ -202,8 +200,8 @@ class _Player:
         stretch: Stretch,
         batch: SchemeBatch,
         asked: NDArray[np.uint8] | None,
-        margins: Sequence[tuple[int, str]],
-        texts: Sequence[str],
+        part: Part,
+        events: Sequence[Event],
     ) -> None:
         """Compare a stretch with the log, where there is something to compare with."""
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
@@ -216,8 +214,9 @@ class _Player:
         times = ticks.t_ns[batch.contact_places].tolist()
         self._reports |= zip(times, batch.contacts, strict=True)
         self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
-        logged = [margin for margin in margins if ticks.t_ns[0] <= margin[0] <= ticks.t_ns[-1]]
-        self.comparison.compare_events(logged, texts, int(ticks.cycle[0]))
+        logged = [event for event in part.events if ticks.t_ns[0] <= event.t_ns <= ticks.t_ns[-1]]
+        replayed = [event for event in events if event.name in part.said]
+        self.comparison.compare_events(logged, replayed, int(ticks.cycle[0]))
 
     def _begin(self) -> None:
         self._pipeline = pipeline_of(self.settings)
@@ -318,7 +317,7 @@ def _replay_part(
         all_arms = decoders.read(stretch)
         for mine, rows, is_told in _split(stretch, bounds_ns):
             for place, (player, arms) in enumerate(zip(players, all_arms, strict=True)):
-                batch = player.play(mine, _arms_of(arms, rows), part.margins, is_told)
+                batch = player.play(mine, _arms_of(arms, rows), part, is_told)
                 if watch is not None:
                     watch(place, mine.ticks, batch)
             if mine.is_exact and is_told:

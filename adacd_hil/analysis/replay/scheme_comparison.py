@@ -5,6 +5,7 @@ value may be off by `TOLERANCE` of the largest one that its field has had so far
 all that is counted, named or switched has to be the same, and what is infinite or not a number.
 """
 
+import itertools
 import math
 import struct
 from collections import Counter
@@ -18,8 +19,8 @@ from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.provenance import arithmetic
-from adacd_hil.log.reader import Series
-from adacd_hil.records import JOINTS, ContactReport, Layout, Vector
+from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Vector
 from adacd_hil.scheme.batch import SchemeBatch
 from adacd_hil.scheme.selection import layout_of
 
@@ -170,13 +171,19 @@ class SchemeComparison:
         is_real = isinstance(logged, float) and math.isfinite(logged) and math.isfinite(replayed)
         return is_real and abs(logged - replayed) <= self._tolerance * max(1.0, abs(logged))
 
-    def compare_events(self, logged: Sequence[tuple[int, str]], replayed: Sequence[str], cycle: int) -> None:
-        """Compare the texts of the margin's events (t_ns, text) of the stretch that begins with a cycle, in order."""
-        for index in range(max(len(logged), len(replayed))):
-            t_ns, theirs = logged[index] if index < len(logged) else (0, "no event")
-            ours = replayed[index] if index < len(replayed) else "no event"
-            if theirs != ours:
-                self.add(Mismatch("/events", "margin", "", cycle, t_ns, repr(theirs), repr(ours)))
+    def compare_events(self, logged: Sequence[LoggedEvent], replayed: Sequence[Event], cycle: int) -> None:
+        """Compare the scheme's own events of the stretch that begins with a cycle, in order."""
+        for theirs, ours in itertools.zip_longest(logged, replayed):
+            if theirs is not None and theirs.event == ours:
+                continue
+            name = ours.name if theirs is None else theirs.event.name
+            t_ns = 0 if theirs is None else theirs.t_ns
+            logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
+            self.add(Mismatch("/events", name, "", cycle, t_ns, logged_text, replayed_text))
+
+
+def _event_text(event: Event | None) -> str:
+    return repr("no event" if event is None else f"{event.level}: {event.message}")
 
 
 def _same_bits(first: Vector, second: Vector) -> bool:

@@ -19,8 +19,9 @@ from adacd_hil.wire.codec import Codec, parse_codec
 FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
 TOPICS: Final = (*FRAME_TOPICS, "/scheme", "/cycle", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 20_000
-_MARGIN: Final = "margin"
-"""Name of the events that the scheme itself says."""
+_SAID_ALWAYS: Final = frozenset({"margin"})
+_SAID: Final = frozenset({"margin", "anchor", "certificate"})
+"""Names of the events that the scheme itself says; logs from before the anchors have the margin's alone."""
 
 
 class Source(Protocol):
@@ -42,11 +43,12 @@ class Source(Protocol):
 
 
 class Part(NamedTuple):
-    """What one piece of a log holds. contacts: logged reports by time, ns; margins: (time, text)."""
+    """What one piece of a log holds. contacts: logged reports by time, ns; events: of the names in `said`."""
 
     stretches: Iterable[Stretch]
     contacts: Mapping[int, Mapping[str, Any]]
-    margins: Sequence[tuple[int, str]]
+    events: Sequence[LoggedEvent]
+    said: frozenset[str]
 
 
 class LogSource:
@@ -59,14 +61,15 @@ class LogSource:
         self.metadata: Mapping[str, str] = self._stream.metadata
         self.settings = settings_of(path, self._stream.attachments)
         self.codec = codec_of(path, self._stream.attachments)
+        self._said = _SAID if _has_anchors(self._stream.attachments) else _SAID_ALWAYS
         self._splitter = AttemptSplitter(self._stream.epoch_ns)
 
     def __iter__(self) -> Iterator[Part]:
         """Give the parts, in order."""
         for read in self._stream:
             piece = self._piece(read)
-            margins = list(_margins(self._stream.events(piece)))
-            yield Part(self._splitter.split(piece), contact_records(piece.series["/contact"]), margins)
+            events = [logged for logged in self._stream.events(piece) if logged.event.name in self._said]
+            yield Part(self._splitter.split(piece), contact_records(piece.series["/contact"]), events, self._said)
 
     @property
     def start_ns(self) -> int:
@@ -117,7 +120,7 @@ def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
     return parse_codec(attachments["arm.dbc"], path.with_name("arm.dbc"))
 
 
-def _margins(events: Iterable[LoggedEvent]) -> Iterator[tuple[int, str]]:
-    for t_ns, event in events:
-        if event.name == _MARGIN:
-            yield t_ns, event.message
+def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
+    """Tell whether the run that the settings are of knew anchors: since then they say how a zero drifts."""
+    tare = parse_toml(attachments["config.toml"]).get("tare")
+    return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare

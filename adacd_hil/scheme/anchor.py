@@ -1,0 +1,177 @@
+"""Anchors: what says where the zero of a torque sensor is, apart from the fit.
+
+A lean and an offset have the same column of the regressor, on every motion, so no fit tells them apart. What does is
+knowledge from elsewhere. An anchor judges the fitted offset and never pulls it: that would push a lean into friction.
+
+    REST      the reading at rest before the drives are enabled. A motor without power, friction and brake transmits no
+              torque, so the reading is the offset, whoever leans. What the motor side can hold, `holding_Nm`, is the
+              most by which a lean shifts it; where that is not known the reading says nothing.
+    TARE      the zero of the configuration, where a tare says how well it is known.
+    ACCEPTED  what the user has accepted in place of both.
+
+The fitted offset o must keep to each anchor a that there is:
+
+    |o - a| <= SIGMAS sqrt(u P_oo + sigma_a² + b² t + (0.1 F_c)² + 0.005²) + holding_Nm (of REST)
+
+u P_oo: the belief's variance in the unit of its residuals; b² t: drift since; 0.1 F_c: friction that differs by
+direction looks like an offset. Before the drives are enabled the reading at rest must keep to the tare likewise.
+
+Shapes: anchor_Nm, anchor_std, bound_Nm (3, n), inf where there is none; judged_Nm (n,): what was compared last with
+them; holding_Nm (n,), inf where not known.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, Vector
+
+REST, TARE, ACCEPTED = range(3)
+KINDS = 3
+SIGMAS = 4.0
+"""Two joints, two-sided: 1.3e-4 of clean arms."""
+REST_STD_NM = 0.004
+"""Of the reading at rest beside its noise: the sensor's hysteresis, and its warming until the certificate."""
+MODEL_STD_NM = 0.005
+"""What else the model leaves in the offset of a clean arm."""
+ASYMMETRY = 0.1
+"""Part of the Coulomb friction by which its two directions may differ."""
+NO_ANCHOR = "offsets not anchored: what has leaned on the arm since before the start is learnt as the sensors' zero"
+FEWEST = 50
+"""Samples of a reading at rest that is compared with the tare."""
+
+
+def constants_of(settings: Settings) -> dict[str, Vector]:
+    """Return what the kernel needs to know: `holding_Nm`, `zero_std_Nm` (n,), `zero_drift_Nm2_s`, `rest_count_max`."""
+    arm = settings.arm
+    return {
+        "holding_Nm": _or_unknown(arm.holding_torque_Nm),
+        "zero_std_Nm": _or_unknown(arm.torque_offset_std_Nm),
+        "zero_drift_Nm2_s": np.array(settings.tare.drift_Nm_sqrt_s**2),
+        "rest_count_max": np.array(max(settings.safety.commission_s / settings.bus.period_s, FEWEST)),
+    }
+
+
+def _or_unknown(values: tuple[float, float] | None) -> Vector:
+    return np.full(JOINTS, np.inf) if values is None else np.array(values)
+
+
+def begin(k: Any, m: Any) -> None:
+    """Fill the anchors before the first sample: the tare alone."""
+    m["anchor_std"][:] = np.inf
+    m["anchor_std"][TARE] = k["zero_std_Nm"]
+
+
+@compiled
+def measure(k: Any, m: Any, tau_J: Vector, is_resting: bool) -> None:
+    """Take one sample before the drives are enabled into the reading at rest, which begins anew when the arm moves.
+
+    A mean over the last `rest_count_max` samples or so: who leaned before and has gone is forgotten.
+    """
+    m["rest_count"] = min(m["rest_count"] + 1.0, k["rest_count_max"]) if is_resting else 0.0
+    m["anchor_age_s"] = 0.0
+    for i in range(tau_J.shape[0]):
+        if not is_resting:
+            m["anchor_std"][REST, i] = np.inf
+            continue
+        m["anchor_Nm"][REST, i] += (tau_J[i] - m["anchor_Nm"][REST, i]) / m["rest_count"]
+        if k["holding_Nm"][i] != np.inf:
+            m["anchor_std"][REST, i] = np.sqrt(_rest_variance(k, m, i))
+
+
+@compiled
+def _rest_variance(k: Any, m: Any, joint: int) -> float:
+    noise = k["torque_noise_Nm"] ** 2 * m["roughness"][joint] / max(m["rest_count"], 1.0)
+    return float(noise + REST_STD_NM**2)
+
+
+@compiled
+def is_rest_refused(k: Any, m: Any) -> bool:
+    """Tell whether some joint reads at rest what its tare excludes, beyond what the motor side may hold."""
+    if m["rest_count"] < FEWEST:
+        return False
+    is_refused = False
+    for i in range(m["judged_Nm"].shape[0]):
+        std, slack = m["anchor_std"][TARE, i], k["holding_Nm"][i]
+        m["judged_Nm"][i] = m["anchor_Nm"][REST, i]
+        m["bound_Nm"][:, i] = np.inf
+        if np.isfinite(std + slack):
+            m["bound_Nm"][TARE, i] = SIGMAS * np.sqrt(std**2 + _rest_variance(k, m, i)) + slack
+        off = abs(m["judged_Nm"][i] - m["anchor_Nm"][TARE, i])
+        is_refused = is_refused or not (off <= m["bound_Nm"][TARE, i])
+    return is_refused
+
+
+@compiled
+def is_kept(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
+    """Tell whether a model's offsets keep to all anchors that there are. theta (p,), P (p, p)."""
+    base, first_coulomb = int(k["base"]), int(k["first_coulomb"])
+    drift = k["zero_drift_Nm2_s"] * m["anchor_age_s"]
+    is_kept = True
+    for i in range(m["judged_Nm"].shape[0]):
+        m["judged_Nm"][i] = theta[base + i]
+        friction = ASYMMETRY * max(theta[first_coulomb + i], 0.0)
+        fitted = min(m["unit"][i], 1.0) * P[base + i, base + i] + friction**2 + MODEL_STD_NM**2
+        for kind in range(KINDS):
+            std, slack = m["anchor_std"][kind, i], k["holding_Nm"][i] if kind == REST else 0.0
+            m["bound_Nm"][kind, i] = SIGMAS * np.sqrt(fitted + std**2 + drift) + slack if std != np.inf else np.inf
+            is_kept = is_kept and abs(theta[base + i] - m["anchor_Nm"][kind, i]) <= m["bound_Nm"][kind, i]
+    return bool(is_kept)
+
+
+def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
+    """Let offsets (n,) that the user takes for the sensors' zero, with their deviations, replace all anchors."""
+    m["anchor_std"][:] = np.inf
+    m["anchor_Nm"][ACCEPTED] = offset_Nm
+    m["anchor_std"][ACCEPTED] = std_Nm
+    m["anchor_age_s"] = 0.0
+
+
+def accept_reading(m: Any) -> None:
+    """Let the reading at rest, which the tare excludes, stand without the tare."""
+    m["anchor_std"][TARE] = np.inf
+
+
+def describe(k: Any, m: Any) -> str:
+    """Say what anchors the offsets that have been judged last, and how closely, Nm."""
+    names = [
+        f"{_name(k, kind)} ± {', '.join(f'{limit:.3f}' for limit in m['bound_Nm'][kind])} Nm"
+        for kind in range(KINDS)
+        if np.isfinite(m["bound_Nm"][kind]).any()
+    ]
+    return "offsets anchored by the " + " and the ".join(names) if names else NO_ANCHOR
+
+
+def _name(k: Any, kind: int) -> str:
+    if kind != REST:
+        return "tare" if kind == TARE else "user's word"
+    if not k["holding_Nm"].any():
+        return "reading at rest of free motors"
+    held = ", ".join(f"{value:g}" for value in k["holding_Nm"])
+    return f"reading at rest of motors that hold up to {held} Nm"
+
+
+def describe_refused(m: Any, is_reading: bool) -> list[str]:
+    """Say which of the torques that have been judged last an anchor excludes, and by how much, a line each.
+
+    is_reading: it was the reading at rest; else the offsets of a fit.
+    """
+    anchors = ("at rest it read", "by the tare it is", "the user accepted")
+    lines = []
+    for i in range(m["judged_Nm"].shape[0]):
+        value = float(m["judged_Nm"][i])
+        for kind in range(KINDS):
+            expected, limit = float(m["anchor_Nm"][kind, i]), float(m["bound_Nm"][kind, i])
+            if not abs(value - expected) <= limit:
+                what = (
+                    f"reads {value:.3f} Nm at rest"
+                    if is_reading
+                    else f"has a torque offset of {value:.3f} Nm by the fit"
+                )
+                lines.append(
+                    f"joint {i + 1} {what}, {anchors[kind]} {expected:.3f} ± {limit:.3f} Nm: "
+                    "somebody leans on it, or the sensor has moved"
+                )
+    return lines

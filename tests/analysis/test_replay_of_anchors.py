@@ -1,0 +1,70 @@
+"""A replay comes to what the log says of a certificate and of one that was withheld; logs from before say nothing."""
+
+from pathlib import Path
+
+import pytest
+
+from adacd_hil.analysis.replay.replay import replay
+from adacd_hil.analysis.replay.source import LogSource
+from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.config import to_toml
+from adacd_hil.control.operator import ScriptedOperator
+from adacd_hil.log.reader import read_log
+from adacd_hil.scheme import anchor
+
+pytestmark = pytest.mark.slow
+
+LEAN = """
+lasts_s = 6.0
+start_deg = [-30.0, -60.0]
+
+[[contacts]]
+at_s = 0.0
+link = 1
+point_m = 0.25
+force_N = 2.0
+duration_s = 2.0
+angle_deg = 90.0
+"""
+
+
+@pytest.fixture(scope="module")
+def leant_on(tmp_path_factory) -> Path:
+    """The log of an arm that somebody leans on for the first 2 s."""
+    folder = tmp_path_factory.mktemp("leant_on")
+    (folder / "lean.toml").write_text(LEAN)
+    summary, _ = run_embedded(resolve("certified", str(folder / "lean.toml"), None, None), "lockstep", folder / "out")
+    return summary.log.path
+
+
+def events_of(path: Path) -> list[str]:
+    return [
+        name for name in (logged.event.name for logged in read_log(path).events) if name in ("anchor", "certificate")
+    ]
+
+
+def test_the_log_says_that_a_certificate_was_withheld_and_what_anchors_the_one_that_was_not(leant_on: Path) -> None:
+    assert events_of(leant_on) == ["anchor", "certificate"]
+    found = replay(leant_on, script_of=ScriptedOperator)
+    assert found.mismatches == ()
+    assert found.is_identical
+
+
+def test_another_word_about_a_certificate_is_a_difference(leant_on: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(anchor, "describe", lambda k, m: "something else")
+    (mismatch,) = replay(leant_on, script_of=ScriptedOperator).mismatches
+    assert (mismatch.topic, mismatch.field) == ("/events", "certificate")
+    assert mismatch.replayed == "'info: something else'"
+
+
+def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
+    leant_on: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (now,) = {part.said for part in LogSource(leant_on)}
+    assert now == {"margin", "anchor", "certificate"}
+    config = to_toml(LogSource(leant_on).settings).split("\n")
+    before = "\n".join(line for line in config if not line.startswith("drift_Nm_sqrt_s"))
+    attachments = {**read_log(leant_on).attachments, "config.toml": before.encode()}
+    monkeypatch.setattr("adacd_hil.log.stream.LogStream.attachments", attachments, raising=False)
+    (then,) = {part.said for part in LogSource(leant_on)}
+    assert then == {"margin"}

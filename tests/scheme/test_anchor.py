@@ -1,0 +1,290 @@
+"""Anchors: a lean is no offset, an offset is no lean, and what isn't known is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from excited_arm import NAMES, PERIOD_S, SETTINGS, ExcitedLoop, arm_state
+from planar_arm import PAYLOAD_1KG
+
+from adacd_hil.records import Event, FaultReason, Request, SchemeState
+from adacd_hil.scheme import anchor, certified_kernel
+from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
+
+COMMISSION_S = 0.1
+LARGEST_ERROR_NM = 0.06
+"""A fit may hold the end of a lean; its certificate says within how much the anchors bound it."""
+OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
+FRICTION = NAMES.index("F_c1")
+
+
+def settings_with(timeout_s=None, **arm):
+    safety = replace(SETTINGS.safety, commission_s=COMMISSION_S)
+    termination = SETTINGS.termination
+    if timeout_s is not None:
+        safety = replace(safety, phase_timeout_s=timeout_s)
+        termination = replace(termination, timeout_s=timeout_s)
+    return replace(SETTINGS, safety=safety, termination=termination, arm=replace(SETTINGS.arm, **arm))
+
+
+FREE = settings_with(holding_torque_Nm=(0.0, 0.0))
+TARED = settings_with(torque_offset_std_Nm=(0.005, 0.005))
+BOTH = settings_with(holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 0.005))
+UNKNOWN = settings_with()
+
+
+class Loop(ExcitedLoop):
+    """The arm on the excitation, with sensors that are off by `offset_Nm`; keeps the pipeline's events."""
+
+    def __init__(self, settings, offset_Nm=(0.0, 0.0), **options):
+        super().__init__(settings, **options)
+        self.offset_Nm = np.array(offset_Nm)
+        self.events: list[Event] = []
+
+    def measure(self):
+        arm = super().measure()
+        return arm._replace(tau_J=arm.tau_J + self.offset_Nm)
+
+    def step(self):
+        output = super().step()
+        self.events += self.pipeline.take_events()
+        return output
+
+    def lean(self, joint, torque_Nm, seconds):
+        self.tau_ext[joint] = torque_Nm
+        outputs = self.run(round(seconds / PERIOD_S))
+        self.tau_ext[joint] = 0.0
+        return outputs
+
+    @property
+    def offset_error_Nm(self):
+        """Of the model in use: how far its offsets are off (2,)."""
+        return self.pipeline._memory[0]["theta"][OFFSETS] - self.offset_Nm
+
+    def recover(self):
+        """Run until it monitors; the user acknowledges a release that was a collision."""
+        for _ in range(9000):
+            state = self.step().state
+            if state is SchemeState.MONITOR:
+                return
+            if state is SchemeState.STOPPED:
+                self.request = Request.ACKNOWLEDGE
+        raise AssertionError(f"still in {state.name}")
+
+    def said(self, name):
+        return [event.message for event in self.events if event.name == name]
+
+
+@pytest.mark.parametrize(
+    ("settings", "joint", "torque_Nm"), [(FREE, 0, 0.1), (TARED, 0, -0.5), (BOTH, 1, 0.1), (FREE, 0, 2.0)]
+)
+def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(settings, joint, torque_Nm):
+    loop = Loop(settings)
+    loop.run_until(SchemeState.ENABLE)  # this arm's motors hold it from the first cycle on
+    leant = loop.lean(joint, torque_Nm, 3.5)
+    assert SchemeState.MONITOR not in {output.state for output in leant}
+    withheld = loop.said("anchor")[0]
+    assert f"joint {joint + 1} has a torque offset of" in withheld
+    assert "somebody leans on it" in withheld
+    assert not any(output.is_model_valid for output in leant)
+    loop.recover()
+    assert np.abs(loop.offset_error_Nm).max() < LARGEST_ERROR_NM
+
+
+@pytest.mark.parametrize(("begins_s", "torque_Nm"), [(0.3, 0.2), (0.7, 1.0), (1.6, 0.2), (2.0, 0.2)])
+def test_a_lean_that_begins_while_the_arm_learns_gets_no_certificate_either(begins_s, torque_Nm):
+    loop = Loop(FREE)
+    loop.run_until(SchemeState.ADAPT)
+    before = loop.run(round(begins_s / PERIOD_S))
+    leant = loop.lean(0, torque_Nm, 5.0)
+    assert SchemeState.MONITOR not in {output.state for output in before + leant}
+    loop.recover()
+    assert np.abs(loop.offset_error_Nm).max() < LARGEST_ERROR_NM
+
+
+def test_what_can_not_be_told_is_said_in_the_certificate():
+    loop = Loop(UNKNOWN)
+    loop.tau_ext[0] = 0.5
+    loop.run_until(SchemeState.MONITOR)
+    assert abs(loop.offset_error_Nm[0]) > 0.4
+    assert loop.said("certificate") == [anchor.NO_ANCHOR]
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        (FREE, "offsets anchored by the reading at rest of free motors ± 0.0"),
+        (TARED, "offsets anchored by the tare ± 0.0"),
+        (BOTH, "offsets anchored by the reading at rest of free motors ± 0.0"),
+        (
+            settings_with(holding_torque_Nm=(8.0, 4.0)),
+            "offsets anchored by the reading at rest of motors that hold up to",
+        ),
+    ],
+)
+def test_a_certificate_names_its_anchors(settings, named):
+    loop = Loop(settings)
+    loop.run_until(SchemeState.MONITOR)
+    (text,) = loop.said("certificate")
+    assert text.startswith(named)
+    assert ("and the tare ±" in text) is (settings is BOTH)
+
+
+@pytest.mark.parametrize("offset_Nm", [(0.0, 0.0), (0.2, -0.2)])
+def test_an_untouched_arm_is_certified_at_once_whatever_its_offset(offset_Nm):
+    loop = Loop(FREE, offset_Nm, seed=2)
+    outputs = loop.run_until(SchemeState.MONITOR)
+    learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
+    assert learnt_s < 2.5
+    assert loop.said("anchor") == []
+    assert np.abs(loop.offset_error_Nm).max() < 0.02
+
+
+def test_a_payload_is_learnt_with_the_anchor_of_the_start():
+    loop = Loop(FREE, (0.1, 0.0))
+    loop.run_until(SchemeState.MONITOR)
+    loop.request = Request.PAYLOAD
+    loop.run(400)
+    loop.theta = loop.theta + PAYLOAD_1KG
+    loop.request = Request.PAYLOAD_CHANGED
+    loop.run_until(SchemeState.MONITOR)
+    assert len(loop.said("certificate")) == 2
+
+
+def test_a_sensor_that_has_moved_since_its_tare_keeps_the_drives_off_and_the_time_out_says_why():
+    loop = Loop(settings_with(0.6, holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 0.005)), (0.5, 0.0))
+    outputs = loop.run(700)
+    assert {output.state for output in outputs} <= {SchemeState.INIT, SchemeState.COMMISSION, SchemeState.FAULT}
+    assert outputs[-1].fault is FaultReason.COMMISSION_TIMEOUT
+    (said,) = loop.said("anchor")
+    assert "joint 1 reads 0.499 Nm at rest, by the tare it is 0.000 ± 0.0" in said
+    assert "the drives stay off" in said
+    assert any("joint 1 reads " in line for line in loop.pipeline.describe_anchors())
+
+
+def test_the_user_may_let_the_reading_stand_in_place_of_the_tare():
+    loop = Loop(BOTH, (0.5, 0.0))
+    loop.run(300)
+    assert loop.pipeline._supervisor.state is SchemeState.COMMISSION
+    loop.request = Request.ACCEPT_OFFSET
+    loop.run_until(SchemeState.MONITOR)
+    assert "the user accepts the reading at rest, 0.49" in loop.said("anchor")[-1]
+    (text,) = loop.said("certificate")
+    assert "reading at rest of free motors" in text
+    assert "tare" not in text
+
+
+def test_who_leans_on_brakes_before_the_start_is_seen_by_the_tare_beyond_what_they_hold():
+    settings = settings_with(holding_torque_Nm=(0.3, 0.3), torque_offset_std_Nm=(0.005, 0.005))
+    inside, beyond = Loop(settings, (0.2, 0.0)), Loop(settings, (0.4, 0.0))
+    inside.run(300)
+    beyond.run(300)
+    assert inside.said("anchor") == []
+    assert "± 0.3" in beyond.said("anchor")[0]
+
+
+def test_who_has_leaned_before_the_start_and_gone_is_forgotten():
+    loop = Loop(BOTH, (0.5, 0.0))
+    loop.run(1000)
+    loop.offset_Nm[:] = 0.0
+    outputs = loop.run_until(SchemeState.ENABLE, 2000)
+    assert len(outputs) * PERIOD_S < 10 * COMMISSION_S
+
+
+def test_the_user_may_accept_an_offset_and_the_certificate_then_carries_it():
+    loop = Loop(FREE)
+    loop.run_until(SchemeState.ADAPT)
+    loop.offset_Nm[0] = 0.4  # the sensor has moved after its reading at rest
+    loop.run(3000)
+    assert loop.said("certificate") == []
+    loop.request = Request.ACCEPT_OFFSET
+    loop.run_until(SchemeState.MONITOR, 6000)
+    assert "the user accepts 0.39" in loop.said("anchor")[-1]
+    (text,) = loop.said("certificate")
+    assert text.startswith("offsets anchored by the user's word ± 0.0")
+
+
+def test_what_the_user_has_accepted_excuses_no_other_lean():
+    loop = Loop(FREE)
+    loop.run_until(SchemeState.ADAPT)
+    loop.tau_ext[0] = 0.4
+    loop.run(3000)
+    loop.request = Request.ACCEPT_OFFSET
+    loop.run(1)
+    loop.tau_ext[0] = -0.4
+    assert SchemeState.MONITOR not in {output.state for output in loop.run(4000)}
+
+
+def test_nothing_is_accepted_beforehand():
+    loop = Loop(FREE)
+    loop.run_until(SchemeState.ADAPT)
+    loop.request = Request.ACCEPT_OFFSET
+    leant = loop.lean(0, 0.5, 3.0)
+    assert SchemeState.MONITOR not in {output.state for output in leant}
+    assert loop.said("anchor")[0] == "nothing to accept: no anchor is contradicted"
+
+
+def test_a_lean_that_does_not_end_is_a_fault_that_says_so():
+    loop = Loop(settings_with(8.0, holding_torque_Nm=(0.0, 0.0)))
+    loop.tau_ext[0] = 0.5
+    outputs = loop.run_until(SchemeState.FAULT, 9000)
+    assert outputs[-1].fault is FaultReason.ADAPT_TIMEOUT
+    lines = loop.pipeline.describe_missing()
+    assert "joint 1 has a torque offset of" in lines[0]
+    assert lines[1] in ("withheld 3 times", "withheld 4 times")
+
+
+def test_a_reading_at_rest_begins_anew_when_the_arm_moves():
+    pipeline = CertifiedPipeline(FREE)
+    m = pipeline._memory[0]
+    for cycle in range(60):
+        pipeline.step(arm_state(cycle, tau_J=(0.3, 0.0), is_enabled=False))
+    pipeline.step(arm_state(60, dq=(0.5, 0.0), tau_J=(0.3, 0.0), is_enabled=False))
+    assert m["rest_count"] == 0.0
+    assert np.isinf(m["anchor_std"][anchor.REST]).all()
+    for cycle in range(61, 71):
+        pipeline.step(arm_state(cycle, tau_J=(0.1, 0.0), is_enabled=False))
+    assert m["anchor_Nm"][anchor.REST, 0] == pytest.approx(0.1)
+
+
+class Judged:
+    """A kernel's memory with one joint's offset judged by an anchor."""
+
+    def __init__(self, settings=FREE, std_Nm=0.01, friction_Nm=0.0):
+        self.k, self.m = certified_kernel.constants_of(settings)[0], certified_kernel.new_memory(settings)[0]
+        self.theta, self.P = np.zeros(len(NAMES)), np.zeros((len(NAMES), len(NAMES)))
+        self.P[OFFSETS, OFFSETS] = std_Nm**2
+        self.theta[FRICTION] = friction_Nm
+        self.m["anchor_std"][anchor.REST] = 0.004
+
+    def bound_Nm(self, kind=anchor.REST):
+        anchor.is_kept(self.k, self.m, self.theta, self.P)
+        return float(self.m["bound_Nm"][kind, 0])
+
+
+def test_the_bound_is_four_deviations_of_all_that_is_not_known():
+    assert Judged().bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2))
+    assert Judged(friction_Nm=0.2).bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2 + 0.02**2))
+    judged = Judged()
+    judged.m["anchor_age_s"] = 3600.0
+    drift_Nm = FREE.tare.drift_Nm_sqrt_s * 60.0
+    assert judged.bound_Nm() == pytest.approx(4.0 * np.sqrt(0.01**2 + 0.004**2 + 0.005**2 + drift_Nm**2))
+    assert Judged().bound_Nm(anchor.TARE) == np.inf
+
+
+@pytest.mark.parametrize("offset_Nm", [1.01, -1.01, np.nan])
+def test_an_offset_beyond_its_bound_is_not_kept(offset_Nm):
+    judged = Judged()
+    judged.theta[OFFSETS[0]] = 0.99 * judged.bound_Nm()
+    assert anchor.is_kept(judged.k, judged.m, judged.theta, judged.P)
+    judged.theta[OFFSETS[0]] = offset_Nm * judged.bound_Nm()
+    assert not anchor.is_kept(judged.k, judged.m, judged.theta, judged.P)
+
+
+def test_residuals_worse_than_expected_widen_no_bound():
+    judged = Judged()
+    before_Nm = judged.bound_Nm()
+    judged.m["unit"] = 9.0
+    assert judged.bound_Nm() == before_Nm
+    judged.m["unit"] = 0.25
+    assert judged.bound_Nm() < before_Nm
