@@ -16,6 +16,7 @@ from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.analysis.touches import bank_channels
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.scheme.anchor import NO_ANCHOR
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class ChannelMargin:
 class Evidence:
     """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
 
-    margins: by section. promotions: refined models that took over in the run.
+    margins: by section. promotions: refined models that took over in the run. anchors: what each certificate says that
+    its torque offsets are anchored by, in order; empty in logs from before.
     """
 
     tests: dict[str, int]
@@ -53,6 +55,12 @@ class Evidence:
     margins: dict[str, tuple[ChannelMargin, ...]]
     promotions: int
     paper_beside: Beside | None
+    anchors: tuple[str, ...]
+
+    @property
+    def is_anchored(self) -> bool:
+        """Whether no certificate says that nothing anchors its offsets."""
+        return NO_ANCHOR not in self.anchors
 
     @property
     def smallest_margin(self) -> float | None:
@@ -79,6 +87,7 @@ def evaluate_certified(
         margins=margins,
         promotions=promotions,
         paper_beside=beside,
+        anchors=tuple(event.message for _, event in run.events if event.name == "certificate"),
     )
 
 

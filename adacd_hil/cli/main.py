@@ -93,8 +93,9 @@ def run(
 ) -> ExitCode:
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
-    On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, and
-    `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C stops at once.
+    On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, `accept`
+    to take a refused torque for the sensors' zero, and `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C
+    stops at once.
     """
     from adacd_hil.cli.run import as_text, run_on_bus
 

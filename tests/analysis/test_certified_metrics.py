@@ -26,7 +26,9 @@ from adacd_hil.analysis.report.report import Report
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.sections import split_sections
 from adacd_hil.analysis.touches import Channel, two_pole_delay_s
-from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction
+from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
+from adacd_hil.scheme.anchor import NO_ANCHOR
 
 
 def kinds(*stays):
@@ -142,6 +144,19 @@ def test_a_papers_scheme_that_does_not_end_its_adaptation_has_no_time():
     run = make_certified_run()
     run.beside.is_armed[5551:] = False
     assert beside(run).adaptation_s == {"A": pytest.approx(2.0), "D": None}
+
+
+def certificates(*texts):
+    events = (LoggedEvent(k, Event("info", "certificate", text)) for k, text in enumerate(texts))
+    return replace(make_certified_run(), events=tuple(events))
+
+
+def test_a_verdict_says_that_nothing_anchored_the_offsets_of_some_certificate():
+    anchored = "offsets anchored by the tare ± 0.020, 0.020 Nm"
+    metrics = evaluate(certificates(anchored, NO_ANCHOR))
+    assert metrics.evidence.anchors == (anchored, NO_ANCHOR)
+    assert "after the payload change, its torque offsets not anchored; the paper's scheme" in metrics.verdict
+    assert "not anchored" not in evaluate(certificates(anchored, anchored)).verdict
 
 
 def test_a_verdict_compares_with_the_papers_scheme():

@@ -83,15 +83,23 @@ def test_a_change_without_key_or_value_is_refused(given: str) -> None:
 
 
 def test_another_configuration_keeps_what_made_the_numbers_of_the_log() -> None:
-    tared = replace(PAPER.arm, torque_offset_Nm=(0.3, -0.2), sign=(-1, 1))
+    tared = replace(PAPER.arm, torque_offset_Nm=(0.3, -0.2), torque_offset_std_Nm=(0.01, 0.01), sign=(-1, 1))
     own = replace(PAPER, arm=tared, bus=replace(PAPER.bus, heartbeat_ms=200))
     own = apply_settings(own, {"realtime.sample_period": "nominal"})
     kept = keep_facts(own, load_settings("certified"))
     assert kept.scheme == "certified"
     assert kept.arm.torque_offset_Nm == (0.3, -0.2)
+    assert kept.arm.torque_offset_std_Nm == (0.01, 0.01)
     assert kept.arm.sign == (-1, 1)
     assert kept.bus == own.bus
     assert kept.realtime.sample_period == "nominal"
+
+
+def test_what_the_motors_hold_is_another_configurations_to_say_only_where_the_log_does_not() -> None:
+    braked = apply_settings(load_settings("certified"), {"arm.holding_torque_Nm": "[8.0, 4.0]"})
+    free = apply_settings(PAPER, {"arm.holding_torque_Nm": "[0.0, 0.0]"})
+    assert keep_facts(free, braked).arm.holding_torque_Nm == (0.0, 0.0)
+    assert keep_facts(PAPER, braked).arm.holding_torque_Nm == (8.0, 4.0)
 
 
 def test_changed_settings_are_listed_by_key_with_both_values() -> None:
