@@ -60,7 +60,7 @@ class Evidence:
     @property
     def is_anchored(self) -> bool:
         """Whether no certificate says that nothing anchors its offsets."""
-        return NO_ANCHOR not in self.anchors
+        return not any(text.startswith(NO_ANCHOR) for text in self.anchors)
 
     @property
     def smallest_margin(self) -> float | None:

@@ -10,6 +10,8 @@ from adacd_hil.scheme.kernel import Structured
 from adacd_hil.scheme.observation import Observation
 
 _WITHHELD = int(Observation.WITHHELD)
+THIS_RUN_ONLY = "friction and inertia: by this run only"
+"""A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
 _REMEDY = "`accept` takes it for the sensor's zero"
 
 
@@ -28,7 +30,8 @@ class AnchorWatch:
         """Take in what a cycle has come to, before the state's traces are left."""
         if state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
             self._forget()
-            self._say(Event("info", "certificate", anchor.describe(self._constants, self._memory)))
+            text = f"{anchor.describe(self._constants, self._memory)}; {THIS_RUN_ONLY}"
+            self._say(Event("info", "certificate", text))
         elif state is SchemeState.ENABLE and previous is SchemeState.COMMISSION:
             self._forget()
         elif observation & _WITHHELD:

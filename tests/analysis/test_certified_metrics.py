@@ -153,8 +153,9 @@ def certificates(*texts):
 
 def test_a_verdict_says_that_nothing_anchored_the_offsets_of_some_certificate():
     anchored = "offsets anchored by the tare ± 0.020, 0.020 Nm"
-    metrics = evaluate(certificates(anchored, NO_ANCHOR))
-    assert metrics.evidence.anchors == (anchored, NO_ANCHOR)
+    open_ended = f"{NO_ANCHOR}; and more"
+    metrics = evaluate(certificates(anchored, open_ended))
+    assert metrics.evidence.anchors == (anchored, open_ended)
     assert "after the payload change, its torque offsets not anchored; the paper's scheme" in metrics.verdict
     assert "not anchored" not in evaluate(certificates(anchored, anchored)).verdict
 

@@ -11,6 +11,7 @@ from adacd_hil.config import to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log
 from adacd_hil.scheme import anchor
+from adacd_hil.scheme.anchor_watch import THIS_RUN_ONLY
 
 pytestmark = pytest.mark.slow
 
@@ -54,7 +55,7 @@ def test_another_word_about_a_certificate_is_a_difference(leant_on: Path, monkey
     monkeypatch.setattr(anchor, "describe", lambda k, m: "something else")
     (mismatch,) = replay(leant_on, script_of=ScriptedOperator).mismatches
     assert (mismatch.topic, mismatch.field) == ("/events", "certificate")
-    assert mismatch.replayed == "'info: something else'"
+    assert mismatch.replayed == f"'info: something else; {THIS_RUN_ONLY}'"
 
 
 def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(

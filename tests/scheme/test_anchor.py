@@ -9,6 +9,7 @@ from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import Event, FaultReason, Request, SchemeState
 from adacd_hil.scheme import anchor, certified_kernel
+from adacd_hil.scheme.anchor_watch import THIS_RUN_ONLY
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
 COMMISSION_S = 0.1
@@ -107,7 +108,7 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
     loop.tau_ext[0] = 0.5
     loop.run_until(SchemeState.MONITOR)
     assert abs(loop.offset_error_Nm[0]) > 0.4
-    assert loop.said("certificate") == [anchor.NO_ANCHOR]
+    assert loop.said("certificate") == [f"{anchor.NO_ANCHOR}; {THIS_RUN_ONLY}"]
 
 
 @pytest.mark.parametrize(
@@ -127,6 +128,7 @@ def test_a_certificate_names_its_anchors(settings, named):
     loop.run_until(SchemeState.MONITOR)
     (text,) = loop.said("certificate")
     assert text.startswith(named)
+    assert text.endswith(f"; {THIS_RUN_ONLY}")
     assert ("and the tare ±" in text) is (settings is BOTH)
 
 
