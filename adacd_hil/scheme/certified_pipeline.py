@@ -82,7 +82,7 @@ class CertifiedPipeline(RunsBatches):
         self._monitored = 0
         self._has_warned = False
         self._events: list[Event] = []
-        self._anchors = AnchorWatch(self._constants, self._memory, self._events.append)
+        self._anchors = AnchorWatch(self._constants, self._memory)
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
@@ -165,8 +165,7 @@ class CertifiedPipeline(RunsBatches):
 
     def take_events(self) -> list[Event]:
         """Return what is worth a line since the last call: a margin that has shrunk, a certificate, none."""
-        events = self._events.copy()
-        self._events.clear()
+        events, self._events = self._events + self._anchors.take_events(), []
         return events
 
     def _watch_margin(self, state: SchemeState) -> None:

