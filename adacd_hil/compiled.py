@@ -20,9 +20,11 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core.caching import FunctionCache
 
+_ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("adacd_hil", "firmware_sim")
 _IMPORT = re.compile(r"^\s*from\s+((?:adacd_hil|firmware_sim)[\w.]*)\s+import\s+(\([^)]*\)|[^\n]*)", re.MULTILINE)
 _NAME = re.compile(r"\w+")
+_USE = re.compile(rb"^[ \t]*@(?:compiled|released)\b", re.MULTILINE)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -34,14 +36,20 @@ def _imports(text: str) -> Iterator[str]:
         yield from (f"{module}.{name}" for name in _NAME.findall(names))
 
 
-def compiled_sources(root: Path) -> dict[str, bytes]:
-    """Return the text of every module below `root` that compiles functions and of all modules they import, by name."""
+def all_sources(root: Path) -> dict[str, bytes]:
+    """Return the text of every module below `root`, by name."""
     texts = {}
     for package in _PACKAGES:
         for path in sorted((root / package).rglob("*.py")):
             name = ".".join(path.relative_to(root).with_suffix("").parts)
             texts[name.removesuffix(".__init__")] = path.read_bytes()
-    waiting = [name for name, text in texts.items() if b"adacd_hil.compiled" in text]
+    return texts
+
+
+def compiled_sources(root: Path) -> dict[str, bytes]:
+    """Return the text of every module below `root` that compiles functions and of all modules they import, by name."""
+    texts = all_sources(root)
+    waiting = [name for name, text in texts.items() if name == __name__ or _USE.search(text)]
     found: set[str] = set()
     while waiting:
         name = waiting.pop()
@@ -53,8 +61,17 @@ def compiled_sources(root: Path) -> dict[str, bytes]:
 
 def source_digest() -> str:
     """Digest the sources that compiled code may depend on."""
+    return _digest(compiled_sources(_ROOT))
+
+
+def program_digest() -> str:
+    """Digest all sources: what a result may depend on."""
+    return _digest(all_sources(_ROOT))
+
+
+def _digest(sources: dict[str, bytes]) -> str:
     digest = hashlib.sha256()
-    for name, text in compiled_sources(Path(__file__).resolve().parent.parent).items():
+    for name, text in sources.items():
         digest.update(name.encode() + b"\0" + text)
     return digest.hexdigest()[:16]
 

@@ -9,9 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.compiled import cache_folder, compiled, compiled_sources, source_digest
+from adacd_hil.compiled import (
+    all_sources,
+    cache_folder,
+    compiled,
+    compiled_sources,
+    program_digest,
+    source_digest,
+)
 
-CALLER = "from adacd_hil.compiled import compiled\nfrom adacd_hil.scheme import (\n    callee,\n)\n"
+CALLER = (
+    "from adacd_hil.compiled import compiled\nfrom adacd_hil.scheme import (\n    callee,\n)\n\n"
+    "@compiled\ndef call(): pass\n"
+)
 CALLEE = "from adacd_hil.scheme.constants import GRAVITY\n"
 
 
@@ -19,7 +29,9 @@ CALLEE = "from adacd_hil.scheme.constants import GRAVITY\n"
 def tree(tmp_path: Path) -> Path:
     folder = tmp_path / "adacd_hil" / "scheme"
     folder.mkdir(parents=True)
-    for name, text in (("caller", CALLER), ("callee", CALLEE), ("constants", "GRAVITY = 9.81\n"), ("other", "A = 1\n")):
+    other = "from adacd_hil.compiled import source_digest\nfrom adacd_hil.scheme import far\n"
+    texts = {"caller": CALLER, "callee": CALLEE, "constants": "GRAVITY = 9.81\n", "other": other, "far": "A = 1\n"}
+    for name, text in texts.items():
         (folder / f"{name}.py").write_text(text)
     return tmp_path
 
@@ -32,7 +44,15 @@ def test_the_key_has_the_text_of_the_package_itself() -> None:
     sources = compiled_sources(Path(__file__).resolve().parent.parent)
     assert b"def step(" in sources["adacd_hil.scheme.kernel"]
     assert b"class Layout" in sources["adacd_hil.records"]
-    assert "adacd_hil.cli.main" not in sources
+    assert b"def source_digest" in sources["adacd_hil.compiled"]
+    assert not [name for name in sources if name.startswith(("adacd_hil.cli", "adacd_hil.analysis.report"))]
+    assert "adacd_hil.scheme.certified_pipeline" not in sources
+
+
+def test_a_result_depends_on_more_than_what_is_compiled() -> None:
+    sources = all_sources(Path(__file__).resolve().parent.parent)
+    assert {"adacd_hil.cli.main", "adacd_hil.scheme.certified_pipeline"} < set(sources)
+    assert program_digest() != source_digest()
 
 
 @pytest.fixture

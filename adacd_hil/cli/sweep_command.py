@@ -107,14 +107,14 @@ def _plan(
     from adacd_hil import __version__
     from adacd_hil.analysis.replay.what_if import apply_settings, parse_variations
     from adacd_hil.analysis.sweep.plan import plan_logs, plan_scenarios
-    from adacd_hil.compiled import source_digest
+    from adacd_hil.compiled import program_digest
     from adacd_hil.config import load_settings
 
     variants = parse_variations(vary)
     base = load_settings(config or "certified", profile or None)
     for changes in variants:  # what no run could take is refused before the first one
         apply_settings(base, changes)
-    version = f"{__version__} {source_digest()}"
+    version = f"{__version__} {program_digest()}"
     if logs:
         return plan_logs(_files(logs), variants, config, profile, version)
     from firmware_sim.scenario import load_scenario
