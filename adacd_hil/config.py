@@ -887,6 +887,11 @@ class Settings:
         return max(self.data.blind_cycles, self.bus.max_age_cycles)
 
     @property
+    def commission_cycles(self) -> int:
+        """Good cycles in a row before the drives are enabled: those of `safety.commission_s`, at least one."""
+        return max(1, round(self.safety.commission_s / self.bus.period_s))
+
+    @property
     def further_names(self) -> tuple[str, ...]:
         """Names of what the certified scheme estimates beside the dynamic parameters, in order; none of the paper's."""
         if self.scheme == "paper":

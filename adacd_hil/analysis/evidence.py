@@ -16,7 +16,6 @@ from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.analysis.touches import bank_channels
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, SchemeState, Vector
-from adacd_hil.scheme.anchor import NO_ANCHOR
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,8 @@ class ChannelMargin:
 class Evidence:
     """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
 
-    margins: by section. promotions: refined models that took over in the run. anchors: what each certificate says that
-    its torque offsets are anchored by, in order; empty in logs from before.
+    margins: by section. promotions: refined models that took over in the run. certificates: what
+    each says of its anchors, in order; empty in logs from before there were any. is_anchored: whether all offsets were.
     """
 
     tests: dict[str, int]
@@ -55,12 +54,8 @@ class Evidence:
     margins: dict[str, tuple[ChannelMargin, ...]]
     promotions: int
     paper_beside: Beside | None
-    anchors: tuple[str, ...]
-
-    @property
-    def is_anchored(self) -> bool:
-        """Whether no certificate says that nothing anchors its offsets."""
-        return not any(text.startswith(NO_ANCHOR) for text in self.anchors)
+    certificates: tuple[str, ...]
+    is_anchored: bool
 
     @property
     def smallest_margin(self) -> float | None:
@@ -80,6 +75,7 @@ def evaluate_certified(
     """Judge a run of the certified scheme. margins, promotions: of all its cycles, see `untouched`."""
     adaptations = [section for section in sections if section.kind == "adaptation"]
     stays = {section.label: _tests(run, section) for section in adaptations}
+    certificates = [event for _, event in run.events if event.name == "certificate"]
     return Evidence(
         tests={label: len(lengths_s) for label, lengths_s in stays.items()},
         test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
@@ -87,7 +83,8 @@ def evaluate_certified(
         margins=margins,
         promotions=promotions,
         paper_beside=beside,
-        anchors=tuple(event.message for _, event in run.events if event.name == "certificate"),
+        certificates=tuple(certificate.message for certificate in certificates),
+        is_anchored=all(certificate.level == "info" for certificate in certificates),
     )
 
 

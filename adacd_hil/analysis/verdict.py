@@ -35,7 +35,7 @@ def give_verdict(
     identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
     text = f"{_contacts_text(run, contacts, false_s, missed)}; {identified}"
     if evidence is not None and not evidence.is_anchored:
-        text += ", its torque offsets not anchored"
+        text += ", with torque offsets that nothing anchors"
     if evidence is not None and evidence.paper_beside is not None:
         text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     if is_margin_below_1(evidence):

@@ -250,7 +250,6 @@ class Cycle:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
         exchange = self._exchange
-        told: list[Event] = []
         for source in (
             self._master,
             self._arm.strangers,
@@ -265,13 +264,11 @@ class Cycle:
             for event in source.take_events():
                 recorder.event(t_ns, event)
                 if event.name in _TOLD:
-                    told.append(event)
+                    self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
         if output.state is not self._state:
             event = self._transition(output)
             recorder.event(t_ns, event)
             self._follow_state(output.state, arm.cycle)
-            told.insert(0, event)
-        for event in told:
             self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
 
     def _transition(self, output: SchemeOutput) -> Event:

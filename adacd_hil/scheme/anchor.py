@@ -30,27 +30,25 @@ from adacd_hil.records import JOINTS, Vector
 
 REST, TARE, ACCEPTED = range(3)
 KINDS = 3
+NAMES = ("the reading at rest", "the tare", "the user's word")
 SIGMAS = 4.0
-"""Two joints, two-sided: 1.3e-4 of clean arms."""
+"""Two joints, two-sided: 1.3e-4 of clean arms, each time that it is asked."""
 REST_STD_NM = 0.004
 """Of the reading at rest beside its noise: the sensor's hysteresis, and its warming until the certificate."""
 MODEL_STD_NM = 0.005
 """What else the model leaves in the offset of a clean arm."""
 ASYMMETRY = 0.1
 """Part of the Coulomb friction by which its two directions may differ."""
-NO_ANCHOR = "offsets not anchored: what has leaned on the arm since before the start is learnt as the sensors' zero"
-FEWEST = 50
-"""Samples of a reading at rest that is compared with the tare."""
 
 
 def constants_of(settings: Settings) -> dict[str, Vector]:
-    """Return what the kernel needs to know: `holding_Nm`, `zero_std_Nm` (n,), `zero_drift_Nm2_s`, `rest_count_max`."""
+    """Return what the kernel needs to know: `holding_Nm`, `zero_std_Nm` (n,), `zero_drift_Nm2_s`, `rest_cycles`."""
     arm = settings.arm
     return {
         "holding_Nm": _or_unknown(arm.holding_torque_Nm),
         "zero_std_Nm": _or_unknown(arm.torque_offset_std_Nm),
         "zero_drift_Nm2_s": np.array(settings.tare.drift_Nm_sqrt_s**2),
-        "rest_count_max": np.array(max(settings.safety.commission_s / settings.bus.period_s, FEWEST)),
+        "rest_cycles": np.array(settings.commission_cycles),
     }
 
 
@@ -68,9 +66,9 @@ def begin(k: Any, m: Any) -> None:
 def measure(k: Any, m: Any, tau_J: Vector, is_resting: bool) -> None:
     """Take one sample before the drives are enabled into the reading at rest, which begins anew when the arm moves.
 
-    A mean over the last `rest_count_max` samples or so: who leaned before and has gone is forgotten.
+    A mean over the last `rest_cycles` samples or so: who leaned before and has gone is forgotten.
     """
-    m["rest_count"] = min(m["rest_count"] + 1.0, k["rest_count_max"]) if is_resting else 0.0
+    m["rest_count"] = min(m["rest_count"] + 1.0, k["rest_cycles"]) if is_resting else 0.0
     m["anchor_age_s"] = 0.0
     for i in range(tau_J.shape[0]):
         if not is_resting:
@@ -89,8 +87,11 @@ def _rest_variance(k: Any, m: Any, joint: int) -> float:
 
 @compiled
 def is_rest_refused(k: Any, m: Any) -> bool:
-    """Tell whether some joint reads at rest what its tare excludes, beyond what the motor side may hold."""
-    if m["rest_count"] < FEWEST:
+    """Tell whether some joint reads at rest what its tare excludes, beyond what the motor side may hold.
+
+    Asked of a whole reading: the supervisor counts as many cycles, so no arm gets on without.
+    """
+    if m["rest_count"] < k["rest_cycles"]:
         return False
     is_refused = False
     for i in range(m["judged_Nm"].shape[0]):
@@ -134,23 +135,31 @@ def accept_reading(m: Any) -> None:
     m["anchor_std"][TARE] = np.inf
 
 
+def tightest(k: Any, m: Any, joint: int) -> int | None:
+    """Return the anchor that bounds the offset that was judged last most closely; None where none does.
+
+    One that leaves open more than a test of the frozen model does, `beta_Nm`, is none.
+    """
+    kind = int(np.argmin(m["bound_Nm"][:, joint]))
+    return kind if m["bound_Nm"][kind, joint] <= k["beta_Nm"] else None
+
+
+def is_anchored(k: Any, m: Any) -> bool:
+    """Tell whether every offset that was judged last has an anchor."""
+    return all(tightest(k, m, i) is not None for i in range(m["judged_Nm"].shape[0]))
+
+
 def describe(k: Any, m: Any) -> str:
-    """Say what anchors the offsets that have been judged last, and how closely, Nm."""
-    names = [
-        f"{_name(k, kind)} ± {', '.join(f'{limit:.3f}' for limit in m['bound_Nm'][kind])} Nm"
-        for kind in range(KINDS)
-        if np.isfinite(m["bound_Nm"][kind]).any()
-    ]
-    return "offsets anchored by the " + " and the ".join(names) if names else NO_ANCHOR
-
-
-def _name(k: Any, kind: int) -> str:
-    if kind != REST:
-        return "tare" if kind == TARE else "user's word"
-    if not k["holding_Nm"].any():
-        return "reading at rest of free motors"
-    held = ", ".join(f"{value:g}" for value in k["holding_Nm"])
-    return f"reading at rest of motors that hold up to {held} Nm"
+    """Say of each joint what anchors the offset that was judged last, and how closely, Nm."""
+    texts = []
+    for i in range(m["judged_Nm"].shape[0]):
+        kind = tightest(k, m, i)
+        texts.append(
+            f"joint {i + 1} not at all: who has leaned on it since before the start is in its torque offset"
+            if kind is None
+            else f"joint {i + 1} to ± {m['bound_Nm'][kind, i]:.3f} Nm by {NAMES[kind]}"
+        )
+    return f"torque offsets anchored: {'; '.join(texts)}"
 
 
 def describe_refused(m: Any, is_reading: bool) -> list[str]:
@@ -158,7 +167,6 @@ def describe_refused(m: Any, is_reading: bool) -> list[str]:
 
     is_reading: it was the reading at rest; else the offsets of a fit.
     """
-    anchors = ("at rest it read", "by the tare it is", "the user accepted")
     lines = []
     for i in range(m["judged_Nm"].shape[0]):
         value = float(m["judged_Nm"][i])
@@ -166,12 +174,10 @@ def describe_refused(m: Any, is_reading: bool) -> list[str]:
             expected, limit = float(m["anchor_Nm"][kind, i]), float(m["bound_Nm"][kind, i])
             if not abs(value - expected) <= limit:
                 what = (
-                    f"reads {value:.3f} Nm at rest"
-                    if is_reading
-                    else f"has a torque offset of {value:.3f} Nm by the fit"
+                    f"reads {value:.3f} Nm at rest" if is_reading else f"has a fitted torque offset of {value:.3f} Nm"
                 )
                 lines.append(
-                    f"joint {i + 1} {what}, {anchors[kind]} {expected:.3f} ± {limit:.3f} Nm: "
+                    f"joint {i + 1} {what}, by {NAMES[kind]} it is {expected:.3f} ± {limit:.3f} Nm: "
                     "somebody leans on it, or the sensor has moved"
                 )
     return lines

@@ -1,77 +1,85 @@
 """What the certified scheme says of its anchors: a certificate's, one that is withheld, and the user's word."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
 from adacd_hil.scheme import anchor
 from adacd_hil.scheme.kernel import Structured
-from adacd_hil.scheme.observation import Observation
 
-_WITHHELD = int(Observation.WITHHELD)
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
-_REMEDY = "`accept` takes it for the sensor's zero"
+
+
+class _Refusal(NamedTuple):
+    """Torques (n,) that an anchor excludes, their standard deviations, and the words for it. times: in a row."""
+
+    is_reading: bool
+    torque_Nm: Vector
+    std_Nm: Vector
+    lines: list[str]
+    times: int
 
 
 class AnchorWatch:
-    """Makes events of what the kernel has found, and hands it what the user accepts."""
+    """Says what the kernel has found, and hands it what the user accepts."""
 
     def __init__(self, constants: Structured, memory: Structured) -> None:
         self._constants, self._memory = constants[0], memory[0]
-        self._offsets = slice(int(self._constants["base"]), int(self._constants["base"]) + JOINTS)
-        self._is_reading = False
-        self._refused: tuple[Vector, Vector] | None = None
-        self._lines: list[str] = []
-        self._count = 0
-        self._events: list[Event] = []
+        self._refusal: _Refusal | None = None
 
-    def take_events(self) -> list[Event]:
-        """Return what there is to say since the last call."""
-        events, self._events = self._events, []
-        return events
+    @property
+    def is_refusing(self) -> bool:
+        """Whether something has been refused since the last certificate, acceptance or change of state."""
+        return self._refusal is not None
 
-    def step(self, previous: SchemeState, state: SchemeState, observation: int) -> None:
-        """Take in what a cycle has come to, before the state's traces are left."""
-        if state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
-            self._forget()
-            text = f"{anchor.describe(self._constants, self._memory)}; {THIS_RUN_ONLY}"
-            self._events.append(Event("info", "certificate", text))
-        elif state is SchemeState.ENABLE and previous is SchemeState.COMMISSION:
-            self._forget()
-        elif observation & _WITHHELD:
-            self._withhold(is_reading=previous is SchemeState.COMMISSION)
+    def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
+        """Take in a new state; return what a certificate says."""
+        if state is SchemeState.ENABLE:
+            self._refusal = None
+        if state is not SchemeState.MONITOR or previous is not SchemeState.CERTIFY:
+            return None
+        self._refusal = None
+        level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
+        return Event(level, "certificate", f"{anchor.describe(self._constants, self._memory)}; {THIS_RUN_ONLY}")
 
-    def _withhold(self, is_reading: bool) -> None:
-        is_known = self._refused is not None and self._is_reading is is_reading
-        self._count += 1
-        self._is_reading = is_reading
-        std_Nm = np.sqrt(np.diag(self._memory["P_belief"])[self._offsets])
-        self._refused = (self._memory["judged_Nm"].copy(), std_Nm)
-        self._lines = anchor.describe_refused(self._memory, is_reading)
-        if not is_known:
-            what = "the drives stay off" if is_reading else "no certificate, learning begins anew"
-            self._events.append(Event("warning", "anchor", f"{'; '.join(self._lines)}; {what}; {_REMEDY}"))
+    def refuse(self, is_reading: bool) -> Event | None:
+        """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
+        before = self._refusal
+        offsets = slice(int(self._constants["base"]), int(self._constants["base"]) + JOINTS)
+        self._refusal = _Refusal(
+            is_reading,
+            self._memory["judged_Nm"].copy(),
+            np.sqrt(np.diag(self._memory["P_belief"])[offsets]),
+            anchor.describe_refused(self._memory, is_reading),
+            1 if before is None else before.times + 1,
+        )
+        if before is not None:
+            return None
+        what = "the drives stay off" if is_reading else "no certificate, learning begins anew"
+        return Event("warning", "anchor", "; ".join((*self._refusal.lines, what, self._remedy)))
 
-    def accept(self) -> None:
-        """Take the torque that was refused last for the sensors' zero, because the user says so."""
-        if self._refused is None:
-            self._events.append(Event("warning", "anchor", "nothing to accept: no anchor is contradicted"))
-            return
-        torque = ", ".join(f"{value:.3f}" for value in self._refused[0])
-        if self._is_reading:
+    @property
+    def _remedy(self) -> str:
+        is_reading = self._refusal is not None and self._refusal.is_reading
+        return "`accept` does without the tare" if is_reading else "`accept` takes it for the sensor's zero"
+
+    def accept(self) -> Event:
+        """Believe what was refused last, because the user says so; return what there is to say of that."""
+        refusal, self._refusal = self._refusal, None
+        if refusal is None:
+            return Event("warning", "anchor", "nothing to accept: no anchor is contradicted")
+        torque = ", ".join(f"{value:.3f}" for value in refusal.torque_Nm)
+        if refusal.is_reading:
             anchor.accept_reading(self._memory)
-            text = f"the user accepts the reading at rest, {torque} Nm; the tare is not used"
-        else:
-            anchor.accept(self._memory, *self._refused)
-            text = f"the user accepts {torque} Nm as the zero of the sensors"
-        self._forget()
-        self._events.append(Event("warning", "anchor", text))
+            return Event("warning", "anchor", f"the user accepts {torque} Nm at rest: the tare is not used")
+        anchor.accept(self._memory, refusal.torque_Nm, refusal.std_Nm)
+        return Event("warning", "anchor", f"the user accepts {torque} Nm as the zero of the sensors")
 
     def describe(self) -> list[str]:
         """Say what is refused, a line each; empty while nothing is."""
-        if self._refused is None:
+        if self._refusal is None:
             return []
-        return [*self._lines, f"withheld {self._count} times" if not self._is_reading else _REMEDY]
-
-    def _forget(self) -> None:
-        self._refused, self._lines, self._count = None, [], 0
+        withheld = [] if self._refusal.is_reading else [f"certificates withheld: {self._refusal.times}"]
+        return [*self._refusal.lines, *withheld, self._remedy]

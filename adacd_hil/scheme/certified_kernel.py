@@ -642,8 +642,10 @@ def step_record(
         elif found & _FITTED:
             begin_test(constants, memory)
             now = CERTIFY
-        elif found & (_REFUTED | _WITHHELD):
+        elif found & _REFUTED:
             is_payload, begins_in = False, 0
+        elif found & _WITHHELD:
+            begins_in = 0
         elif found & _CERTIFIED:
             begin_refinement(memory)
             now = MONITOR

@@ -124,11 +124,13 @@ class CertifiedPipeline(RunsBatches):
         supervisor, touch = self._supervisor, self._touch
         previous = supervisor.state
         if request is Request.ACCEPT_OFFSET:
-            self._anchors.accept()
-            observation &= ~_WITHHELD
+            observation &= ~_WITHHELD if self._anchors.is_refusing else ~0
+            self._events.append(self._anchors.accept())
         state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
-        self._anchors.step(previous, state, observation)
+        if observation & _WITHHELD:
+            self._say(self._anchors.refuse(is_reading=previous is SchemeState.COMMISSION))
         if state is not previous:
+            self._say(self._anchors.enter(previous, state))
             self._enter(state, previous)
         elif observation & _WITHHELD and state is SchemeState.ADAPT:
             certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
@@ -165,8 +167,12 @@ class CertifiedPipeline(RunsBatches):
 
     def take_events(self) -> list[Event]:
         """Return what is worth a line since the last call: a margin that has shrunk, a certificate, none."""
-        events, self._events = self._events + self._anchors.take_events(), []
+        events, self._events = self._events, []
         return events
+
+    def _say(self, event: Event | None) -> None:
+        if event is not None:
+            self._events.append(event)
 
     def _watch_margin(self, state: SchemeState) -> None:
         """Judge once a second of monitoring how far the residuals stayed below their thresholds."""

@@ -147,7 +147,7 @@ class Supervisor:
         period_s = settings.bus.period_s
         self._max_age_cycles = settings.bus.max_age_cycles
         self._blind_limit = settings.blind_cycles
-        self._commission_cycles = max(1, round(settings.safety.commission_s / period_s))
+        self._commission_cycles = settings.commission_cycles
         self._rest_cycles = round(REST_HOLD_S / period_s)
         self._clear_cycles = round(settings.reaction.clear_s / period_s)
         self._patience_cycles = round(settings.reaction.patience_s / period_s)

@@ -19,9 +19,9 @@ from adacd_hil.wire.codec import Codec, parse_codec
 FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
 TOPICS: Final = (*FRAME_TOPICS, "/scheme", "/cycle", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 20_000
-_SAID_ALWAYS: Final = frozenset({"margin"})
-_SAID: Final = frozenset({"margin", "anchor", "certificate"})
-"""Names of the events that the scheme itself says; logs from before the anchors have the margin's alone."""
+_SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
+_SAID: Final = _SAID_BEFORE_ANCHORS | {"anchor", "certificate"}
+"""Names of the events that the scheme itself says."""
 
 
 class Source(Protocol):
@@ -61,7 +61,7 @@ class LogSource:
         self.metadata: Mapping[str, str] = self._stream.metadata
         self.settings = settings_of(path, self._stream.attachments)
         self.codec = codec_of(path, self._stream.attachments)
-        self._said = _SAID if _has_anchors(self._stream.attachments) else _SAID_ALWAYS
+        self._said = _SAID if _has_anchors(self._stream.attachments) else _SAID_BEFORE_ANCHORS
         self._splitter = AttemptSplitter(self._stream.epoch_ns)
 
     def __iter__(self) -> Iterator[Part]:

@@ -18,6 +18,8 @@ from adacd_hil.config import SUCCESSORS, ConfigError, Settings, parse, parse_tom
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
 
+_FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", "rated_torque_Nm")
+"""Settings of the arm that made the numbers of a log."""
 NOTE: Final = (
     "The arm in the log moved as it did, and the user asked for what was asked: what another scheme would have done "
     "about a contact, and all that would have followed from it, is not in here."
@@ -93,9 +95,6 @@ def _spread(value: Any, kind: Any, present: Any) -> Any:
         count = len(present) if isinstance(present, list) else len(elements)
         return [value] * count
     return value
-
-
-_FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", "rated_torque_Nm")
 
 
 def keep_facts(own: Settings, other: Settings) -> Settings:
