@@ -9,6 +9,7 @@ os.environ.pop("COLUMNS", None)  # pytest-xdist gives its workers 80; what no te
 os.unsetenv("COLUMNS")  # readline, which pytest loads, sets it behind Python's back
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's job in the background: Ctrl-C would reach nobody
     signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup's children would inherit that it is ignored
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

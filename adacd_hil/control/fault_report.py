@@ -33,7 +33,7 @@ class FaultReport:
             FaultReason.LIMIT: (arm.describe_excess,),
             FaultReason.DEADLINE: (lambda: [watch.deadline.describe()],),
             FaultReason.COMMISSION_TIMEOUT: (
-                pipeline.describe_anchors,
+                pipeline.describe_withheld,
                 self._commission.describe,
                 arm.describe_excess,
             ),

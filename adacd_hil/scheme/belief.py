@@ -76,7 +76,12 @@ def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector) -> bool:
             w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
             if np.inf == R:
                 continue
-            estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
+            epsilon = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
+            doubt = 0.0
+            for j in range(w.shape[0]):
+                doubt += w[j] * m["v"][j]
+            m["fit_square"] += epsilon * epsilon / (R / k["correlated"] + doubt)
+            m["fit_rows"] += 1.0
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W_f

@@ -18,6 +18,10 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.scheme import termination
 
+TEST_NM = 0.03
+TEST_SHARE = 6.0
+"""Largest residual in a test, and deviations of the fit's residuals beside it. Clean arms: 0.032 Nm in all."""
+
 
 @compiled
 def is_complete(k: Any, m: Any) -> bool:
@@ -35,6 +39,16 @@ def is_complete(k: Any, m: Any) -> bool:
     return bool(
         termination.has_moved(m["q_low"], m["q_high"], m["dq_low"], m["dq_high"], k["travel_rad"], k["velocity_rad_s"])
     )
+
+
+@compiled
+def test_limit_Nm(k: Any, square: float) -> float:
+    """Return how large |tau_ext_hat| of the slowest filter may become in a test.
+
+    square: mean square of the fit's residuals over that of the settings. An arm that its fit explains well is asked for
+    as much in the test: what stays below `beta_Nm` only may be a touch that was half learnt.
+    """
+    return float(min(k["beta_Nm"], TEST_NM + TEST_SHARE * k["residual_Nm"] * np.sqrt(square)))
 
 
 def describe_missing(k: Any, m: Any, names: tuple[str, ...], units: dict[str, str]) -> list[str]:

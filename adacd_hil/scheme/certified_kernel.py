@@ -6,7 +6,8 @@ uncertainty of its prediction, so every threshold follows from what is known at 
 of an adaptation P is large and nothing can be told; a fraction of a second later it can.
 
 **A touch is not learnt.** Samples wait in a ring before they correct the belief. When a residual exceeds its threshold
-the ring is thrown away, so nothing of the touch, from its beginning on, is learnt.
+the ring is thrown away, so nothing of the touch, from its beginning on, is learnt. What was known before judges what is
+learnt after (`earlier`), and what is known from elsewhere judges the offsets (`anchor`).
 
 **A certificate** is a test of the frozen model on motion that was not used for the fit (`certificate`). While detection
 is armed the belief goes on learning; its mean takes the place of the frozen one after a test (`refinement`).
@@ -29,6 +30,7 @@ from adacd_hil.scheme import (
     certificate,
     contact,
     detector,
+    earlier,
     friction,
     refinement,
     regressor,
@@ -44,6 +46,9 @@ WATCH = 2  # compare the residuals with their thresholds
 LEARN = 4  # correct the belief and use it at once
 TEST = 8  # test the frozen model
 REFINE = 16  # correct the belief, and let its mean take over after a test
+
+# What contradicts a certificate that is withheld.
+NOTHING, ANCHOR, CHANGED, MORE = range(4)
 
 ADAPT = int(SchemeState.ADAPT)
 CERTIFY = int(SchemeState.CERTIFY)
@@ -139,6 +144,7 @@ def constants_of(settings: Settings) -> Structured:
         "smoothing": np.exp(-certified.smoothing_rad_s * period_s),
         **sensitivity.noise_constants(certified, period_s),
         **anchor.constants_of(settings),
+        **earlier.constants_of(settings, _by_kind(certified.prior_std, names)),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
         "still_rad_s": certified.still_rad_s,
@@ -234,6 +240,9 @@ def new_memory(settings: Settings) -> Structured:
         "anchor_std": (anchor.KINDS, *joint),
         "bound_Nm": (anchor.KINDS, *joint),
         "judged_Nm": joint,
+        # what was known earlier
+        **earlier.shapes_of(count),
+        "withheld_by": (),
         "dq_old": joint,
         "ddq_old": joint,
         "velocity_roughness": joint,
@@ -296,6 +305,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)
     belief.discard(m)
+    earlier.begin(m)
     m["unit"][:] = 1.0
     m["samples"] = 0.0
     m["recovering_cycles"] = 0.0
@@ -328,6 +338,7 @@ def begin_refinement(memory: Structured) -> None:
     m["promotions"] = 0.0
     m["certified"][:] = m["theta"]
     m["P_certified"][:] = m["P"]
+    earlier.forget(m)
     refinement.restart(m)
 
 
@@ -350,6 +361,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
     if is_fresh:
         m["anchor_age_s"] += out["period_s"][0]
+        m["kept_age_s"] += out["period_s"][0]
         if mode & MEASURE:
             _measure_noise(k, m, out["tau_J"])
             anchor.measure(k, m, out["tau_J"], observation & _AT_REST != 0)
@@ -360,6 +372,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     elif is_complete != 0:
         m["has_gap"] = 1.0
     if mode & MEASURE and anchor.is_rest_refused(k, m):
+        m["withheld_by"] = ANCHOR
         observation |= _WITHHELD
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
@@ -510,6 +523,10 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     is_free = m["recovering_cycles"] == 0.0
     if is_touched and is_free_before and mode & (LEARN | TEST):
         sensitivity.strain(m)
+        if mode & LEARN:
+            earlier.keep_before_contact(m)
+        else:
+            earlier.keep_refuted(m)
     if not is_free:
         belief.discard(m)
     if mode & TEST:
@@ -519,9 +536,21 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         return 0
     if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         _use_belief(m)
+        earlier.follow(k, m)
     if not (is_free and _gather_evidence(k, m, out)):
         return 0
-    return _FITTED if anchor.is_kept(k, m, m["belief"], m["P_belief"]) else _WITHHELD
+    m["withheld_by"] = _contradicted_by(k, m, m["belief"], m["P_belief"])
+    return _FITTED if m["withheld_by"] == NOTHING else _WITHHELD
+
+
+@compiled
+def _contradicted_by(k: Any, m: Any, theta: Vector, P: Vector) -> int:
+    """Return what contradicts the fit that theta (p,), P (p, p) come from: an anchor, the fit itself, what was kept."""
+    if not anchor.is_kept(k, m, theta, P):
+        return ANCHOR
+    if not earlier.is_steady(m):
+        return CHANGED
+    return NOTHING if earlier.is_no_more(k, m) else MORE
 
 
 @compiled
@@ -534,15 +563,20 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     termination.widen(dq, m["dq_low"], m["dq_high"])
     sensitivity.follow_unit(k, m, _FIT, k["unit_test_share"])
     has_moved = True
+    limit_Nm = certificate.test_limit_Nm(k, earlier.late_square(m))
     for i in range(dq.shape[0]):
-        if not (abs(m["r"][_FIT, i]) <= k["beta_Nm"]):
+        if not (abs(m["r"][_FIT, i]) <= limit_Nm):
+            earlier.keep_refuted(m)
             return _REFUTED
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
         has_moved = has_moved and fastest >= k["velocity_rad_s"]
     is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
     if not (is_long and has_moved):
         return 0
-    return _CERTIFIED if anchor.is_kept(k, m, m["theta"], m["P"]) else _REFUTED | _WITHHELD
+    if anchor.is_kept(k, m, m["theta"], m["P"]):
+        return _CERTIFIED
+    m["withheld_by"] = ANCHOR
+    return _REFUTED | _WITHHELD
 
 
 @compiled

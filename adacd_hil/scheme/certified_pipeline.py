@@ -19,10 +19,10 @@ from adacd_hil.records import (
     certified_layout,
 )
 from adacd_hil.scheme import certificate, certified_kernel
-from adacd_hil.scheme.anchor_watch import AnchorWatch
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
+from adacd_hil.scheme.certificate_watch import CertificateWatch
 from adacd_hil.scheme.intervals import Intervals
 from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_certified
 from adacd_hil.scheme.margin import MarginWatch
@@ -82,7 +82,7 @@ class CertifiedPipeline(RunsBatches):
         self._monitored = 0
         self._has_warned = False
         self._events: list[Event] = []
-        self._anchors = AnchorWatch(self._constants, self._memory)
+        self._watch = CertificateWatch(self._constants, self._memory)
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
@@ -98,11 +98,11 @@ class CertifiedPipeline(RunsBatches):
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for, a line each."""
         missing = certificate.describe_missing(self._constants[0], self._memory[0], self._names, PARAMETER_UNITS)
-        return [*self._anchors.describe(), *missing]
+        return [*self._watch.describe(), *missing]
 
-    def describe_anchors(self) -> list[str]:
-        """Say which anchor is contradicted, a line each."""
-        return self._anchors.describe()
+    def describe_withheld(self) -> list[str]:
+        """Say what contradicts a certificate that is withheld, a line each."""
+        return self._watch.describe()
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
@@ -124,13 +124,13 @@ class CertifiedPipeline(RunsBatches):
         supervisor, touch = self._supervisor, self._touch
         previous = supervisor.state
         if request is Request.ACCEPT_OFFSET:
-            observation &= ~_WITHHELD if self._anchors.is_refusing else ~0
-            self._events.append(self._anchors.accept())
+            observation &= ~_WITHHELD if self._watch.is_refusing else ~0
+            self._events.append(self._watch.accept())
         state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
         if observation & _WITHHELD:
-            self._say(self._anchors.refuse(is_reading=previous is SchemeState.COMMISSION))
+            self._say(self._watch.refuse(is_reading=previous is SchemeState.COMMISSION))
         if state is not previous:
-            self._say(self._anchors.enter(previous, state))
+            self._say(self._watch.enter(previous, state))
             self._enter(state, previous)
         elif observation & _WITHHELD and state is SchemeState.ADAPT:
             certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)

@@ -75,7 +75,7 @@ class Pipeline(RunsBatches):
         """Say what an adaptation that takes too long is waiting for. The paper's condition is one: eq. (15)."""
         return []
 
-    def describe_anchors(self) -> list[str]:
+    def describe_withheld(self) -> list[str]:
         """Say which anchor is contradicted: none, the paper identifies no offsets."""
         return []
 

@@ -11,7 +11,7 @@ from adacd_hil.config import to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log
 from adacd_hil.scheme import anchor
-from adacd_hil.scheme.anchor_watch import THIS_RUN_ONLY
+from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
 
 pytestmark = pytest.mark.slow
 
@@ -40,7 +40,9 @@ def leant_on(tmp_path_factory) -> Path:
 
 def events_of(path: Path) -> list[str]:
     return [
-        name for name in (logged.event.name for logged in read_log(path).events) if name in ("anchor", "certificate")
+        name
+        for name in (logged.event.name for logged in read_log(path).events)
+        if name in ("anchor", "touch", "certificate")
     ]
 
 
@@ -62,7 +64,7 @@ def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
     leant_on: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (now,) = {part.said for part in LogSource(leant_on)}
-    assert now == {"margin", "anchor", "certificate"}
+    assert now == {"margin", "anchor", "touch", "certificate"}
     config = to_toml(LogSource(leant_on).settings).split("\n")
     before = "\n".join(line for line in config if not line.startswith("drift_Nm_sqrt_s"))
     attachments = {**read_log(leant_on).attachments, "config.toml": before.encode()}

@@ -9,7 +9,7 @@ from planar_arm import ENCODER_LSB_RAD, THETA, TORQUE_LSB_NM, TORQUE_NOISE_NM, V
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.excitation import Excitation
-from adacd_hil.records import ArmState, FaultReason, Request, SchemeOutput, SchemeState
+from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme import certified_kernel
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
@@ -17,6 +17,7 @@ PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")
 SETTINGS = replace(SETTINGS, safety=replace(SETTINGS.safety, commission_s=0.01))
 NAMES = certified_kernel.parameter_names(SETTINGS)
+OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
 
 
 class Record(NamedTuple):
@@ -174,6 +175,51 @@ class ExcitedLoop:
             if outputs[-1].state is state:
                 return outputs
         raise AssertionError(f"still in {outputs[-1].state.name} after {most_cycles} cycles")
+
+
+class TouchedLoop(ExcitedLoop):
+    """The arm on the excitation, with sensors that are off by `offset_Nm`; keeps the pipeline's events."""
+
+    def __init__(self, settings, offset_Nm=(0.0, 0.0), **options):
+        super().__init__(settings, **options)
+        self.offset_Nm = np.array(offset_Nm)
+        self.events: list[Event] = []
+
+    def measure(self):
+        arm = super().measure()
+        return arm._replace(tau_J=arm.tau_J + self.offset_Nm)
+
+    def step(self):
+        output = super().step()
+        self.events += self.pipeline.take_events()
+        return output
+
+    def lean(self, joint, torque_Nm, seconds):
+        self.tau_ext[joint] = torque_Nm
+        outputs = self.run(round(seconds / PERIOD_S))
+        self.tau_ext[joint] = 0.0
+        return outputs
+
+    @property
+    def offset_error_Nm(self):
+        """Of the model in use: how far its offsets are off (2,)."""
+        return self.pipeline._memory[0]["theta"][OFFSETS] - self.offset_Nm
+
+    def recover(self):
+        """Run until it monitors; the user acknowledges a release that was a collision."""
+        for _ in range(9000):
+            state = self.step().state
+            if state is SchemeState.MONITOR:
+                return
+            if state is SchemeState.STOPPED:
+                self.request = Request.ACKNOWLEDGE
+        raise AssertionError(f"still in {state.name}")
+
+    def said(self, name):
+        return [event.message for event in self.events if event.name == name]
+
+    def levels(self, name):
+        return [event.level for event in self.events if event.name == name]
 
 
 def arm_state(cycle, q=(0.0, 0.0), dq=(0.0, 0.0), tau_J=(0.0, 0.0), **changes) -> ArmState:

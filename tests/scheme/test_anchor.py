@@ -5,19 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, PERIOD_S, SETTINGS, ExcitedLoop, arm_state
+from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop, arm_state
 from planar_arm import PAYLOAD_1KG
 
-from adacd_hil.records import Event, FaultReason, Request, SchemeState
+from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme import anchor, certified_kernel
-from adacd_hil.scheme.anchor_watch import THIS_RUN_ONLY
+from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
 COMMISSION_S = 0.1
 LARGEST_ERROR_NM = 0.06
 """A fit may hold the end of a lean; its certificate says within how much the anchors bound it."""
 NOT_AT_ALL = "not at all: who has leaned on it since before the start is in its torque offset"
-OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
 FRICTION = NAMES.index("F_c1")
 
 
@@ -36,54 +35,9 @@ BOTH = settings_with(holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 
 UNKNOWN = settings_with()
 
 
-class Loop(ExcitedLoop):
-    """The arm on the excitation, with sensors that are off by `offset_Nm`; keeps the pipeline's events."""
-
-    def __init__(self, settings, offset_Nm=(0.0, 0.0), **options):
-        super().__init__(settings, **options)
-        self.offset_Nm = np.array(offset_Nm)
-        self.events: list[Event] = []
-
-    def measure(self):
-        arm = super().measure()
-        return arm._replace(tau_J=arm.tau_J + self.offset_Nm)
-
-    def step(self):
-        output = super().step()
-        self.events += self.pipeline.take_events()
-        return output
-
-    def lean(self, joint, torque_Nm, seconds):
-        self.tau_ext[joint] = torque_Nm
-        outputs = self.run(round(seconds / PERIOD_S))
-        self.tau_ext[joint] = 0.0
-        return outputs
-
-    @property
-    def offset_error_Nm(self):
-        """Of the model in use: how far its offsets are off (2,)."""
-        return self.pipeline._memory[0]["theta"][OFFSETS] - self.offset_Nm
-
-    def recover(self):
-        """Run until it monitors; the user acknowledges a release that was a collision."""
-        for _ in range(9000):
-            state = self.step().state
-            if state is SchemeState.MONITOR:
-                return
-            if state is SchemeState.STOPPED:
-                self.request = Request.ACKNOWLEDGE
-        raise AssertionError(f"still in {state.name}")
-
-    def said(self, name):
-        return [event.message for event in self.events if event.name == name]
-
-    def levels(self, name):
-        return [event.level for event in self.events if event.name == name]
-
-
 @pytest.mark.parametrize(("settings", "joint", "torque_Nm"), [(FREE, 0, 0.1), (TARED, 1, -0.5), (FREE, 0, 2.0)])
 def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(settings, joint, torque_Nm):
-    loop = Loop(settings)
+    loop = TouchedLoop(settings)
     loop.run_until(SchemeState.ENABLE)  # this arm's motors hold it from the first cycle on
     leant = loop.lean(joint, torque_Nm, 3.5)
     assert SchemeState.MONITOR not in {output.state for output in leant}
@@ -97,7 +51,7 @@ def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(se
 
 @pytest.mark.parametrize(("begins_s", "torque_Nm"), [(0.7, 1.0), (2.0, 0.2)])
 def test_a_lean_that_begins_while_the_arm_learns_gets_no_certificate_either(begins_s, torque_Nm):
-    loop = Loop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.ADAPT)
     before = loop.run(round(begins_s / PERIOD_S))
     leant = loop.lean(0, torque_Nm, 5.0)
@@ -107,7 +61,7 @@ def test_a_lean_that_begins_while_the_arm_learns_gets_no_certificate_either(begi
 
 
 def test_what_can_not_be_told_is_said_in_the_certificate():
-    loop = Loop(UNKNOWN)
+    loop = TouchedLoop(UNKNOWN)
     loop.tau_ext[0] = 0.5
     loop.run_until(SchemeState.MONITOR)
     assert abs(loop.offset_error_Nm[0]) > 0.4
@@ -127,7 +81,7 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
     ],
 )
 def test_a_certificate_says_of_each_joint_what_anchors_it(settings, level, joint_1):
-    loop = Loop(settings)
+    loop = TouchedLoop(settings)
     loop.run_until(SchemeState.MONITOR)
     (text,) = loop.said("certificate")
     assert re.fullmatch(
@@ -137,7 +91,7 @@ def test_a_certificate_says_of_each_joint_what_anchors_it(settings, level, joint
 
 
 def test_an_untouched_arm_is_certified_at_once_whatever_its_offset():
-    loop = Loop(FREE, (0.2, -0.2), seed=2)
+    loop = TouchedLoop(FREE, (0.2, -0.2), seed=2)
     outputs = loop.run_until(SchemeState.MONITOR)
     learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
     assert learnt_s < 2.5
@@ -146,7 +100,7 @@ def test_an_untouched_arm_is_certified_at_once_whatever_its_offset():
 
 
 def test_a_payload_is_learnt_with_the_anchor_of_the_start():
-    loop = Loop(FREE, (0.1, 0.0))
+    loop = TouchedLoop(FREE, (0.1, 0.0))
     loop.run_until(SchemeState.MONITOR)
     loop.request = Request.PAYLOAD
     loop.run(400)
@@ -157,18 +111,20 @@ def test_a_payload_is_learnt_with_the_anchor_of_the_start():
 
 
 def test_a_sensor_that_has_moved_since_its_tare_keeps_the_drives_off_and_the_time_out_says_why():
-    loop = Loop(settings_with(0.6, holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 0.005)), (0.5, 0.0))
+    loop = TouchedLoop(
+        settings_with(0.6, holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 0.005)), (0.5, 0.0)
+    )
     outputs = loop.run(700)
     assert {output.state for output in outputs} <= {SchemeState.INIT, SchemeState.COMMISSION, SchemeState.FAULT}
     assert outputs[-1].fault is FaultReason.COMMISSION_TIMEOUT
     (said,) = loop.said("anchor")
     assert re.search(r"joint 1 reads 0\.49\d Nm at rest, by the tare it is 0\.000 ± 0\.0\d\d Nm: somebody", said)
     assert "the drives stay off" in said
-    assert any("joint 1 reads " in line for line in loop.pipeline.describe_anchors())
+    assert any("joint 1 reads " in line for line in loop.pipeline.describe_withheld())
 
 
 def test_the_shortest_reading_is_compared_with_the_tare_too():
-    loop = Loop(
+    loop = TouchedLoop(
         settings_with(commission_s=0.01, holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 0.005)), (0.5, 0.0)
     )
     assert {output.state for output in loop.run(300)} <= {SchemeState.INIT, SchemeState.COMMISSION}
@@ -176,7 +132,7 @@ def test_the_shortest_reading_is_compared_with_the_tare_too():
 
 
 def test_the_user_may_let_the_reading_stand_in_place_of_the_tare():
-    loop = Loop(BOTH, (0.5, 0.0))
+    loop = TouchedLoop(BOTH, (0.5, 0.0))
     loop.run(300)
     assert loop.pipeline._supervisor.state is SchemeState.COMMISSION
     loop.request = Request.ACCEPT_OFFSET
@@ -190,7 +146,7 @@ def test_the_user_may_let_the_reading_stand_in_place_of_the_tare():
 
 def test_who_leans_on_brakes_before_the_start_is_seen_by_the_tare_beyond_what_they_hold():
     settings = settings_with(holding_torque_Nm=(0.3, 0.3), torque_offset_std_Nm=(0.005, 0.005))
-    inside, beyond = Loop(settings, (0.2, 0.0)), Loop(settings, (0.4, 0.0))
+    inside, beyond = TouchedLoop(settings, (0.2, 0.0)), TouchedLoop(settings, (0.4, 0.0))
     inside.run(300)
     beyond.run(300)
     assert inside.said("anchor") == []
@@ -198,7 +154,7 @@ def test_who_leans_on_brakes_before_the_start_is_seen_by_the_tare_beyond_what_th
 
 
 def test_who_has_leaned_before_the_start_and_gone_is_forgotten():
-    loop = Loop(BOTH, (0.5, 0.0))
+    loop = TouchedLoop(BOTH, (0.5, 0.0))
     loop.run(1000)
     loop.offset_Nm[:] = 0.0
     outputs = loop.run_until(SchemeState.ENABLE, 2000)
@@ -206,7 +162,7 @@ def test_who_has_leaned_before_the_start_and_gone_is_forgotten():
 
 
 def test_the_user_may_accept_an_offset_and_the_certificate_then_carries_it():
-    loop = Loop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.ADAPT)
     loop.offset_Nm[0] = 0.4  # the sensor has moved after its reading at rest
     loop.run(3000)
@@ -220,7 +176,7 @@ def test_the_user_may_accept_an_offset_and_the_certificate_then_carries_it():
 
 def test_the_word_that_comes_with_the_first_refusal_is_no_word_about_it():
     """`accept` is typed about something that was read; what is refused in the same cycle nobody has read."""
-    loop = Loop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.ADAPT)
     loop.tau_ext[0] = 0.5
     state = SchemeState.ADAPT
@@ -235,7 +191,7 @@ def test_the_word_that_comes_with_the_first_refusal_is_no_word_about_it():
 
 
 def test_what_the_user_has_accepted_excuses_no_other_lean():
-    loop = Loop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.ADAPT)
     loop.tau_ext[0] = 0.4
     loop.run(3000)
@@ -246,16 +202,16 @@ def test_what_the_user_has_accepted_excuses_no_other_lean():
 
 
 def test_nothing_is_accepted_beforehand():
-    loop = Loop(FREE)
+    loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.ADAPT)
     loop.request = Request.ACCEPT_OFFSET
     leant = loop.lean(0, 0.5, 3.0)
     assert SchemeState.MONITOR not in {output.state for output in leant}
-    assert loop.said("anchor")[0] == "nothing to accept: no anchor is contradicted"
+    assert loop.said("anchor")[0] == "nothing to accept: no certificate is withheld"
 
 
 def test_a_lean_that_does_not_end_is_a_fault_that_says_so():
-    loop = Loop(settings_with(8.0, holding_torque_Nm=(0.0, 0.0)))
+    loop = TouchedLoop(settings_with(8.0, holding_torque_Nm=(0.0, 0.0)))
     loop.tau_ext[0] = 0.5
     outputs = loop.run_until(SchemeState.FAULT, 9000)
     assert outputs[-1].fault is FaultReason.ADAPT_TIMEOUT

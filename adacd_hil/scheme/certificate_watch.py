@@ -1,0 +1,115 @@
+"""What the certified scheme says of its certificates: what anchors one, why one is withheld, and the user's word."""
+
+from enum import Enum, unique
+from typing import NamedTuple
+
+import numpy as np
+
+from adacd_hil.records import JOINTS, Event, SchemeState, Vector
+from adacd_hil.scheme import anchor, certified_kernel, earlier
+from adacd_hil.scheme.kernel import Structured
+
+THIS_RUN_ONLY = "friction and inertia: by this run only"
+"""A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
+_CHANGED = "no one model explains the whole fit: something has touched the arm or let go while it was learnt"
+_BEGINS_ANEW = "no certificate, learning begins anew"
+
+
+@unique
+class _Cause(Enum):
+    """What contradicts what: the name of its event, what follows, and what the user can do."""
+
+    READING = "anchor", "the drives stay off", "`accept` does without the tare"
+    ANCHOR = "anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"
+    CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
+    MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
+
+
+_CAUSES = {
+    certified_kernel.ANCHOR: _Cause.ANCHOR,
+    certified_kernel.CHANGED: _Cause.CHANGED,
+    certified_kernel.MORE: _Cause.MORE,
+}
+
+
+class _Refusal(NamedTuple):
+    """What was refused, in words; torques (n,) that were judged, their standard deviations. times: in a row."""
+
+    cause: _Cause
+    torque_Nm: Vector
+    std_Nm: Vector
+    lines: list[str]
+    times: int
+
+
+class CertificateWatch:
+    """Says what the kernel has found, and hands it what the user accepts."""
+
+    def __init__(self, constants: Structured, memory: Structured) -> None:
+        self._constants, self._memory = constants[0], memory[0]
+        self._refusal: _Refusal | None = None
+
+    @property
+    def is_refusing(self) -> bool:
+        """Whether something has been refused since the last certificate, acceptance or change of state."""
+        return self._refusal is not None
+
+    def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
+        """Take in a new state; return what a certificate says."""
+        if state is SchemeState.ENABLE:
+            self._refusal = None
+        if state is not SchemeState.MONITOR or previous is not SchemeState.CERTIFY:
+            return None
+        self._refusal = None
+        level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
+        return Event(level, "certificate", f"{anchor.describe(self._constants, self._memory)}; {THIS_RUN_ONLY}")
+
+    def refuse(self, is_reading: bool) -> Event | None:
+        """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
+        before = self._refusal
+        cause = _Cause.READING if is_reading else _CAUSES[int(self._memory["withheld_by"])]
+        offsets = slice(int(self._constants["base"]), int(self._constants["base"]) + JOINTS)
+        self._refusal = _Refusal(
+            cause,
+            self._memory["judged_Nm"].copy(),
+            np.sqrt(np.diag(self._memory["P_belief"])[offsets]),
+            self._describe(cause),
+            1 if before is None else before.times + 1,
+        )
+        if before is not None and before.cause is cause:
+            return None
+        name, what, remedy = cause.value
+        return Event("warning", name, "; ".join((*self._refusal.lines, what, remedy)))
+
+    def _describe(self, cause: _Cause) -> list[str]:
+        if cause is _Cause.MORE:
+            return earlier.describe_more(self._memory)
+        if cause is _Cause.CHANGED:
+            return [_CHANGED]
+        return anchor.describe_refused(self._memory, cause is _Cause.READING)
+
+    def accept(self) -> Event:
+        """Believe what was refused last, because the user says so; return what there is to say of that."""
+        refusal, self._refusal = self._refusal, None
+        if refusal is None:
+            return Event("warning", "anchor", "nothing to accept: no certificate is withheld")
+        torque = ", ".join(f"{value:.3f}" for value in refusal.torque_Nm)
+        match refusal.cause:
+            case _Cause.READING:
+                anchor.accept_reading(self._memory)
+                what = f"the user accepts {torque} Nm at rest: the tare is not used"
+            case _Cause.ANCHOR:
+                anchor.accept(self._memory, refusal.torque_Nm, refusal.std_Nm)
+                what = f"the user accepts {torque} Nm as the zero of the sensors"
+            case _:
+                earlier.forget(self._memory)
+                what = "the user says that nobody touches the arm: what was learnt before is not compared"
+        return Event("warning", refusal.cause.value[0], what)
+
+    def describe(self) -> list[str]:
+        """Say what is refused, a line each; empty while nothing is."""
+        if self._refusal is None:
+            return []
+        is_reading = self._refusal.cause is _Cause.READING
+        withheld = [] if is_reading else [f"certificates withheld: {self._refusal.times}"]
+        return [*self._refusal.lines, *withheld, self._refusal.cause.value[2]]

@@ -1,0 +1,302 @@
+"""What was known earlier in the run judges what is learnt later: a touch that has begun must be seen to end.
+
+A hand that drags, or moves like a mass, has a column of the regressor, so a fit made while it is there explains it.
+What tells it apart is that the arm was known without it before.
+
+**Within a fit** one model must explain all of it. With theta_0, P_0 what the fit had come to some time ago,
+
+    (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' <= STEADY u
+
+u: mean square of its residuals over that of the settings. More, and something has touched the arm or let go meanwhile.
+
+**Over a touch** a belief is *kept*: that of a while before a contact interrupted the fit, before a change, or the
+model that a test has refuted. A later fit must agree with it in each quantity c that a hand can look like, a joint's
+friction at some speed, an inertia, an offset that nothing anchors:
+
+    c (theta - theta_0) <= max(floor, SIGMAS sqrt(c (P_0 + P) c'))
+
+A hand that doesn't help the arm only adds friction and inertia. So **less is the arm's**, and more is a touch that has
+not been seen to end. Of an offset that nothing anchors neither value is known to be the arm's, so both signs count; of
+one that is anchored the fit's value is, so what was kept has been leant on if it differs, and says nothing.
+A variance's part that the samples say is scaled by u, the prior's is not.
+
+Shapes: p parameters, q quantities, s steps; rows (q, p); kept (p,), P_kept (p, p); steps_theta (s, p), steps_P
+(s, p, p), steps_square, steps_rows (s,); change_, limit_ (q,) by quantity as compared last.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+
+STEADY = 200.0
+"""Squared distance over u at which a fit has changed. Clean arms of 13 parameters: 80 at most."""
+SMALLEST_SQUARE = 0.015
+"""Least u of a fit that is asked whether it has changed."""
+REGULAR = 0.01
+"""Share of P_0 that is added to P_0 - P, so that what no sample has shown since is no difference."""
+STEP_S = 0.2
+STEPS = 8
+"""The fit's own earlier beliefs: how far apart, and how many."""
+BACK = 2
+"""Steps before a contact of which the last is kept: a touch begins before it is seen."""
+SIGMAS = 4.5
+"""11 quantities, one-sided but for the offsets: 4e-5 of fits that agree."""
+SPEEDS_RAD_S = (0.2, 0.6, 1.2)
+"""At which friction is compared: what viscous and Coulomb friction hide from each other shows in their sum."""
+FRICTION_NM = 0.03
+OFFSET_NM = 0.03
+INERTIA_KGM2 = 0.006
+INERTIA_SHARE = 0.03
+"""Less than these, and less than this share of an inertia, is nothing."""
+UNIT_PEAK = 4.0
+SMALLEST_UNIT, LARGEST_UNIT = 0.1, 9.0
+"""Of the residuals' mean square that scales variances: `sensitivity`."""
+_INERTIAS = ("a1", "a2", "a3")
+
+
+def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
+    """Return `compared` (q, p), `compared_floor`, `_share`, `_prior` (q,), and `step_samples`. prior_std (p,)."""
+    unit = np.eye(prior_std.size)
+    base = len(settings.estimator.parameter_names)
+    viscous, coulomb = PARAMETER_NAMES.index("F_v1"), PARAMETER_NAMES.index("F_c1")
+    friction = [v * unit[viscous + i] + unit[coulomb + i] for i in range(JOINTS) for v in SPEEDS_RAD_S]
+    inertia = [unit[PARAMETER_NAMES.index(name)] for name in _INERTIAS]
+    offset = [unit[base + i] for i in range(JOINTS)]
+    rows = np.array(friction + inertia + offset)
+    learn_s = settings.bus.period_s * settings.certified.learn_every
+    return {
+        "compared": rows,
+        "compared_floor": np.repeat((FRICTION_NM, INERTIA_KGM2, OFFSET_NM), (len(friction), len(inertia), JOINTS)),
+        "compared_share": np.repeat((0.0, INERTIA_SHARE, 0.0), (len(friction), len(inertia), JOINTS)),
+        "compared_prior": rows**2 @ prior_std**2,
+        "step_samples": np.array(max(round(STEP_S / learn_s), 1)),
+    }
+
+
+def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name, of a model with this many parameters."""
+    quantities = (JOINTS * len(SPEEDS_RAD_S) + len(_INERTIAS) + JOINTS,)
+    return {
+        "fit_square": (),
+        "fit_rows": (),
+        "fit_samples": (),
+        "steps_used": (),
+        "steps_theta": (STEPS, count),
+        "steps_P": (STEPS, count, count),
+        "steps_square": (STEPS,),
+        "steps_rows": (STEPS,),
+        "has_kept": (),
+        "kept": (count,),
+        "P_kept": (count, count),
+        "kept_unit": (),
+        "kept_age_s": (),
+        "change": quantities,
+        "change_limit": quantities,
+    }
+
+
+@compiled
+def begin(m: Any) -> None:
+    """Begin a fit: it has no earlier beliefs yet. What was kept stays."""
+    m["steps_used"] = 0.0
+    m["fit_square"] = 0.0
+    m["fit_rows"] = 0.0
+    m["fit_samples"] = 0.0
+
+
+@compiled
+def follow(k: Any, m: Any) -> None:
+    """Take in that the fit has learnt a sample."""
+    m["fit_samples"] += 1.0
+    if m["fit_samples"] % k["step_samples"] != 0.0:
+        return
+    s = int(m["steps_used"]) % m["steps_rows"].shape[0]
+    m["steps_theta"][s] = m["belief"]
+    m["steps_P"][s] = m["P_belief"]
+    m["steps_square"][s] = m["fit_square"]
+    m["steps_rows"][s] = m["fit_rows"]
+    m["steps_used"] += 1.0
+
+
+@compiled
+def forget(m: Any) -> None:
+    """Keep nothing: a certificate stands, or the user says that nobody touches the arm."""
+    m["has_kept"] = 0.0
+
+
+@compiled
+def keep_before_contact(m: Any) -> None:
+    """Keep what the fit had come to a while before the contact that interrupts it, if nothing is kept yet."""
+    number = int(m["steps_used"]) - BACK
+    if number >= 0:
+        _keep_step(m, number % m["steps_rows"].shape[0])
+
+
+@compiled
+def keep_refuted(m: Any) -> None:
+    """Keep the model that its test refutes, if nothing is kept yet: a touch that has begun since may be what does it.
+
+    Not with a new payload: hands have been on the arm, and friction may depend on the load.
+    """
+    if m["has_kept"] == 0.0 and m["is_payload"] == 0.0:
+        _keep(m, m["theta"], m["P"], _unit(m["fit_square"], m["fit_rows"]))
+
+
+@compiled
+def _keep_step(m: Any, s: int) -> None:
+    if m["has_kept"] == 0.0:
+        _keep(m, m["steps_theta"][s], m["steps_P"][s], _unit(m["steps_square"][s], m["steps_rows"][s]))
+
+
+@compiled
+def _keep(m: Any, theta: Vector, P: Vector, unit: float) -> None:
+    m["kept"][:] = theta
+    m["P_kept"][:] = P
+    m["kept_unit"] = unit
+    m["kept_age_s"] = 0.0
+    m["has_kept"] = 1.0
+
+
+@compiled
+def _unit(square: float, rows: float) -> float:
+    return min(max(UNIT_PEAK * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
+
+
+@compiled
+def late_square(m: Any) -> float:
+    """Return u of the later half of the fit, so that what touched its beginning doesn't count; 1 of a short one."""
+    used = int(m["steps_used"])
+    if used < 2:
+        return 1.0
+    steps = m["steps_rows"].shape[0]
+    s = max(used // 2 - 1, used - steps) % steps
+    return float((m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0))
+
+
+@compiled
+def is_steady(m: Any) -> bool:
+    """Tell whether one model explains the whole fit; if not, keep what it had come to before it changed."""
+    used, steps = int(m["steps_used"]), m["steps_rows"].shape[0]
+    for number in range(used - 1, max(used - steps, 0) - 1, -1):
+        s = number % steps
+        early = m["steps_square"][s] / max(m["steps_rows"][s], 1.0)
+        late = (m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0)
+        if not _distance(m, s) <= STEADY * max(min(early, late), SMALLEST_SQUARE):
+            _keep_step(m, s)
+            return False
+    return True
+
+
+@compiled
+def _distance(m: Any, s: int) -> float:
+    """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of the belief and its step s; inf if there is none.
+
+    By a Cholesky decomposition, in units of the square roots of P_0's diagonal.
+    """
+    L, x = m["scratch"], m["v"]
+    for j in range(x.shape[0]):
+        scale = np.sqrt(m["steps_P"][s, j, j])
+        x[j] = (m["belief"][j] - m["steps_theta"][s, j]) / scale
+        for n in range(j + 1):
+            V = (1.0 + REGULAR) * m["steps_P"][s, j, n] - m["P_belief"][j, n]
+            V /= scale * np.sqrt(m["steps_P"][s, n, n])
+            for i in range(n):
+                V -= L[j, i] * L[n, i]
+            if n < j:
+                L[j, n] = V / L[n, n]
+            elif V > 0.0:
+                L[j, j] = np.sqrt(V)
+            else:
+                return np.inf
+        for n in range(j):
+            x[j] -= L[j, n] * x[n]
+        x[j] /= L[j, j]
+    return float(np.sum(x * x))
+
+
+@compiled
+def is_no_more(k: Any, m: Any) -> bool:
+    """Tell whether the fit has no more friction and inertia, and no other unanchored offset, than what was kept.
+
+    The fit's offsets keep to their anchors. Where those of what was kept don't, somebody leant on the arm then already:
+    it is forgotten.
+    """
+    if m["has_kept"] == 0.0:
+        return True
+    joints = m["bound_Nm"].shape[1]
+    first_offset = m["change"].shape[0] - joints
+    unit = _unit(m["fit_square"], m["fit_rows"])
+    is_agreed = True
+    for q in range(m["change"].shape[0]):
+        row, prior = k["compared"][q], k["compared_prior"][q]
+        before, now = 0.0, 0.0
+        for j in range(row.shape[0]):
+            if row[j] != 0.0:
+                before += row[j] * m["kept"][j]
+                now += row[j] * m["belief"][j]
+        known = _split(_variance(row, m["P_kept"]), prior, m["kept_unit"])
+        fitted = _split(_variance(row, m["P_belief"]), prior, unit)
+        floor = max(k["compared_floor"][q], k["compared_share"][q] * abs(before))
+        m["change"][q] = now - before
+        m["change_limit"][q] = max(floor, SIGMAS * np.sqrt(known + fitted))
+        more = m["change"][q]
+        if q >= first_offset:
+            more = abs(more)
+            is_anchored = np.min(m["bound_Nm"][:, q - first_offset]) != np.inf
+            if is_anchored and more > m["change_limit"][q]:
+                m["has_kept"] = 0.0
+                return True
+        is_agreed = is_agreed and more <= m["change_limit"][q]
+    return bool(is_agreed)
+
+
+@compiled
+def _variance(row: Vector, P: Vector) -> float:
+    """Return c P c'. row (p,), P (p, p)."""
+    total = 0.0
+    for j in range(row.shape[0]):
+        if row[j] != 0.0:
+            for n in range(row.shape[0]):
+                total += row[j] * P[j, n] * row[n]
+    return float(total)
+
+
+@compiled
+def _split(variance: float, prior: float, unit: float) -> float:
+    """Return a variance of which `unit` scales what the samples say, and not what the prior does."""
+    return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
+
+
+def describe_more(m: Any) -> list[str]:
+    """Say of which quantities the fit has more than what was kept, by how much and since when, a line each.
+
+    Of a joint's friction only the speed at which it stands out most.
+    """
+    speeds, quantities = len(SPEEDS_RAD_S), m["change"].size
+    excess = m["change"] / m["change_limit"]
+    is_open = ~np.isfinite(m["bound_Nm"]).any(axis=0)
+    excess[-JOINTS:] = np.where(is_open, abs(excess[-JOINTS:]), 0.0)
+    lines = []
+    for i in range(JOINTS):
+        q = speeds * i + int(np.argmax(excess[speeds * i : speeds * (i + 1)]))
+        if excess[q] > 1.0:
+            lines.append(_more(m, q, f"friction of joint {i + 1} at {SPEEDS_RAD_S[q - speeds * i]:g} rad/s", "Nm"))
+    for q, name in enumerate(_INERTIAS, speeds * JOINTS):
+        if excess[q] > 1.0:
+            lines.append(_more(m, q, name, "kg m²"))
+    for i, q in enumerate(range(quantities - JOINTS, quantities)):
+        if excess[q] > 1.0:
+            lines.append(_more(m, q, f"torque offset of joint {i + 1}", "Nm"))
+    return lines
+
+
+def _more(m: Any, q: int, what: str, unit: str) -> str:
+    change, limit, age_s = float(m["change"][q]), float(m["change_limit"][q]), float(m["kept_age_s"])
+    return (
+        f"{what} is {abs(change):.3f} {unit} {'more' if change > 0.0 else 'less'} than {age_s:.1f} s ago, "
+        f"bound {limit:.3f} {unit}: a touch that began then has not been seen to end"
+    )

@@ -1,0 +1,214 @@
+"""A touch that begins or ends while the arm learns: what was known before judges what is learnt after."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from excited_arm import NAMES, PERIOD_S, SETTINGS, TouchedLoop
+from planar_arm import THETA
+
+from adacd_hil.records import FaultReason, Request, SchemeState
+from adacd_hil.scheme import certified_kernel, earlier
+
+FREE = replace(
+    SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)
+)
+UNKNOWN = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=None))
+VISCOUS, COULOMB, INERTIA = NAMES.index("F_v1"), NAMES.index("F_c1"), NAMES.index("a1")
+
+
+def added(**parameters):
+    theta = np.zeros(7)
+    for name, value in parameters.items():
+        theta[NAMES.index(name)] = value
+    return theta
+
+
+class HeldLoop(TouchedLoop):
+    """An arm under a hand whose torque is a change of parameters: one that drags, or moves like a mass."""
+
+    def hold(self, hand, seconds):
+        free = self.theta
+        self.theta = free + hand
+        outputs = self.run(round(seconds / PERIOD_S))
+        self.theta = free
+        return outputs
+
+    def learn(self, seconds):
+        self.run_until(SchemeState.ADAPT)
+        return self.run(round(seconds / PERIOD_S))
+
+    def error_of(self, name):
+        place = NAMES.index(name)
+        return abs(self.pipeline._memory[0]["theta"][place] - self.theta[place])
+
+
+def states(outputs):
+    return {output.state for output in outputs}
+
+
+@pytest.mark.parametrize(
+    ("hand", "named"),
+    [
+        (added(F_c1=0.4), r"friction of joint 1 at [\d.]+ rad/s is 0\.\d\d\d Nm more than"),
+        (added(F_v2=0.25), r"friction of joint 2 at 1.2 rad/s is 0\.\d\d\d Nm more than"),
+        (added(a1=0.08), r"a1 is 0\.\d\d\d kg m² more than"),
+    ],
+)
+def test_a_hand_that_begins_to_hold_while_the_arm_learns_gets_no_certificate_and_is_named(hand, named):
+    loop = HeldLoop(FREE)
+    loop.learn(1.0)
+    held = loop.hold(hand, 8.0)
+    assert SchemeState.MONITOR not in states(held)
+    said = loop.said("touch")
+    assert any(re.search(named, text) for text in said)
+    assert any("a touch that began then has not been seen to end" in text for text in said)
+    released_at = loop.cycle
+    loop.recover()
+    assert (loop.cycle - released_at) * PERIOD_S < 6.5
+    for name in ("a1", "F_v1", "F_c1", "F_v2"):
+        assert loop.error_of(name) < 0.02
+
+
+def test_a_hand_that_lets_go_while_the_arm_learns_leaves_less_and_less_is_the_arms():
+    loop = HeldLoop(FREE)
+    loop.run_until(SchemeState.ADAPT)
+    loop.hold(added(F_c1=0.4), 1.0)
+    released_at = loop.cycle
+    loop.recover()
+    assert (loop.cycle - released_at) * PERIOD_S < 5.0
+    assert loop.error_of("F_c1") < 0.02
+
+
+def test_a_touch_within_the_fit_that_no_threshold_saw_is_no_certificate():
+    """What was half learnt would hold its half: neither the arm nor the hand."""
+    loop = HeldLoop(FREE)
+    loop.learn(0.55)
+    loop.hold(added(a1=0.04, a2=0.02, a3=0.016), 0.3)
+    loop.recover()
+    assert loop.error_of("a1") < 0.005
+
+
+def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_the_offset_before():
+    loop = HeldLoop(UNKNOWN)
+    loop.learn(1.0)
+    leant = loop.lean(0, 0.5, 6.0)
+    assert SchemeState.MONITOR not in states(leant)
+    assert loop.said("touch")[0].startswith("torque offset of joint 1 is 0.50")
+    loop.recover()
+    assert abs(loop.offset_error_Nm[0]) < 0.03
+
+
+def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
+    loop = HeldLoop(FREE, theta=THETA["S"])
+    loop.run_until(SchemeState.ADAPT)
+    loop.lean(1, 0.44, 0.35)
+    released_at = loop.cycle
+    loop.recover()
+    assert (loop.cycle - released_at) * PERIOD_S < 6.5
+
+
+def test_the_word_of_the_user_that_nobody_touches_the_arm_ends_the_comparison():
+    loop = HeldLoop(FREE)
+    loop.learn(1.0)
+    loop.theta = loop.theta + added(F_c1=0.4)  # a brake that drags from now on
+    outputs = loop.run(6000)
+    assert SchemeState.MONITOR not in states(outputs)
+    loop.request = Request.ACCEPT_OFFSET
+    loop.recover()
+    assert "the user says that nobody touches the arm" in loop.said("touch")[-1]
+    assert loop.error_of("F_c1") < 0.02
+
+
+def test_a_hand_that_never_lets_go_is_a_fault_that_says_what_contradicts_what():
+    loop = HeldLoop(replace(FREE, termination=replace(FREE.termination, timeout_s=6.0)))
+    loop.learn(1.0)
+    outputs = loop.hold(added(F_c1=0.4), 12.0)
+    assert outputs[-1].fault is FaultReason.ADAPT_TIMEOUT
+    lines = loop.pipeline.describe_missing()
+    assert re.search(r"friction of joint 1 at .* more than \d+\.\d s ago, bound 0\.\d\d\d Nm: a touch", lines[0])
+    assert any(re.fullmatch(r"certificates withheld: \d", line) for line in lines)
+    assert "`accept` says that nobody touches the arm" in lines
+
+
+def test_a_certificate_forgets_what_was_kept():
+    loop = HeldLoop(FREE)
+    loop.learn(1.0)
+    loop.lean(0, 1.0, 0.2)
+    assert loop.pipeline._memory[0]["has_kept"] == 1.0
+    loop.recover()
+    assert loop.pipeline._memory[0]["has_kept"] == 0.0
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
+    loop = HeldLoop(FREE, theta=THETA[profile], seed=5)
+    outputs = loop.run_until(SchemeState.MONITOR)
+    learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
+    assert learnt_s == pytest.approx(2.25, abs=0.01)
+    assert loop.said("touch") == []
+    m = loop.pipeline._memory[0]
+    furthest = max(earlier._distance(m, s) for s in range(int(m["steps_used"])))
+    assert furthest < 0.5 * earlier.STEADY * earlier.SMALLEST_SQUARE
+
+
+class Compared:
+    """A kernel's memory with a fit and something kept, both known to `std` in every parameter."""
+
+    def __init__(self, settings=FREE, std=0.005):
+        self.k, self.m = certified_kernel.constants_of(settings)[0], certified_kernel.new_memory(settings)[0]
+        self.m["P_belief"] = self.m["P_kept"] = std**2 * np.eye(len(NAMES))
+        self.m["belief"] = self.m["kept"] = 0.1
+        self.m["fit_square"], self.m["fit_rows"], self.m["kept_unit"], self.m["has_kept"] = 1.0, 4.0, 1.0, 1.0
+        self.m["bound_Nm"] = np.inf if settings is UNKNOWN else 0.04
+
+    def agrees_with(self, name, change):
+        self.m["belief"] = self.m["kept"]
+        self.m["belief"][NAMES.index(name)] += change
+        return earlier.is_no_more(self.k, self.m)
+
+
+def test_more_is_a_touch_and_less_is_the_arms():
+    limit_Nm = earlier.SIGMAS * 0.005 * np.sqrt(2.0 * (1.0 + 0.2**2))
+    compared = Compared()
+    assert limit_Nm > earlier.FRICTION_NM
+    assert compared.agrees_with("F_c1", 0.99 * limit_Nm)
+    assert not compared.agrees_with("F_c1", 1.01 * limit_Nm)
+    assert compared.agrees_with("F_c1", -2.0 * limit_Nm)
+    assert not compared.agrees_with("F_c2", np.nan)
+
+
+@pytest.mark.parametrize(("name", "floor"), [("F_c2", 0.03), ("a3", 0.006), ("offset2", 0.03)])
+def test_less_than_the_floor_is_nothing_however_well_all_is_known(name, floor):
+    compared = Compared(UNKNOWN, std=1e-5)
+    assert compared.agrees_with(name, 0.99 * floor)
+    assert not compared.agrees_with(name, 1.01 * floor)
+
+
+def test_an_offset_counts_both_ways_and_where_something_anchors_it_shows_that_what_was_kept_was_leant_on():
+    compared = Compared(std=1e-5)
+    assert compared.agrees_with("offset1", 0.0)
+    compared.m["bound_Nm"] = np.inf
+    assert not compared.agrees_with("offset1", -0.05)
+    compared.m["bound_Nm"][0] = 0.04
+    assert compared.agrees_with("offset1", -0.05)
+    assert compared.m["has_kept"] == 0.0
+
+
+def test_what_the_prior_alone_says_judges_nothing():
+    prior = Compared()
+    prior.m["P_kept"] = np.diag(certified_kernel.new_memory(FREE)[0]["P_belief"].diagonal())
+    prior.m["kept_unit"] = earlier.SMALLEST_UNIT
+    assert prior.agrees_with("F_c1", 1.0)
+    assert prior.agrees_with("a1", 1.0)
+
+
+def test_the_step_kept_is_from_before_the_contact():
+    loop = HeldLoop(FREE)
+    loop.learn(1.1)
+    m = loop.pipeline._memory[0]
+    steps = int(m["steps_used"])
+    loop.lean(0, 3.0, 0.05)
+    assert m["has_kept"] == 1.0
+    assert (m["kept"] == m["steps_theta"][steps - earlier.BACK]).all() or m["steps_used"] == 0.0
