@@ -191,6 +191,7 @@ class Request(IntEnum):
     FAULT_FOLLOWING = 6
     FAULT_TAMPERED = 7
     ACCEPT_OFFSET = 8  # the torque that the sensors read, or the fit found, is their zero: nobody leans on the arm
+    RELEARN = 9  # nobody touches the stopped arm, what is known of it is wrong: learn it anew
 
 
 class Reaction(IntEnum):

@@ -94,7 +94,8 @@ def run(
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
     On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, `accept`
-    to take a refused torque for the sensors' zero, and `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C
+    to say that nobody touches the arm whose certificate is withheld, `relearn` to take back a certificate in a stop,
+    and `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C
     stops at once.
     """
     from adacd_hil.cli.run import as_text, run_on_bus

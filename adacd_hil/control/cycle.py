@@ -55,7 +55,7 @@ FRAME_CHECKS_S = 1.0
 """How often the log gets what the checks of frames have counted."""
 
 _ENABLING = POWERED | {SchemeState.ENABLE}
-_TOLD = frozenset(("anchor", "touch", "certificate"))
+_TOLD = frozenset(("anchor", "touch", "certificate", "revoked"))
 """Events that the user is told as they happen."""
 
 

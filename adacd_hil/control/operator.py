@@ -16,6 +16,7 @@ CONSOLE_WORDS = {
     "payload": Request.PAYLOAD,
     "changed": Request.PAYLOAD_CHANGED,
     "accept": Request.ACCEPT_OFFSET,
+    "relearn": Request.RELEARN,
     "finish": Request.FINISH,
 }
 

@@ -30,6 +30,7 @@ from adacd_hil.scheme import (
     certificate,
     contact,
     detector,
+    doubt,
     earlier,
     friction,
     refinement,
@@ -46,6 +47,7 @@ WATCH = 2  # compare the residuals with their thresholds
 LEARN = 4  # correct the belief and use it at once
 TEST = 8  # test the frozen model
 REFINE = 16  # correct the belief, and let its mean take over after a test
+WEIGH = 32  # weigh what a contact of the certified model looks like
 
 # What contradicts a certificate that is withheld.
 NOTHING, ANCHOR, CHANGED, MORE = range(4)
@@ -144,6 +146,7 @@ def constants_of(settings: Settings) -> Structured:
         "smoothing": np.exp(-certified.smoothing_rad_s * period_s),
         **sensitivity.noise_constants(certified, period_s),
         **anchor.constants_of(settings),
+        **doubt.constants_of(settings, len(names)),
         **earlier.constants_of(settings, _by_kind(certified.prior_std, names)),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
@@ -242,6 +245,7 @@ def new_memory(settings: Settings) -> Structured:
         "judged_Nm": joint,
         # what was known earlier
         **earlier.shapes_of(count),
+        **doubt.shapes_of(),
         "withheld_by": (),
         "dq_old": joint,
         "ddq_old": joint,
@@ -380,6 +384,8 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
         out["threshold"][:] = np.inf
         out["threshold_bank"][:] = np.inf
         m["wide_threshold"][:] = np.inf
+    if is_fresh and mode & WEIGH:
+        doubt.weigh(k, m)
     if is_fresh and mode & (LEARN | TEST | REFINE):
         observation |= _improve(k, m, out, observation & _CONTACT != 0, mode)
     _fill_model(k, m, out)
@@ -527,6 +533,8 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
             earlier.keep_before_contact(m)
         else:
             earlier.keep_refuted(m)
+    if is_touched and mode & REFINE:
+        doubt.begin(k, m)
     if not is_free:
         belief.discard(m)
     if mode & TEST:

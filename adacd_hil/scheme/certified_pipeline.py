@@ -18,11 +18,12 @@ from adacd_hil.records import (
     SchemeState,
     certified_layout,
 )
-from adacd_hil.scheme import certificate, certified_kernel
+from adacd_hil.scheme import certificate, certified_kernel, earlier
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.certificate_watch import CertificateWatch
+from adacd_hil.scheme.doubt import Doubt
 from adacd_hil.scheme.intervals import Intervals
 from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_certified
 from adacd_hil.scheme.margin import MarginWatch
@@ -30,6 +31,7 @@ from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.regressor import inverse_dynamics
 from adacd_hil.scheme.supervisor import Supervisor
 from adacd_hil.scheme.touch import Touch
+from adacd_hil.scheme.transitions import SchemeEvent
 
 _WATCH = certified_kernel.WATCH
 _MODES = {
@@ -83,6 +85,8 @@ class CertifiedPipeline(RunsBatches):
         self._has_warned = False
         self._events: list[Event] = []
         self._watch = CertificateWatch(self._constants, self._memory)
+        self._doubt = Doubt(settings, self._constants, self._memory)
+        self._is_doubted = False
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
@@ -118,7 +122,9 @@ class CertifiedPipeline(RunsBatches):
     @property
     def _mode(self) -> int:
         """What the numbers do in the state reached so far."""
-        return _MODES.get(self._supervisor.state, 0)
+        supervisor = self._supervisor
+        is_weighed = supervisor.state is SchemeState.REACT and supervisor.origin is SchemeState.MONITOR
+        return _MODES.get(supervisor.state, 0) | (certified_kernel.WEIGH if is_weighed else 0)
 
     def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
         supervisor, touch = self._supervisor, self._touch
@@ -130,6 +136,7 @@ class CertifiedPipeline(RunsBatches):
         if observation & _WITHHELD:
             self._say(self._watch.refuse(is_reading=previous is SchemeState.COMMISSION))
         if state is not previous:
+            state = self._weigh(state, previous, arm.cycle, observation >> CONTACT_SHIFT != 0)
             self._say(self._watch.enter(previous, state))
             self._enter(state, previous)
         elif observation & _WITHHELD and state is SchemeState.ADAPT:
@@ -218,6 +225,31 @@ class CertifiedPipeline(RunsBatches):
     def _standing(self) -> tuple[Reaction, bool]:
         return self._touch.reaction, self._has_certificate
 
+    def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
+        """Take in the begin or the end of a contact; return where the arm goes if the contacts have one cause."""
+        if state is SchemeState.REACT and previous is SchemeState.MONITOR:
+            self._doubt.begin(cycle, is_touched)
+        if previous is not SchemeState.REACT or self._supervisor.origin is not SchemeState.MONITOR:
+            return state
+        if state not in (SchemeState.MONITOR, SchemeState.STOPPED):
+            return state
+        verdict = self._doubt.end(cycle)
+        if verdict is None or self._touch.goes_on:
+            if is_touched and state is SchemeState.STOPPED:
+                self._events.append(Event("warning", "touch", self._describe_push()))
+            return state
+        remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
+        self._events.append(Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}"))
+        self._is_doubted = True
+        return self._supervisor.doubt()
+
+    def _describe_push(self) -> str:
+        torque = ", ".join(f"{value:.2f}" for value in self._memory[0]["y"][0])
+        return (
+            f"something still pushes the arm at rest, {torque} Nm by joint: "
+            "if nobody touches it the model is wrong, and `relearn` learns it anew"
+        )
+
     def _enter(self, state: SchemeState, previous: SchemeState) -> None:
         """Do what a new state begins with, and what the previous one ends with."""
         if state is SchemeState.ADAPT:
@@ -227,17 +259,30 @@ class CertifiedPipeline(RunsBatches):
         elif state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
             certified_kernel.begin_refinement(self._memory)
             self._margin.restart()
+            self._doubt.forget()
             self._has_certificate = True
             self._feed_forward()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
         """Begin to learn anew: a payload on top of the certified arm, until that has failed; else everything."""
-        if previous in (SchemeState.ENABLE, SchemeState.PAYLOAD):
+        cause = self._supervisor.cause
+        if cause is SchemeEvent.REVOKED or (self._is_doubted and cause is SchemeEvent.ACKNOWLEDGED):
+            self._revoke()
+        elif cause in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
             self._is_payload = self._has_certificate
             self._paper.begin_adaptation()
         elif previous is SchemeState.CERTIFY:
             self._is_payload = False
+        self._is_doubted = False
         certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+
+    def _revoke(self) -> None:
+        """Take back the certificate: nothing is known of the arm, and nothing is fed forward."""
+        self._is_payload = self._has_certificate = False
+        self._theta_ff = np.zeros(self._theta_ff.size)
+        earlier.forget(self._memory[0])
+        self._paper.begin_adaptation()
+        self._events.append(Event("warning", "revoked", "the user takes the certificate back: the arm is learnt anew"))
 
     def _forget_if_disturbed(self, state: SchemeState) -> None:
         """Once a contact that interrupted an adaptation is reported, forget what this adaptation has learnt.

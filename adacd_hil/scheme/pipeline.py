@@ -30,6 +30,7 @@ from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_paper
 from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.regressor import inverse_dynamics, is_positive_definite
 from adacd_hil.scheme.supervisor import Supervisor
+from adacd_hil.scheme.transitions import SchemeEvent
 
 _MODES = {
     state: (kernel.LEARN if state is SchemeState.ADAPT else 0)
@@ -141,6 +142,9 @@ class Pipeline(RunsBatches):
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
             self._theta_ff = self._values[self._theta_hat].copy()
             self._is_model_valid = is_positive_definite(self._theta_ff)
+        if state is SchemeState.ADAPT and self._supervisor.cause is SchemeEvent.REVOKED:
+            self._theta_ff = np.zeros(self._theta_ff.size)
+            self._is_model_valid = False
         if state is SchemeState.ADAPT:
             kernel.begin_adaptation(self._constants, self._memory, self._block)
         elif state is SchemeState.REACT:

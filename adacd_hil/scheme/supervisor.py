@@ -67,6 +67,7 @@ KEPT_IN = MappingProxyType(
         Request.PAYLOAD_CHANGED: frozenset((SchemeState.PAYLOAD,)),
         Request.FINISH: frozenset[SchemeState](),
         Request.ACCEPT_OFFSET: frozenset[SchemeState](),
+        Request.RELEARN: frozenset((SchemeState.STOPPED,)),
         Request.FAULT_TORQUE: frozenset[SchemeState](),
         Request.FAULT_FOLLOWING: frozenset[SchemeState](),
         Request.FAULT_TAMPERED: frozenset[SchemeState](),
@@ -164,6 +165,8 @@ class Supervisor:
         self._state = SchemeState.INIT
         self._origin = SchemeState.MONITOR
         self._is_latched = False
+        self._is_doubted = False
+        self._cause = SchemeEvent.NONE
         self._fault = FaultReason.NONE
         self._pending: set[Request] = set()
         self._is_told_here = False
@@ -189,6 +192,21 @@ class Supervisor:
     def is_latched(self) -> bool:
         """Whether what REACT and STOPPED are about is to be acknowledged."""
         return self._is_latched
+
+    @property
+    def cause(self) -> SchemeEvent:
+        """The event by which this state was entered."""
+        return self._cause
+
+    def doubt(self) -> SchemeState:
+        """Take in, once a contact is over, that the model is wrong: hold the arm until the user says how to go on.
+
+        `ack` then learns anew; `changed` learns a payload, which needs no announcement.
+        """
+        self._enter(next_state(self._state, SchemeEvent.DOUBTED, self._origin), SchemeEvent.DOUBTED)
+        self._origin = SchemeState.ADAPT
+        self._is_latched = self._is_doubted = True
+        return self._state
 
     @property
     def fault(self) -> FaultReason:
@@ -239,6 +257,8 @@ class Supervisor:
                 cycles = self._commission_cycles - self._commissioned_cycles
             case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
                 cycles = 0
+            case SchemeState.STOPPED if Request.RELEARN in self._pending or self._is_told_of_payload:
+                waits_for_rest = True
             case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
                 watched |= _CONTACT
                 expected |= _CONTACT
@@ -287,11 +307,15 @@ class Supervisor:
         """Whether a change of payload is to be served in MONITOR or STOPPED; a stop ends only by a word about it."""
         return self._is_told_here or (Request.PAYLOAD in self._pending and self._state is SchemeState.MONITOR)
 
+    @property
+    def _is_told_of_payload(self) -> bool:
+        return self._is_doubted and Request.PAYLOAD_CHANGED in self._pending
+
     def _keeps(self, request: Request, state: SchemeState) -> bool:
         """Tell whether a request waits in a state; hands that change a payload may touch the arm."""
         is_interrupted = state in (SchemeState.REACT, SchemeState.STOPPED)
-        if request is Request.PAYLOAD_CHANGED and is_interrupted and self._origin is SchemeState.PAYLOAD:
-            return True
+        if request is Request.PAYLOAD_CHANGED and is_interrupted:
+            return self._is_doubted or self._origin is SchemeState.PAYLOAD
         return state in KEPT_IN[request]
 
     def _enter(self, state: SchemeState, event: SchemeEvent) -> None:
@@ -301,8 +325,10 @@ class Supervisor:
         if state is SchemeState.REACT:
             self._origin = SchemeState.ADAPT if self._state is SchemeState.CERTIFY else self._state
             self._is_latched = event is not SchemeEvent.CONTACT
-        elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
+        elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED, SchemeEvent.REVOKED):
             self._learning_cycles = 0
+        self._cause = event
+        self._is_doubted &= state is SchemeState.STOPPED
         self._state = state
         self._is_told_here = False
         self._phase_cycles = 0
@@ -340,6 +366,10 @@ class Supervisor:
                 event = SchemeEvent.LATE
             case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
                 event = SchemeEvent.PAYLOAD_ANNOUNCED
+            case SchemeState.STOPPED if self._is_told_of_payload:
+                event = SchemeEvent.PAYLOAD_CHANGED if is_still and not arm.is_late else SchemeEvent.NONE
+            case SchemeState.STOPPED if Request.RELEARN in self._pending:
+                event = SchemeEvent.REVOKED if is_still and not arm.is_late else SchemeEvent.NONE
             case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
                 if not (observation & _ANY_CONTACT or arm.is_late):
                     event = SchemeEvent.ACKNOWLEDGED

@@ -29,6 +29,8 @@ class SchemeEvent(IntEnum):
     ACKNOWLEDGED = 14  # the user has acknowledged, no joint is over its threshold and the host is on time
     PAYLOAD_ANNOUNCED = 15  # the user wants to change the payload
     PAYLOAD_CHANGED = 16  # the user has changed the payload and the arm is at rest
+    REVOKED = 17  # the user takes back what is known of the arm, which is at rest
+    DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
 
 
 class Back(Enum):
@@ -72,13 +74,15 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.CERTIFIED: SchemeState.MONITOR,
             SchemeEvent.REFUTED: SchemeState.ADAPT,
         },
-        # Moves, detection armed. Out: a contact; a host that is late; the announcement of a payload change.
+        # Moves, detection armed. Out: a contact; a host that is late; the announcement of a payload change; back from a
+        # contact, the doubt of the model.
         SchemeState.MONITOR: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
             SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.LATE: SchemeState.REACT,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
+            SchemeEvent.DOUBTED: SchemeState.STOPPED,
         },
         # Reacts. Out, once the report is final: at rest, if it is to be acknowledged; else cleared.
         SchemeState.REACT: {
@@ -86,11 +90,14 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.AT_REST: SchemeState.STOPPED,
             SchemeEvent.CLEARED: Back.TO_ORIGIN,
         },
-        # Holds its place. Out: acknowledged while nothing pushes; the announcement of a payload change.
+        # Holds its place. Out: acknowledged while nothing pushes; the announcement of a payload change; a payload that
+        # contacts looked like; with the certificate taken back, even while something seems to push.
         SchemeState.STOPPED: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.ACKNOWLEDGED: Back.TO_ORIGIN,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
+            SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
+            SchemeEvent.REVOKED: SchemeState.ADAPT,
         },
         # Parks. Out: the payload has been changed and the arm is at rest; a contact.
         SchemeState.PAYLOAD: {

@@ -64,7 +64,7 @@ def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
     leant_on: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (now,) = {part.said for part in LogSource(leant_on)}
-    assert now == {"margin", "anchor", "touch", "certificate"}
+    assert now == {"margin", "anchor", "touch", "certificate", "revoked"}
     config = to_toml(LogSource(leant_on).settings).split("\n")
     before = "\n".join(line for line in config if not line.startswith("drift_Nm_sqrt_s"))
     attachments = {**read_log(leant_on).attachments, "config.toml": before.encode()}

@@ -15,19 +15,19 @@ from adacd_hil.scheme.transitions import TRANSITIONS, SchemeEvent, next_state
 # the state from which REACT was entered.
 EVENTS = (
     "FAULT COLLISION CONTACT LATE COMPLETE COMMISSIONED ENABLED ADAPTED FITTED CERTIFIED REFUTED "
-    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED"
+    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED REVOKED DOUBTED"
 )
 EXPECTED = """
-INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .
-COMMISSION  FAULT  .      .      .      .           ENABLE  .      .        .        .        .      .        .     .     .        .
-ENABLE      FAULT  REACT  REACT  .      .           .       ADAPT  .        .        .        .      .        .     .     .        .
-ADAPT       FAULT  REACT  REACT  .      .           .       .      MONITOR  CERTIFY  .        .      .        .     .     .        .
-CERTIFY     FAULT  REACT  REACT  .      .           .       .      .        .        MONITOR  ADAPT  .        .     .     .        .
-MONITOR     FAULT  REACT  REACT  REACT  .           .       .      .        .        .        .      .        .     .     PAYLOAD  .
-REACT       FAULT  .      .      .      .           .       .      .        .        .        .      STOPPED  back  .     .        .
-STOPPED     FAULT  .      .      .      .           .       .      .        .        .        .      .        .     back  PAYLOAD  .
-PAYLOAD     FAULT  REACT  REACT  .      .           .       .      .        .        .        .      .        .     .     .        ADAPT
-FAULT       .      .      .      .      .           .       .      .        .        .        .      .        .     .     .        .
+INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .        .        .
+COMMISSION  FAULT  .      .      .      .           ENABLE  .      .        .        .        .      .        .     .     .        .        .        .
+ENABLE      FAULT  REACT  REACT  .      .           .       ADAPT  .        .        .        .      .        .     .     .        .        .        .
+ADAPT       FAULT  REACT  REACT  .      .           .       .      MONITOR  CERTIFY  .        .      .        .     .     .        .        .        .
+CERTIFY     FAULT  REACT  REACT  .      .           .       .      .        .        MONITOR  ADAPT  .        .     .     .        .        .        .
+MONITOR     FAULT  REACT  REACT  REACT  .           .       .      .        .        .        .      .        .     .     PAYLOAD  .        .        STOPPED
+REACT       FAULT  .      .      .      .           .       .      .        .        .        .      STOPPED  back  .     .        .        .        .
+STOPPED     FAULT  .      .      .      .           .       .      .        .        .        .      .        .     back  PAYLOAD  ADAPT    ADAPT    .
+PAYLOAD     FAULT  REACT  REACT  .      .           .       .      .        .        .        .      .        .     .     .        ADAPT    .        .
+FAULT       .      .      .      .      .           .       .      .        .        .        .      .        .     .     .        .        .        .
 """  # noqa: E501
 ORIGINS = ("ENABLE", "ADAPT", "CERTIFY", "MONITOR", "PAYLOAD")
 
@@ -593,6 +593,56 @@ def test_an_acknowledgement_before_the_stop_does_not_release_it(state):
     run.step(request=Request.ACKNOWLEDGE)
     run.to(SchemeState.STOPPED)
     assert run.step(cycles=100) is SchemeState.STOPPED
+
+
+def test_what_is_known_of_a_stopped_arm_can_be_taken_back_even_while_something_seems_to_push():
+    run = run_in(SchemeState.STOPPED)
+    assert run.step(request=Request.RELEARN, observation=CONTACT) is SchemeState.STOPPED
+    assert run.step(observation=CONTACT | Observation.AT_REST, cycles=REST_CYCLES - 1) is SchemeState.STOPPED
+    assert run.step(observation=CONTACT | Observation.AT_REST) is SchemeState.ADAPT
+    assert run.supervisor.cause is SchemeEvent.REVOKED
+
+
+@pytest.mark.parametrize("state", [state for state in SchemeState if state is not SchemeState.STOPPED])
+def test_only_a_stopped_arm_is_learnt_anew(state):
+    run, plain = run_in(state), run_in(state)
+    resting = {"observation": Observation.AT_REST, "cycles": 2 * REST_CYCLES}
+    run.step(request=Request.RELEARN)
+    plain.step()
+    assert run.step(**resting) is plain.step(**resting)
+    assert run.supervisor.cause is not SchemeEvent.REVOKED
+
+
+def doubted():
+    run = run_in(SchemeState.MONITOR)
+    assert run.supervisor.doubt() is SchemeState.STOPPED
+    return run
+
+
+def test_a_doubted_arm_holds_until_the_user_says_how_to_go_on():
+    assert doubted().step(cycles=1000) is SchemeState.STOPPED
+    assert doubted().step(request=Request.ACKNOWLEDGE) is SchemeState.ADAPT
+
+
+def test_a_payload_that_contacts_looked_like_needs_no_announcement():
+    run = doubted()
+    run.step(request=Request.PAYLOAD_CHANGED)
+    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.ADAPT
+    assert run.supervisor.cause is SchemeEvent.PAYLOAD_CHANGED
+
+
+def test_in_a_stop_that_nothing_doubts_a_changed_payload_means_nothing():
+    run = run_in(SchemeState.STOPPED)
+    run.step(request=Request.PAYLOAD_CHANGED)
+    assert run.step(observation=Observation.AT_REST, cycles=2 * REST_CYCLES) is SchemeState.STOPPED
+
+
+def test_the_doubt_ends_with_its_stop():
+    run = doubted()
+    run.step(request=Request.ACKNOWLEDGE)
+    run.to(SchemeState.STOPPED)
+    run.step(request=Request.PAYLOAD_CHANGED)
+    assert run.step(observation=Observation.AT_REST, cycles=2 * REST_CYCLES) is SchemeState.STOPPED
 
 
 def test_an_acknowledgement_is_good_for_one_stop():

@@ -20,7 +20,7 @@ FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_
 TOPICS: Final = (*FRAME_TOPICS, "/scheme", "/cycle", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 20_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
-_SAID: Final = _SAID_BEFORE_ANCHORS | {"anchor", "touch", "certificate"}
+_SAID: Final = _SAID_BEFORE_ANCHORS | {"anchor", "touch", "certificate", "revoked"}
 """Names of the events that the scheme itself says."""
 
 

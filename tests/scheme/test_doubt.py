@@ -1,0 +1,174 @@
+"""A certificate that is wrong meets the same cause again and again: it is named, and taken back."""
+
+import re
+
+import numpy as np
+import pytest
+from excited_arm import NAMES, PERIOD_S, SETTINGS
+from planar_arm import PAYLOAD_1KG, THETA
+from test_earlier import FREE, HeldLoop, added
+
+from adacd_hil.records import Request, SchemeState
+from adacd_hil.scheme import certified_kernel, doubt
+from adacd_hil.scheme.doubt import Doubt
+
+PAYLOAD, COULOMB1 = range(2)
+
+
+class MonitoredLoop(HeldLoop):
+    """An arm that has been certified, and two seconds more."""
+
+    def __init__(self, profile="P", **options):
+        super().__init__(FREE, theta=THETA[profile], **options)
+        self.run_until(SchemeState.MONITOR)
+        self.run(2000)
+
+    def run_until_taken_back(self, seconds=20.0):
+        """Return how many contacts there were; the user acknowledges those that are collisions."""
+        contacts = stopped = 0
+        for _ in range(round(seconds / PERIOD_S)):
+            output = self.step()
+            contacts += output.state is SchemeState.REACT and output.previous_state is SchemeState.MONITOR
+            if self.said("revoked"):
+                assert output.state is SchemeState.STOPPED
+                return contacts
+            stopped = stopped + 1 if output.state is SchemeState.STOPPED else 0
+            if stopped == 600:
+                self.request, stopped = Request.ACKNOWLEDGE, 0
+        raise AssertionError(f"{contacts} contacts, and nothing was taken back")
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+@pytest.mark.parametrize("kg", [0.1, 0.5, 1.0])
+def test_a_payload_that_nobody_announced_is_named_and_learnt_at_a_word(profile, kg):
+    loop = MonitoredLoop(profile)
+    loop.theta = loop.theta + kg * PAYLOAD_1KG
+    assert loop.run_until_taken_back() <= 5
+    (text,) = loop.said("revoked")
+    named = re.fullmatch(r"\d contacts look like (\S+) ± (\S+) kg picked up: .*, `changed` learns it", text)
+    assert float(named[1]) == pytest.approx(kg, rel=0.1)
+    loop.request = Request.PAYLOAD_CHANGED
+    loop.run_until(SchemeState.ADAPT)
+    assert len(loop.run_until(SchemeState.MONITOR)) * PERIOD_S < 1.5
+    assert loop.error_of("a1") < 0.01
+
+
+def test_a_payload_that_is_put_down_is_named_too():
+    loop = MonitoredLoop()
+    loop.theta = loop.theta - 0.05 * PAYLOAD_1KG
+    loop.run_until_taken_back()
+    assert "kg put down" in loop.said("revoked")[0]
+
+
+@pytest.mark.parametrize(
+    ("hand", "named"),
+    [
+        (added(F_c1=0.3), r"0\.\d\d ± 0\.\d\d Nm more Coulomb friction of joint 1"),
+        (added(F_v2=0.2), r"0\.(19|20|21) ± 0\.\d\d Nm s/rad more viscous friction of joint 2"),
+    ],
+)
+def test_friction_that_is_not_the_certified_one_is_named_and_learnt_at_a_word(hand, named):
+    loop = MonitoredLoop()
+    loop.theta = loop.theta + hand
+    assert loop.run_until_taken_back() == 3
+    assert re.search(rf"3 contacts look like {named} than was certified", loop.said("revoked")[0])
+    loop.request = Request.ACKNOWLEDGE
+    loop.recover()
+    assert loop.error_of("F_c1") < 0.02
+    assert loop.error_of("F_v2") < 0.02
+
+
+def test_a_contact_that_never_ends_has_an_exit():
+    """A sensor that has moved by 0.5 Nm looks like somebody who leans: only the user knows, and says it by a word."""
+    loop = MonitoredLoop()
+    loop.offset_Nm[0] = 0.5
+    loop.run_until(SchemeState.STOPPED, 15_000)
+    assert re.match(r"something still pushes the arm at rest, -?0\.[45]\d, ", loop.said("touch")[-1])
+    loop.request = Request.ACKNOWLEDGE
+    assert {output.state for output in loop.run(1000)} == {SchemeState.STOPPED}
+    loop.request = Request.RELEARN
+    outputs = loop.run_until(SchemeState.ADAPT, 100)
+    assert not outputs[-1].is_model_valid
+    assert (outputs[-1].theta_ff == 0.0).all()
+    assert loop.said("revoked") == ["the user takes the certificate back: the arm is learnt anew"]
+    loop.run(3000)
+    assert "joint 1 has a fitted torque offset of 0." in loop.said("anchor")[-1]  # the reading at rest says otherwise
+    loop.request = Request.ACCEPT_OFFSET
+    loop.recover()
+    assert abs(loop.offset_error_Nm[0]) < 0.03
+
+
+def test_who_touches_the_arm_again_and_again_takes_nothing_back():
+    loop = MonitoredLoop()
+    random = np.random.default_rng(7)
+    contacts = 0
+    for _ in range(25):
+        loop.tau_ext[:] = random.uniform(0.3, 1.5) * random.choice([-1.0, 1.0]) * np.array([1.0, random.uniform(0, 1)])
+        for _ in range(int(random.uniform(50, 400))):
+            output = loop.step()
+            contacts += output.state is SchemeState.REACT and output.previous_state is SchemeState.MONITOR
+        loop.tau_ext[:] = 0.0
+        loop.recover()
+        loop.run(int(random.uniform(0, 1500)))
+    assert contacts > 15
+    assert loop.said("revoked") == []
+
+
+def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
+    """The sums of a contact that one cause explains to this share, with this sigma of its size."""
+    correlated = 2.0 / (SETTINGS.certified.cutoffs_rad_s[doubt.FILTER] * PERIOD_S)
+    ww = correlated * (doubt.RESIDUAL_NM / sigma) ** 2
+    rw = np.zeros(others)
+    rw[cause] = size * ww
+    return rw, np.full(others, ww), size * size * ww / share
+
+
+def verdict_of(contacts, gap_s=1.0):
+    values = {"cause_rw": np.zeros(5), "cause_ww": np.zeros(5), "contact_rr": 0.0, "theta": np.zeros(len(NAMES))}
+    memory = [values]
+    judge, cycle, verdict = Doubt(SETTINGS, certified_kernel.constants_of(SETTINGS), memory), 0, None
+    for rw, ww, rr in contacts:
+        cycle += round(gap_s / PERIOD_S)
+        judge.begin(cycle, is_touched=True)
+        values["cause_rw"], values["cause_ww"], values["contact_rr"] = rw, ww, rr
+        cycle += 500
+        verdict = judge.end(cycle)
+    return verdict
+
+
+def test_two_contacts_that_agree_in_a_payload_are_one_and_a_single_contact_is_none():
+    assert verdict_of([sums(0.5)]) is None
+    verdict = verdict_of([sums(0.5), sums(0.5)])
+    assert verdict.is_payload
+    assert verdict.text == "2 contacts look like 0.50 ± 0.03 kg picked up"
+
+
+@pytest.mark.parametrize(
+    "contacts",
+    [
+        [sums(0.5), sums(0.5, share=0.7)],
+        [sums(0.5, share=0.88), sums(0.5, share=0.88)],
+        [sums(0.5), sums(0.8)],
+        [sums(0.5), sums(-0.5)],
+        [sums(0.5, sigma=0.1), sums(0.5, sigma=0.1)],
+    ],
+    ids=["one is something else", "not all of it", "another size", "another sign", "hardly known"],
+)
+def test_contacts_that_do_not_agree_are_no_payload(contacts):
+    assert verdict_of(contacts) is None
+
+
+def test_another_error_than_a_payload_must_strike_three_times_at_once():
+    contact = sums(0.3, cause=COULOMB1)
+    assert verdict_of([contact, contact]) is None
+    assert "Coulomb friction of joint 1" in verdict_of([contact] * 3).text
+    assert verdict_of([contact] * 3, gap_s=doubt.AT_ONCE_S + 0.1) is None
+
+
+@pytest.mark.parametrize("size", [-0.3, 2.1])
+def test_no_arm_has_less_friction_than_none_or_more_than_any(size):
+    assert verdict_of([sums(size, cause=COULOMB1)] * 3) is None
+
+
+def test_contacts_of_more_than_a_minute_ago_do_not_count():
+    assert verdict_of([sums(0.5), sums(0.5)], gap_s=doubt.WITHIN_S) is None
