@@ -46,6 +46,7 @@ class Evidence:
 
     margins: by section. promotions: refined models that took over in the run. certificates: what
     each says of its anchors, in order; empty in logs from before there were any. is_anchored: whether all offsets were.
+    revoked: why certificates were taken back, in order.
     """
 
     tests: dict[str, int]
@@ -56,6 +57,7 @@ class Evidence:
     paper_beside: Beside | None
     certificates: tuple[str, ...]
     is_anchored: bool
+    revoked: tuple[str, ...]
 
     @property
     def smallest_margin(self) -> float | None:
@@ -85,6 +87,7 @@ def evaluate_certified(
         paper_beside=beside,
         certificates=tuple(certificate.message for certificate in certificates),
         is_anchored=all(certificate.level == "info" for certificate in certificates),
+        revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
     )
 
 

@@ -39,7 +39,7 @@ from adacd_hil.analysis.sections import Section, rows_of, split_sections
 from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_reactions
 from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.analysis.untouched import Residual, Untouched, gather_untouched
-from adacd_hil.analysis.verdict import give_verdict, is_margin_below_1
+from adacd_hil.analysis.verdict import give_verdict, is_margin_below_1, is_revoked
 from adacd_hil.records import PARAMETER_NAMES
 
 
@@ -136,7 +136,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         ),
         is_clean=is_identified
         and missed == 0
-        and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence)),
+        and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
     )
 
 

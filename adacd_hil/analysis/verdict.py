@@ -1,7 +1,7 @@
 """The verdict on a run: one sentence, what went wrong first."""
 
 import itertools
-from typing import Final
+from typing import Final, TypeGuard
 
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.cyclic_data import CyclicData, data_text
@@ -40,6 +40,8 @@ def give_verdict(
         text += _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     if is_margin_below_1(evidence):
         text = f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}; {text}"
+    if is_revoked(evidence):
+        text = "; ".join((*evidence.revoked, text))
     broken = f"the run was broken off: {'; '.join(causes)}" if causes else ""
     text = "; ".join(filter(None, (*_fault_texts(faults), broken, text, data_text(data))))
     return text[:1].upper() + text[1:] + "."
@@ -48,6 +50,11 @@ def give_verdict(
 def is_margin_below_1(evidence: Evidence | None) -> bool:
     """Tell whether some residual was over its threshold while nobody touched the arm."""
     return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
+
+
+def is_revoked(evidence: Evidence | None) -> TypeGuard[Evidence]:
+    """Tell whether some certificate was taken back."""
+    return evidence is not None and bool(evidence.revoked)
 
 
 def _margin_text(evidence: Evidence | None) -> str:

@@ -157,6 +157,16 @@ def test_a_verdict_says_that_nothing_anchors_the_offsets_of_some_certificate():
     assert "anchors" not in evaluate(certificates("info", "info")).verdict
 
 
+def test_a_certificate_that_was_taken_back_is_what_the_verdict_begins_with_and_the_run_is_not_good():
+    why = "2 contacts look like 0.50 ± 0.06 kg picked up: the certificate is taken back"
+    run = replace(make_certified_run(), events=(LoggedEvent(5, Event("warning", "revoked", why)),))
+    metrics = evaluate(run)
+    assert metrics.evidence.revoked == (why,)
+    assert metrics.verdict.startswith(f"{why}; ")
+    assert not metrics.is_clean
+    assert evaluate(make_certified_run()).is_clean
+
+
 def test_a_verdict_compares_with_the_papers_scheme():
     assert evaluate(make_certified_run()).verdict.endswith(
         "; the paper's scheme on the same stream took 2.00 s and 2.00 s; no cyclic data was late or lost."
