@@ -88,8 +88,9 @@ def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_certified_host_comes_to_what_is_expected_of_it(tmp_path: Path) -> None:
-    cast = resolve("certified", "push-during-adaptation", None, None)
+@pytest.mark.parametrize("name", ["push-during-adaptation", "payload-fitted-in-motion"])
+def test_a_certified_host_comes_to_what_is_expected_of_it(name: str, tmp_path: Path) -> None:
+    cast = resolve("certified", name, None, None)
     outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))
     expected = cast.scenario.expected_of("certified")
     assert expected is not None
