@@ -11,6 +11,7 @@ from adacd_hil.scheme.kernel import Structured
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
+BY_WORD = "friction and inertia: by this run and the user's word, against what the run had learnt before"
 _CHANGED = "no one model explains the whole fit: something has touched the arm or let go while it was learnt"
 _BEGINS_ANEW = "no certificate, learning begins anew"
 
@@ -48,6 +49,7 @@ class CertificateWatch:
     def __init__(self, constants: Structured, memory: Structured) -> None:
         self._constants, self._memory = constants[0], memory[0]
         self._refusal: _Refusal | None = None
+        self._is_vouched = False
 
     @property
     def is_refusing(self) -> bool:
@@ -61,8 +63,9 @@ class CertificateWatch:
         if state is not SchemeState.MONITOR or previous is not SchemeState.CERTIFY:
             return None
         self._refusal = None
+        known_by, self._is_vouched = BY_WORD if self._is_vouched else THIS_RUN_ONLY, False
         level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
-        return Event(level, "certificate", f"{anchor.describe(self._constants, self._memory)}; {THIS_RUN_ONLY}")
+        return Event(level, "certificate", f"{anchor.describe(self._constants, self._memory)}; {known_by}")
 
     def refuse(self, is_reading: bool) -> Event | None:
         """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
@@ -103,6 +106,7 @@ class CertificateWatch:
                 what = f"the user accepts {torque} Nm as the zero of the sensors"
             case _:
                 earlier.forget(self._memory)
+                self._is_vouched = True
                 what = "the user says that nobody touches the arm: what was learnt before is not compared"
         return Event("warning", refusal.cause.value[0], what)
 

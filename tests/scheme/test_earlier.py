@@ -10,6 +10,7 @@ from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme import certified_kernel, earlier
+from adacd_hil.scheme.certificate_watch import BY_WORD
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)
@@ -118,6 +119,7 @@ def test_the_word_of_the_user_that_nobody_touches_the_arm_ends_the_comparison():
     loop.request = Request.ACCEPT_OFFSET
     loop.recover()
     assert "the user says that nobody touches the arm" in loop.said("touch")[-1]
+    assert loop.said("certificate")[0].endswith(f"; {BY_WORD}")
     assert loop.error_of("F_c1") < 0.02
 
 

@@ -190,6 +190,20 @@ def test_a_stopped_arm_goes_on_after_acknowledgement():
 
 
 @pytest.mark.slow
+def test_what_is_known_of_a_stopped_arm_is_taken_back_at_a_word_though_something_pushes():
+    loop = ClosedLoop(load_settings("paper", "P"), THETA["P"])
+    loop.run_until(SchemeState.MONITOR)
+    loop.tau_ext[0] = 1.0
+    loop.run_until(SchemeState.STOPPED, 5000)
+    loop.request = Request.ACKNOWLEDGE
+    assert loop.run(200)[-1].state is SchemeState.STOPPED
+    loop.request = Request.RELEARN
+    output = loop.run_until(SchemeState.ADAPT)[-1]
+    assert not output.is_model_valid
+    assert (output.theta_ff == 0.0).all()
+
+
+@pytest.mark.slow
 def test_an_arm_that_stands_still_never_ends_its_adaptation():
     """Eq. (15) alone would end it after 5 s with theta_hat = 0."""
     settings = settings_with(termination={"timeout_s": 8.0}, trajectory={"amplitude_deg": [0.0, 0.0]})
