@@ -1,0 +1,86 @@
+"""tools/touch_campaign.py: what it draws, one of its trials, and its figures."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import touch_campaign
+import touch_trials
+from touch_trials import Hand, HandLoop, Trial
+
+GOOD = Trial(1, "P", "lean", False, True, False, 2.25, (0.01,), 2.0, True, "")
+
+
+def met(figures):
+    return {name: is_met for name, _, _, is_met in figures}
+
+
+def test_a_seed_draws_the_same_touch_and_every_kind_comes():
+    hands = [touch_trials.draw_hand(np.random.default_rng(seed)) for seed in range(300)]
+    again = touch_trials.draw_hand(np.random.default_rng(7))
+    assert (again.kind, again.size, again.begins_s) == (hands[7].kind, hands[7].size, hands[7].begins_s)
+    assert {hand.kind for hand in hands} == set(touch_trials.KINDS)
+    assert 0.15 < np.mean([np.isinf(hand.lasts_s) for hand in hands]) < 0.25
+    assert 0.2 < np.mean([hand.begins_s == 0.0 for hand in hands]) < 0.3
+
+
+def test_a_hand_pushes_and_lets_go():
+    loop = HandLoop(3)
+    nothing = {"added": np.zeros(7), "torque_Nm": np.zeros(2)}
+    loop.touch(Hand("tip force", 2.0, 0.0, 1.0, **nothing, tip_N=2.0), 0.1)
+    l1, l2 = touch_trials.FREE.arm.link_length_m
+    assert loop.tau_ext == pytest.approx([2.0 * (l2 + l1 * np.cos(loop.q[1])), 2.0 * l2])
+    loop.touch(Hand("ramp", 1.0, 0.0, 1.0, np.zeros(7), np.array([1.0, 0.0]), ramp_s=0.5), 0.1)
+    assert loop.tau_ext == pytest.approx([0.2, 0.0])
+    loop.let_go()
+    assert not loop.tau_ext.any()
+
+
+def test_a_spring_pulls_towards_where_it_was_taken_hold_of():
+    loop = HandLoop(3)
+    spring = Hand("spring", 5.0, 0.0, 1.0, np.zeros(7), np.zeros(2), spring_N_m=5.0)
+    loop.touch(spring, 0.0)
+    assert not loop.tau_ext.any()
+    loop.q += (0.1, 0.0)
+    loop.touch(spring, 0.1)
+    assert loop.tau_ext[0] < 0.0
+
+
+def test_the_error_of_a_model_is_that_of_its_torque_on_the_papers_motion():
+    error = np.zeros(len(touch_trials.NAMES))
+    error[touch_trials.OFFSETS[0]] = 0.3
+    assert np.abs(touch_trials.paper_rows() @ error).max() == pytest.approx(0.3, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_an_arm_that_nobody_touches_is_certified_and_is_within_the_bounds():
+    trial = touch_trials.play(1, is_touched=False)
+    assert trial.certified_s == pytest.approx(2.25, abs=0.01)
+    assert all(met(touch_campaign.untouched_figures([trial])).values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "missed"),
+    [
+        ({}, set()),
+        ({"errors_Nm": (0.01, 0.06)}, {"off by > 0.05 Nm, hands like a joint from before 0.5 s apart"}),
+        ({"errors_Nm": (0.2,), "is_excused": True}, set()),
+        ({"back_after_s": 5.1}, {"back within 5 s of the release"}),
+        ({"back_after_s": None}, {"back within 5 s of the release"}),
+        ({"back_after_s": None, "is_released": False}, set()),
+    ],
+)
+def test_a_figure_that_is_not_within_its_bound_is_told(changes, missed):
+    figures = met(touch_campaign.touched_figures([replace(GOOD, **changes)]))
+    assert {name for name, is_met in figures.items() if not is_met} == missed
+
+
+@pytest.mark.parametrize("changes", [{"is_withheld": True}, {"certified_s": None}, {"errors_Nm": (0.051,)}])
+def test_an_untouched_arm_that_is_withheld_late_or_wrong_is_told(changes):
+    untouched = replace(GOOD, kind="none", is_reported=False, back_after_s=None, is_released=False)
+    assert all(met(touch_campaign.untouched_figures([untouched])).values())
+    assert not all(met(touch_campaign.untouched_figures([replace(untouched, **changes)])).values())

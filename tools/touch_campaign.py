@@ -1,0 +1,110 @@
+"""Hands on an arm that learns: what is certified with them, and how soon the arm is back after they let go.
+
+    python tools/touch_campaign.py --seeds 0:200 -j 2
+    python tools/touch_campaign.py --untouched --seeds 0:200
+
+Arms and touches by seed (`touch_trials`). Tables go to stdout, progress to stderr. Exit status: 0 all figures are
+within their bounds, 1 one is not, 2 wrong usage.
+"""
+
+import argparse
+import json
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from functools import partial
+
+import numpy as np
+from touch_trials import KINDS, Trial, play
+
+from adacd_hil.cli.table import format_table
+
+LARGE_NM, WRONG_NM = 0.1, 0.05
+WRONG_SHARE = 0.01
+BACK_S, BACK_SHARE = 5.0, 0.92
+WITHHELD_SHARE = 0.01
+
+
+def seeds_of(text: str) -> range:
+    """Read FIRST:END."""
+    first, _, end = text.partition(":")
+    return range(int(first), int(end) if end else int(first) + 1)
+
+
+def touched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
+    """Return name, value, bound of each figure, and whether it is within."""
+    judged = [max(trial.errors_Nm, default=0.0) for trial in trials if not trial.is_excused]
+    wrong, large = sum(error > WRONG_NM for error in judged), sum(error > LARGE_NM for error in judged)
+    waited = [trial for trial in trials if trial.is_released and trial.is_reported and not trial.fault]
+    back = sum(trial.back_after_s is not None and trial.back_after_s <= BACK_S for trial in waited)
+    apart = "hands like a joint from before 0.5 s apart"
+    return [
+        (f"off by > {WRONG_NM:g} Nm, {apart}", f"{wrong} of {len(judged)}", "1 %", wrong <= WRONG_SHARE * len(judged)),
+        (f"off by > {LARGE_NM:g} Nm, {apart}", f"{large} of {len(judged)}", "0", large == 0),
+        (
+            f"back within {BACK_S:g} s of the release",
+            f"{back} of {len(waited)}",
+            "92 %",
+            back >= BACK_SHARE * len(waited),
+        ),
+    ]
+
+
+def untouched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
+    """Return name, value, bound of each figure, and whether it is within."""
+    withheld = sum(trial.is_withheld or trial.is_reported for trial in trials)
+    times_s = [trial.certified_s for trial in trials if trial.certified_s is not None]
+    worst = max((error for trial in trials for error in trial.errors_Nm), default=0.0)
+    took = f"{np.median(times_s):.2f}, {max(times_s):.2f} s" if times_s else "never"
+    return [
+        ("withheld or reported", f"{withheld} of {len(trials)}", "1 %", withheld <= WITHHELD_SHARE * len(trials)),
+        ("certified", f"{len(times_s)} of {len(trials)}", "all", len(times_s) == len(trials)),
+        ("certified after, median and worst", took, "", True),
+        ("largest error", f"{worst:.3f} Nm", f"{WRONG_NM:g} Nm", worst <= WRONG_NM),
+    ]
+
+
+def kind_table(trials: list[Trial]) -> str:
+    """Return a table with a row for each kind of touch."""
+    head = ("touch", "played", "reported", "withheld", "certified", "> 0.05 Nm", "> 0.1 Nm", "worst, Nm")
+    rows = []
+    for kind in KINDS:
+        mine = [trial for trial in trials if trial.kind == kind]
+        errors = [max(trial.errors_Nm, default=0.0) for trial in mine]
+        counts = (
+            len(mine), sum(trial.is_reported for trial in mine), sum(trial.is_withheld for trial in mine),
+            sum(bool(trial.errors_Nm) for trial in mine), sum(error > WRONG_NM for error in errors),
+            sum(error > LARGE_NM for error in errors),
+        )  # fmt: skip
+        rows.append([kind, *map(str, counts), f"{max(errors, default=0.0):.3f}"])
+    return format_table(head, rows, right=range(1, len(head)))
+
+
+def main() -> int:
+    """Play the seeds that were asked for."""
+    parser = argparse.ArgumentParser(description="Hands on an arm that learns.")
+    parser.add_argument("--seeds", type=seeds_of, default=range(200), metavar="FIRST:END", help="default: 0:200")
+    parser.add_argument("--untouched", action="store_true", help="leave the arms alone")
+    parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
+    parser.add_argument("--json", action="store_true", help="print each trial as JSON")
+    options = parser.parse_args()
+    trials = []
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for trial in pool.map(partial(play, is_touched=not options.untouched), options.seeds):
+            trials.append(trial)
+            if len(trials) % 20 == 0:
+                print(f"{len(trials)}/{len(options.seeds)}", file=sys.stderr, flush=True)
+    figures = untouched_figures(trials) if options.untouched else touched_figures(trials)
+    if options.json:
+        print(json.dumps([asdict(trial) for trial in trials]))
+    else:
+        if not options.untouched:
+            print(kind_table(trials))
+        rows = [[name, value, bound, "" if is_met else "not met"] for name, value, bound, is_met in figures]
+        print(format_table(("figure", "measured", "bound", ""), rows))
+    return 0 if all(row[3] for row in figures) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
