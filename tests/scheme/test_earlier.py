@@ -206,6 +206,21 @@ def test_what_the_prior_alone_says_judges_nothing():
     assert prior.agrees_with("a1", 1.0)
 
 
+@pytest.mark.parametrize(("share", "is_steady"), [(0.95, True), (1.05, False)])
+def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share, is_steady):
+    compared = Compared(std=0.01)
+    m = compared.m
+    m["has_kept"], m["steps_used"], m["steps_theta"][0] = 0.0, 1.0, 0.1
+    m["steps_P"][0] = 0.02**2 * np.eye(len(NAMES))
+    m["steps_square"][0], m["steps_rows"][0], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
+    added_variance = (1.0 + earlier.REGULAR) * 0.02**2 - 0.01**2
+    m["belief"][INERTIA] += share * np.sqrt(earlier.STEADY * earlier.SMALLEST_SQUARE * added_variance)
+    assert earlier.is_steady(m) is is_steady
+    assert bool(m["has_kept"]) is not is_steady
+    if not is_steady:
+        assert (m["kept"] == 0.1).all()
+
+
 def test_the_step_kept_is_from_before_the_contact():
     loop = HeldLoop(FREE)
     loop.learn(1.1)
