@@ -190,7 +190,7 @@ class Request(IntEnum):
     FAULT_TORQUE = 5
     FAULT_FOLLOWING = 6
     FAULT_TAMPERED = 7
-    ACCEPT_OFFSET = 8  # the torque that the sensors read, or the fit found, is their zero: nobody leans on the arm
+    ACCEPT = 8  # nobody touches the arm: what was refused, a torque sensor's zero or more friction, is the arm's
     RELEARN = 9  # nobody touches the stopped arm, what is known of it is wrong: learn it anew
 
 

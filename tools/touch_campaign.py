@@ -16,6 +16,7 @@ from dataclasses import asdict
 from functools import partial
 
 import numpy as np
+from property_campaign import parse_seeds
 from touch_trials import KINDS, Trial, play
 
 from adacd_hil.cli.table import format_table
@@ -24,12 +25,6 @@ LARGE_NM, WRONG_NM = 0.1, 0.05
 WRONG_SHARE = 0.01
 BACK_S, BACK_SHARE = 5.0, 0.92
 WITHHELD_SHARE = 0.01
-
-
-def seeds_of(text: str) -> range:
-    """Read FIRST:END."""
-    first, _, end = text.partition(":")
-    return range(int(first), int(end) if end else int(first) + 1)
 
 
 def touched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
@@ -84,7 +79,7 @@ def kind_table(trials: list[Trial]) -> str:
 def main() -> int:
     """Play the seeds that were asked for."""
     parser = argparse.ArgumentParser(description="Hands on an arm that learns.")
-    parser.add_argument("--seeds", type=seeds_of, default=range(200), metavar="FIRST:END", help="default: 0:200")
+    parser.add_argument("--seeds", type=parse_seeds, default=range(200), help="A:B, B excluded, or one; default 0:200")
     parser.add_argument("--untouched", action="store_true", help="leave the arms alone")
     parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
     parser.add_argument("--json", action="store_true", help="print each trial as JSON")

@@ -29,6 +29,11 @@ KINDS = {
     "ramp": 0.10,
 }  # fmt: skip
 """Kinds of touch, and their shares."""
+SIZES = {
+    "lean": (0.1, 2.0), "tip force": (1.0, 8.0), "drag": (0.1, 1.0), "viscous": (0.05, 0.3), "spring": (0.5, 10.0),
+    "inertia": (0.01, 0.1), "payload": (0.05, 1.0), "ramp": (0.02, 1.0),
+}  # fmt: skip
+"""Nm, N, Nm, Nm s/rad, N/m, kg m², kg, Nm/s; log-uniform."""
 LIKE_A_JOINT = ("drag", "viscous", "inertia", "payload")
 """Whose torque is a change of the arm's parameters."""
 KNOWN_S = 0.5
@@ -123,13 +128,6 @@ def draw_hand(random: np.random.Generator) -> Hand:
     return Hand(kind, size, begins_s, lasts_s, added, torque, **more)
 
 
-SIZES = {
-    "lean": (0.1, 2.0), "tip force": (1.0, 8.0), "drag": (0.1, 1.0), "viscous": (0.05, 0.3), "spring": (0.5, 10.0),
-    "inertia": (0.01, 0.1), "payload": (0.05, 1.0), "ramp": (0.02, 1.0),
-}  # fmt: skip
-"""Nm, N, Nm, Nm s/rad, N/m, kg m², kg, Nm/s; log-uniform."""
-
-
 class HandLoop(TouchedLoop):
     """The arm under a hand; the user acknowledges a stop after STEADY_S."""
 
@@ -218,5 +216,5 @@ def play(seed: int, is_touched: bool) -> Trial:
     return Trial(
         seed, loop.arm, "none" if hand is None else hand.kind, hand is not None and hand.is_like_a_joint_from_the_start,
         is_reported, bool(loop.said("anchor") or loop.said("touch")), certified_s, tuple(errors), back_after_s,
-        is_released=ends_s < LONGEST_S, fault=fault,
+        is_released=np.isfinite(ends_s), fault=fault,
     )  # fmt: skip

@@ -44,9 +44,9 @@ class ChannelMargin:
 class Evidence:
     """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
 
-    margins: by section. promotions: refined models that took over in the run. certificates: what
-    each says of its anchors, in order; empty in logs from before there were any. is_anchored: whether all offsets were.
-    revoked: why certificates were taken back, in order.
+    margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
+    says what anchors all its offsets; logs from before there were anchors say nothing. revoked: why certificates were
+    taken back, in order.
     """
 
     tests: dict[str, int]
@@ -55,7 +55,6 @@ class Evidence:
     margins: dict[str, tuple[ChannelMargin, ...]]
     promotions: int
     paper_beside: Beside | None
-    certificates: tuple[str, ...]
     is_anchored: bool
     revoked: tuple[str, ...]
 
@@ -77,7 +76,6 @@ def evaluate_certified(
     """Judge a run of the certified scheme. margins, promotions: of all its cycles, see `untouched`."""
     adaptations = [section for section in sections if section.kind == "adaptation"]
     stays = {section.label: _tests(run, section) for section in adaptations}
-    certificates = [event for _, event in run.events if event.name == "certificate"]
     return Evidence(
         tests={label: len(lengths_s) for label, lengths_s in stays.items()},
         test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
@@ -85,8 +83,7 @@ def evaluate_certified(
         margins=margins,
         promotions=promotions,
         paper_beside=beside,
-        certificates=tuple(certificate.message for certificate in certificates),
-        is_anchored=all(certificate.level == "info" for certificate in certificates),
+        is_anchored=all(event.level == "info" for _, event in run.events if event.name == "certificate"),
         revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
     )
 

@@ -15,7 +15,7 @@ CONSOLE_WORDS = {
     "ack": Request.ACKNOWLEDGE,
     "payload": Request.PAYLOAD,
     "changed": Request.PAYLOAD_CHANGED,
-    "accept": Request.ACCEPT_OFFSET,
+    "accept": Request.ACCEPT,
     "relearn": Request.RELEARN,
     "finish": Request.FINISH,
 }

@@ -106,11 +106,11 @@ def is_rest_refused(k: Any, m: Any) -> bool:
 
 
 @compiled
-def is_kept(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
-    """Tell whether a model's offsets keep to all anchors that there are. theta (p,), P (p, p)."""
+def is_within(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
+    """Tell whether a model's offsets are within the bounds of all anchors. theta (p,), P (p, p)."""
     base, first_coulomb = int(k["base"]), int(k["first_coulomb"])
     drift = k["zero_drift_Nm2_s"] * m["anchor_age_s"]
-    is_kept = True
+    is_within = True
     for i in range(m["judged_Nm"].shape[0]):
         m["judged_Nm"][i] = theta[base + i]
         friction = ASYMMETRY * max(theta[first_coulomb + i], 0.0)
@@ -118,8 +118,8 @@ def is_kept(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
         for kind in range(KINDS):
             std, slack = m["anchor_std"][kind, i], k["holding_Nm"][i] if kind == REST else 0.0
             m["bound_Nm"][kind, i] = SIGMAS * np.sqrt(fitted + std**2 + drift) + slack if std != np.inf else np.inf
-            is_kept = is_kept and abs(theta[base + i] - m["anchor_Nm"][kind, i]) <= m["bound_Nm"][kind, i]
-    return bool(is_kept)
+            is_within = is_within and abs(theta[base + i] - m["anchor_Nm"][kind, i]) <= m["bound_Nm"][kind, i]
+    return bool(is_within)
 
 
 def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
@@ -135,13 +135,15 @@ def accept_reading(m: Any) -> None:
     m["anchor_std"][TARE] = np.inf
 
 
-def tightest(k: Any, m: Any, joint: int) -> int | None:
-    """Return the anchor that bounds the offset that was judged last most closely; None where none does.
+@compiled
+def is_open(k: Any, m: Any, joint: int) -> bool:
+    """Tell whether no anchor bounds the offset that was judged last as closely as a test does, to `beta_Nm`."""
+    return bool(not (np.min(m["bound_Nm"][:, joint]) <= k["beta_Nm"]))
 
-    One that leaves open more than a test of the frozen model does, `beta_Nm`, is none.
-    """
-    kind = int(np.argmin(m["bound_Nm"][:, joint]))
-    return kind if m["bound_Nm"][kind, joint] <= k["beta_Nm"] else None
+
+def tightest(k: Any, m: Any, joint: int) -> int | None:
+    """Return the anchor that bounds the offset that was judged last most closely; None where none does."""
+    return None if is_open(k, m, joint) else int(np.argmin(m["bound_Nm"][:, joint]))
 
 
 def is_anchored(k: Any, m: Any) -> bool:

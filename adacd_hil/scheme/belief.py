@@ -76,11 +76,8 @@ def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector) -> bool:
             w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
             if np.inf == R:
                 continue
-            epsilon = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
-            doubt = 0.0
-            for j in range(w.shape[0]):
-                doubt += w[j] * m["v"][j]
-            m["fit_square"] += epsilon * epsilon / (R / k["correlated"] + doubt)
+            epsilon, s = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
+            m["fit_square"] += epsilon * epsilon / (s - R + R / k["correlated"])
             m["fit_rows"] += 1.0
     else:
         m["ring_used"] += 1.0

@@ -1,4 +1,4 @@
-"""What the certified scheme says of its certificates: what anchors one, why one is withheld, and the user's word."""
+"""What the certified scheme says of its certificates, and what the user says to that."""
 
 from enum import Enum, unique
 from typing import NamedTuple
@@ -7,6 +7,7 @@ import numpy as np
 
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
 from adacd_hil.scheme import anchor, certified_kernel, earlier
+from adacd_hil.scheme.doubt import Verdict
 from adacd_hil.scheme.kernel import Structured
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
@@ -53,7 +54,7 @@ class CertificateWatch:
 
     @property
     def is_refusing(self) -> bool:
-        """Whether something has been refused since the last certificate, acceptance or change of state."""
+        """Whether something has been refused since the last certificate, the user's last word or the enabling."""
         return self._refusal is not None
 
     def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
@@ -84,9 +85,20 @@ class CertificateWatch:
         name, what, remedy = cause.value
         return Event("warning", name, "; ".join((*self._refusal.lines, what, remedy)))
 
+    def doubt(self, verdict: Verdict) -> Event:
+        """Say that contacts have taken the certificate back, and why."""
+        remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
+        return Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}")
+
+    def push(self, torque_Nm: Vector) -> Event:
+        """Say that the arm, stopped, is still pushed. torque_Nm (n,): external, filtered."""
+        torque = ", ".join(f"{value:.2f}" for value in torque_Nm)
+        remedy = "if nobody touches it the model is wrong, and `relearn` learns it anew"
+        return Event("warning", "touch", f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}")
+
     def _describe(self, cause: _Cause) -> list[str]:
         if cause is _Cause.MORE:
-            return earlier.describe_more(self._memory)
+            return earlier.describe_more(self._constants, self._memory)
         if cause is _Cause.CHANGED:
             return [_CHANGED]
         return anchor.describe_refused(self._memory, cause is _Cause.READING)

@@ -210,6 +210,7 @@ def new_memory(settings: Settings) -> Structured:
         "is_payload": (),
         "samples": (),
         "tested": (),
+        "test_limit_Nm": (),
         "q_low": joint,
         "q_high": joint,
         "dq_low": joint,
@@ -331,6 +332,7 @@ def begin_test(constants: Structured, memory: Structured) -> None:
     _use_belief(m)
     belief.discard(m)
     m["tested"] = 0.0
+    m["test_limit_Nm"] = certificate.test_limit_Nm(k, earlier.late_square(m))
     m["dq_low"][:] = np.inf
     m["dq_high"][:] = -np.inf
 
@@ -384,7 +386,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
         out["threshold"][:] = np.inf
         out["threshold_bank"][:] = np.inf
         m["wide_threshold"][:] = np.inf
-    if is_fresh and mode & WEIGH:
+    if mode & WEIGH and not observation & _UNSEEN:
         doubt.weigh(k, m)
     if is_fresh and mode & (LEARN | TEST | REFINE):
         observation |= _improve(k, m, out, observation & _CONTACT != 0, mode)
@@ -547,14 +549,14 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         earlier.follow(k, m)
     if not (is_free and _gather_evidence(k, m, out)):
         return 0
-    m["withheld_by"] = _contradicted_by(k, m, m["belief"], m["P_belief"])
+    m["withheld_by"] = _contradicted_by(k, m)
     return _FITTED if m["withheld_by"] == NOTHING else _WITHHELD
 
 
 @compiled
-def _contradicted_by(k: Any, m: Any, theta: Vector, P: Vector) -> int:
-    """Return what contradicts the fit that theta (p,), P (p, p) come from: an anchor, the fit itself, what was kept."""
-    if not anchor.is_kept(k, m, theta, P):
+def _contradicted_by(k: Any, m: Any) -> int:
+    """Return what contradicts the fit: an anchor, the fit itself, what was kept, or nothing."""
+    if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
         return ANCHOR
     if not earlier.is_steady(m):
         return CHANGED
@@ -571,9 +573,8 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     termination.widen(dq, m["dq_low"], m["dq_high"])
     sensitivity.follow_unit(k, m, _FIT, k["unit_test_share"])
     has_moved = True
-    limit_Nm = certificate.test_limit_Nm(k, earlier.late_square(m))
     for i in range(dq.shape[0]):
-        if not (abs(m["r"][_FIT, i]) <= limit_Nm):
+        if not (abs(m["r"][_FIT, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
             return _REFUTED
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
@@ -581,7 +582,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
     if not (is_long and has_moved):
         return 0
-    if anchor.is_kept(k, m, m["theta"], m["P"]):
+    if anchor.is_within(k, m, m["theta"], m["P"]):
         return _CERTIFIED
     m["withheld_by"] = ANCHOR
     return _REFUTED | _WITHHELD

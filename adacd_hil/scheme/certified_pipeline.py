@@ -86,7 +86,6 @@ class CertifiedPipeline(RunsBatches):
         self._events: list[Event] = []
         self._watch = CertificateWatch(self._constants, self._memory)
         self._doubt = Doubt(settings, self._constants, self._memory)
-        self._is_doubted = False
 
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
@@ -95,6 +94,7 @@ class CertifiedPipeline(RunsBatches):
         certified_kernel.step(self._constants, memory, block, 1, 1, _WATCH | certified_kernel.LEARN)
         certified_kernel.begin_test(self._constants, memory)
         certified_kernel.begin_refinement(memory)
+        earlier.forget(memory[0])
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
         self._touch.compile()
         self._paper.compile(self._block)
@@ -129,7 +129,7 @@ class CertifiedPipeline(RunsBatches):
     def _conclude(self, arm: ArmState, request: Request, observation: int) -> SchemeOutput:
         supervisor, touch = self._supervisor, self._touch
         previous = supervisor.state
-        if request is Request.ACCEPT_OFFSET:
+        if request is Request.ACCEPT:
             observation &= ~_WITHHELD if self._watch.is_refusing else ~0
             self._events.append(self._watch.accept())
         state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
@@ -226,29 +226,20 @@ class CertifiedPipeline(RunsBatches):
         return self._touch.reaction, self._has_certificate
 
     def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
-        """Take in the begin or the end of a contact; return where the arm goes if the contacts have one cause."""
-        if state is SchemeState.REACT and previous is SchemeState.MONITOR:
+        """Take in how a contact of the certified model goes on; return where the arm goes, STOPPED if it is doubted."""
+        if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             self._doubt.begin(cycle, is_touched)
-        if previous is not SchemeState.REACT or self._supervisor.origin is not SchemeState.MONITOR:
-            return state
-        if state not in (SchemeState.MONITOR, SchemeState.STOPPED):
-            return state
-        verdict = self._doubt.end(cycle)
-        if verdict is None or self._touch.goes_on:
+        is_over = previous is SchemeState.REACT and state in (SchemeState.MONITOR, SchemeState.STOPPED)
+        if is_over and self._supervisor.origin is SchemeState.MONITOR:
+            verdict = self._doubt.end(cycle)
+            if verdict is not None and not self._touch.goes_on:
+                self._events.append(self._watch.doubt(verdict))
+                return self._supervisor.doubt()
             if is_touched and state is SchemeState.STOPPED:
-                self._events.append(Event("warning", "touch", self._describe_push()))
-            return state
-        remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
-        self._events.append(Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}"))
-        self._is_doubted = True
-        return self._supervisor.doubt()
-
-    def _describe_push(self) -> str:
-        torque = ", ".join(f"{value:.2f}" for value in self._memory[0]["y"][0])
-        return (
-            f"something still pushes the arm at rest, {torque} Nm by joint: "
-            "if nobody touches it the model is wrong, and `relearn` learns it anew"
-        )
+                self._events.append(self._watch.push(self._memory[0]["y"][0]))
+        if state is SchemeState.MONITOR:
+            self._doubt.go_on(cycle)
+        return state
 
     def _enter(self, state: SchemeState, previous: SchemeState) -> None:
         """Do what a new state begins with, and what the previous one ends with."""
@@ -266,14 +257,13 @@ class CertifiedPipeline(RunsBatches):
     def _begin_adaptation(self, previous: SchemeState) -> None:
         """Begin to learn anew: a payload on top of the certified arm, until that has failed; else everything."""
         cause = self._supervisor.cause
-        if cause is SchemeEvent.REVOKED or (self._is_doubted and cause is SchemeEvent.ACKNOWLEDGED):
+        if cause is SchemeEvent.REVOKED:
             self._revoke()
         elif cause in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
             self._is_payload = self._has_certificate
             self._paper.begin_adaptation()
         elif previous is SchemeState.CERTIFY:
             self._is_payload = False
-        self._is_doubted = False
         certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
 
     def _revoke(self) -> None:
@@ -282,7 +272,7 @@ class CertifiedPipeline(RunsBatches):
         self._theta_ff = np.zeros(self._theta_ff.size)
         earlier.forget(self._memory[0])
         self._paper.begin_adaptation()
-        self._events.append(Event("warning", "revoked", "the user takes the certificate back: the arm is learnt anew"))
+        self._events.append(Event("warning", "revoked", "at the user's word the arm is learnt anew"))
 
     def _forget_if_disturbed(self, state: SchemeState) -> None:
         """Once a contact that interrupted an adaptation is reported, forget what this adaptation has learnt.

@@ -11,7 +11,7 @@ Shapes: c (h, p), sums (h,).
 """
 
 from collections import deque
-from itertools import pairwise
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme import belief
 
 WITHIN_S = 60.0
-"""How far back contacts count."""
+"""How far back the end of a contact may lie."""
 FILTER = 1
 """Of the bank: fast enough to forget within 0.1 s that the arm has rested."""
 RESIDUAL_NM = 0.012
@@ -102,12 +102,12 @@ class Verdict(NamedTuple):
 
 
 class _Weighed(NamedTuple):
-    """One contact's sums (h,), when it began and when the arm went on after it, s."""
+    """One contact's sums (h,). waited_s: from when the arm went on to its begin; ended_s: when it was over."""
 
     rw: Vector
     ww: Vector
     rr: float
-    began_s: float
+    waited_s: float
     ended_s: float
 
 
@@ -119,15 +119,20 @@ class Doubt:
         self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[FILTER] * settings.bus.period_s)
         self._period_s = settings.bus.period_s
         self._contacts: deque[_Weighed] = deque(maxlen=MOST)
-        self._began_s = 0.0
+        self._monitored_s = 0.0
+        self._waited_s = 0.0
 
     def forget(self) -> None:
         """Begin with a new certificate."""
         self._contacts.clear()
 
+    def go_on(self, cycle: int) -> None:
+        """Take in that the arm monitors from this cycle on."""
+        self._monitored_s = cycle * self._period_s
+
     def begin(self, cycle: int, is_touched: bool) -> None:
         """Take in that the arm reacts, to a touch or, as where the host is late, to none."""
-        self._began_s = cycle * self._period_s
+        self._waited_s = cycle * self._period_s - self._monitored_s
         if not is_touched:
             for name in ("cause_rw", "cause_ww", "contact_rr"):
                 self._memory[name] = 0.0
@@ -137,9 +142,9 @@ class Doubt:
         now_s = cycle * self._period_s
         m = self._memory
         self._contacts.append(
-            _Weighed(m["cause_rw"].copy(), m["cause_ww"].copy(), float(m["contact_rr"]), self._began_s, now_s)
+            _Weighed(m["cause_rw"].copy(), m["cause_ww"].copy(), float(m["contact_rr"]), self._waited_s, now_s)
         )
-        while self._contacts[0].began_s < now_s - WITHIN_S:
+        while self._contacts[0].ended_s < now_s - WITHIN_S:
             self._contacts.popleft()
         return self._payload() or self._other()
 
@@ -156,11 +161,9 @@ class Doubt:
 
     def _other(self) -> Verdict | None:
         last = list(self._contacts)[-FEWEST:]
-        gaps_s = [after.began_s - before.ended_s for before, after in pairwise(last)]
-        if len(last) < FEWEST or max(gaps_s) > AT_ONCE_S:
+        if len(last) < FEWEST or max(contact.waited_s for contact in last[1:]) > AT_ONCE_S:
             return None
-        found = [(self._explained(last, h), h) for h in range(1, len(last[0].rw))]
-        for _, h in sorted(found, reverse=True):
+        for h in sorted(range(1, len(last[0].rw)), key=partial(_explained, last), reverse=True):
             size = self._common(last, h, SPREAD)
             ww = sum(contact.ww[h] for contact in last)
             if size is not None and abs(size) > SURE * self._sigma(ww) and self._can_be(h, size):
@@ -171,12 +174,9 @@ class Doubt:
 
     def _can_be(self, h: int, size: float) -> bool:
         """Tell whether an arm may have so much more of a friction than the model: none has less than none."""
-        cause, k = self._constants["causes"][h], self._constants
+        cause = self._constants["causes"][h]
         total = float(cause @ self._memory["theta"]) + size
-        return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ k["prior_std"])
-
-    def _explained(self, contacts: list[_Weighed], h: int) -> float:
-        return float(sum(c.rw[h] ** 2 / max(c.ww[h], 1e-12) for c in contacts))
+        return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._constants["prior_std"])
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
         """Return the size of cause h that explains each of the contacts, or None."""
@@ -194,6 +194,11 @@ class Doubt:
 
     def _sigma(self, ww: float) -> float:
         return float(RESIDUAL_NM * np.sqrt(self._correlated / ww))
+
+
+def _explained(contacts: list[_Weighed], h: int) -> float:
+    """Return how much of the contacts' squared residuals cause h explains."""
+    return float(sum(contact.rw[h] ** 2 / contact.ww[h] for contact in contacts if contact.ww[h] > 0.0))
 
 
 def _words(kind: int, joint: int, size: float, sigma: float) -> str:

@@ -31,9 +31,11 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.scheme import anchor
+from adacd_hil.scheme.sensitivity import LARGEST_UNIT, UNIT_PEAK
 
 STEADY = 200.0
-"""Squared distance over u at which a fit has changed. Clean arms of 13 parameters: 80 at most."""
+"""Squared distance over u at which a fit has changed. 200 untouched arms, wide ones included: 113 at most."""
 SMALLEST_SQUARE = 0.015
 """Least u of a fit that is asked whether it has changed."""
 REGULAR = 0.01
@@ -52,9 +54,8 @@ OFFSET_NM = 0.03
 INERTIA_KGM2 = 0.006
 INERTIA_SHARE = 0.03
 """Less than these, and less than this share of an inertia, is nothing."""
-UNIT_PEAK = 4.0
-SMALLEST_UNIT, LARGEST_UNIT = 0.1, 9.0
-"""Of the residuals' mean square that scales variances: `sensitivity`."""
+SMALLEST_UNIT = 0.1
+"""Least unit of the variances; the rest of it as `sensitivity` has it."""
 _INERTIAS = ("a1", "a2", "a3")
 
 
@@ -246,8 +247,7 @@ def is_no_more(k: Any, m: Any) -> bool:
         more = m["change"][q]
         if q >= first_offset:
             more = abs(more)
-            is_anchored = np.min(m["bound_Nm"][:, q - first_offset]) != np.inf
-            if is_anchored and more > m["change_limit"][q]:
+            if more > m["change_limit"][q] and not anchor.is_open(k, m, q - first_offset):
                 m["has_kept"] = 0.0
                 return True
         is_agreed = is_agreed and more <= m["change_limit"][q]
@@ -271,15 +271,14 @@ def _split(variance: float, prior: float, unit: float) -> float:
     return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
 
 
-def describe_more(m: Any) -> list[str]:
+def describe_more(k: Any, m: Any) -> list[str]:
     """Say of which quantities the fit has more than what was kept, by how much and since when, a line each.
 
     Of a joint's friction only the speed at which it stands out most.
     """
     speeds, quantities = len(SPEEDS_RAD_S), m["change"].size
     excess = m["change"] / m["change_limit"]
-    is_open = ~np.isfinite(m["bound_Nm"]).any(axis=0)
-    excess[-JOINTS:] = np.where(is_open, abs(excess[-JOINTS:]), 0.0)
+    excess[-JOINTS:] = [abs(excess[i - JOINTS]) if anchor.is_open(k, m, i) else 0.0 for i in range(JOINTS)]
     lines = []
     for i in range(JOINTS):
         q = speeds * i + int(np.argmax(excess[speeds * i : speeds * (i + 1)]))

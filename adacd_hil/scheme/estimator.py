@@ -34,10 +34,10 @@ def update(
 @compiled
 def correct(
     w: Vector, tau: float, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
-) -> float:
+) -> tuple[float, float]:
     """Correct theta_hat (p,), and P (p, p) if least squares, by one row w (p,) of variance R; v and K are scratch.
 
-    Return epsilon, with theta_hat as it was; v is then P w' of before.
+    Return epsilon and its variance s, with theta_hat and P as they were.
     """
     count = theta_hat.shape[0]
     epsilon = tau
@@ -56,7 +56,7 @@ def correct(
             for k in range(j + 1):
                 P[j, k] += s * K[j] * K[k] - (K[j] * v[k] + v[j] * K[k])
                 P[k, j] = P[j, k]
-    return float(epsilon)
+    return epsilon, s
 
 
 @compiled

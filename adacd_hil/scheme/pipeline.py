@@ -77,7 +77,7 @@ class Pipeline(RunsBatches):
         return []
 
     def describe_withheld(self) -> list[str]:
-        """Say which anchor is contradicted: none, the paper identifies no offsets."""
+        """Say what contradicts a certificate that is withheld: the paper has no certificate."""
         return []
 
     def take_events(self) -> list[Event]:

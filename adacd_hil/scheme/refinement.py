@@ -45,7 +45,7 @@ def test_candidate(k: Any, m: Any) -> bool:
     if m["candidate_cycles"] < k["refine_cycles"]:
         return False
     is_better = m["candidate_square"] < m["frozen_square"] and m["candidate_worst"] < 1.0
-    is_anchored = is_better and anchor.is_kept(k, m, m["candidate"], m["P_candidate"])
+    is_anchored = is_better and anchor.is_within(k, m, m["candidate"], m["P_candidate"])
     is_promoted = is_anchored and is_positive_definite(m["candidate"])
     if is_promoted:
         m["theta"][:] = m["candidate"]

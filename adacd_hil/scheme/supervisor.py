@@ -66,14 +66,14 @@ KEPT_IN = MappingProxyType(
         Request.PAYLOAD: POWERED - {SchemeState.PAYLOAD},
         Request.PAYLOAD_CHANGED: frozenset((SchemeState.PAYLOAD,)),
         Request.FINISH: frozenset[SchemeState](),
-        Request.ACCEPT_OFFSET: frozenset[SchemeState](),
+        Request.ACCEPT: frozenset[SchemeState](),
         Request.RELEARN: frozenset((SchemeState.STOPPED,)),
         Request.FAULT_TORQUE: frozenset[SchemeState](),
         Request.FAULT_FOLLOWING: frozenset[SchemeState](),
         Request.FAULT_TAMPERED: frozenset[SchemeState](),
     }
 )
-"""Where a request waits to be served. FINISH is the control layer's; ACCEPT_OFFSET and a fault are served at once, or
+"""Where a request waits to be served. FINISH is the control layer's; ACCEPT and a fault are served at once, or
 not at all."""
 _FAULT_ASKED = MappingProxyType(
     {
@@ -201,10 +201,9 @@ class Supervisor:
     def doubt(self) -> SchemeState:
         """Take in, once a contact is over, that the model is wrong: hold the arm until the user says how to go on.
 
-        `ack` then learns anew; `changed` learns a payload, which needs no announcement.
+        An acknowledgement then takes back what is known of the arm; a payload may change without an announcement.
         """
         self._enter(next_state(self._state, SchemeEvent.DOUBTED, self._origin), SchemeEvent.DOUBTED)
-        self._origin = SchemeState.ADAPT
         self._is_latched = self._is_doubted = True
         return self._state
 
@@ -372,7 +371,7 @@ class Supervisor:
                 event = SchemeEvent.REVOKED if is_still and not arm.is_late else SchemeEvent.NONE
             case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
                 if not (observation & _ANY_CONTACT or arm.is_late):
-                    event = SchemeEvent.ACKNOWLEDGED
+                    event = SchemeEvent.REVOKED if self._is_doubted else SchemeEvent.ACKNOWLEDGED
             case SchemeState.ADAPT | SchemeState.CERTIFY:
                 event = _verdict(self._state, observation)
             case SchemeState.REACT if not is_reporting:

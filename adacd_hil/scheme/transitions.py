@@ -29,7 +29,7 @@ class SchemeEvent(IntEnum):
     ACKNOWLEDGED = 14  # the user has acknowledged, no joint is over its threshold and the host is on time
     PAYLOAD_ANNOUNCED = 15  # the user wants to change the payload
     PAYLOAD_CHANGED = 16  # the user has changed the payload and the arm is at rest
-    REVOKED = 17  # the user takes back what is known of the arm, which is at rest
+    REVOKED = 17  # the user takes back what is known of the arm, or acknowledges that it is doubted
     DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
 
 

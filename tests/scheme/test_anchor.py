@@ -135,7 +135,7 @@ def test_the_user_may_let_the_reading_stand_in_place_of_the_tare():
     loop = TouchedLoop(BOTH, (0.5, 0.0))
     loop.run(300)
     assert loop.pipeline._supervisor.state is SchemeState.COMMISSION
-    loop.request = Request.ACCEPT_OFFSET
+    loop.request = Request.ACCEPT
     loop.run_until(SchemeState.MONITOR)
     assert re.fullmatch(
         r"the user accepts 0\.49\d, -?0\.00\d Nm at rest: the tare is not used", loop.said("anchor")[-1]
@@ -167,7 +167,7 @@ def test_the_user_may_accept_an_offset_and_the_certificate_then_carries_it():
     loop.offset_Nm[0] = 0.4  # the sensor has moved after its reading at rest
     loop.run(3000)
     assert loop.said("certificate") == []
-    loop.request = Request.ACCEPT_OFFSET
+    loop.request = Request.ACCEPT
     loop.run_until(SchemeState.MONITOR, 6000)
     assert "the user accepts 0.39" in loop.said("anchor")[-1]
     (text,) = loop.said("certificate")
@@ -181,7 +181,7 @@ def test_the_word_that_comes_with_the_first_refusal_is_no_word_about_it():
     loop.tau_ext[0] = 0.5
     state = SchemeState.ADAPT
     for _ in range(4000):
-        loop.request = Request.ACCEPT_OFFSET
+        loop.request = Request.ACCEPT
         state = loop.step().state
         if not loop.said("anchor")[-1].startswith("nothing to accept"):
             break
@@ -195,7 +195,7 @@ def test_what_the_user_has_accepted_excuses_no_other_lean():
     loop.run_until(SchemeState.ADAPT)
     loop.tau_ext[0] = 0.4
     loop.run(3000)
-    loop.request = Request.ACCEPT_OFFSET
+    loop.request = Request.ACCEPT
     loop.run(1)
     loop.tau_ext[0] = -0.4
     assert SchemeState.MONITOR not in {output.state for output in loop.run(4000)}
@@ -204,7 +204,7 @@ def test_what_the_user_has_accepted_excuses_no_other_lean():
 def test_nothing_is_accepted_beforehand():
     loop = TouchedLoop(FREE)
     loop.run_until(SchemeState.ADAPT)
-    loop.request = Request.ACCEPT_OFFSET
+    loop.request = Request.ACCEPT
     leant = loop.lean(0, 0.5, 3.0)
     assert SchemeState.MONITOR not in {output.state for output in leant}
     assert loop.said("anchor")[0] == "nothing to accept: no certificate is withheld"
@@ -244,7 +244,7 @@ class Judged:
         self.m["anchor_std"][anchor.REST] = 0.004
 
     def bound_Nm(self, kind=anchor.REST):
-        anchor.is_kept(self.k, self.m, self.theta, self.P)
+        anchor.is_within(self.k, self.m, self.theta, self.P)
         return float(self.m["bound_Nm"][kind, 0])
 
 
@@ -262,9 +262,9 @@ def test_the_bound_is_four_deviations_of_all_that_is_not_known():
 def test_an_offset_beyond_its_bound_is_not_kept(offset_Nm):
     judged = Judged()
     judged.theta[OFFSETS[0]] = 0.99 * judged.bound_Nm()
-    assert anchor.is_kept(judged.k, judged.m, judged.theta, judged.P)
+    assert anchor.is_within(judged.k, judged.m, judged.theta, judged.P)
     judged.theta[OFFSETS[0]] = offset_Nm * judged.bound_Nm()
-    assert not anchor.is_kept(judged.k, judged.m, judged.theta, judged.P)
+    assert not anchor.is_within(judged.k, judged.m, judged.theta, judged.P)
 
 
 def test_residuals_worse_than_expected_widen_no_bound():

@@ -90,10 +90,10 @@ def test_a_contact_that_never_ends_has_an_exit():
     outputs = loop.run_until(SchemeState.ADAPT, 100)
     assert not outputs[-1].is_model_valid
     assert (outputs[-1].theta_ff == 0.0).all()
-    assert loop.said("revoked") == ["the user takes the certificate back: the arm is learnt anew"]
+    assert loop.said("revoked") == ["at the user's word the arm is learnt anew"]
     loop.run(3000)
     assert "joint 1 has a fitted torque offset of 0." in loop.said("anchor")[-1]  # the reading at rest says otherwise
-    loop.request = Request.ACCEPT_OFFSET
+    loop.request = Request.ACCEPT
     loop.recover()
     assert abs(loop.offset_error_Nm[0]) < 0.03
 
@@ -123,15 +123,16 @@ def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
     return rw, np.full(others, ww), size * size * ww / share
 
 
-def verdict_of(contacts, gap_s=1.0):
+def verdict_of(contacts, gap_s=1.0, lasts_s=0.5):
     values = {"cause_rw": np.zeros(5), "cause_ww": np.zeros(5), "contact_rr": 0.0, "theta": np.zeros(len(NAMES))}
     memory = [values]
     judge, cycle, verdict = Doubt(SETTINGS, certified_kernel.constants_of(SETTINGS), memory), 0, None
     for rw, ww, rr in contacts:
+        judge.go_on(cycle)
         cycle += round(gap_s / PERIOD_S)
         judge.begin(cycle, is_touched=True)
         values["cause_rw"], values["cause_ww"], values["contact_rr"] = rw, ww, rr
-        cycle += 500
+        cycle += round(lasts_s / PERIOD_S)
         verdict = judge.end(cycle)
     return verdict
 
@@ -168,6 +169,13 @@ def test_another_error_than_a_payload_must_strike_three_times_at_once():
 @pytest.mark.parametrize("size", [-0.3, 2.1])
 def test_no_arm_has_less_friction_than_none_or_more_than_any(size):
     assert verdict_of([sums(size, cause=COULOMB1)] * 3) is None
+
+
+@pytest.mark.parametrize("lasts_s", [3600.0, doubt.AT_ONCE_S + 1.0])
+def test_how_long_a_contact_and_its_acknowledgement_took_is_not_asked(lasts_s):
+    friction = [sums(0.3, cause=COULOMB1)] * 3
+    assert (verdict_of(friction, lasts_s=lasts_s) is not None) == (lasts_s < doubt.WITHIN_S)
+    assert verdict_of([sums(0.5)], lasts_s=lasts_s) is None
 
 
 def test_contacts_of_more_than_a_minute_ago_do_not_count():

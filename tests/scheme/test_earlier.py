@@ -101,6 +101,14 @@ def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_t
     assert abs(loop.offset_error_Nm[0]) < 0.03
 
 
+def test_an_anchor_that_a_brake_leaves_open_is_none_for_a_lean_that_begins_while_the_arm_learns():
+    """What was kept is not forgotten for the word of an anchor that bounds nothing."""
+    loop = HeldLoop(replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=(8.0, 8.0))))
+    loop.learn(1.0)
+    assert SchemeState.MONITOR not in states(loop.lean(0, 0.5, 6.0))
+    assert loop.said("touch")[0].startswith("torque offset of joint 1 is 0.50")
+
+
 def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
     loop = HeldLoop(FREE, theta=THETA["S"])
     loop.run_until(SchemeState.ADAPT)
@@ -116,7 +124,7 @@ def test_the_word_of_the_user_that_nobody_touches_the_arm_ends_the_comparison():
     loop.theta = loop.theta + added(F_c1=0.4)  # a brake that drags from now on
     outputs = loop.run(6000)
     assert SchemeState.MONITOR not in states(outputs)
-    loop.request = Request.ACCEPT_OFFSET
+    loop.request = Request.ACCEPT
     loop.recover()
     assert "the user says that nobody touches the arm" in loop.said("touch")[-1]
     assert loop.said("certificate")[0].endswith(f"; {BY_WORD}")

@@ -621,7 +621,9 @@ def doubted():
 
 def test_a_doubted_arm_holds_until_the_user_says_how_to_go_on():
     assert doubted().step(cycles=1000) is SchemeState.STOPPED
-    assert doubted().step(request=Request.ACKNOWLEDGE) is SchemeState.ADAPT
+    run = doubted()
+    assert run.step(request=Request.ACKNOWLEDGE) is SchemeState.ADAPT
+    assert run.supervisor.cause is SchemeEvent.REVOKED
 
 
 def test_a_payload_that_contacts_looked_like_needs_no_announcement():
