@@ -5,11 +5,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-realtime check compiled bench clean
+.PHONY: help demo test test-all test-realtime check compiled-certified compiled-paper bench clean
 
 help:
 	@echo "make demo   the paper's experiment with an emulated arm, certified scheme and paper's side by side; report in runs/demo/report.html (the last demo's)"
-	@echo "make test   all checks and tests, SocketCAN included"
+	@echo "make test   all checks, and all tests but the longest, SocketCAN included"
+	@echo "make test-all   all checks and all tests"
 	@echo "make test-realtime   SocketCAN tests that need a machine which doesn't stall: 1 kHz contacts, two arms"
 	@echo "make check  format, lint, types, direction of imports"
 	@echo "make bench  codec, step, plant, log hand-off; the cycle over vcan beside a C yardstick and a straightforward loop"
@@ -40,18 +41,25 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache | tail -n 2
 
-# Both schemes' machine code, made beside the checks, which take one processor: two pytest workers would make it twice.
-compiled: $(VENV)/.run
+# Both schemes' machine code; pytest's workers would each make it for themselves. The paper's, which takes less time, is
+# made after the checks, so that there is work for two processors.
+compiled-certified compiled-paper: compiled-%: $(VENV)/.run
 	@folder=`mktemp -d` && trap 'rm -r "$$folder"' EXIT && printf 'lasts_s = 0.3\n' >"$$folder/short.toml" \
-		&& for config in certified paper; do \
-			$(BIN)/adacd-hil demo --config $$config --scenario "$$folder/short.toml" --out "$$folder/$$config" \
-				>"$$folder/said" 2>&1 || { cat "$$folder/said" >&2; exit 1; }; \
-		done
+		&& { $(BIN)/adacd-hil demo --config $* --scenario "$$folder/short.toml" --out "$$folder/run" \
+			>"$$folder/said" 2>&1 || { cat "$$folder/said" >&2; exit 1; }; }
+compiled-paper: | check
+
+PYTEST := $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.dev
-	$(MAKE) --no-print-directory -j2 check compiled
-	$(BIN)/pytest -m "not vcan" -n auto --dist loadfile --no-loadscope-reorder
+	$(MAKE) --no-print-directory -j2 compiled-certified compiled-paper
+	$(PYTEST) -m "not vcan and not long"
 	tools/test-on-vcan
+
+test-all: $(VENV)/.dev
+	$(MAKE) --no-print-directory -j2 compiled-certified compiled-paper
+	$(PYTEST) -m "not vcan"
+	tools/test-on-vcan --all
 
 test-realtime: $(VENV)/.dev
 	tools/test-on-vcan -m "vcan and realtime"

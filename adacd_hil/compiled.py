@@ -144,7 +144,9 @@ def released(function: Function) -> Function:
 
 
 def _compiled(function: Function, **options: bool) -> Function:
-    dispatcher: Any = numba.njit(fastmath=False, error_model="numpy", **options)(function)  # type: ignore[call-overload]
+    # No wrapper for callers in C, of which there are none: a twentieth of the time that compiling takes.
+    made = numba.njit(fastmath=False, error_model="numpy", no_cfunc_wrapper=True, **options)  # type: ignore[call-overload]
+    dispatcher: Any = made(function)
     if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
         dispatcher._cache = _SharedCache(function)  # type: ignore[no-untyped-call]
     return cast(Function, dispatcher)

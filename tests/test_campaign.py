@@ -24,6 +24,7 @@ def campaign(*arguments: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run([sys.executable, CAMPAIGN, *arguments], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_run_that_deviates_is_told_and_is_the_exit_status(tmp_path: Path) -> None:
     good, bad = tmp_path / "good.toml", tmp_path / "bad.toml"
@@ -39,6 +40,7 @@ def test_a_run_that_deviates_is_told_and_is_the_exit_status(tmp_path: Path) -> N
     assert "2/2" in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_pattern_chooses_by_name_or_group_and_each_configuration_plays_it(tmp_path: Path) -> None:
     one, two = tmp_path / "one.toml", tmp_path / "two.toml"

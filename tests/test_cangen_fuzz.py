@@ -145,6 +145,7 @@ def test_runs_through_a_flood_of_random_frames_end_safely_and_the_next_one_succe
     assert set(described["drive_states"]) <= SAFE_STATES  # type: ignore[call-overload]
 
 
+@pytest.mark.long
 def test_a_flood_of_random_frames_moves_no_arm_that_nobody_enables(tmp_path: Path) -> None:
     outcome: list[dict[str, object]] = []
     with emulated_arm(tmp_path, outcome):

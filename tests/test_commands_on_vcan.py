@@ -119,6 +119,7 @@ def test_commtest_boots_cycles_judges_and_logs(arm: Path, tmp_path: Path) -> Non
     assert len(log.topics["/cycle"]["cycle"]) == result["cycles"]
 
 
+@pytest.mark.long
 @pytest.mark.wallclock
 def test_commtest_with_enabled_drives_commands_no_torque(arm: Path, tmp_path: Path) -> None:
     config = tmp_path / "patient.toml"  # stalls of the machine are not what is tested
@@ -163,6 +164,7 @@ def test_doctor_stops_when_another_master_is_present(arm: Path, tmp_path: Path) 
     assert not any(can_id in (0x000, 0x201, 0x202) or can_id & 0x780 == 0x600 for can_id, _ in frames)
 
 
+@pytest.mark.long
 def test_doctor_tells_another_contract(arm: Path, tmp_path: Path) -> None:
     done = command(tmp_path, "doctor", "--config", str(other_contract(tmp_path)), "--json")
     found = {check["name"]: check for check in done.json["checks"]}
@@ -170,6 +172,7 @@ def test_doctor_tells_another_contract(arm: Path, tmp_path: Path) -> None:
     assert found["contract"]["remedy"] == "give host and devices the same DBC file"
 
 
+@pytest.mark.long
 def test_doctor_tells_a_missing_arm_and_a_missing_interface(tmp_path: Path) -> None:
     done = adacd_hil(tmp_path, "doctor", "-i", "socketcan", "-c", "vcan1")
     assert done.status == 1
@@ -179,6 +182,7 @@ def test_doctor_tells_a_missing_arm_and_a_missing_interface(tmp_path: Path) -> N
     assert "vcan9 is no CAN interface; present: vcan0, vcan1" in done.stdout
 
 
+@pytest.mark.long
 def test_an_interrupted_doctor_leaves_the_nodes_pre_operational(arm: Path) -> None:
     with listening() as frames:
         process = subprocess.Popen(
@@ -193,6 +197,7 @@ def test_an_interrupted_doctor_leaves_the_nodes_pre_operational(arm: Path) -> No
     assert [data for can_id, data in frames if can_id == 0x000][-1] == b"\x80\x00"
 
 
+@pytest.mark.long
 def test_one_node_that_is_out_of_reach_is_named_by_scan_and_doctor(arm: Path, tmp_path: Path) -> None:
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
         can.bind(("vcan0",))
@@ -227,6 +232,7 @@ def test_monitor_shows_the_bus_and_sends_nothing(arm: Path, tmp_path: Path) -> N
     assert watched.json["bus_state"] == "vcan"
 
 
+@pytest.mark.long
 @pytest.mark.wallclock
 def test_monitor_survives_a_full_bus_and_ends_with_ctrl_c(tmp_path: Path) -> None:
     flood = "while True:\n for k in range(50): send(k * 37 % 2048, bytes(8))\n time.sleep(0.005)"

@@ -179,6 +179,7 @@ for count in map(int, sys.argv[1:]):
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_processes_that_compile_for_different_types_at_once_take_nothing_from_each_other(tmp_path: Path) -> None:
     program = tmp_path / "total.py"

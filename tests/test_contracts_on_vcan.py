@@ -18,6 +18,7 @@ LENGTH = 16
 """Bytes of a feedback frame."""
 
 
+@pytest.mark.long
 def test_an_arm_on_can_fd_runs_at_half_a_millisecond(tmp_path: Path) -> None:
     settings = tmp_path / "short.toml"
     settings.write_text('extends = "fd_500us"\n[operator]\nscript = [{ at_s = 0.3, request = "finish" }]\n')

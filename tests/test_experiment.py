@@ -10,7 +10,7 @@ from experiment_runs import Played, demo
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 SEED = "7"
 # profile, first adaptation s, second adaptation s

@@ -29,7 +29,7 @@ from firmware_sim.bench import Bench
 from firmware_sim.scenario import load_scenario
 from firmware_sim.truth import TruthLog
 
-pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]
 
 CODEC = load_codec()
 SETTINGS = '[safety]\ntolerated_emergencies = [0x1000]\n[operator]\nscript = [{ at_s = 0.36, request = "finish" }]\n'

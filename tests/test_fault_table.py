@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from fault_rig import deviations, play, run_lockstep
 from fault_table import CASES, Case, covering, rows_of
+from long_cases import long_but
 
 from firmware_sim.faults import KINDS
 
@@ -24,11 +25,12 @@ def test_the_page_has_a_line_for_every_row() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "clock"), covering(), ids=lambda value: getattr(value, "name", value))
+@pytest.mark.parametrize(("case", "clock"), long_but(5, covering()), ids=lambda value: getattr(value, "name", value))
 def test_the_host_makes_of_a_fault_what_its_row_says(tmp_path: Path, case: Case, clock: str) -> None:
     assert deviations(play(case, clock, tmp_path), getattr(case, clock), case.wire) == []
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_truth_shows_a_fault_for_as_long_as_it_lasts(tmp_path: Path) -> None:
     row = {"kind": "lose", "node": "sensor1", "frame": "status", "at_s": 0.8, "duration_s": 0.1}
@@ -37,6 +39,7 @@ def test_the_truth_shows_a_fault_for_as_long_as_it_lasts(tmp_path: Path) -> None
     assert masks == [0] + [1] * 50 + [3] * 50 + [2] * 50 + [0] * 2
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_same_faults_make_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
     rows = [{"kind": "corrupt", "node": "all", "frame": "torque", "probability": 0.05, "at_s": 0.1}]
@@ -46,6 +49,7 @@ def test_the_same_faults_make_the_same_run_and_another_seed_another(tmp_path: Pa
     assert first != other
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_faults_that_never_begin_change_no_frame(tmp_path: Path) -> None:
     rows = [{"kind": "lose", "node": "all", "frame": "torque", "at_s": 100.0}]
@@ -54,6 +58,7 @@ def test_faults_that_never_begin_change_no_frame(tmp_path: Path) -> None:
     assert plain.tobytes() == waiting.tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_sensor_that_is_well_again_can_be_acknowledged(tmp_path: Path) -> None:
     rows = [{"kind": "sensor_error", "node": "sensor1", "at_s": 0.8, "duration_s": 0.1}]

@@ -246,6 +246,7 @@ def test_drives_stop_by_themselves_when_the_host_dies(tmp_path: Path) -> None:
         assert_drives_stop_by_themselves(played, signal.SIGKILL)
 
 
+@pytest.mark.long
 def test_drives_stop_by_themselves_when_the_host_is_stopped_and_it_wakes_up_without_torque(tmp_path: Path) -> None:
     with scene(tmp_path) as played:
         off = assert_drives_stop_by_themselves(played, signal.SIGSTOP)
@@ -255,6 +256,7 @@ def test_drives_stop_by_themselves_when_the_host_is_stopped_and_it_wakes_up_with
         assert any("FAULT: " in line for line in played.said)
 
 
+@pytest.mark.long
 def test_the_host_sends_no_torque_to_an_arm_that_went_away(tmp_path: Path) -> None:
     with scene(tmp_path) as played:
         played.wait_until_moving()
@@ -267,6 +269,7 @@ def test_the_host_sends_no_torque_to_an_arm_that_went_away(tmp_path: Path) -> No
         assert log.scheme["state"][-1] == SchemeState.FAULT
 
 
+@pytest.mark.long
 def test_a_node_that_falls_silent_is_named_and_torque_ends(tmp_path: Path) -> None:
     with scene(tmp_path, faults='[[faults]]\nkind = "silence"\nnode = "sensor1"\nat_s = 0.5\n') as played:
         played.wait_until_moving()
@@ -275,6 +278,7 @@ def test_a_node_that_falls_silent_is_named_and_torque_ends(tmp_path: Path) -> No
         assert any("FAULT: " in line and "Sensor1" in line for line in played.said), played.said
 
 
+@pytest.mark.long
 def test_a_node_that_somebody_else_stops_ends_torque_and_it_is_said_who(tmp_path: Path) -> None:
     with scene(tmp_path) as played:
         played.wait_until_moving()
@@ -285,6 +289,7 @@ def test_a_node_that_somebody_else_stops_ends_torque_and_it_is_said_who(tmp_path
         assert any(said in line for line in played.said), played.said
 
 
+@pytest.mark.long
 def test_an_interface_that_goes_down_and_comes_back_needs_an_acknowledgement(tmp_path: Path) -> None:
     with scene(tmp_path, "acknowledge_faults = 1\nacknowledge_fault_after_s = 0.5\n") as played:
         played.wait_until_moving()

@@ -38,6 +38,7 @@ def lockstep(tmp_path_factory: pytest.TempPathFactory) -> Played:
         return run_on_vcan(folder, "--clock", "lockstep", "--config", str(folder / "settings.toml"))
 
 
+@pytest.mark.long
 def test_lockstep_on_vcan_logs_the_same_as_the_embedded_bus_bit_for_bit(lockstep: Played, tmp_path: Path) -> None:
     embedded = demo(tmp_path, "--seed", SEED, "--config", str(lockstep.folder / "settings.toml"))
     for name in ("run.mcap", "truth.mcap"):

@@ -40,6 +40,7 @@ def test_stamps_are_those_of_the_modelled_bus(tmp_path: Path) -> None:
     assert usual(feedback.t_ns[:count] - sync.t_ns[:count]) == 65_000 + 135_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("latency_us", "growth_ns"), [(205.0, 0), (206.0, 1_000), (215.0, 10_000)])
 def test_205_us_are_what_the_host_has_beyond_them_every_cycle_is_later(
     tmp_path: Path, latency_us: float, growth_ns: int
@@ -82,6 +83,7 @@ def test_a_host_that_stalls_for_periods_skips_them_and_keeps_the_grid(tmp_path: 
     assert usual(log.cycle["lateness_ns"]) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("latency_us", "growth_ns"), [(435.0, 0), (436.0, 1_000)])
 def test_pipelined_commands_leave_the_host_all_of_the_period_but_sync_and_feedback(
     tmp_path: Path, latency_us: float, growth_ns: int

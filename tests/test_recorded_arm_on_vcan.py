@@ -14,7 +14,7 @@ from lockstep_rig import play
 from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings
 from adacd_hil.log.reader import topic_bytes
 
-pytestmark = [pytest.mark.vcan, pytest.mark.slow]
+pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]
 
 AT_S = 0.1
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from long_cases import long_but
 
 from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.cli.outcome import outcome_of
@@ -79,7 +80,7 @@ def test_a_contact_that_counts_comes_while_the_run_lasts(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PLAYED)
+@pytest.mark.parametrize("name", long_but(1, PLAYED))
 def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None:
     cast = resolve("paper", name, None, None)
     outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))
@@ -88,7 +89,7 @@ def test_a_run_of_it_comes_to_what_it_expects(name: str, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["push-during-adaptation", "payload-fitted-in-motion"])
+@pytest.mark.parametrize("name", long_but(1, ["push-during-adaptation", "payload-fitted-in-motion"]))
 def test_a_certified_host_comes_to_what_is_expected_of_it(name: str, tmp_path: Path) -> None:
     cast = resolve("certified", name, None, None)
     outcome = outcome_of(*run_embedded(cast, "lockstep", tmp_path))

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from experiment_runs import BIN, PAPER
 from hang import HANG_S
+from long_cases import long_but
 
 from adacd_hil.cli.monitor import Screen
 from adacd_hil.log.reader import read_log
@@ -63,6 +64,7 @@ def test_a_table_that_is_redrawn_moves_the_cursor_by_its_own_sequences_only(monk
     assert "".join(written) == "\x1b[Hname\\u001b[2J\x1b[K\nother\\u000c\x1b[K\n\x1b[J\x1b[H\x1b[Jname\\u001b[2J\n"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "status", "line"),
@@ -110,6 +112,7 @@ def wait_until_full(pipe: int, process: "subprocess.Popen[bytes]") -> None:
         os.sched_yield()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("is_both", [False, True], ids=["stdout", "both"])
 @pytest.mark.parametrize("command", LONG, ids=lambda command: command[0].name)
@@ -128,7 +131,9 @@ def test_an_output_that_blocks_ends_with_ctrl_c(command: list[str], is_both: boo
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
-    [*LONG, *([BIN / name, *words] for name in ("adacd-hil", "firmware-sim") for words in (("--help",), ("x",)))],
+    long_but(
+        2, [*LONG, *([BIN / name, *words] for name in ("adacd-hil", "firmware-sim") for words in (("--help",), ("x",)))]
+    ),
     ids=lambda command: " ".join(map(str, command[1:])),
 )
 def test_a_reader_that_goes_away_is_no_error(command: list[str], small_pipe: tuple[int, int]) -> None:
@@ -156,6 +161,7 @@ def test_results_on_a_full_disk_are_partial(words: tuple[str, ...]) -> None:
     assert done.stderr == b"adacd-hil: standard output can't be written: No space left on device\n"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_words_on_a_full_disk_or_to_nobody_cost_a_run_nothing(tmp_path: Path) -> None:
     (tmp_path / "short.toml").write_text("lasts_s = 0.3\n")
@@ -246,6 +252,7 @@ def test_columns_are_those_of_the_environment_where_there_is_no_terminal(monkeyp
     assert terminal_columns() == 97
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_terminal_that_dies_costs_a_run_that_outlives_it_nothing(tmp_path: Path) -> None:
     """`nohup` ignores SIGHUP: the run goes on to its end, though each of its words fails with EIO."""

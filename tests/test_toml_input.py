@@ -41,6 +41,7 @@ def test_a_bomb_is_one_line_and_cheap(text, reason):
     assert time.process_time() - begin_s < 5.0  # takes 0.1 s; without the bound hours
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_long_key_with_many_below_it_takes_little_memory():
     text = f"[{'k' * 400_000}]\n" + "".join(f"a{number}=1\n" for number in range(40_000))

@@ -5,9 +5,8 @@ import functools
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from adacd_hil.analysis.report.report import Report, write_report
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
@@ -23,6 +22,9 @@ from firmware_sim.bench import Bench
 from firmware_sim.contracts import playable_contract
 from firmware_sim.scenario import Scenario, load_scenario, named_profile
 from firmware_sim.truth import TruthLog
+
+if TYPE_CHECKING:
+    from adacd_hil.analysis.report.report import Report
 
 SCENARIO = "paper"
 """Whose requests to the host are in a script; the user of another one only asks to finish."""
@@ -118,7 +120,7 @@ def play(
     clock_name: str,
     out: Path | None,
     live: LiveAddress | None = None,
-) -> tuple[Report, ExitCode]:
+) -> tuple["Report", ExitCode]:
     """Play a scenario and report it; `out` None: in a new folder by date.
 
     Raises ConfigError, CodecError, LogError, CommandError, OSError.
@@ -134,6 +136,8 @@ def play(
             played_s = summary.result.cycles * settings.bus.period_s
             pace = played_s / summary.elapsed_s
             progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
+        from adacd_hil.analysis.report.report import write_report  # what draws takes longest to import
+
         progress("drawing the report")
         report = write_report(summary.log.path, truth_path, folder.path)
         progress(f"report: {folder.path / 'report.html'}")

@@ -12,7 +12,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.errors import LogError
 from adacd_hil.wire.codec import load_codec
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 CODEC = load_codec()
 
 

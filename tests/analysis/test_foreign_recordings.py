@@ -93,6 +93,7 @@ def test_period_and_noise_are_found_in_the_recording(free: Path, example) -> Non
     assert recording.duration_s == pytest.approx(10.0)
 
 
+@pytest.mark.long
 def test_parameters_torque_and_touches_are_found(free: Path, touched: Path, example) -> None:
     found = identify(example, [read_recording(free, example)], None, [read_recording(touched, example)])
     estimates = dict(zip(found.model.parameter_names, found.estimate.theta, strict=True))

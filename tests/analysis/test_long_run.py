@@ -160,6 +160,7 @@ def test_around_the_first_contacts_every_cycle_is_kept(few_kept, monkeypatch, ce
     assert (len(around), set(np.diff(around).tolist())) == (729, {1})
 
 
+@pytest.mark.long
 def test_the_page_of_a_long_run_says_that_cycles_are_left_out(few_kept, certified, tmp_path):
     read = read_run(certified, truth_of(certified), full_cycles=1000)
     report = write_run_report(read.run, tmp_path, read.source, read.gathered)
@@ -343,6 +344,7 @@ def test_a_stretch_that_is_none_is_refused_in_one_line(certified, options, line)
     assert (ran.exit_code, ran.stderr) == (2, f"adacd-hil: {line}\n")
 
 
+@pytest.mark.long
 def test_the_report_of_a_stretch_says_which_it_is(certified, tmp_path):
     ran = CliRunner().invoke(
         cli, ["report", str(certified), "--from", "2.9", "--until", "3.93", "--out", str(tmp_path), "--json"]

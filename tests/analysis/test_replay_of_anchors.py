@@ -13,7 +13,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.scheme import anchor
 from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 LEAN = """
 lasts_s = 6.0

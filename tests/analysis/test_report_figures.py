@@ -203,6 +203,7 @@ def test_a_fragment_describes_itself_to_those_who_cannot_see_it(fragments):
     assert 'role="img" aria-label="Figure 5 — error in' in fragments["fig5"]
 
 
+@pytest.mark.long
 def test_the_same_run_gives_the_same_fragment(fragments):
     assert {name: drawing.svg() for name, drawing in draw_touched_run().items()} == fragments
 

@@ -47,6 +47,7 @@ def test_every_run_of_a_folder_is_reported_and_one_that_cannot_be_keeps_none_bac
     ]
 
 
+@pytest.mark.long
 def test_the_index_leads_to_the_reports(folder: Path, tmp_path: Path) -> None:
     report(folder, "--out", tmp_path)
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
@@ -55,6 +56,7 @@ def test_the_index_leads_to_the_reports(folder: Path, tmp_path: Path) -> None:
     assert '<header class="bad">' in page
 
 
+@pytest.mark.long
 def test_the_json_has_a_table_for_each_run(folder: Path, tmp_path: Path) -> None:
     tables = json.loads(report(folder, "--out", tmp_path, "--json").stdout)
     assert [table["folder"] for table in tables] == ["a c#1", "b/deep", "d"]
@@ -67,12 +69,14 @@ def test_a_folder_without_a_run_is_one_line(tmp_path: Path) -> None:
     assert (found.exit_code, found.stderr) == (1, f"adacd-hil: {tmp_path} has no run.mcap, nor has any folder in it\n")
 
 
+@pytest.mark.long
 def test_a_folder_with_a_run_is_that_run(folder: Path, tmp_path: Path) -> None:
     found = report(folder / "b" / "deep", "--out", tmp_path)
     assert found.exit_code == 0
     assert not (tmp_path / "index.html").exists()
 
 
+@pytest.mark.long
 def test_several_logs_are_reported_in_folders_of_their_names(folder: Path, tmp_path: Path) -> None:
     found = report(folder / "b" / "deep", folder / "a c#1" / "run.mcap", "--out", tmp_path)
     assert found.exit_code == 0, found.output

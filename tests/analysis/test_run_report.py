@@ -56,6 +56,7 @@ def test_a_report_is_a_page_tables_and_three_pictures(report):
     assert names == sorted([*TABLES, *PICTURES, "report.html", "report.json"])
 
 
+@pytest.mark.long
 def test_a_printed_report_has_the_same_on_paper_and_as_one_picture(tmp_path):
     report = write_run_report(make_run((A, 10)), tmp_path, Source("run.mcap"), is_printed=True)
     pdf, png = (tmp_path / "report.pdf").read_bytes(), (tmp_path / "report.png").read_bytes()
@@ -387,6 +388,7 @@ def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
     assert page.unbalanced == []
 
 
+@pytest.mark.long
 def test_the_same_run_gives_the_same_page(html, tmp_path):
     again = write_run_report(touched_run(), tmp_path, Source("run.mcap"))
     assert again.html_path.read_text(encoding="utf-8") == html
@@ -396,6 +398,7 @@ def test_the_page_is_small(html):
     assert len(html.encode()) < 5_000_000
 
 
+@pytest.mark.long
 def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(LogError, match=r"report in .*taken can't be written"):
@@ -408,6 +411,7 @@ def without_cycle_times(table):
     return {key: value for key, value in table.items() if key not in skipped}
 
 
+@pytest.mark.long
 def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
     run = replace(touched_run(), tau_ext_hat_cad=touched_run().tau_ext_hat_cad * 0.0)
     record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
@@ -417,6 +421,7 @@ def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
     assert without_cycle_times(from_files) == without_cycle_times(from_memory)
 
 
+@pytest.mark.long
 def test_a_report_from_files_knows_the_emulators_seed(tmp_path):
     run = make_run((A, 10), (M, 10))
     record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
@@ -446,6 +451,7 @@ BROWSE = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "tools
 in_chromium = pytest.mark.skipif(BROWSE.chromium() is None, reason="no Chromium to open the page in")
 
 
+@pytest.mark.long
 @in_chromium
 def test_a_browser_opens_the_page_without_a_word(report):
     seen = BROWSE.browse(report.html_path)

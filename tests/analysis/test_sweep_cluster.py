@@ -64,6 +64,7 @@ def test_a_small_sweep_over_tls(tmp_path: Path, log: Path, cluster, authority: A
     assert [(row["set.detector.threshold_Nm"], row["status"]) for row in rows] == [("0.1", "ok"), ("0.4", "ok")]
 
 
+@pytest.mark.long
 def test_certificates_can_stand_in_dasks_configuration(
     tmp_path: Path, log: Path, cluster, authority: Authority, monkeypatch
 ) -> None:
@@ -74,6 +75,7 @@ def test_certificates_can_stand_in_dasks_configuration(
     assert sweep(tmp_path, log, "--scheduler", cluster.scheduler_address).returncode == 0
 
 
+@pytest.mark.long
 def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(
     tmp_path: Path, log: Path, cluster, authority: Authority
 ) -> None:

@@ -118,6 +118,7 @@ def statistics():
     return statistics_of({"run.mcap": log_of(120.0)})
 
 
+@pytest.mark.long
 @compiled_only
 def test_the_lag_of_the_velocity_is_identified():
     lag_s, of_joint_s = find_lag(motion_of(log_of(30.0)))
@@ -169,6 +170,7 @@ def test_logs_of_different_periods_do_not_go_together():
         statistics_of(logs)
 
 
+@pytest.mark.long
 @compiled_only
 def test_where_a_log_is_cut_into_pieces_does_not_matter():
     logs = {"a.mcap": log_of(30.0, tau_J=between(9_000, 9_001, np.nan)), "b.mcap": log_of(25.05, 2)}
@@ -223,6 +225,7 @@ def test_a_step_is_seen_as_the_loop_makes_it():
     np.testing.assert_allclose(shape[1:], exact[:-1], atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @compiled_only
 def test_the_detectors_are_compared_at_one_rate(statistics, tmp_path):

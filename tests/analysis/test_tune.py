@@ -431,6 +431,7 @@ def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeyp
     assert [(window.number, cycle[window.first] - first.onset) for window in read.windows] == [(1, 0), (2, 240)]
 
 
+@pytest.mark.long
 def test_of_a_stretch_its_motion_and_its_contacts_count(log):
     (whole,) = read_logs([log])
     (window,) = whole.windows

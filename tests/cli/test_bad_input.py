@@ -89,6 +89,7 @@ def test_a_bus_without_devices_says_who_is_missing(tmp_path: Path) -> None:
     assert "no boot-up from Drive1 (node 1), Drive2 (node 2), Sensor1 (node 3), Sensor2 (node 4)" in complaint
 
 
+@pytest.mark.long
 def test_a_run_that_never_started_leaves_a_readable_log_with_the_reason(tmp_path: Path) -> None:
     adacd_hil(tmp_path, "run", "-i", "virtual", "-c", "empty", *PAPER, "--out", str(tmp_path))
     log = read_log(tmp_path / "run.mcap")
@@ -117,6 +118,7 @@ def test_a_contract_that_no_emulated_device_has_is_refused_before_a_folder_is_ma
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.long
 @pytest.mark.vcan
 def test_devices_with_another_contract_are_refused_before_the_arm_moves(tmp_path: Path) -> None:
     config = other_contract(tmp_path)
@@ -128,6 +130,7 @@ def test_devices_with_another_contract_are_refused_before_the_arm_moves(tmp_path
     assert read_log(played.log).is_complete
 
 
+@pytest.mark.long
 @pytest.mark.vcan
 def test_an_emulator_that_stops_mid_run_is_a_safety_stop_in_lockstep(tmp_path: Path) -> None:
     with emulator(tmp_path, "--scenario", "idle") as process:

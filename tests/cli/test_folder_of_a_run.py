@@ -20,6 +20,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_path: Path) -> None:
     (tmp_path / "short.toml").write_text("lasts_s = 0.3\n")
@@ -41,6 +42,7 @@ def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_p
     assert contents(tmp_path) == before
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.mcap", "truth.mcap"])
 def test_a_run_into_the_folder_of_one_that_is_going_on_is_told_by_whom(name: str, tmp_path: Path) -> None:
@@ -55,6 +57,7 @@ def test_a_run_into_the_folder_of_one_that_is_going_on_is_told_by_whom(name: str
     assert len(read_log(tmp_path / name).events) == 1
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_start_that_fails_leaves_yesterday_alone_and_can_be_tried_again(tmp_path: Path) -> None:
     yesterday = tmp_path / "runs" / "yesterday"

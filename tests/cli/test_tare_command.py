@@ -210,6 +210,7 @@ def test_a_tare_that_cant_be_used_is_one_line_and_wrong_usage(
     assert line in complaint
 
 
+@pytest.mark.long
 def test_a_bus_without_devices_says_who_is_missing_and_writes_nothing(tmp_path: Path) -> None:
     played = adacd_hil(tmp_path, "tare", "-i", "virtual", "-c", "empty")
     assert played.status == BUS_MISSING

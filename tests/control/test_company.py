@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from long_cases import long_but
 from session_rig import CODEC, TROUBLE_CYCLE, Rig, torques_from
 
 from adacd_hil.log.reader import RunLog
@@ -36,13 +37,16 @@ def forged_command() -> bytes:
 
 @pytest.mark.parametrize(
     ("can_id", "data", "says"),
-    [
-        (0x201, forged_command(), "somebody else commands drive 1 (0x201)"),
-        (0x080, b"\x07", "somebody else sends SYNC (0x080)"),
-        (0x000, NMT_STOP_ALL, "somebody else sends NMT stop to all nodes (0x000)"),
-        (0x77F, b"\x05", "somebody else sends this host's heartbeat (0x77F)"),
-        (0x602, SDO_WRITE, "somebody else writes objects of drive 2 (0x602)"),
-    ],
+    long_but(
+        2,
+        [
+            (0x201, forged_command(), "somebody else commands drive 1 (0x201)"),
+            (0x080, b"\x07", "somebody else sends SYNC (0x080)"),
+            (0x000, NMT_STOP_ALL, "somebody else sends NMT stop to all nodes (0x000)"),
+            (0x77F, b"\x05", "somebody else sends this host's heartbeat (0x77F)"),
+            (0x602, SDO_WRITE, "somebody else writes objects of drive 2 (0x602)"),
+        ],
+    ),
 )
 def test_a_frame_that_only_this_host_sends_is_named_and_faults_at_once(
     tmp_path: Path, can_id: int, data: bytes, says: str

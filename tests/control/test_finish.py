@@ -62,6 +62,7 @@ def run_by_script(tmp_path: Path, fault_s: float, script: tuple[tuple[float, str
     return read_log(summary.log.path)
 
 
+@pytest.mark.long
 def test_a_payload_that_was_announced_and_not_yet_served_is_announced_again(tmp_path: Path) -> None:
     log = run_by_script(tmp_path, 1.05, ((0.9, "payload"), (9.0, "finish")))
     asked = log.scheme["cycle"][log.scheme["request"] == Request.PAYLOAD]
@@ -69,6 +70,7 @@ def test_a_payload_that_was_announced_and_not_yet_served_is_announced_again(tmp_
     assert np.any(log.scheme["state"] == SchemeState.PAYLOAD)
 
 
+@pytest.mark.long
 def test_a_payload_announced_where_that_means_nothing_is_not_announced_again(tmp_path: Path) -> None:
     log = run_by_script(tmp_path, 8.0, ((5.8, "payload"), (6.2, "payload"), (7.2, "payload_changed"), (11.0, "finish")))
     asked = log.scheme["state"][log.scheme["request"] == Request.PAYLOAD]
@@ -77,6 +79,7 @@ def test_a_payload_announced_where_that_means_nothing_is_not_announced_again(tmp
     assert np.any(log.scheme["state"][faulted:] == SchemeState.ADAPT)
 
 
+@pytest.mark.long
 def test_an_arm_that_cannot_be_parked_is_disabled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("adacd_hil.control.reference.Reference.is_parked", lambda *_: False)
     rig = Rig(tmp_path, finish_s=0.5)

@@ -46,6 +46,7 @@ def test_a_fault_that_nobody_acknowledges_ends_the_run(tmp_path: Path) -> None:
     assert (summary.recoveries, states(log)[-1]) == (0, SchemeState.FAULT)
 
 
+@pytest.mark.long
 def test_the_second_fault_is_latched_when_one_may_be_acknowledged(tmp_path: Path) -> None:
     rig = faulting_rig(tmp_path, acknowledge_faults=1)
 
@@ -79,11 +80,13 @@ def test_the_arm_is_enabled_where_it_is_with_zero_torque_first(tmp_path: Path) -
     assert np.degrees(np.abs(log.scheme["q"][start])).max() > 5.0  # not the place where the run began
 
 
+@pytest.mark.long
 def test_the_bus_is_emptied_before_the_devices_are_booted_again(tmp_path: Path) -> None:
     _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
     assert messages(log, "recovery") == ["fault acknowledged", "transmit queue emptied"]
 
 
+@pytest.mark.long
 def test_a_bus_that_fails_in_operation_is_emptied_at_once_and_comes_back_after_an_acknowledgement(
     tmp_path: Path,
 ) -> None:
@@ -100,6 +103,7 @@ def test_a_bus_that_fails_in_operation_is_emptied_at_once_and_comes_back_after_a
     assert controlwords(log)[-40] == ENABLE_OPERATION
 
 
+@pytest.mark.long
 def test_what_the_devices_said_before_the_recovery_is_not_taken_for_fresh(tmp_path: Path) -> None:
     rig = faulting_rig(tmp_path, acknowledge_faults=1)
     _, log = rig.run()
@@ -116,6 +120,7 @@ def test_torque_flows_again_after_the_recovery(tmp_path: Path) -> None:
     assert np.any(torques_from(log, last_cycle - 1500) != 0)
 
 
+@pytest.mark.long
 def test_the_time_of_the_wait_is_not_lived_through_twice(tmp_path: Path) -> None:
     _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
     (acknowledged,) = [entry.t_ns for entry in log.events if entry.event.message == "fault acknowledged"]

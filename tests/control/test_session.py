@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from long_cases import long_but
 from session_rig import (
     CODEC,
     DISABLE_VOLTAGE,
@@ -43,7 +44,7 @@ def test_the_gate_is_closed_until_the_arm_is_enabled(tmp_path: Path) -> None:
     assert set(log.control["gate_flags"][:ENABLED_CYCLE].tolist()) == {int(GateFlag.CLOSED)}
 
 
-@pytest.mark.parametrize("can_id", [0x181, 0x182, 0x183, 0x184])
+@pytest.mark.parametrize("can_id", long_but(1, [0x183, 0x181, 0x182, 0x184]))
 def test_a_device_that_falls_silent_faults_the_run_after_its_age_budget(tmp_path: Path, can_id: int) -> None:
     rig = Rig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == can_id and cycle >= TROUBLE_CYCLE else data
@@ -66,6 +67,7 @@ def test_a_device_whose_heartbeat_stops_faults_the_run_and_is_named(tmp_path: Pa
     assert "Sensor1 (node 3): no heartbeat for" in reason
 
 
+@pytest.mark.long
 def test_error_frames_are_in_the_log_in_words(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     error_passive = bytes((0, 0x20, 0, 0, 0, 0, 130, 0))
@@ -116,6 +118,7 @@ def test_two_lost_torque_frames_are_forgiven(tmp_path: Path) -> None:
     assert summary.result.fault is FaultReason.NONE
 
 
+@pytest.mark.long
 def test_corrupted_torque_frames_count_as_lost_and_change_no_value(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
 
@@ -132,6 +135,7 @@ def test_corrupted_torque_frames_count_as_lost_and_change_no_value(tmp_path: Pat
     assert log.scheme["tau_J"][TROUBLE_CYCLE][0] == log.scheme["tau_J"][TROUBLE_CYCLE - 1][0]
 
 
+@pytest.mark.long
 def test_the_log_counts_what_the_checks_said_of_each_frame(tmp_path: Path) -> None:
     rig = Rig(tmp_path)
     lost = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 2)
@@ -193,6 +197,7 @@ def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
     assert any(entry.event.name == "Drive1" and "EMCY 0x8100" in entry.event.message for entry in log.events)
 
 
+@pytest.mark.long
 def test_viewers_find_the_arm_and_a_layout_in_the_log_and_beside_it_and_the_address(tmp_path: Path) -> None:
     rig = Rig(tmp_path, finish_s=0.3)
     said: list[str] = []

@@ -22,6 +22,7 @@ at_s = 0.0
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scenario", "line"),
     [

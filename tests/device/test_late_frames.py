@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from long_cases import long_but
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import Settings, load_settings
@@ -82,7 +83,7 @@ DELAYS_US = range(50, 1501, 50)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", USUAL_NS)
-@pytest.mark.parametrize("config", ["paper", "stock"])
+@pytest.mark.parametrize("config", long_but(1, ["paper", "stock"]))
 def test_a_sample_is_of_one_sync_and_its_age_is_true_however_late_a_frame_is(config: str, name: str) -> None:
     for delay_us in DELAYS_US:
         if config == "stock" and name.startswith("Sensor") and 950 <= delay_us <= 1050:
@@ -98,6 +99,7 @@ def test_a_sample_is_of_one_sync_and_its_age_is_true_however_late_a_frame_is(con
         assert max(*state.age_q, *state.age_tau_J) <= 2, delay_us
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("name", USUAL_NS)
 @pytest.mark.parametrize("config", ["paper", "stock"])

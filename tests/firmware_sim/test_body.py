@@ -301,6 +301,7 @@ def test_another_seed_gives_another_run():
     assert run(9) != run(10)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_interpreted_arm_moves_like_the_compiled_one():
     script = (

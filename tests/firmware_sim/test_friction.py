@@ -33,6 +33,7 @@ def sliding(
     return moved
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("velocity_rad_s", [0.01, 0.03, 0.1, 0.3, -0.05, 2.0])
 @pytest.mark.parametrize("model", [STRIBECK, LUGRE])
 def test_friction_at_steady_speed_lies_on_the_stribeck_curve(model, velocity_rad_s):

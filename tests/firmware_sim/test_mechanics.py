@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio
 import pytest
 from general_arm import LOCKED_NM, NOBODY, GeneralArm, one_joint, without_friction
+from long_cases import long_but
 
 from adacd_hil.config import ConfigError, parse
 from adacd_hil.records import TRUTH_LAYOUT
@@ -39,16 +40,19 @@ def truth_of(body: Body) -> dict[str, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "payload", "is_struck", "substeps", "bound"),
-    [
-        (AS_RIGID, None, False, None, 1e-9),
-        (MechanicsSettings(tilt_deg=30.0, tilt_direction_deg=50.0), None, False, None, 1e-9),
-        (MechanicsSettings(tilt_deg=90.0, tilt_direction_deg=-20.0), PAYLOAD, False, None, 1e-9),
-        (MechanicsSettings(**ELASTIC), None, False, None, 1e-7),
-        (MechanicsSettings(**ELASTIC, tilt_deg=30.0), PAYLOAD, False, None, 1e-7),
-        (MechanicsSettings(**ELASTIC), None, True, None, 1e-5),
-        (MechanicsSettings(**ELASTIC), None, True, 2, 1e-6),
-        (MechanicsSettings(**ELASTIC, tilt_deg=30.0), PAYLOAD, True, 2, 1e-6),
-    ],
+    long_but(
+        2,
+        [
+            (AS_RIGID, None, False, None, 1e-9),
+            (MechanicsSettings(tilt_deg=30.0, tilt_direction_deg=50.0), None, False, None, 1e-9),
+            (MechanicsSettings(tilt_deg=90.0, tilt_direction_deg=-20.0), PAYLOAD, False, None, 1e-9),
+            (MechanicsSettings(**ELASTIC), None, False, None, 1e-7),
+            (MechanicsSettings(**ELASTIC, tilt_deg=30.0), PAYLOAD, False, None, 1e-7),
+            (MechanicsSettings(**ELASTIC), None, True, None, 1e-5),
+            (MechanicsSettings(**ELASTIC), None, True, 2, 1e-6),
+            (MechanicsSettings(**ELASTIC, tilt_deg=30.0), PAYLOAD, True, 2, 1e-6),
+        ],
+    ),
 )
 def test_energy_stays_for_a_minute_without_friction_torque_and_contact(settings, payload, is_struck, substeps, bound):
     """Struck: the motors stand while the links move at full speed, so that a third of the energy vibrates undamped."""

@@ -149,6 +149,7 @@ def test_a_quick_stop_that_stays_never_says_target_reached():
     assert host.statusword() & (0x6F | REACHED) == 0x07
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("clock_mode", ["sync", "wall"])
 def test_after_nmt_start_the_first_sync_may_take_its_time_and_have_any_counter(clock_mode):
     host = BenchHost(clock_mode=clock_mode)

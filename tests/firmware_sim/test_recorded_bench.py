@@ -165,6 +165,7 @@ def test_without_cycles_all_but_sync_is_answered():
     assert host.read(1, 0x6064) == 0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_host_against_the_recorded_arm_decides_as_it_did(tmp_path):
     operator = OperatorSettings(script=(RequestSettings(at_s=0.05, request="finish"),))

@@ -152,6 +152,7 @@ def test_a_run_with_every_error_differs_with_another_seed():
     assert run_with_everything(9).tobytes() != run_with_everything(10).tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_interpreted_errors_are_those_of_the_compiled_ones():
     script = (

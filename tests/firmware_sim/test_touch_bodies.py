@@ -77,6 +77,7 @@ BLOWS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("profile", "link", "point_m", "side", "kind"), BLOWS)
 def test_an_elastic_blow_has_the_force_time_and_speeds_of_two_masses(profile, link, point_m, side, kind):
     body = beside(link, point_m, side, **kind)

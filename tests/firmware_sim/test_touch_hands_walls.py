@@ -35,6 +35,7 @@ def hand(**changes) -> HandSettings:
     return HandSettings(**values)
 
 
+@pytest.mark.long
 def test_a_hand_guides_the_tip_along_a_line_and_stops_at_its_end():
     start = TouchedArm(q=POSE).tip(*POSE)
     end = start + np.array([-0.12, 0.05])

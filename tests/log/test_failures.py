@@ -270,6 +270,7 @@ def cuts(size):
     return sorted({*range(60), *range(size - 60, size), *generator.integers(0, size, 250).tolist()})
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_log_cut_anywhere_gives_what_came_before(run, whole, tmp_path):
     path = tmp_path / "cut.mcap"
@@ -290,6 +291,7 @@ def test_a_log_cut_anywhere_gives_what_came_before(run, whole, tmp_path):
     assert len(set(counts)) > 2
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_flipped_bit_is_noticed_or_harmless(run, whole, tmp_path):
     path = tmp_path / "flipped.mcap"

@@ -412,6 +412,7 @@ def crowd(url, count):
         clients.stdout.close()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("blocking", [True, False])
 def test_five_hundred_clients_that_behave_badly_cost_the_log_nothing(tmp_path, blocking):
@@ -441,6 +442,7 @@ def is_running(pid):
         return False
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
 def test_a_live_view_that_is_stopped_or_killed_costs_the_log_nothing(tmp_path, number):
     run = make_run(1500, seed=9)

@@ -71,6 +71,7 @@ def test_a_cycle_comes_out_as_it_went_in(cycle):
     assert contents(unpacked(pack_cycle(*cycle))) == [cycle]
 
 
+@pytest.mark.long
 @given(TIMES, COUNTS, EVENTS)
 def test_an_event_comes_out_as_it_went_in(t_ns, dropped, event):
     assert contents(unpacked(pack_event(t_ns, dropped, event))) == [(t_ns, dropped, event)]

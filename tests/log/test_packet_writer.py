@@ -102,6 +102,7 @@ def assert_same(files):
     assert ours == theirs
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("epoch_ns", "parameter_count"), [(0, 7), (EPOCH_NS, 9)])
 def test_a_run_is_written_as_the_straightforward_way_would(epoch_ns, parameter_count):

@@ -50,6 +50,7 @@ def test_a_reference_run_has_the_stored_bits(played: tuple[Reference, Reference]
     assert bit_differences(stored, now) == [], RENEW
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("name", UNCOMPILED)
 def test_uncompiled_code_comes_to_the_same_bits(name: str, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The small 2R arm of `planar_arm` on the excitation: recorded and played, or in closed loop with the pipeline."""
 
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -62,15 +63,6 @@ def follow(theta, q_d, dq_d, Kp, Kd, tau_ext, noise, q, dq, tau_J):
         advance(at, speed, tracked_q, tracked_dq, tau + tau_ext[k], theta[k], PERIOD_S)
 
 
-def excitation_of(settings: Settings, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return q_d, dq_d (n, 2) of the excitation."""
-    excitation = Excitation(settings)
-    q_d, dq_d, ddq_d = (np.zeros((round(seconds / PERIOD_S), 2)) for _ in range(3))
-    for k in range(len(q_d)):
-        excitation.evaluate(k * PERIOD_S, q_d[k], dq_d[k], ddq_d[k])
-    return q_d, dq_d
-
-
 def record(theta, seconds, tau_ext=None, added=None, added_at_s=0.0, motion=None, seed=1) -> Record:
     """Record the arm; added (7,): what a payload adds to its parameters from added_at_s on."""
     q_d, dq_d = excitation_of(SETTINGS, seconds) if motion is None else motion
@@ -99,6 +91,51 @@ def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS, 
     return Played(state, observation, y, h, theta, constants, memory, block)
 
 
+class Motion:
+    """The excitation by cycles, evaluated once for all loops."""
+
+    def __init__(self, settings: Settings):
+        self._excitation = Excitation(settings)
+        self._rows: list[np.ndarray] = []
+
+    def at(self, cycle: int) -> np.ndarray:
+        """Return q_d, dq_d, ddq_d (3, 2)."""
+        while len(self._rows) <= cycle:
+            row = np.zeros((3, 2))
+            self._excitation.evaluate(len(self._rows) * PERIOD_S, *row)
+            self._rows.append(row)
+        return self._rows[cycle]
+
+
+@cache
+def motion_of(trajectory, excitation) -> Motion:
+    return Motion(replace(SETTINGS, trajectory=trajectory, excitation=excitation))
+
+
+def excitation_of(settings: Settings, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return q_d, dq_d (n, 2) of the excitation."""
+    motion = motion_of(settings.trajectory, settings.excitation)
+    rows = np.array([motion.at(k) for k in range(round(seconds / PERIOD_S))])
+    return rows[:, 0].copy(), rows[:, 1].copy()
+
+
+@compiled
+def quantise(q, dq, tau_J):
+    """Round to what the encoder, the drive and the sensor can say, in place."""
+    for i in range(2):
+        q[i] = np.round(q[i] / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
+        dq[i] = np.round(dq[i] / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S
+        tau_J[i] = np.round(tau_J[i] / TORQUE_LSB_NM) * TORQUE_LSB_NM
+
+
+@compiled
+def lead(x, lead_s, away, q_d, dq_d):
+    """Add the way back from where the motion was left, at the share x of its time."""
+    for i in range(2):
+        q_d[i] += away[i] * (1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+        dq_d[i] -= away[i] * 30.0 * x**2 * (1.0 - x) ** 2 / lead_s
+
+
 LEAD_S = 1.5
 BRAKE_RAD_S2 = 12.0
 MOVING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
@@ -113,27 +150,26 @@ class ExcitedLoop:
     def __init__(self, settings: Settings = SETTINGS, theta: np.ndarray = THETA["P"], seed: int = 1):
         self.settings = settings
         self.pipeline = CertifiedPipeline(settings)
-        self.excitation = Excitation(settings)
+        self.motion = motion_of(settings.trajectory, settings.excitation)
         self.theta = theta.copy()
         self.random = np.random.default_rng(seed)
-        self.desired = np.zeros((3, 2))
-        self.excitation.evaluate(0.0, *self.desired)
+        self.desired = self.motion.at(0).copy()
         self.corner = self.desired[0].copy()
         self.q, self.dq = self.corner.copy(), np.zeros(2)
         self.tracked_q, self.tracked_dq = self.q.copy(), np.zeros(2)
         self.tau, self.tau_next, self.tau_ext = np.zeros(2), np.zeros(2), np.zeros(2)
-        self.away = np.zeros(2)
+        self.away, self.offset_Nm = np.zeros(2), np.zeros(2)
         self.cycle = self.motion_cycles = 0
         self.request = Request.NONE
 
     def measure(self) -> ArmState:
+        q, dq = self.q.copy(), self.tracked_dq.copy()
         tau_J = self.tau + TORQUE_NOISE_NM * self.random.standard_normal(2)
-        return arm_state(
-            self.cycle,
-            np.round(self.q / ENCODER_LSB_RAD) * ENCODER_LSB_RAD,
-            np.round(self.tracked_dq / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S,
-            np.round(tau_J / TORQUE_LSB_NM) * TORQUE_LSB_NM,
-        )
+        quantise(q, dq, tau_J)
+        return ArmState(
+            self.cycle, self.cycle * 1_000_000, 1, q, dq, tau_J + self.offset_Nm, (0, 0), (0, 0), is_enabled=True,
+            is_complete=True, fault=FaultReason.NONE,
+        )  # fmt: skip
 
     def move(self, output: SchemeOutput) -> None:
         """Go on with the desired motion."""
@@ -146,10 +182,9 @@ class ExcitedLoop:
             self.away = self.desired[0] - self.corner
             self.motion_cycles = 0
         at_s = self.motion_cycles * PERIOD_S
-        self.excitation.evaluate(at_s, *self.desired)
-        x = min(at_s / LEAD_S, 1.0)
-        self.desired[0] += self.away * (1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
-        self.desired[1] -= self.away * 30.0 * x**2 * (1.0 - x) ** 2 / LEAD_S
+        self.desired[:] = self.motion.at(self.motion_cycles)
+        if at_s < LEAD_S:
+            lead(at_s / LEAD_S, LEAD_S, self.away, self.desired[0], self.desired[1])
         self.motion_cycles += 1
 
     def step(self) -> SchemeOutput:
@@ -184,10 +219,6 @@ class TouchedLoop(ExcitedLoop):
         super().__init__(settings, **options)
         self.offset_Nm = np.array(offset_Nm)
         self.events: list[Event] = []
-
-    def measure(self):
-        arm = super().measure()
-        return arm._replace(tau_J=arm.tau_J + self.offset_Nm)
 
     def step(self):
         output = super().step()

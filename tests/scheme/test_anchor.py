@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop, arm_state
+from long_cases import long_but
 from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import FaultReason, Request, SchemeState
@@ -35,7 +36,9 @@ BOTH = settings_with(holding_torque_Nm=(0.0, 0.0), torque_offset_std_Nm=(0.005, 
 UNKNOWN = settings_with()
 
 
-@pytest.mark.parametrize(("settings", "joint", "torque_Nm"), [(FREE, 0, 0.1), (TARED, 1, -0.5), (FREE, 0, 2.0)])
+@pytest.mark.parametrize(
+    ("settings", "joint", "torque_Nm"), long_but(1, [(FREE, 0, 0.1), (TARED, 1, -0.5), (FREE, 0, 2.0)])
+)
 def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(settings, joint, torque_Nm):
     loop = TouchedLoop(settings)
     loop.run_until(SchemeState.ENABLE)  # this arm's motors hold it from the first cycle on
@@ -49,6 +52,7 @@ def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(se
     assert np.abs(loop.offset_error_Nm).max() < LARGEST_ERROR_NM
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("begins_s", "torque_Nm"), [(0.7, 1.0), (2.0, 0.2)])
 def test_a_lean_that_begins_while_the_arm_learns_gets_no_certificate_either(begins_s, torque_Nm):
     loop = TouchedLoop(FREE)
@@ -210,6 +214,7 @@ def test_nothing_is_accepted_beforehand():
     assert loop.said("anchor")[0] == "nothing to accept: no certificate is withheld"
 
 
+@pytest.mark.long
 def test_a_lean_that_does_not_end_is_a_fault_that_says_so():
     loop = TouchedLoop(settings_with(8.0, holding_torque_Nm=(0.0, 0.0)))
     loop.tau_ext[0] = 0.5

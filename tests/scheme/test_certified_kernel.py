@@ -493,6 +493,7 @@ np.savez(sys.argv[1], y=played.y, h=played.h, theta=played.theta, observation=pl
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_without_the_compiler_the_numbers_are_the_same(tmp_path):
     path = tmp_path / "uncompiled.npz"

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from excited_arm import NAMES, PERIOD_S, SETTINGS
+from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added
 
@@ -39,7 +40,7 @@ class MonitoredLoop(HeldLoop):
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
-@pytest.mark.parametrize("kg", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("kg", long_but(1, [0.5, 0.1, 1.0]))
 def test_a_payload_that_nobody_announced_is_named_and_learnt_at_a_word(profile, kg):
     loop = MonitoredLoop(profile)
     loop.theta = loop.theta + kg * PAYLOAD_1KG
@@ -53,6 +54,7 @@ def test_a_payload_that_nobody_announced_is_named_and_learnt_at_a_word(profile, 
     assert loop.error_of("a1") < 0.01
 
 
+@pytest.mark.long
 def test_a_payload_that_is_put_down_is_named_too():
     loop = MonitoredLoop()
     loop.theta = loop.theta - 0.05 * PAYLOAD_1KG
@@ -98,6 +100,7 @@ def test_a_contact_that_never_ends_has_an_exit():
     assert abs(loop.offset_error_Nm[0]) < 0.03
 
 
+@pytest.mark.long
 def test_who_touches_the_arm_again_and_again_takes_nothing_back():
     loop = MonitoredLoop()
     random = np.random.default_rng(7)

@@ -91,6 +91,7 @@ def test_a_touch_within_the_fit_that_no_threshold_saw_is_no_certificate():
     assert loop.error_of("a1") < 0.005
 
 
+@pytest.mark.long
 def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_the_offset_before():
     loop = HeldLoop(UNKNOWN)
     loop.learn(1.0)
@@ -118,6 +119,7 @@ def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
     assert (loop.cycle - released_at) * PERIOD_S < 6.5
 
 
+@pytest.mark.long
 def test_the_word_of_the_user_that_nobody_touches_the_arm_ends_the_comparison():
     loop = HeldLoop(FREE)
     loop.learn(1.0)

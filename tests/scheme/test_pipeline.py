@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA, ClosedLoop
 from smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 
@@ -53,7 +54,7 @@ def paper_times(profile, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", long_but(1, [1, 2]))
 def test_profile_p_adapts_in_the_paper_s_times_and_stays_below_its_threshold(seed):
     times, residuals = paper_times("P", seed)
     assert abs(times[0] - 5.20) < 0.02
@@ -61,6 +62,7 @@ def test_profile_p_adapts_in_the_paper_s_times_and_stays_below_its_threshold(see
     assert max(residuals) < 0.07
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_profile_m_adapts_later_but_stays_below_its_threshold():
     times, residuals = paper_times("M", 1)
@@ -230,6 +232,7 @@ def test_the_gradient_law_ends_its_adaptation_too():
     assert len(loop.run_until(SchemeState.MONITOR)) * 1e-3 < 7.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.01, 0.1])
 def test_lost_frames_do_not_keep_the_adaptation_from_ending(share):
@@ -420,6 +423,7 @@ def test_an_adaptation_forgets_what_the_filters_held():
     assert outputs[begin + 1].tau_ext_hat[0] == 0.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_gravity_is_learnt_where_the_axes_are_not_vertical():
     """2.7 Nm of gravity, all but a fiftieth of it known after 20 s."""
@@ -455,6 +459,7 @@ np.savez(sys.argv[1], closed=closed, record=record)
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_without_the_compiler_the_numbers_are_the_same(tmp_path):
     here = str(Path(__file__).parent)

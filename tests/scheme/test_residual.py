@@ -33,6 +33,7 @@ def motion():
     return (t_s, *smooth_motion(t_s))
 
 
+@pytest.mark.long
 def test_with_the_true_model_nothing_is_left(motion):
     _, q, dq, ddq = motion
     blocks = run_kernel(settings_with(), q, dq, torque_of(q, dq, ddq, SMOOTH), SMOOTH, 0)

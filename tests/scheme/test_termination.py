@@ -61,6 +61,7 @@ def information_of(columns, period_s=1e-3):
     return information
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [7, 9])
 @pytest.mark.parametrize("seed", range(10))
 def test_the_smallest_eigenvalue_is_that_of_lapack(seed, count):

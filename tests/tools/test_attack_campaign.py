@@ -239,6 +239,7 @@ def test_a_second_user_is_refused_by_name_and_disturbs_nobody(
     assert attack_vcan.second_verdict(name, status, said, finding(stopped_ms=stopped_ms)) == expected
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_in_virtual_time_nobody_who_attacks_is_no_alarm_and_forged_commands_reach_the_drives(tmp_path: Path) -> None:
     quiet, _ = attacked_run.play_attack(None, tmp_path / "quiet")

@@ -95,6 +95,7 @@ def test_the_summary_counts_what_was_missed_in_silence() -> None:
     assert "BAD" in blind_grid.as_table([silent])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_without_a_fault_both_pushes_are_found_and_nothing_is_bad(tmp_path: Path) -> None:
     outcome = blind_grid.play_row(Row("certified", "arm", "torque", "sensor1", 0, 1.0, "random"), SHORT, tmp_path)

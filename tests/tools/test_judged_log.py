@@ -24,6 +24,7 @@ from adacd_hil.records import TRUTH_LAYOUT
 from firmware_sim.scenario import Scenario
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_log_and_its_truth_are_judged_as_the_wire_is(tmp_path: Path) -> None:
     push = {"at_s": 2.7, "link": 1, "point_m": 0.3, "force_N": 8.0, "duration_s": 0.3}
