@@ -81,7 +81,7 @@ def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Sec
             raise
         raise ConfigError(f"`{place}`: {error}") from error
     except ValueError as error:
-        raise ConfigError(f"{place}: {error}") from error
+        raise ConfigError(f"{place}: {error}" if place else str(error)) from error
 
 
 def find_problems(section: type[Any], table: dict[str, Any], where: str = "") -> list[str]:
@@ -856,6 +856,41 @@ class TareSettings:
 
 
 @dataclass(frozen=True)
+class HistorySettings:
+    """What the arm's last certificate, of another run, says of it; `run --history` fills it in from the arm's file."""
+
+    date_utc: str = setting("", meaning="when it was certified, ISO 8601, UTC; empty: no last certificate")
+    friction_Nm: tuple[float, ...] = setting(
+        (), unit="Nm", low=-1000.0, high=1000.0, meaning="of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2"
+    )
+    friction_std_Nm: tuple[float, ...] = setting((), unit="Nm", low=0.0, high=1000.0, meaning="their deviations")
+    inertia_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=-1000.0, high=1000.0, meaning="a1, a2, a3")
+    inertia_std_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=0.0, high=1000.0, meaning="their deviations")
+    friction_share: float = setting(
+        0.2, low=0.0, high=10.0, meaning="how far friction differs from run to run, a deviation, share of it"
+    )
+    inertia_share: float = setting(0.02, low=0.0, high=10.0, meaning="likewise of an inertia")
+
+    def __post_init__(self) -> None:
+        for name, values, count in (
+            ("friction_Nm", self.friction_Nm, 3 * JOINTS),
+            ("friction_std_Nm", self.friction_std_Nm, 3 * JOINTS),
+            ("inertia_kgm2", self.inertia_kgm2, 3),
+            ("inertia_std_kgm2", self.inertia_std_kgm2, 3),
+        ):
+            wanted = count if self.is_known else 0
+            if len(values) != wanted:
+                raise ValueError(
+                    f"{name} has {len(values)} values, {wanted} expected with date_utc = {self.date_utc!r}"
+                )
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a last certificate."""
+        return bool(self.date_utc)
+
+
+@dataclass(frozen=True)
 class Settings:
     """Everything a run depends on, resolved. Attached to every log."""
 
@@ -879,6 +914,7 @@ class Settings:
     realtime: RealtimeSettings = setting(RealtimeSettings, meaning="being on time")
     safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
     tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
+    history: HistorySettings = setting(HistorySettings, meaning="the arm's last certificate")
     log: LogSettings = setting(LogSettings, meaning="the log")
 
     @property

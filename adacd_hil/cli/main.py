@@ -10,6 +10,7 @@ import click
 from adacd_hil import __version__
 from adacd_hil.cli.compare_command import compare
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
+from adacd_hil.cli.history_command import history
 from adacd_hil.cli.identify_command import identify
 from adacd_hil.cli.live_options import live_options, require_extra
 from adacd_hil.cli.log_command import log
@@ -84,12 +85,23 @@ def demo(
 @cli.command(epilog=EPILOG)
 @on_bus
 @click.option("--tare", type=click.Path(path_type=Path, dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
+@click.option(
+    "--history",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="What the arm's runs have certified; the last is compared with, and this run's are added.",
+)
 @run_folder_option("run")
 @clock_option(default="realtime")
 @json_option
 @live_options
 def run(
-    connection: "Connection", tare: Path | None, out: Path | None, clock: str, as_json: bool, live: "LiveAddress | None"
+    connection: "Connection",
+    tare: Path | None,
+    history: Path | None,
+    out: Path | None,
+    clock: str,
+    as_json: bool,
+    live: "LiveAddress | None",
 ) -> ExitCode:
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
@@ -100,7 +112,7 @@ def run(
     """
     from adacd_hil.cli.run import as_text, run_on_bus
 
-    result, code = run_on_bus(connection, clock, out, tare, live)
+    result, code = run_on_bus(connection, clock, out, tare, live, history)
     print(json.dumps(result, indent=2) if as_json else as_text(result))
     return code
 
@@ -344,6 +356,7 @@ def monitor(
     return watch_live(place, listened_s, listened_s is None, as_json)
 
 
+cli.add_command(history)
 cli.add_command(identify)
 cli.add_command(play)
 cli.add_command(replay)

@@ -8,6 +8,9 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
+import click
+
+from adacd_hil import __version__
 from adacd_hil.cli.connection import (
     Connection,
     check_autonomy,
@@ -17,14 +20,15 @@ from adacd_hil.cli.connection import (
     never_stopped,
     on_interrupt,
 )
-from adacd_hil.cli.exit_codes import ExitCode, exit_code
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.run_folder import run_folder
 from adacd_hil.clock import wall_ns
 from adacd_hil.config import ConfigError, Settings
+from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
-from adacd_hil.control.tare_file import use_tare
+from adacd_hil.control.tare_file import format_date, use_tare
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.wire.budget import check_budget
@@ -60,8 +64,11 @@ def run_on_bus(
     out: Path | None,
     tare_path: Path | None = None,
     live: LiveAddress | None = None,
+    history_path: Path | None = None,
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Run the scheme on a bus, with the offsets of a tare when one is given; `out` None: a new folder by date.
+    """Run the scheme on a bus, with the offsets of a tare and the arm's history when they are given.
+
+    `out` None: a new folder by date.
 
     Raises ConfigError, CodecError, BusMissingError, LogError, CommandError, OSError.
     """
@@ -74,6 +81,11 @@ def run_on_bus(
     if tare_path is not None:
         tare = use_tare(tare_path, settings, wall_ns())
         settings = tare.apply(settings)
+    history = None
+    if history_path is not None:
+        history = use_history(history_path, wall_ns())
+        settings = history.apply(settings)
+        ask_first_run(history)
     codec = load_contract(settings)
     if clock_name == "realtime":
         check_budget_of(codec, settings)
@@ -96,6 +108,7 @@ def run_on_bus(
             interface,
             progress=progress,
             tare=tare,
+            history=history,
             live=live,
             on_started=functools.partial(folder.link, progress),
         )
@@ -103,7 +116,29 @@ def run_on_bus(
             progress(f"warning: {line}")
         with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: an arm is not left alone
             summary = session.run()
-    return summarise(summary), exit_code(summary)
+    code, described = exit_code(summary), summarise(summary)
+    if history is not None and summary.certificates:
+        origin = Origin(format_date(wall_ns()), str(summary.log.path), settings.arm.profile, __version__)
+        try:
+            described["history"] = history.add(summary.certificates, summary.identities, origin)
+        except (OSError, ConfigError) as error:
+            described["history_error"] = str(error)
+            print(f"adacd-hil: the certificate is not in the history: {error}", file=sys.stderr)
+            code = ExitCode.PARTIAL if code is ExitCode.OK else code
+    return described, code
+
+
+def ask_first_run(history: UsedHistory) -> None:
+    """Have the user say on the terminal that nobody touches an arm of which nothing is known. Raises CommandError."""
+    if not history.is_first_run or sys.stdin is None or not sys.stdin.isatty():
+        return
+    print(
+        f"{history.path} does not exist: this is the arm's first run.\nWho drags it while it learns is learnt as its "
+        "friction, and no run alone can tell. Nobody may touch it until it monitors.",
+        file=sys.stderr,
+    )
+    if not click.confirm("Is nobody touching it?", err=True):
+        raise CommandError("not started: somebody touches the arm")
 
 
 def summarise(summary: SessionSummary) -> dict[str, Any]:

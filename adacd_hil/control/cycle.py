@@ -41,6 +41,7 @@ from adacd_hil.records import (
     SchemeOutput,
     SchemeState,
 )
+from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.scheme.selection import pipeline_of
 from adacd_hil.scheme.supervisor import KEPT_IN, POWERED
 from adacd_hil.wire.tap import Tap
@@ -127,6 +128,11 @@ class Cycle:
     def unserved(self) -> Request:
         """What the user has asked for and not got: the end of the run, or a stop to change the payload; else NONE."""
         return self._unserved
+
+    @property
+    def certificates(self) -> tuple[Certificate, ...]:
+        """The certificates of this attempt that were not taken back, in order."""
+        return self._pipeline.certificates
 
     def compile(self) -> None:
         """Compile everything the loop calls; to be done before the drives are enabled."""

@@ -10,6 +10,7 @@ from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult
+from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.realtime import Pacer, make_pacer, prepare_spin
 from adacd_hil.control.recovery import Recovery
@@ -28,6 +29,7 @@ from adacd_hil.log.setup import MOST_VIEWERS, LiveSetup
 from adacd_hil.output_files import place_file
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
+from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.tap import Tap
@@ -39,7 +41,7 @@ class SessionSummary:
 
     `has_started`: whether the devices had been put into operation, so that the arm may have moved. `recoveries`: how
     often a fault was acknowledged and the run begun again. `elapsed_s`: by the host's clock, from the first frame to
-    the last, without compiling.
+    the last, without compiling. `certificates`: those that were not taken back; `identities`: of the devices.
     """
 
     result: RunResult | None
@@ -49,6 +51,8 @@ class SessionSummary:
     has_started: bool
     recoveries: int
     elapsed_s: float
+    certificates: tuple[Certificate, ...]
+    identities: tuple[Identity, ...]
 
 
 class LiveAddress(NamedTuple):
@@ -99,9 +103,11 @@ class Session:
     metadata: dict[str, str] = field(default_factory=dict)
     progress: Callable[[str], None] = lambda _: None
     tare: UsedTare | None = None
+    history: UsedHistory | None = None
     live: LiveAddress | None = None
     on_started: Callable[[], None] = lambda: None
     _cycle: Cycle | None = None
+    _identities: tuple[Identity, ...] = ()
     _is_interrupted: bool = False
     _has_started: bool = False
 
@@ -142,9 +148,11 @@ class Session:
         stopwatch = MonotonicClock()
         start_ns = stopwatch.now_ns()
         recoveries = 0
+        certificates: list[Certificate] = []
         try:
             while True:
                 ending = self._attempt(attempt, recorder, tap)
+                certificates += attempt.cycle.certificates
                 if ending.is_bus_failed:
                     recovery.empty()
                 if not (self._has_started and ending.is_faulted and recovery.await_acknowledgement()):
@@ -156,7 +164,17 @@ class Session:
         finally:
             log = recorder.close()
         elapsed_s = (stopwatch.now_ns() - start_ns) * 1e-9
-        return SessionSummary(ending.result, log, grant, ending.error, self._has_started, recoveries, elapsed_s)
+        return SessionSummary(
+            ending.result,
+            log,
+            grant,
+            ending.error,
+            self._has_started,
+            recoveries,
+            elapsed_s,
+            tuple(certificates),
+            self._identities,
+        )
 
     def _request_realtime(self) -> RealtimeGrant:
         if self.is_lockstep:
@@ -197,12 +215,14 @@ class Session:
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
         """Bring the devices from whatever they were in to pre-operational and configured. Raises DeviceError."""
         master.reset()
-        identities = master.identify()
+        self._identities = identities = tuple(master.identify())
         for identity in identities:
             recorder.event(self.clock.now_ns(), Event("info", identity.name, _describe(identity)))
         if self.tare is not None:
             for event in self.tare.check_sensors(identities):
                 recorder.event(self.clock.now_ns(), event)
+        if self.history is not None:
+            recorder.event(self.clock.now_ns(), self.history.check_devices(identities))
         master.configure()
         recorder.cycle(self.clock.now_ns(), [], tap.take())
 
@@ -233,6 +253,8 @@ class Session:
         attachments["config.toml"] = to_toml(self.settings).encode()
         if self.tare is not None:
             attachments[TARE_NAME] = self.tare.text
+        if self.history is not None and not self.history.is_first_run:
+            attachments[HISTORY_NAME] = self.history.text
         robot = robot_description(self.settings)
         with grant.unpinned():
             recorder = Recorder(
@@ -289,6 +311,7 @@ class Session:
             "operator": "script" if isinstance(self.operator, ScriptedOperator) else "console",
             **arithmetic(),
             **(self.tare.metadata() if self.tare is not None else {}),
+            **(self.history.metadata() if self.history is not None else {}),
             **self.metadata,
         }
 

@@ -100,13 +100,17 @@ class Tare:
 
     def measured_ns(self) -> int:
         """Return when it was measured, ns since 1970."""
-        date = datetime.strptime(self.date_utc, _DATE).replace(tzinfo=UTC)
-        return int(date.timestamp()) * 1_000_000_000
+        return date_ns(self.date_utc)
 
 
 def format_date(t_ns: int) -> str:
     """Write wall-clock time, ns since 1970, as ISO 8601 in UTC."""
     return datetime.fromtimestamp(t_ns // 1_000_000_000, tz=UTC).strftime(_DATE)
+
+
+def date_ns(date_utc: str) -> int:
+    """Read what `format_date` writes, ns since 1970. Raises ValueError."""
+    return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * 1_000_000_000
 
 
 def read_tare(path: Path) -> Tare:

@@ -6,13 +6,15 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
-from adacd_hil.scheme import anchor, certified_kernel, earlier
+from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate
 from adacd_hil.scheme.doubt import Verdict
 from adacd_hil.scheme.kernel import Structured
+from adacd_hil.scheme.last_certificate import Certificate
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
-BY_WORD = "friction and inertia: by this run and the user's word, against what the run had learnt before"
+BY_WORD = "friction and inertia: by this run and the user's word, against "
+_THE_RUN = "what the run had learnt before"
 _CHANGED = "no one model explains the whole fit: something has touched the arm or let go while it was learnt"
 _BEGINS_ANEW = "no certificate, learning begins anew"
 
@@ -25,12 +27,14 @@ class _Cause(Enum):
     ANCHOR = "anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"
     CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
     MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
+    MORE_THAN_LAST = "history", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
 
 
 _CAUSES = {
     certified_kernel.ANCHOR: _Cause.ANCHOR,
     certified_kernel.CHANGED: _Cause.CHANGED,
     certified_kernel.MORE: _Cause.MORE,
+    certified_kernel.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
 }
 
 
@@ -45,12 +49,21 @@ class _Refusal(NamedTuple):
 
 
 class CertificateWatch:
-    """Says what the kernel has found, and hands it what the user accepts."""
+    """Says what the kernel has found, and hands it what the user accepts. last_utc: the last certificate's date."""
 
-    def __init__(self, constants: Structured, memory: Structured) -> None:
+    def __init__(self, constants: Structured, memory: Structured, last_utc: str) -> None:
         self._constants, self._memory = constants[0], memory[0]
+        self._last = f"the certificate of {last_utc}"
+        self._last_utc = last_utc
         self._refusal: _Refusal | None = None
-        self._is_vouched = False
+        self._vouched_against = ""
+        self._certificates: list[Certificate] = []
+        self._is_standing = False
+
+    @property
+    def certificates(self) -> tuple[Certificate, ...]:
+        """All that were not taken back, in order."""
+        return tuple(self._certificates)
 
     @property
     def is_refusing(self) -> bool:
@@ -64,9 +77,18 @@ class CertificateWatch:
         if state is not SchemeState.MONITOR or previous is not SchemeState.CERTIFY:
             return None
         self._refusal = None
-        known_by, self._is_vouched = BY_WORD if self._is_vouched else THIS_RUN_ONLY, False
+        known_by, self._vouched_against = self._known_by(), ""
         level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
-        return Event(level, "certificate", f"{anchor.describe(self._constants, self._memory)}; {known_by}")
+        text = f"{anchor.describe(self._constants, self._memory)}; {known_by}"
+        self._is_standing = True
+        self._certificates.append(last_certificate.certificate_of(self._constants, self._memory, text))
+        return Event(level, "certificate", text)
+
+    def _known_by(self) -> str:
+        if self._vouched_against:
+            return BY_WORD + self._vouched_against
+        is_compared = self._memory["is_last_believed"] and not self._memory["is_payload"]
+        return f"friction and inertia: no more than in {self._last}" if is_compared else THIS_RUN_ONLY
 
     def refuse(self, is_reading: bool) -> Event | None:
         """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
@@ -87,8 +109,19 @@ class CertificateWatch:
 
     def doubt(self, verdict: Verdict) -> Event:
         """Say that contacts have taken the certificate back, and why."""
+        self._take_back()
         remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
         return Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}")
+
+    def revoke(self) -> Event:
+        """Take in that the user takes the certificate back."""
+        self._take_back()
+        return Event("warning", "revoked", "at the user's word the arm is learnt anew")
+
+    def _take_back(self) -> None:
+        if self._is_standing:
+            self._certificates.pop()
+        self._is_standing = False
 
     def push(self, torque_Nm: Vector) -> Event:
         """Say that the arm, stopped, is still pushed. torque_Nm (n,): external, filtered."""
@@ -99,6 +132,8 @@ class CertificateWatch:
     def _describe(self, cause: _Cause) -> list[str]:
         if cause is _Cause.MORE:
             return earlier.describe_more(self._constants, self._memory)
+        if cause is _Cause.MORE_THAN_LAST:
+            return last_certificate.describe_more(self._memory, self._last_utc)
         if cause is _Cause.CHANGED:
             return [_CHANGED]
         return anchor.describe_refused(self._memory, cause is _Cause.READING)
@@ -116,9 +151,13 @@ class CertificateWatch:
             case _Cause.ANCHOR:
                 anchor.accept(self._memory, refusal.torque_Nm, refusal.std_Nm)
                 what = f"the user accepts {torque} Nm as the zero of the sensors"
+            case _Cause.MORE_THAN_LAST:
+                last_certificate.forget(self._memory)
+                self._vouched_against = self._last
+                what = f"the user says that nobody touches the arm: {self._last} is not compared"
             case _:
                 earlier.forget(self._memory)
-                self._is_vouched = True
+                self._vouched_against = _THE_RUN
                 what = "the user says that nobody touches the arm: what was learnt before is not compared"
         return Event("warning", refusal.cause.value[0], what)
 

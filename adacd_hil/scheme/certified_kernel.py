@@ -33,6 +33,7 @@ from adacd_hil.scheme import (
     doubt,
     earlier,
     friction,
+    last_certificate,
     refinement,
     regressor,
     sensitivity,
@@ -50,7 +51,7 @@ REFINE = 16  # correct the belief, and let its mean take over after a test
 WEIGH = 32  # weigh what a contact of the certified model looks like
 
 # What contradicts a certificate that is withheld.
-NOTHING, ANCHOR, CHANGED, MORE = range(4)
+NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST = range(5)
 
 ADAPT = int(SchemeState.ADAPT)
 CERTIFY = int(SchemeState.CERTIFY)
@@ -148,6 +149,7 @@ def constants_of(settings: Settings) -> Structured:
         **anchor.constants_of(settings),
         **doubt.constants_of(settings, len(names)),
         **earlier.constants_of(settings, _by_kind(certified.prior_std, names)),
+        **last_certificate.constants_of(settings),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
         "still_rad_s": certified.still_rad_s,
@@ -246,6 +248,7 @@ def new_memory(settings: Settings) -> Structured:
         "judged_Nm": joint,
         # what was known earlier
         **earlier.shapes_of(count),
+        **last_certificate.shapes_of(),
         **doubt.shapes_of(),
         "withheld_by": (),
         "dq_old": joint,
@@ -273,7 +276,9 @@ def new_memory(settings: Settings) -> Structured:
     prior = prior_of(settings)
     belief.begin(prior, prior_std, state["belief"], state["P_belief"])
     belief.begin(prior, prior_std, state["theta"], state["P"])
-    anchor.begin(constants_of(settings)[0], state)
+    constants = constants_of(settings)[0]
+    anchor.begin(constants, state)
+    last_certificate.begin(constants, state)
     return memory
 
 
@@ -560,7 +565,9 @@ def _contradicted_by(k: Any, m: Any) -> int:
         return ANCHOR
     if not earlier.is_steady(m):
         return CHANGED
-    return NOTHING if earlier.is_no_more(k, m) else MORE
+    if not earlier.is_no_more(k, m):
+        return MORE
+    return NOTHING if last_certificate.is_no_more(k, m) else MORE_THAN_LAST
 
 
 @compiled

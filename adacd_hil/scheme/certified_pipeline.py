@@ -25,6 +25,7 @@ from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.certificate_watch import CertificateWatch
 from adacd_hil.scheme.doubt import Doubt
 from adacd_hil.scheme.intervals import Intervals
+from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_certified
 from adacd_hil.scheme.margin import MarginWatch
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
@@ -84,7 +85,7 @@ class CertifiedPipeline(RunsBatches):
         self._monitored = 0
         self._has_warned = False
         self._events: list[Event] = []
-        self._watch = CertificateWatch(self._constants, self._memory)
+        self._watch = CertificateWatch(self._constants, self._memory, settings.history.date_utc)
         self._doubt = Doubt(settings, self._constants, self._memory)
 
     def compile(self) -> None:
@@ -107,6 +108,11 @@ class CertifiedPipeline(RunsBatches):
     def describe_withheld(self) -> list[str]:
         """Say what contradicts a certificate that is withheld, a line each."""
         return self._watch.describe()
+
+    @property
+    def certificates(self) -> tuple[Certificate, ...]:
+        """The certificates of the run that were not taken back, in order."""
+        return self._watch.certificates
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
         """Take in one cycle."""
@@ -272,7 +278,7 @@ class CertifiedPipeline(RunsBatches):
         self._theta_ff = np.zeros(self._theta_ff.size)
         earlier.forget(self._memory[0])
         self._paper.begin_adaptation()
-        self._events.append(Event("warning", "revoked", "at the user's word the arm is learnt anew"))
+        self._events.append(self._watch.revoke())
 
     def _forget_if_disturbed(self, state: SchemeState) -> None:
         """Once a contact that interrupted an adaptation is reported, forget what this adaptation has learnt.

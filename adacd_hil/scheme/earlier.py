@@ -57,6 +57,8 @@ INERTIA_SHARE = 0.03
 SMALLEST_UNIT = 0.1
 """Least unit of the variances; the rest of it as `sensitivity` has it."""
 _INERTIAS = ("a1", "a2", "a3")
+FRICTIONS, INERTIAS = JOINTS * len(SPEEDS_RAD_S), len(_INERTIAS)
+"""How many quantities are a joint's friction at some speed, and how many an inertia."""
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
@@ -80,7 +82,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
 
 def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name, of a model with this many parameters."""
-    quantities = (JOINTS * len(SPEEDS_RAD_S) + len(_INERTIAS) + JOINTS,)
+    quantities = (FRICTIONS + INERTIAS + JOINTS,)
     return {
         "fit_square": (),
         "fit_rows": (),
@@ -144,13 +146,13 @@ def keep_refuted(m: Any) -> None:
     Not with a new payload: hands have been on the arm, and friction may depend on the load.
     """
     if m["has_kept"] == 0.0 and m["is_payload"] == 0.0:
-        _keep(m, m["theta"], m["P"], _unit(m["fit_square"], m["fit_rows"]))
+        _keep(m, m["theta"], m["P"], unit_of(m["fit_square"], m["fit_rows"]))
 
 
 @compiled
 def _keep_step(m: Any, s: int) -> None:
     if m["has_kept"] == 0.0:
-        _keep(m, m["steps_theta"][s], m["steps_P"][s], _unit(m["steps_square"][s], m["steps_rows"][s]))
+        _keep(m, m["steps_theta"][s], m["steps_P"][s], unit_of(m["steps_square"][s], m["steps_rows"][s]))
 
 
 @compiled
@@ -163,7 +165,8 @@ def _keep(m: Any, theta: Vector, P: Vector, unit: float) -> None:
 
 
 @compiled
-def _unit(square: float, rows: float) -> float:
+def unit_of(square: float, rows: float) -> float:
+    """Return u of residuals whose squares, over their variances, have this sum."""
     return min(max(UNIT_PEAK * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
 
 
@@ -230,7 +233,7 @@ def is_no_more(k: Any, m: Any) -> bool:
         return True
     joints = m["bound_Nm"].shape[1]
     first_offset = m["change"].shape[0] - joints
-    unit = _unit(m["fit_square"], m["fit_rows"])
+    unit = unit_of(m["fit_square"], m["fit_rows"])
     is_agreed = True
     for q in range(m["change"].shape[0]):
         row, prior = k["compared"][q], k["compared_prior"][q]
@@ -239,8 +242,8 @@ def is_no_more(k: Any, m: Any) -> bool:
             if row[j] != 0.0:
                 before += row[j] * m["kept"][j]
                 now += row[j] * m["belief"][j]
-        known = _split(_variance(row, m["P_kept"]), prior, m["kept_unit"])
-        fitted = _split(_variance(row, m["P_belief"]), prior, unit)
+        known = split(variance_of(row, m["P_kept"]), prior, m["kept_unit"])
+        fitted = split(variance_of(row, m["P_belief"]), prior, unit)
         floor = max(k["compared_floor"][q], k["compared_share"][q] * abs(before))
         m["change"][q] = now - before
         m["change_limit"][q] = max(floor, SIGMAS * np.sqrt(known + fitted))
@@ -255,7 +258,7 @@ def is_no_more(k: Any, m: Any) -> bool:
 
 
 @compiled
-def _variance(row: Vector, P: Vector) -> float:
+def variance_of(row: Vector, P: Vector) -> float:
     """Return c P c'. row (p,), P (p, p)."""
     total = 0.0
     for j in range(row.shape[0]):
@@ -266,7 +269,7 @@ def _variance(row: Vector, P: Vector) -> float:
 
 
 @compiled
-def _split(variance: float, prior: float, unit: float) -> float:
+def split(variance: float, prior: float, unit: float) -> float:
     """Return a variance of which `unit` scales what the samples say, and not what the prior does."""
     return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
 
@@ -276,21 +279,26 @@ def describe_more(k: Any, m: Any) -> list[str]:
 
     Of a joint's friction only the speed at which it stands out most.
     """
-    speeds, quantities = len(SPEEDS_RAD_S), m["change"].size
     excess = m["change"] / m["change_limit"]
     excess[-JOINTS:] = [abs(excess[i - JOINTS]) if anchor.is_open(k, m, i) else 0.0 for i in range(JOINTS)]
-    lines = []
+    return [_more(m, q, what, unit) for q, what, unit in foremost(excess)]
+
+
+def foremost(excess: Vector) -> list[tuple[int, str, str]]:
+    """Return place, name and unit of each quantity whose excess is over 1; of a joint's friction only the largest.
+
+    excess: (q,), or without the offsets.
+    """
+    speeds = len(SPEEDS_RAD_S)
+    found = []
     for i in range(JOINTS):
         q = speeds * i + int(np.argmax(excess[speeds * i : speeds * (i + 1)]))
-        if excess[q] > 1.0:
-            lines.append(_more(m, q, f"friction of joint {i + 1} at {SPEEDS_RAD_S[q - speeds * i]:g} rad/s", "Nm"))
-    for q, name in enumerate(_INERTIAS, speeds * JOINTS):
-        if excess[q] > 1.0:
-            lines.append(_more(m, q, name, "kg m²"))
-    for i, q in enumerate(range(quantities - JOINTS, quantities)):
-        if excess[q] > 1.0:
-            lines.append(_more(m, q, f"torque offset of joint {i + 1}", "Nm"))
-    return lines
+        found.append((q, f"friction of joint {i + 1} at {SPEEDS_RAD_S[q - speeds * i]:g} rad/s", "Nm"))
+    found += [(q, name, "kg m²") for q, name in enumerate(_INERTIAS, FRICTIONS)]
+    found += [
+        (q, f"torque offset of joint {i + 1}", "Nm") for i, q in enumerate(range(FRICTIONS + INERTIAS, excess.size))
+    ]
+    return [(q, what, unit) for q, what, unit in found if excess[q] > 1.0]
 
 
 def _more(m: Any, q: int, what: str, unit: str) -> str:

@@ -26,6 +26,7 @@ from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.contact import Isolation
 from adacd_hil.scheme.intervals import Intervals
+from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_paper
 from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.regressor import inverse_dynamics, is_positive_definite
@@ -79,6 +80,11 @@ class Pipeline(RunsBatches):
     def describe_withheld(self) -> list[str]:
         """Say what contradicts a certificate that is withheld: the paper has no certificate."""
         return []
+
+    @property
+    def certificates(self) -> tuple[Certificate, ...]:
+        """The certificates of the run: the paper has none."""
+        return ()
 
     def take_events(self) -> list[Event]:
         """Return what is worth a line since the last call: nothing, the paper watches no margin."""

@@ -129,7 +129,7 @@ def test_the_word_of_the_user_that_nobody_touches_the_arm_ends_the_comparison():
     loop.request = Request.ACCEPT
     loop.recover()
     assert "the user says that nobody touches the arm" in loop.said("touch")[-1]
-    assert loop.said("certificate")[0].endswith(f"; {BY_WORD}")
+    assert loop.said("certificate")[0].endswith(f"; {BY_WORD}what the run had learnt before")
     assert loop.error_of("F_c1") < 0.02
 
 

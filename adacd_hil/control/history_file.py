@@ -1,0 +1,204 @@
+"""An arm's history: what each run has certified, as TOML, and the checks before a run uses the last certificate.
+
+A history belongs to the devices of one arm, by their serial numbers of 0x1018:4. Every certificate carries a digest of
+itself and of the one before, so that a file that was damaged, shortened in the middle or edited by hand is refused. It
+is no signature: who can write the file can compute digests, too.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from adacd_hil.config import ConfigError, HistorySettings, Settings, parse, parse_toml, setting, to_toml
+from adacd_hil.control.tare_file import date_ns
+from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.device.network import Identity
+from adacd_hil.input_files import read_input
+from adacd_hil.output_files import replacing
+from adacd_hil.records import Event
+from adacd_hil.scheme.last_certificate import Certificate
+
+HISTORY_NAME = "history.toml"
+FORMAT = 1
+_FUTURE_NS = 360_000_000_000
+"""How far ahead of this machine's clock a certificate may be dated."""
+
+
+@dataclass(frozen=True)
+class DeviceRecord:
+    """One device: object 0x1018."""
+
+    name: str = setting(meaning="name in the DBC")
+    node_id: int = setting(low=1, high=127, meaning="CANopen node id")
+    vendor: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:1")
+    product: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:2")
+    serial: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:4")
+
+
+@dataclass(frozen=True)
+class CertificateRecord:
+    """What one run has certified, see `Certificate`."""
+
+    date_utc: str = setting(meaning="when the run ended, ISO 8601, UTC")
+    log: str = setting(meaning="the run's log")
+    profile: str = setting(meaning="arm profile of the configuration")
+    version: str = setting(meaning="of adacd-hil")
+    parameters: tuple[float, ...] = setting(meaning="a1 … F_c2, and those of gravity")
+    friction_Nm: tuple[float, ...] = setting(unit="Nm", meaning="of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2")
+    friction_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, meaning="their deviations")
+    inertia_kgm2: tuple[float, ...] = setting(unit="kg m²", meaning="a1, a2, a3")
+    inertia_std_kgm2: tuple[float, ...] = setting(unit="kg m²", low=0.0, meaning="their deviations")
+    offset_Nm: tuple[float, ...] = setting(unit="Nm", meaning="of the torque sensors, beside the configuration's")
+    offset_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, meaning="their deviations")
+    is_payload: bool = setting(meaning="with a payload that was announced in the run")
+    text: str = setting(meaning="what anchors it, and what friction and inertia are known by")
+    digest: str = setting("", meaning="SHA-256 of the digest before and of all above")
+
+    def __post_init__(self) -> None:
+        self.known(HistorySettings())
+
+    def known(self, settings: HistorySettings) -> HistorySettings:
+        """Return settings whose last certificate is this one. Raises ValueError where values are missing."""
+        return dataclasses.replace(
+            settings,
+            date_utc=self.date_utc,
+            friction_Nm=self.friction_Nm,
+            friction_std_Nm=self.friction_std_Nm,
+            inertia_kgm2=self.inertia_kgm2,
+            inertia_std_kgm2=self.inertia_std_kgm2,
+        )
+
+    def digest_after(self, before: str) -> str:
+        """Return the digest that this record must have after another's."""
+        return hashlib.sha256((before + to_toml(dataclasses.replace(self, digest=""))).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class History:
+    """The certificates of one arm, the oldest first."""
+
+    format: int = setting(low=FORMAT, high=FORMAT, meaning="version of this file's layout")
+    devices: tuple[DeviceRecord, ...] = setting(meaning="drives and sensors of the arm")
+    certificates: tuple[CertificateRecord, ...] = setting(meaning="what runs have certified")
+
+    def __post_init__(self) -> None:
+        if not self.certificates:
+            raise ValueError("a history without certificates")
+        before = ""
+        for number, certificate in enumerate(self.certificates, start=1):
+            try:
+                date_ns(certificate.date_utc)
+            except ValueError:
+                raise ValueError(f"certificate {number}: date_utc is not like 2026-01-31T12:00:00Z") from None
+            if certificate.digest != certificate.digest_after(before):
+                raise ValueError(f"certificate {number} is not as it was written: its digest is another")
+            before = certificate.digest
+
+    @property
+    def last(self) -> CertificateRecord:
+        """The newest certificate."""
+        return self.certificates[-1]
+
+
+def read_history(path: Path) -> History:
+    """Read an arm's history. Raises ConfigError."""
+    if not path.exists():
+        raise ConfigError(f"history {path} does not exist; `adacd-hil run --history` makes one")
+    return _parse(path, read_input(path))
+
+
+def _parse(path: Path, text: bytes) -> History:
+    try:
+        return parse(History, parse_toml(text))
+    except ConfigError as error:
+        raise ConfigError(f"history {path}: {error}") from None
+
+
+@dataclass(frozen=True)
+class UsedHistory:
+    """The history that a run uses and adds to. `text`: the file as it was; `history` None: there was none yet."""
+
+    path: Path
+    text: bytes
+    history: History | None
+
+    @property
+    def is_first_run(self) -> bool:
+        """Whether nothing is known of the arm."""
+        return self.history is None
+
+    def apply(self, settings: Settings) -> Settings:
+        """Return settings whose `history` is the last certificate."""
+        if self.history is None:
+            return settings
+        return dataclasses.replace(settings, history=self.history.last.known(settings.history))
+
+    def check_devices(self, identities: Sequence[Identity]) -> Event:
+        """Return what goes to the log's events. Raises DeviceError unless the devices are those of the history."""
+        if self.history is None:
+            return Event("warning", "history", f"{self.path}: the arm's first run, nothing is known of its friction")
+        known = {record.name: record for record in self.history.devices}
+        for identity in identities:
+            record = known.get(identity.name)
+            if record is None:
+                raise DeviceError(f"{identity.name} (node {identity.node_id}) is no device of history {self.path}")
+            for what in ("vendor", "product", "serial"):
+                if getattr(record, what) != getattr(identity, what):
+                    raise DeviceError(
+                        f"{identity.name} (node {identity.node_id}): {what} {getattr(identity, what)} is not the "
+                        f"{getattr(record, what)} of history {self.path}: it is another arm's"
+                    )
+        return Event("info", "history", f"{self.path}: {self._count()}, the last of {self.history.last.date_utc}")
+
+    def _count(self) -> str:
+        count = 0 if self.history is None else len(self.history.certificates)
+        return f"{count} certificate{'' if count == 1 else 's'}"
+
+    def metadata(self) -> dict[str, str]:
+        """Describe the history for the log's metadata."""
+        return {"history": str(self.path), "history_certificates": self._count()}
+
+    def add(self, certificates: Sequence[Certificate], identities: Sequence[Identity], origin: "Origin") -> str:
+        """Write the history with more certificates, in one step; say so. Raises OSError, ConfigError.
+
+        Those of another run that came in between are kept.
+        """
+        now = _parse(self.path, read_input(self.path)) if self.path.exists() else None
+        records = [] if now is None else list(now.certificates)
+        for certificate in certificates:
+            record = CertificateRecord(**origin._asdict(), **certificate._asdict())
+            before = records[-1].digest if records else ""
+            records.append(dataclasses.replace(record, digest=record.digest_after(before)))
+        devices = now.devices if now is not None else tuple(_record(identity) for identity in identities)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(self.path, is_durable=True) as new:
+            new.write_text(to_toml(History(FORMAT, devices, tuple(records))), encoding="utf-8")
+        return f"{self.path}: {len(certificates)} more, {len(records)} in all"
+
+
+class Origin(NamedTuple):
+    """Where certificates come from: see `CertificateRecord`."""
+
+    date_utc: str
+    log: str
+    profile: str
+    version: str
+
+
+def _record(identity: Identity) -> DeviceRecord:
+    return DeviceRecord(identity.name, identity.node_id, identity.vendor, identity.product, identity.serial)
+
+
+def use_history(path: Path, now_ns: int) -> UsedHistory:
+    """Read the arm's history for a run; none yet is a first run. Raises ConfigError when it can't be used."""
+    if not path.exists():
+        return UsedHistory(path, b"", None)
+    text = read_input(path)
+    history = _parse(path, text)
+    ahead_ns = date_ns(history.last.date_utc) - now_ns
+    if ahead_ns > _FUTURE_NS:
+        raise ConfigError(f"history {path}: its last certificate is {ahead_ns / 3.6e12:.1f} h ahead of this clock")
+    return UsedHistory(path, text, history)

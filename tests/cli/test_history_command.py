@@ -1,0 +1,156 @@
+"""`adacd-hil run --history` and `adacd-hil history`: the commands on the embedded bus."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from test_tare_command import BUS_MISSING, FAILURE, USAGE, Lab, complaints
+
+from adacd_hil.cli.main import cli
+from adacd_hil.cli.run import ask_first_run
+from adacd_hil.config import ConfigError, parse_toml
+from adacd_hil.control.history_file import FORMAT, History, UsedHistory, read_history, use_history
+
+pytestmark = pytest.mark.slow
+
+CERTIFIED = 'extends = "certified"\n[operator]\nscript = [{at_s = 3.5, request = "finish"}]\n'
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
+    lab = Lab(tmp_path, monkeypatch)
+    lab.scenario["torque_offset_Nm"] = [0.0, 0.0]
+    lab.settings_file.write_text(CERTIFIED)
+    return lab
+
+
+@pytest.fixture
+def file(lab: Lab) -> Path:
+    """The history that a first run has left."""
+    path = lab.folder / "arm.toml"
+    result = lab.run("--history", str(path))
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["history"] == f"{path}: 1 more, 1 in all"
+    (lab.folder / "run.mcap").rename(lab.folder / "first.mcap")
+    return path
+
+
+def test_a_run_adds_its_certificate_and_the_next_one_is_compared_with_it(lab: Lab, file: Path) -> None:
+    first = read_history(file).last
+    assert first.text.endswith("by this run only")
+    result = lab.run("--history", str(file))
+    assert result.exit_code == 0, result.stderr
+    one, two = read_history(file).certificates
+    assert one == first
+    assert two.text.endswith(f"no more than in the certificate of {first.date_utc}")
+    log = lab.log
+    assert log.metadata["history_certificates"] == "1 certificate"
+    assert log.attachments["history.toml"] != file.read_bytes()
+    assert parse_toml(log.attachments["config.toml"])["history"]["friction_Nm"] == list(first.friction_Nm)
+    replayed = CliRunner().invoke(cli, ["replay", str(lab.folder / "run.mcap")])
+    assert "identical, bit for bit" in replayed.stdout + replayed.stderr
+
+
+def test_devices_with_other_serial_numbers_are_another_arms(lab: Lab, file: Path) -> None:
+    before = file.read_bytes()
+    lab.serials[1] = 4711
+    result = lab.run("--history", str(file))
+    assert result.exit_code == BUS_MISSING
+    (line,) = complaints(result)
+    assert "serial 4711 is not the" in line
+    assert line.endswith(f"of history {file}: it is another arm's")
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("friction_Nm = [", "friction_Nm = [0.5, ", "is not as it was written"),
+        ("is_payload = false", "is_payload = true", "certificate 1 is not as it was written: its digest is another"),
+        ("certificates = [", "certificate = [", "did you mean `certificates`?"),
+        ("format = 1", "format = 2", "`format` = 2 is above 1"),
+        ('date_utc = "', 'date_utc = "x', ": certificate 1: date_utc is not like 2026-01-31T12:00:00Z"),
+    ],
+)
+def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(
+    lab: Lab, file: Path, old: str, new: str, says: str
+) -> None:
+    file.write_text(file.read_text().replace(old, new, 1))
+    for result in (lab.run("--history", str(file)), CliRunner().invoke(cli, ["history", str(file)])):
+        assert result.exit_code == USAGE
+        (line,) = complaints(result)
+        assert says in line
+
+
+def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(file: Path) -> None:
+    found = read_history(file)
+    second = replace(found.last, date_utc="2030-01-01T00:00:00Z")
+    second = replace(second, digest=second.digest_after(found.last.digest))
+    assert len(History(FORMAT, found.devices, (found.last, second)).certificates) == 2
+    for certificates in ((second,), (second, found.last), (found.last, found.last)):
+        with pytest.raises(ValueError, match="is not as it was written"):
+            History(FORMAT, found.devices, certificates)
+
+
+def test_a_certificate_that_lacks_values_is_refused_though_its_digest_is_right(file: Path) -> None:
+    last = read_history(file).last
+    with pytest.raises(ValueError, match="friction_Nm has 5 values, 6 expected"):
+        replace(last, friction_Nm=last.friction_Nm[1:])
+    with pytest.raises(ValueError, match="inertia_kgm2 has 3 values, 0 expected"):
+        replace(last, date_utc="", friction_Nm=(), friction_std_Nm=())
+
+
+def test_a_certificate_of_the_future_is_refused(file: Path) -> None:
+    with pytest.raises(ConfigError, match="h ahead of this clock"):
+        use_history(file, 1_000_000_000)
+
+
+def test_it_is_listed_printed_and_drawn(lab: Lab, file: Path) -> None:
+    picture = lab.folder / "history.png"
+    listed = CliRunner().invoke(cli, ["history", str(file), "--plot", str(picture)])
+    assert listed.exit_code == 0
+    last = read_history(file).last
+    assert last.date_utc in listed.stdout
+    assert f"{last.friction_Nm[1]:.3f}" in listed.stdout
+    assert "Sensor1" in listed.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    printed = json.loads(CliRunner().invoke(cli, ["history", str(file), "--json"]).stdout)
+    assert printed == json.loads(json.dumps(asdict(read_history(file))))
+
+
+def test_a_run_without_a_certificate_adds_nothing(lab: Lab) -> None:
+    lab.settings_file.write_text(CERTIFIED.replace("3.5", "0.5"))
+    path = lab.folder / "arm.toml"
+    result = lab.run("--history", str(path))
+    assert "history" not in json.loads(result.stdout)
+    assert not path.exists()
+    assert CliRunner().invoke(cli, ["history", str(path)]).exit_code == USAGE
+
+
+def test_a_history_that_cannot_be_written_is_partial_and_says_so(lab: Lab) -> None:
+    blocker = lab.folder / "blocker"
+    blocker.write_text("no folder")
+    result = lab.run("--history", str(blocker / "arm.toml"))
+    assert result.exit_code == 3
+    (line,) = complaints(result)
+    assert line.startswith("adacd-hil: the certificate is not in the history:")
+
+
+@pytest.mark.parametrize(("answer", "is_started"), [("y\n", True), ("n\n", False), ("\n", False)])
+def test_before_a_first_run_the_user_says_that_nobody_touches_the_arm(
+    monkeypatch: pytest.MonkeyPatch, answer: str, is_started: bool
+) -> None:
+    import click
+
+    @click.command()
+    def command() -> None:
+        monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+        ask_first_run(UsedHistory(Path("arm.toml"), b"", None))
+        print("started")
+
+    result = CliRunner().invoke(command, input=answer)
+    assert ("started" in result.stdout) is is_started
+    assert "this is the arm's first run" in result.stderr
+    assert FAILURE == 1
