@@ -67,7 +67,7 @@ def test_devices_with_other_serial_numbers_are_another_arms(lab: Lab, file: Path
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("friction_Nm = [", "friction_Nm = [0.5, ", "is not as it was written"),
+        ("friction_Nm = [0.", "friction_Nm = [1.", "is not as it was written"),
         ("is_payload = false", "is_payload = true", "certificate 1 is not as it was written: its digest is another"),
         ("certificates = [", "certificate = [", "did you mean `certificates`?"),
         ("format = 1", "format = 2", "`format` = 2 is above 1"),
