@@ -25,7 +25,7 @@ def test_the_page_has_a_line_for_every_row() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "clock"), long_but(5, covering()), ids=lambda value: getattr(value, "name", value))
+@pytest.mark.parametrize(("case", "clock"), long_but(4, covering()), ids=lambda value: getattr(value, "name", value))
 def test_the_host_makes_of_a_fault_what_its_row_says(tmp_path: Path, case: Case, clock: str) -> None:
     assert deviations(play(case, clock, tmp_path), getattr(case, clock), case.wire) == []
 

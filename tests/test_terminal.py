@@ -132,7 +132,7 @@ def test_an_output_that_blocks_ends_with_ctrl_c(command: list[str], is_both: boo
 @pytest.mark.parametrize(
     "command",
     long_but(
-        2, [*LONG, *([BIN / name, *words] for name in ("adacd-hil", "firmware-sim") for words in (("--help",), ("x",)))]
+        1, [*LONG, *([BIN / name, *words] for name in ("adacd-hil", "firmware-sim") for words in (("--help",), ("x",)))]
     ),
     ids=lambda command: " ".join(map(str, command[1:])),
 )

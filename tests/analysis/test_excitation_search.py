@@ -55,6 +55,7 @@ def test_the_motion_is_the_one_that_the_arm_makes() -> None:
             np.testing.assert_allclose(ours[n], theirs, atol=1e-12)
 
 
+@pytest.mark.long
 def test_what_a_motion_shows_is_what_the_scheme_counts() -> None:
     """Information from the equation of motion, filtered in continuous time, and the derivative by differences."""
     settings = load_settings("certified")

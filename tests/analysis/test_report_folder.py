@@ -33,6 +33,7 @@ def report(*given: object):
     return CliRunner().invoke(cli, ["report", *map(str, given)])
 
 
+@pytest.mark.long
 def test_every_run_of_a_folder_is_reported_and_one_that_cannot_be_keeps_none_back(folder: Path, tmp_path: Path) -> None:
     found = report(folder, "--out", tmp_path)
     assert found.exit_code == 3

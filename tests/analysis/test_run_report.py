@@ -288,6 +288,7 @@ def test_the_policy_allows_the_pages_own_styles_and_scripts_and_nothing_else(htm
     assert policy_of(html) == f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
 
 
+@pytest.mark.long
 def test_a_page_without_traces_allows_no_script(tmp_path):
     run = make_run((A, 1))
     html = write_run_report(run, tmp_path, Source("run.mcap")).html_path.read_text(encoding="utf-8")
@@ -360,11 +361,13 @@ def test_a_run_without_a_reaction_has_dashes_for_its_latency():
     assert row_of(tables_of(make_run()), "Reaction") == ["–"] * 4
 
 
+@pytest.mark.long
 def test_the_page_says_what_the_log_lacks(tmp_path):
     report = write_run_report(make_run((A, 10)), tmp_path, Source("run.mcap", "cut after 12 s"))
     assert "The log is not whole: cut after 12 s" in report.html_path.read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_the_page_says_how_many_packets_were_dropped(tmp_path):
     report = write_run_report(replace(make_run((A, 10)), dropped=3), tmp_path, Source("run.mcap"))
     assert "3 packets are not in the log" in report.html_path.read_text(encoding="utf-8")

@@ -57,6 +57,7 @@ def files(authority: Authority, who: str, **changes: timedelta) -> list[object]:
     return ["--tls-ca-file", authority.ca_file, "--tls-cert", certificate, "--tls-key", key]
 
 
+@pytest.mark.long
 def test_a_small_sweep_over_tls(tmp_path: Path, log: Path, cluster, authority: Authority) -> None:
     played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(authority, "engineer"))
     assert (played.returncode, "is open" in played.stderr) == (0, False)

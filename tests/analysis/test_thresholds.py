@@ -181,6 +181,7 @@ def test_where_a_log_is_cut_into_pieces_does_not_matter():
     assert len(one.peaks) == 551
 
 
+@pytest.mark.long
 @compiled_only
 def test_of_long_motion_some_windows_tell_the_lag_and_all_of_it_the_peaks(monkeypatch):
     log = log_of(120.0, contact_joints=between(30_000, 70_000, 1))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from experiment_runs import PAPER, adacd_hil, demo, emulator, other_contract, run_on_vcan, run_while_killing
+from long_cases import long_but
 
 from adacd_hil.log.reader import read_log
 from adacd_hil.wire.codec import contract_folder
@@ -22,17 +23,20 @@ def settings_file(folder: Path, text: str) -> str:
 
 @pytest.mark.parametrize(
     ("text", "line"),
-    [
-        ("[filtr]\na_rad_s = 10.0\n", "unknown key `filtr`; did you mean `filter`?"),
-        ("[filter]\na_rads = 10.0\n", "unknown key `filter.a_rads`; did you mean `filter.a_rad_s`?"),
-        ("[filter]\na_rad_s = -1.0\n", "`filter.a_rad_s` = -1.0 rad/s is below 0.1 rad/s"),
-        ("[filter]\na_rad_s = nan\n", "`filter.a_rad_s` = nan is not finite"),
-        ('[filter]\na_rad_s = "ten"\n', "`filter.a_rad_s` = 'ten' must be of type float"),
-        ("[detector]\nthreshold_Nm = [0.1]\n", "`detector.threshold_Nm` has 1 values, 2 expected"),
-        ('[estimator]\nlaw = "least_square"\n', "did you mean 'least_squares'?"),
-        ("[filter\n", "settings.toml"),
-        ('extends = "papper"\n', "did you mean 'paper'?"),
-    ],
+    long_but(
+        3,
+        [
+            ("[filtr]\na_rad_s = 10.0\n", "unknown key `filtr`; did you mean `filter`?"),
+            ("[filter]\na_rads = 10.0\n", "unknown key `filter.a_rads`; did you mean `filter.a_rad_s`?"),
+            ("[filter]\na_rad_s = -1.0\n", "`filter.a_rad_s` = -1.0 rad/s is below 0.1 rad/s"),
+            ("[filter]\na_rad_s = nan\n", "`filter.a_rad_s` = nan is not finite"),
+            ('[filter]\na_rad_s = "ten"\n', "`filter.a_rad_s` = 'ten' must be of type float"),
+            ("[detector]\nthreshold_Nm = [0.1]\n", "`detector.threshold_Nm` has 1 values, 2 expected"),
+            ('[estimator]\nlaw = "least_square"\n', "did you mean 'least_squares'?"),
+            ("[filter\n", "settings.toml"),
+            ('extends = "papper"\n', "did you mean 'paper'?"),
+        ],
+    ),
 )
 def test_a_setting_that_cant_be_used_is_named_with_its_bound(tmp_path: Path, text: str, line: str) -> None:
     played = demo(tmp_path, "--config", settings_file(tmp_path, text))
@@ -43,17 +47,20 @@ def test_a_setting_that_cant_be_used_is_named_with_its_bound(tmp_path: Path, tex
 
 @pytest.mark.parametrize(
     ("arguments", "status", "line"),
-    [
-        (("demo", "--config", "papper"), USAGE, "did you mean 'paper'?"),
-        (("demo", "--scenario", "papr"), USAGE, "did you mean 'paper'?"),
-        (("demo", "--scenario", "nowhere.toml"), USAGE, "nowhere.toml does not exist"),
-        (("demo", "--config", "none.toml"), USAGE, "configuration none.toml does not exist"),
-        (("run", "-i", "sockecan", "-c", "x"), BUS_MISSING, "did you mean 'socketcan'?"),
-        (("run", "-i", "socketcan", "-c", "can77"), BUS_MISSING, "can77"),
-        (("run", "-i", "virtual", "-c", "x", "--dbc", "none.dbc"), USAGE, "none.dbc: No such file"),
-        (("run", "-i", "slcan", "-c", "ttyX", "--clock", "lockstep"), USAGE, "lockstep is for emulated arms"),
-        (("report", "none.mcap"), FAILURE, "none.mcap"),
-    ],
+    long_but(
+        4,
+        [
+            (("demo", "--config", "papper"), USAGE, "did you mean 'paper'?"),
+            (("demo", "--scenario", "papr"), USAGE, "did you mean 'paper'?"),
+            (("demo", "--scenario", "nowhere.toml"), USAGE, "nowhere.toml does not exist"),
+            (("demo", "--config", "none.toml"), USAGE, "configuration none.toml does not exist"),
+            (("run", "-i", "sockecan", "-c", "x"), BUS_MISSING, "did you mean 'socketcan'?"),
+            (("run", "-i", "socketcan", "-c", "can77"), BUS_MISSING, "can77"),
+            (("run", "-i", "virtual", "-c", "x", "--dbc", "none.dbc"), USAGE, "none.dbc: No such file"),
+            (("run", "-i", "slcan", "-c", "ttyX", "--clock", "lockstep"), USAGE, "lockstep is for emulated arms"),
+            (("report", "none.mcap"), FAILURE, "none.mcap"),
+        ],
+    ),
 )
 def test_a_wrong_argument_is_one_line(tmp_path: Path, arguments: tuple[str, ...], status: int, line: str) -> None:
     played = adacd_hil(tmp_path, *arguments)

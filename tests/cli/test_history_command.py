@@ -26,14 +26,25 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
     return lab
 
 
-@pytest.fixture
-def file(lab: Lab) -> Path:
-    """The history that a first run has left."""
-    path = lab.folder / "arm.toml"
-    result = lab.run("--history", str(path))
+@pytest.fixture(scope="module")
+def first_history(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """What a first run leaves."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        lab = Lab(tmp_path_factory.mktemp("first"), monkeypatch)
+        lab.scenario["torque_offset_Nm"] = [0.0, 0.0]
+        lab.settings_file.write_text(CERTIFIED)
+        path = lab.folder / "arm.toml"
+        result = lab.run("--history", str(path))
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["history"] == f"{path}: 1 more, 1 in all"
-    (lab.folder / "run.mcap").rename(lab.folder / "first.mcap")
+    return path.read_text()
+
+
+@pytest.fixture
+def file(lab: Lab, first_history: str) -> Path:
+    """The history that a first run has left."""
+    path = lab.folder / "arm.toml"
+    path.write_text(first_history)
     return path
 
 

@@ -70,6 +70,7 @@ def test_after_a_recovery_there_is_no_torque_until_the_drives_are_enabled_again(
     assert np.count_nonzero(command["target_torque"][is_quiet]) == 0
 
 
+@pytest.mark.long
 def test_the_arm_is_enabled_where_it_is_with_zero_torque_first(tmp_path: Path) -> None:
     _, log = faulting_rig(tmp_path, acknowledge_faults=1).run()
     state = log.scheme["state"]

@@ -82,7 +82,7 @@ DELAYS_US = range(50, 1501, 50)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", USUAL_NS)
+@pytest.mark.parametrize("name", long_but(2, USUAL_NS))
 @pytest.mark.parametrize("config", long_but(1, ["paper", "stock"]))
 def test_a_sample_is_of_one_sync_and_its_age_is_true_however_late_a_frame_is(config: str, name: str) -> None:
     for delay_us in DELAYS_US:

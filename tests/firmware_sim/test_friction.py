@@ -44,6 +44,7 @@ def test_friction_at_steady_speed_lies_on_the_stribeck_curve(model, velocity_rad
     assert moved.observe()["friction"][0] == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_a_joint_breaks_away_at_its_static_friction_and_not_before(way):
     arm, _ = one_joint(COULOMB_NM)

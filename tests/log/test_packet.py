@@ -77,6 +77,7 @@ def test_an_event_comes_out_as_it_went_in(t_ns, dropped, event):
     assert contents(unpacked(pack_event(t_ns, dropped, event))) == [(t_ns, dropped, event)]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @given(st.lists(st.one_of(CYCLES, st.tuples(TIMES, COUNTS, EVENTS)), max_size=8))
 def test_many_packets_come_out_in_order(packets):
