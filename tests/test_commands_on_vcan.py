@@ -133,6 +133,7 @@ def test_commtest_with_enabled_drives_commands_no_torque(arm: Path, tmp_path: Pa
     assert commands[-1][CONTROLWORD] == b"\x00\x00"
 
 
+@pytest.mark.long
 def test_commtest_names_the_node_that_is_missing(tmp_path: Path) -> None:
     tested = adacd_hil(tmp_path, "commtest", "-i", "socketcan", "-c", "vcan1")
     assert (tested.status, tested.stdout) == (5, "")
@@ -153,6 +154,7 @@ def test_doctor_passes_the_arm_and_leaves_it_pre_operational(arm: Path, tmp_path
     assert {data[CONTROLWORD] for can_id, data in frames if can_id in (0x201, 0x202)} == {b"\x00\x00"}
 
 
+@pytest.mark.long
 def test_doctor_stops_when_another_master_is_present(arm: Path, tmp_path: Path) -> None:
     source = "while True: send(0x080, b'\\1'); send(0x77F, b'\\5'); time.sleep(0.01)"
     with other_program(source), listening() as frames:

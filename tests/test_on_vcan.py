@@ -80,6 +80,7 @@ def witness(lockstep: Played) -> Witness:
     return Witness(lockstep.folder / "candump.log")
 
 
+@pytest.mark.long
 def test_candump_sees_the_frames_and_cantools_decodes_every_one(witness: Witness) -> None:
     done = subprocess.run(
         [BIN / "python", "-m", "cantools", "decode", "--single-line", str(contract_folder() / "arm.dbc")],

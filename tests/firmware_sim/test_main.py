@@ -296,6 +296,7 @@ def test_a_signal_before_a_host_ends_it_with_exit_code_0_and_leaves_nothing(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.wallclock
 @pytest.mark.vcan
