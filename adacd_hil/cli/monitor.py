@@ -62,6 +62,7 @@ class Monitor:
         self._link_name = connection.channel if connection.interface == "socketcan" else None
         self._carried = self._count_carried()
         self._view = BusView(codec, *read_bitrates(codec), clock.now_ns())
+        self._dropped = bus.frames_lost
         self._state = ""
         self._state_ns = -round(_LINK_S * 1e9)
         self.is_stopped = False
@@ -73,15 +74,20 @@ class Monitor:
     def listen(self, duration_s: float) -> None:
         """Take in what comes for a while. Raises BusError."""
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
-        accept: Callable[[Frame], None] = self._view.accept
         while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
-            accept(frame)
+            self._accept(frame)
             while (waiting := self._bus.receive(0.0)) is not None:  # a batch, looking at the clock every so often
-                accept(waiting)
+                self._accept(waiting)
                 if self._view.frames % 256 == 0:
                     break
             if self.is_stopped:
                 return
+
+    def _accept(self, frame: Frame) -> None:
+        if self._bus.frames_lost != self._dropped:
+            self._dropped = self._bus.frames_lost
+            self._view.skip_loss()
+        self._view.accept(frame)
 
     def describe(self) -> dict[str, Any]:
         """Put what has been seen into plain values."""

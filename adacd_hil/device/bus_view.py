@@ -126,6 +126,12 @@ class BusView:
             entry = self._entries[frame.can_id] = _Entry(self._codec.by_id.get(frame.can_id))
         entry.accept(frame)
 
+    def skip_loss(self) -> None:
+        """Note that this computer has lost frames: counters that jump now are no device's fault."""
+        for entry in self._entries.values():
+            if entry.receiver is not None:
+                entry.receiver.restart()
+
     def snapshot(self, t_ns: int, node_id: int | None = None) -> Snapshot:
         """Sum up at `t_ns`; with `node_id`, only that node's part of it."""
         mark_ns, counts = self._marks[0]

@@ -83,13 +83,17 @@ _poll.argtypes = (ctypes.c_void_p, ctypes.c_ulong, ctypes.c_void_p, ctypes.c_voi
 
 
 class FrameReceiver:
-    """Takes what waits in a CAN socket. `frames_lost`: dropped by the kernel for want of room, as of the last frame."""
+    """Takes what waits in a CAN socket.
+
+    `frames_lost`: dropped by the kernel for want of room before the frames of the last `take`, which ends before a loss.
+    """
 
     def __init__(self, opened: socket.socket, clock: Clock) -> None:
         """Ask the socket for stamps and drops. Frames of a clock other than the monotonic one carry its time."""
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         self.frames_lost = 0
+        self._held: list[tuple[int, Frame]] = []  # after a loss, each with how many had been dropped before it
         self._descriptor = opened.fileno()
         self._clock = None if isinstance(clock, MonotonicClock) else clock
         self._memory = ctypes.create_string_buffer(_FRAMES * _SLOT_BYTES)
@@ -109,6 +113,8 @@ class FrameReceiver:
 
     def wait(self, timeout_s: float) -> bool:
         """Wait until there is something to take; False after `timeout_s`, anew after a signal. Raises OSError."""
+        if self._held:
+            return True
         whole_s = int(timeout_s)
         self._duration.seconds = whole_s
         self._duration.nanoseconds = int((timeout_s - whole_s) * 1e9)
@@ -120,23 +126,37 @@ class FrameReceiver:
 
     def take(self) -> list[Frame]:
         """Return what waits, at most 64 frames; the rest is for the next time. Raises OSError."""
+        if self._held:
+            return self._take_held()
         count = _receive(self._descriptor, self._place, _FRAMES, _MSG_DONTWAIT, None)
         if count < 0:
             error = ctypes.get_errno()
             raise OSError(error, os.strerror(error))
         ctypes.memmove(self._place, self._fresh, count * ctypes.sizeof(_Message))
-        return [self._decode(index * _SLOT_BYTES) for index in range(count)]
+        frames = [self._decode(index * _SLOT_BYTES) for index in range(count)]
+        if count and self._lost_before(count - 1) > self.frames_lost:
+            self._held = [(self._lost_before(index), frame) for index, frame in enumerate(frames)]
+            return self._take_held()
+        return frames
 
     def _decode(self, place: int) -> Frame:
-        can_id, length, data, _, _, _, seconds, nanoseconds, _, _, kind, lost = _RECEIVED.unpack_from(
-            self._memory, place
-        )
-        if kind == _SO_RXQ_OVFL:
-            self.frames_lost = lost
+        can_id, length, data, _, _, _, seconds, nanoseconds, *_ = _RECEIVED.unpack_from(self._memory, place)
         t_ns = self._to_clock(seconds * 1_000_000_000 + nanoseconds)
         if can_id <= MAX_STANDARD_ID:
             return Frame(can_id, data[:length], t_ns)
         return Frame(can_id & CAN_ID_MASK, data[:length], t_ns, bool(can_id & CAN_ERR_FLAG))
+
+    def _lost_before(self, index: int) -> int:
+        """Return how many frames the kernel had dropped before one of the batch came; those of the past, where none."""
+        *_, kind, lost = _RECEIVED.unpack_from(self._memory, index * _SLOT_BYTES)
+        return lost if kind == _SO_RXQ_OVFL else self.frames_lost
+
+    def _take_held(self) -> list[Frame]:
+        """Return the held frames up to the next loss."""
+        self.frames_lost = max(self.frames_lost, self._held[0][0])
+        frames = [frame for lost, frame in self._held if lost <= self.frames_lost]
+        self._held = self._held[len(frames) :]
+        return frames
 
     def _to_clock(self, wall_ns: int) -> int:
         """Take a stamp of the kernel to the clock that frames carry."""

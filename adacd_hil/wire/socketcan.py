@@ -43,9 +43,12 @@ _FD_FRAME = struct.Struct("=IBB2x64s")
 _FILTER = struct.Struct("=II")
 _CAN_RAW_ERR_FILTER = 2
 _SO_MEMINFO = 55
+_SO_RCVBUFFORCE = 33
 _MEMINFO = struct.Struct("=9I")
 _RECEIVED, _SENT, _DROPS = 0, 2, 8  # of its numbers
 _DOWN = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
+_LISTENER_BYTES = 1 << 24
+"""Room for what a listener has not read: some 20,000 frames, 2 s of a full bus at 1 Mbit/s."""
 _LIVE_S = 0.25
 """Longest silence of a bus with two arms: 2.5 of the usual heartbeat periods."""
 _SEND_PATIENCE_S = 0.05
@@ -63,10 +66,14 @@ class SocketCanBus(Bus):
         is_fd: bool = False,
         is_shared: bool = False,
     ) -> None:
-        """Open `channel`, receiving only `can_ids` when given; `is_shared`: see `recover`. Raises BusMissingError."""
+        """Open `channel`, receiving only `can_ids` when given; `is_shared`: see `recover`. Raises BusMissingError.
+
+        Who receives everything gets as much room for what it has not read as the system allows.
+        """
         self._is_shared = is_shared
         self.channel = channel
         self._clock = clock
+        self._is_listener = can_ids is None
         self._filters = _pack_filters(can_ids)
         self._is_fd = is_fd
         self._interface = CanInterface(channel)
@@ -86,6 +93,8 @@ class SocketCanBus(Bus):
             opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
             opened.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, ERROR_CLASS_MASK)
             opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, int(self._is_fd))
+            if self._is_listener:
+                _widen(opened)
             opened.setblocking(False)
             opened.bind((self.channel,))
             self._receiver = FrameReceiver(opened, self._clock)
@@ -248,6 +257,14 @@ class SocketCanBus(Bus):
         """Close the socket; twice is once."""
         self._is_closed = True
         self._retire_socket()
+
+
+def _widen(opened: socket.socket) -> None:
+    """Give a socket a listener's room, or as much as the system gives to who may not set up networks."""
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _LISTENER_BYTES)
+    except PermissionError:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _LISTENER_BYTES)
 
 
 def _pack_filters(can_ids: Iterable[int] | None) -> bytes:

@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from bench_bus import CODEC, BenchBus
 from click.testing import CliRunner
 
@@ -43,6 +44,29 @@ def test_the_node_filter_shows_one_node() -> None:
         "Sensor1Status",
         "Sensor1Heartbeat",
     }
+
+
+def test_frames_that_this_computer_dropped_are_not_counted_against_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = BenchBus()
+    rig.start()
+    rig.add_host()
+    inner = rig.bus.receive
+    heard = 0
+
+    def lossy(timeout_s: float) -> Frame | None:  # of the frames of 0.5 s nothing is read
+        nonlocal heard
+        heard += 1
+        while 3000 <= heard < 6000 and inner(1.0) is not None:
+            heard += 1
+        return inner(timeout_s)
+
+    monkeypatch.setattr(rig.bus, "receive", lossy)
+    monkeypatch.setattr(type(rig.bus), "frames_lost", property(lambda _: 3000 * (heard >= 6000)), raising=False)
+    watched = monitor(rig)
+    watched.listen(1.5)
+    messages = {message["message"]: message for message in watched.describe()["messages"]}
+    assert heard > 6500
+    assert (messages["Sensor1Torque"]["lost"], messages["Sensor1Torque"]["errors"]) == (0, 0)
 
 
 def test_a_full_bus_ends_in_time_and_misses_nothing() -> None:

@@ -44,6 +44,18 @@ def test_a_lost_frame_and_a_wrong_crc_are_told_apart_and_change_no_value() -> No
     assert message.values == (("torque", pytest.approx(0.004), "Nm"),)
 
 
+def test_what_this_computer_lost_is_no_fault_of_a_device() -> None:
+    frames = torque_frames(60)
+    blamed, excused = view(), view()
+    for number in (0, 1, 58, 59):
+        if number == 58:
+            excused.skip_loss()
+        for seen in (blamed, excused):
+            seen.accept(Frame(0x183, frames[number], number * MS))
+    verdicts = [by_name(seen.snapshot(60 * MS))["Sensor1Torque"] for seen in (blamed, excused)]
+    assert [(verdict.lost, verdict.errors) for verdict in verdicts] == [(0, 2), (0, 0)]
+
+
 def test_a_frame_of_the_wrong_length_is_an_error_and_has_no_value() -> None:
     seen = view()
     seen.accept(Frame(0x181, b"\x01\x02", MS))

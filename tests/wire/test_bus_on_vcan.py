@@ -1,6 +1,7 @@
 """Real SocketCAN: what crosses, what is filtered, and how each way of failing shows and is recovered from."""
 
 import contextlib
+import itertools
 import json
 import os
 import socket
@@ -266,6 +267,43 @@ def test_frames_that_the_kernel_dropped_are_counted_over_a_recovery_too(raw: soc
     assert 0 < kept < sent
     assert dropped == sent - kept
     assert after == dropped
+
+
+def test_what_was_lost_is_known_with_the_first_frame_after_it(raw: socket.socket) -> None:
+    bus = open_end([0x181])
+    numbers = iter(range(1 << 20))
+
+    def send(count: int) -> None:
+        for _ in range(count):
+            raw.send(CLASSIC.pack(0x181, 4, next(numbers).to_bytes(4, "big")))
+
+    seen: list[tuple[int, int]] = []
+
+    def read(count: int) -> None:
+        for _ in range(count):
+            if (frame := bus.receive(0.1)) is not None:
+                seen.append((int.from_bytes(frame.data, "big"), bus.frames_lost))
+
+    send(2000)
+    for _ in range(3):  # some room, a few frames, and again none: losses in the middle of what one system call takes
+        read(70)
+        send(150)
+    read(2000)
+    bus.close()
+    jumps = [(after - before - 1, lost - known) for (before, known), (after, lost) in itertools.pairwise(seen)]
+    assert sum(jump > 0 for jump, _ in jumps) >= 3
+    assert [jump for jump, _ in jumps] == [lost for _, lost in jumps]
+
+
+def test_who_hears_everything_has_room_for_what_it_reads_late(raw: socket.socket) -> None:
+    bus = open_end()
+    for _ in range(2000):
+        raw.send(CLASSIC.pack(0x181, 0, b""))
+    heard = 0
+    while bus.receive(0.1) is not None:
+        heard += 1
+    bus.close()
+    assert (heard, bus.frames_lost) == (2000, 0)
 
 
 def test_drops_are_known_without_another_frame_once_somebody_looks_at_the_queues(raw: socket.socket) -> None:
