@@ -51,15 +51,13 @@ compiled-paper: | check
 
 PYTEST := $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
-test: $(VENV)/.dev
+# test leaves the longest tests out, test-all nothing.
+test: left_out := and not long
+test-all: all := --all
+test test-all: $(VENV)/.dev
 	$(MAKE) --no-print-directory -j2 compiled-certified compiled-paper
-	$(PYTEST) -m "not vcan and not long"
-	tools/test-on-vcan
-
-test-all: $(VENV)/.dev
-	$(MAKE) --no-print-directory -j2 compiled-certified compiled-paper
-	$(PYTEST) -m "not vcan"
-	tools/test-on-vcan --all
+	$(PYTEST) -m "not vcan $(left_out)"
+	tools/test-on-vcan $(all)
 
 test-realtime: $(VENV)/.dev
 	tools/test-on-vcan -m "vcan and realtime"

@@ -6,12 +6,14 @@
 import ctypes
 import os
 import time
+from datetime import UTC, datetime
 from typing import Protocol
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
 _EINTR = 4
 _NS_PER_S = 1_000_000_000
+_DATE = "%Y-%m-%dT%H:%M:%SZ"
 
 
 class _Timespec(ctypes.Structure):
@@ -84,3 +86,13 @@ def wall_offset_ns() -> int:
         after_ns = time.monotonic_ns()
         offsets.append((after_ns - before_ns, now_ns - (before_ns + after_ns) // 2))
     return min(offsets)[1]
+
+
+def format_date(t_ns: int) -> str:
+    """Write wall-clock time, ns since 1970, as ISO 8601 in UTC."""
+    return datetime.fromtimestamp(t_ns // _NS_PER_S, tz=UTC).strftime(_DATE)
+
+
+def date_ns(date_utc: str) -> int:
+    """Read what `format_date` writes, ns since 1970. Raises ValueError."""
+    return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * _NS_PER_S

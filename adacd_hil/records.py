@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -400,3 +400,7 @@ class Event(NamedTuple):
     level: str  # "info", "warning", "error"
     name: str
     message: str
+
+
+CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "certificate", "revoked"))
+"""Names of what the scheme says of its certificates: the user is told as it happens, and a replay must say it again."""

@@ -136,9 +136,9 @@ def play(
             played_s = summary.result.cycles * settings.bus.period_s
             pace = played_s / summary.elapsed_s
             progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
+        progress("drawing the report")
         from adacd_hil.analysis.report.report import write_report  # what draws takes longest to import
 
-        progress("drawing the report")
         report = write_report(summary.log.path, truth_path, folder.path)
         progress(f"report: {folder.path / 'report.html'}")
     if summary.error:

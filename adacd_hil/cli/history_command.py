@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import EPILOG, ExitCode
+from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.output_files import replace_file
 
 if TYPE_CHECKING:
     from adacd_hil.control.history_file import History
+
+_MIDDLE = slice(1, None, 3)
+"""Of friction at 0.2, 0.6, 1.2 rad/s, joint by joint: at 0.6 rad/s."""
 
 
 @click.command(epilog=EPILOG)
@@ -28,7 +32,9 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
 
     found = read_history(file)
     if plot is not None:
-        plot.write_bytes(_as_png(found))
+        if plot.exists() and plot.samefile(file):
+            raise CommandError(f"--plot {plot} is the history itself; give another name", ExitCode.USAGE)
+        replace_file(plot, _as_png(found))
     print(json.dumps(dataclasses.asdict(found), indent=2) if as_json else _as_text(found))
     return ExitCode.OK
 
@@ -39,19 +45,19 @@ def _as_png(found: "History") -> bytes:
     from adacd_hil.analysis.history_figure import Panel, history_figure
 
     shown = found.certificates
-    friction, friction_std = (
-        np.array([values[1::3] for values in column])
-        for column in ([each.friction_Nm for each in shown], [each.friction_std_Nm for each in shown])
-    )
-    joints = tuple(f"joint {number}" for number in range(1, friction.shape[1] + 1))
-    inertia, inertia_std = np.array([[each.inertia_kgm2, each.inertia_std_kgm2] for each in shown]).swapaxes(0, 1)
-    offset, offset_std = np.array([[each.offset_Nm, each.offset_std_Nm] for each in shown]).swapaxes(0, 1)
+    joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))
+
+    def panel(title: str, names: tuple[str, ...], values: str, std: str) -> Panel:
+        columns = [np.array([getattr(certificate, name) for certificate in shown]) for name in (values, std)]
+        return Panel(title, names, *columns)
+
+    friction = panel("Friction at 0.6 rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
     panels = (
-        Panel("Friction at 0.6 rad/s, Nm", joints, friction, friction_std),
-        Panel("Inertia, kg m²", ("a1", "a2", "a3"), inertia, inertia_std),
-        Panel("Torque offset, Nm", joints, offset, offset_std),
+        friction._replace(values=friction.values[:, _MIDDLE], std=friction.std[:, _MIDDLE]),
+        panel("Inertia, kg m²", ("a1", "a2", "a3"), "inertia_kgm2", "inertia_std_kgm2"),
+        panel("Torque offset, Nm", joints, "offset_Nm", "offset_std_Nm"),
     )
-    return history_figure([each.date_utc for each in shown], panels).png()
+    return history_figure([certificate.date_utc for certificate in shown], panels).png()
 
 
 def _as_text(found: "History") -> str:
@@ -61,12 +67,10 @@ def _as_text(found: "History") -> str:
     head = ("certified", "F1 Nm", "F2 Nm", "a1 kg m²", "a2 kg m²", "a3 kg m²", "offset Nm", "payload", "known by")
     rows = []
     for certificate in found.certificates:
-        _, f1, _, _, f2, _ = certificate.friction_Nm
         rows.append(
             [
                 certificate.date_utc,
-                f"{f1:.3f}",
-                f"{f2:.3f}",
+                *(f"{value:.3f}" for value in certificate.friction_Nm[_MIDDLE]),
                 *(f"{value:.4f}" for value in certificate.inertia_kgm2),
                 ", ".join(f"{value:.3f}" for value in certificate.offset_Nm),
                 "yes" if certificate.is_payload else "",

@@ -23,12 +23,12 @@ from adacd_hil.cli.connection import (
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.run_folder import run_folder
-from adacd_hil.clock import wall_ns
+from adacd_hil.clock import format_date, wall_ns
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
-from adacd_hil.control.tare_file import format_date, use_tare
+from adacd_hil.control.tare_file import use_tare
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.wire.budget import check_budget
@@ -83,6 +83,8 @@ def run_on_bus(
         settings = tare.apply(settings)
     history = None
     if history_path is not None:
+        if settings.scheme != "certified":
+            raise CommandError(f"--history: scheme {settings.scheme!r} certifies nothing", ExitCode.USAGE)
         history = use_history(history_path, wall_ns())
         settings = history.apply(settings)
         ask_first_run(history)
@@ -112,8 +114,9 @@ def run_on_bus(
             live=live,
             on_started=functools.partial(folder.link, progress),
         )
-        for line in () if tare is None else tare.warnings:
-            progress(f"warning: {line}")
+        for used in (tare, history):
+            for line in () if used is None else used.warnings:
+                progress(f"warning: {line}")
         with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: an arm is not left alone
             summary = session.run()
     code, described = exit_code(summary), summarise(summary)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from adacd_hil import __version__
-from adacd_hil.clock import Clock, wall_ns
+from adacd_hil.clock import Clock, format_date, wall_ns
 from adacd_hil.commission.idle_cycle import IdleCycle
 from adacd_hil.commission.tare import (
     ArmMovedError,
@@ -25,7 +25,7 @@ from adacd_hil.commission.tare import (
 )
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.session import git_commit
-from adacd_hil.control.tare_file import FORMAT, PoseRecord, SensorRecord, Tare, format_date, sensor_identities
+from adacd_hil.control.tare_file import FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master

@@ -31,6 +31,7 @@ from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import (
+    CERTIFICATE_EVENTS,
     CONTROL_LAYOUT,
     ArmCommand,
     ArmState,
@@ -56,8 +57,6 @@ FRAME_CHECKS_S = 1.0
 """How often the log gets what the checks of frames have counted."""
 
 _ENABLING = POWERED | {SchemeState.ENABLE}
-_TOLD = frozenset(("anchor", "touch", "certificate", "revoked"))
-"""Events that the user is told as they happen."""
 
 
 @dataclass(frozen=True)
@@ -269,7 +268,7 @@ class Cycle:
         ):
             for event in source.take_events():
                 recorder.event(t_ns, event)
-                if event.name in _TOLD:
+                if event.name in CERTIFICATE_EVENTS:
                     self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
         if output.state is not self._state:
             event = self._transition(output)

@@ -1,8 +1,9 @@
 """An arm's history: what each run has certified, as TOML, and the checks before a run uses the last certificate.
 
-A history belongs to the devices of one arm, by their serial numbers of 0x1018:4. Every certificate carries a digest of
-itself and of the one before, so that a file that was damaged, shortened in the middle or edited by hand is refused. It
-is no signature: who can write the file can compute digests, too.
+A history belongs to the devices of one arm, by their serial numbers of 0x1018:4. The first certificate carries a digest
+of the devices and of itself, each further one that of the one before and of itself, so that a file that was damaged or
+edited by hand is refused. That the newest were cut off isn't seen. It is no signature: who can write the file can
+compute digests, too.
 """
 
 import dataclasses
@@ -12,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from adacd_hil.clock import date_ns
 from adacd_hil.config import ConfigError, HistorySettings, Settings, parse, parse_toml, setting, to_toml
-from adacd_hil.control.tare_file import date_ns
+from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.input_files import read_input
@@ -25,17 +27,6 @@ HISTORY_NAME = "history.toml"
 FORMAT = 1
 _FUTURE_NS = 360_000_000_000
 """How far ahead of this machine's clock a certificate may be dated."""
-
-
-@dataclass(frozen=True)
-class DeviceRecord:
-    """One device: object 0x1018."""
-
-    name: str = setting(meaning="name in the DBC")
-    node_id: int = setting(low=1, high=127, meaning="CANopen node id")
-    vendor: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:1")
-    product: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:2")
-    serial: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:4")
 
 
 @dataclass(frozen=True)
@@ -55,7 +46,7 @@ class CertificateRecord:
     offset_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, meaning="their deviations")
     is_payload: bool = setting(meaning="with a payload that was announced in the run")
     text: str = setting(meaning="what anchors it, and what friction and inertia are known by")
-    digest: str = setting("", meaning="SHA-256 of the digest before and of all above")
+    digest: str = setting("", meaning="SHA-256 of the digest before (of the devices at first) and of all above")
 
     def __post_init__(self) -> None:
         self.known(HistorySettings())
@@ -73,7 +64,7 @@ class CertificateRecord:
 
     def digest_after(self, before: str) -> str:
         """Return the digest that this record must have after another's."""
-        return hashlib.sha256((before + to_toml(dataclasses.replace(self, digest=""))).encode()).hexdigest()
+        return _digest(before + to_toml(dataclasses.replace(self, digest="")))
 
 
 @dataclass(frozen=True)
@@ -87,7 +78,7 @@ class History:
     def __post_init__(self) -> None:
         if not self.certificates:
             raise ValueError("a history without certificates")
-        before = ""
+        before = devices_digest(self.devices)
         for number, certificate in enumerate(self.certificates, start=1):
             try:
                 date_ns(certificate.date_utc)
@@ -101,6 +92,27 @@ class History:
     def last(self) -> CertificateRecord:
         """The newest certificate."""
         return self.certificates[-1]
+
+
+def devices_digest(devices: Sequence[DeviceRecord]) -> str:
+    """Return the digest that stands before that of the first certificate."""
+    return _digest("\n".join(map(to_toml, devices)))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity], path: Path) -> str:
+    """Say why devices are not those of a history; "" where they are."""
+    known = {record.name: record for record in devices}
+    for identity in identities:
+        record = known.get(identity.name)
+        if record is None:
+            return f"{identity.name} (node {identity.node_id}) is no device of history {path}"
+        if difference := record.difference(identity):
+            return f"{difference} of history {path}: it is another arm's"
+    return ""
 
 
 def read_history(path: Path) -> History:
@@ -130,6 +142,11 @@ class UsedHistory:
         """Whether nothing is known of the arm."""
         return self.history is None
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What there is to say of it."""
+        return (f"{self.path}: the arm's first run, nothing is known of its friction",) if self.is_first_run else ()
+
     def apply(self, settings: Settings) -> Settings:
         """Return settings whose `history` is the last certificate."""
         if self.history is None:
@@ -139,18 +156,9 @@ class UsedHistory:
     def check_devices(self, identities: Sequence[Identity]) -> Event:
         """Return what goes to the log's events. Raises DeviceError unless the devices are those of the history."""
         if self.history is None:
-            return Event("warning", "history", f"{self.path}: the arm's first run, nothing is known of its friction")
-        known = {record.name: record for record in self.history.devices}
-        for identity in identities:
-            record = known.get(identity.name)
-            if record is None:
-                raise DeviceError(f"{identity.name} (node {identity.node_id}) is no device of history {self.path}")
-            for what in ("vendor", "product", "serial"):
-                if getattr(record, what) != getattr(identity, what):
-                    raise DeviceError(
-                        f"{identity.name} (node {identity.node_id}): {what} {getattr(identity, what)} is not the "
-                        f"{getattr(record, what)} of history {self.path}: it is another arm's"
-                    )
+            return Event("warning", "history", self.warnings[0])
+        if difference := _difference(self.history.devices, identities, self.path):
+            raise DeviceError(difference)
         return Event("info", "history", f"{self.path}: {self._count()}, the last of {self.history.last.date_utc}")
 
     def _count(self) -> str:
@@ -166,13 +174,17 @@ class UsedHistory:
 
         Those of another run that came in between are kept.
         """
-        now = _parse(self.path, read_input(self.path)) if self.path.exists() else None
-        records = [] if now is None else list(now.certificates)
+        devices, records = tuple(DeviceRecord(*identity) for identity in identities), []
+        if self.path.exists():
+            now = _parse(self.path, read_input(self.path))
+            if difference := _difference(now.devices, identities, self.path):
+                raise ConfigError(difference)
+            devices, records = now.devices, list(now.certificates)
+        before = records[-1].digest if records else devices_digest(devices)
         for certificate in certificates:
             record = CertificateRecord(**origin._asdict(), **certificate._asdict())
-            before = records[-1].digest if records else ""
-            records.append(dataclasses.replace(record, digest=record.digest_after(before)))
-        devices = now.devices if now is not None else tuple(_record(identity) for identity in identities)
+            before = record.digest_after(before)
+            records.append(dataclasses.replace(record, digest=before))
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(self.path, is_durable=True) as new:
             new.write_text(to_toml(History(FORMAT, devices, tuple(records))), encoding="utf-8")
@@ -186,10 +198,6 @@ class Origin(NamedTuple):
     log: str
     profile: str
     version: str
-
-
-def _record(identity: Identity) -> DeviceRecord:
-    return DeviceRecord(identity.name, identity.node_id, identity.vendor, identity.product, identity.serial)
 
 
 def use_history(path: Path, now_ns: int) -> UsedHistory:

@@ -9,10 +9,11 @@ import math
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
+from adacd_hil.clock import date_ns
 from adacd_hil.config import ConfigError, Settings, TareSettings, parse, read_toml, setting, to_toml
+from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.input_files import read_input
@@ -21,7 +22,6 @@ from adacd_hil.records import JOINTS, Event
 
 TARE_NAME = "tare.toml"
 FORMAT = 1
-_DATE = "%Y-%m-%dT%H:%M:%SZ"
 SMALLEST_STD_NM = 0.001
 """No zero is known better than this, however long it was measured."""
 _NS_PER_H = 3_600_000_000_000
@@ -29,15 +29,9 @@ _CLOCK_TOLERANCE_H = 0.1
 
 
 @dataclass(frozen=True)
-class SensorRecord:
-    """The sensor of one joint: object 0x1018, and its temperature where it has object 0x2111."""
+class SensorRecord(DeviceRecord):
+    """The sensor of one joint, and its temperature where it has object 0x2111."""
 
-    name: str = setting(meaning="name in the DBC")
-    node_id: int = setting(low=1, high=127, meaning="CANopen node id")
-    vendor: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:1")
-    product: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:2")
-    revision: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:3")
-    serial: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:4")
     temperature_C: float | None = setting(None, unit="°C", low=-273.15, high=1000.0, meaning="when it was tared")
 
 
@@ -103,16 +97,6 @@ class Tare:
         return date_ns(self.date_utc)
 
 
-def format_date(t_ns: int) -> str:
-    """Write wall-clock time, ns since 1970, as ISO 8601 in UTC."""
-    return datetime.fromtimestamp(t_ns // 1_000_000_000, tz=UTC).strftime(_DATE)
-
-
-def date_ns(date_utc: str) -> int:
-    """Read what `format_date` writes, ns since 1970. Raises ValueError."""
-    return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * 1_000_000_000
-
-
 def read_tare(path: Path) -> Tare:
     """Read a tare file. Raises ConfigError."""
     if not path.exists():
@@ -174,16 +158,8 @@ class UsedTare:
     def check_sensors(self, identities: Sequence[Identity]) -> list[Event]:
         """Return what goes to the log's events. Raises DeviceError unless the sensors are those that were tared."""
         for sensor, identity in zip(self.tare.sensors, sensor_identities(identities), strict=True):
-            for what, of_tare, of_sensor in (
-                ("vendor", sensor.vendor, identity.vendor),
-                ("product code", sensor.product, identity.product),
-                ("serial number", sensor.serial, identity.serial),
-            ):
-                if of_tare != of_sensor:
-                    raise DeviceError(
-                        f"{identity.name} (node {identity.node_id}): {what} {of_sensor} is not the {of_tare} of tare "
-                        f"{self.path}; tare again"
-                    )
+            if difference := sensor.difference(identity):
+                raise DeviceError(f"{difference} of tare {self.path}; tare again")
         events = [Event("info", "tare", f"{self.path} of {self.tare.date_utc}: {self.describe_offset()} Nm subtracted")]
         return events + [Event("warning", "tare", line) for line in self.warnings]
 

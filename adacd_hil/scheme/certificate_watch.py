@@ -27,7 +27,7 @@ class _Cause(Enum):
     ANCHOR = "anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"
     CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
     MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
-    MORE_THAN_LAST = "history", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
+    MORE_THAN_LAST = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
 
 
 _CAUSES = {
@@ -48,6 +48,15 @@ class _Refusal(NamedTuple):
     times: int
 
 
+class _Certified(NamedTuple):
+    """The model when it was certified (p,), its covariance (p, p), whether with a payload, and what was said."""
+
+    theta: Vector
+    P: Vector
+    is_payload: bool
+    text: str
+
+
 class CertificateWatch:
     """Says what the kernel has found, and hands it what the user accepts. last_utc: the last certificate's date."""
 
@@ -57,13 +66,13 @@ class CertificateWatch:
         self._last_utc = last_utc
         self._refusal: _Refusal | None = None
         self._vouched_against = ""
-        self._certificates: list[Certificate] = []
+        self._certified: list[_Certified] = []
         self._is_standing = False
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
         """All that were not taken back, in order."""
-        return tuple(self._certificates)
+        return tuple(last_certificate.certificate_of(self._constants, *certified) for certified in self._certified)
 
     @property
     def is_refusing(self) -> bool:
@@ -81,14 +90,15 @@ class CertificateWatch:
         level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
         text = f"{anchor.describe(self._constants, self._memory)}; {known_by}"
         self._is_standing = True
-        self._certificates.append(last_certificate.certificate_of(self._constants, self._memory, text))
+        m = self._memory
+        self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
         return Event(level, "certificate", text)
 
     def _known_by(self) -> str:
         if self._vouched_against:
             return BY_WORD + self._vouched_against
         is_compared = self._memory["is_last_believed"] and not self._memory["is_payload"]
-        return f"friction and inertia: no more than in {self._last}" if is_compared else THIS_RUN_ONLY
+        return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
 
     def refuse(self, is_reading: bool) -> Event | None:
         """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
@@ -120,7 +130,7 @@ class CertificateWatch:
 
     def _take_back(self) -> None:
         if self._is_standing:
-            self._certificates.pop()
+            self._certified.pop()
         self._is_standing = False
 
     def push(self, torque_Nm: Vector) -> Event:

@@ -560,7 +560,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
 
 @compiled
 def _contradicted_by(k: Any, m: Any) -> int:
-    """Return what contradicts the fit: an anchor, the fit itself, what was kept, or nothing."""
+    """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
     if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
         return ANCHOR
     if not earlier.is_steady(m):

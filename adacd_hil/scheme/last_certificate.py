@@ -18,7 +18,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme import earlier
 
 SIGMAS = 4.0
@@ -47,13 +47,12 @@ class Certificate(NamedTuple):
 def constants_of(settings: Settings) -> dict[str, Vector]:
     """Return `last_certified` (q,), `_std`, `_floor`; nan where there is no last certificate."""
     history = settings.history
-    friction, inertia = np.array(history.friction_Nm), np.array(history.inertia_kgm2)
-    if not history.is_known:
-        friction, inertia = np.full(earlier.FRICTIONS, np.nan), np.full(earlier.INERTIAS, np.nan)
-    counts = (friction.size, inertia.size)
+    counts = (earlier.FRICTIONS, earlier.INERTIAS)
+    last, std = np.full(sum(counts), np.nan), np.zeros(sum(counts))
+    if history.is_known:
+        last = np.array((*history.friction_Nm, *history.inertia_kgm2))
+        std = np.array((*history.friction_std_Nm, *history.inertia_std_kgm2))
     share = np.repeat((history.friction_share, history.inertia_share), counts)
-    std = np.array((*history.friction_std_Nm, *history.inertia_std_kgm2)) if history.is_known else np.zeros(sum(counts))
-    last = np.concatenate((friction, inertia))
     return {
         "last_certified": last,
         "last_certified_std": np.hypot(std, share * last),
@@ -106,21 +105,21 @@ def describe_more(m: Any, date_utc: str) -> list[str]:
     ]
 
 
-def certificate_of(k: Any, m: Any, text: str) -> Certificate:
-    """Return what the model that has just been certified says. text: its event."""
+def certificate_of(k: Any, theta: Vector, P: Vector, is_payload: bool, text: str) -> Certificate:
+    """Return what a model that was certified says. theta (p,), P (p, p): with the offsets; text: its event."""
     base, first = int(k["base"]), earlier.FRICTIONS
     rows = k["compared"][: first + earlier.INERTIAS]
-    values = rows @ m["theta"]
-    std = np.sqrt([row @ m["P"] @ row for row in rows])
-    offsets = slice(base, base + m["judged_Nm"].size)
+    values = rows @ theta
+    std = np.sqrt([row @ P @ row for row in rows])
+    offsets = slice(base, base + JOINTS)
     return Certificate(
-        parameters=tuple(m["theta"][:base].tolist()),
+        parameters=tuple(theta[:base].tolist()),
         friction_Nm=tuple(values[:first].tolist()),
         friction_std_Nm=tuple(std[:first].tolist()),
         inertia_kgm2=tuple(values[first:].tolist()),
         inertia_std_kgm2=tuple(std[first:].tolist()),
-        offset_Nm=tuple(m["theta"][offsets].tolist()),
-        offset_std_Nm=tuple(np.sqrt(np.diag(m["P"])[offsets]).tolist()),
-        is_payload=bool(m["is_payload"]),
+        offset_Nm=tuple(theta[offsets].tolist()),
+        offset_std_Nm=tuple(np.sqrt(np.diag(P)[offsets]).tolist()),
+        is_payload=is_payload,
         text=text,
     )

@@ -85,7 +85,7 @@ _poll.argtypes = (ctypes.c_void_p, ctypes.c_ulong, ctypes.c_void_p, ctypes.c_voi
 class FrameReceiver:
     """Takes what waits in a CAN socket.
 
-    `frames_lost`: dropped by the kernel for want of room before the frames of the last `take`, which ends before a loss.
+    `frames_lost`: dropped by the kernel for want of room before the frames of the last `take`; one ends before a loss.
     """
 
     def __init__(self, opened: socket.socket, clock: Clock) -> None:

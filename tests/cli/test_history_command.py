@@ -5,13 +5,15 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
+from bus_lab import BUS_MISSING, SHORT_RUN, USAGE, Lab, complaints
 from click.testing import CliRunner
-from test_tare_command import BUS_MISSING, FAILURE, USAGE, Lab, complaints
 
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.run import ask_first_run
+from adacd_hil.clock import wall_ns
 from adacd_hil.config import ConfigError, parse_toml
-from adacd_hil.control.history_file import FORMAT, History, UsedHistory, read_history, use_history
+from adacd_hil.control.history_file import FORMAT, History, Origin, UsedHistory, read_history, use_history
+from adacd_hil.device.network import Identity
 
 pytestmark = pytest.mark.slow
 
@@ -48,17 +50,19 @@ def file(lab: Lab, first_history: str) -> Path:
     return path
 
 
-def test_a_run_adds_its_certificate_and_the_next_one_is_compared_with_it(lab: Lab, file: Path) -> None:
+def test_a_run_adds_its_certificate_and_the_next_one_is_compared_with_it(
+    lab: Lab, file: Path, first_history: str
+) -> None:
     first = read_history(file).last
     assert first.text.endswith("by this run only")
     result = lab.run("--history", str(file))
     assert result.exit_code == 0, result.stderr
     one, two = read_history(file).certificates
     assert one == first
-    assert two.text.endswith(f"no more than in the certificate of {first.date_utc}")
+    assert two.text.endswith(f"within what the certificate of {first.date_utc} allows")
     log = lab.log
     assert log.metadata["history_certificates"] == "1 certificate"
-    assert log.attachments["history.toml"] != file.read_bytes()
+    assert log.attachments["history.toml"] == first_history.encode()
     assert parse_toml(log.attachments["config.toml"])["history"]["friction_Nm"] == list(first.friction_Nm)
     replayed = CliRunner().invoke(cli, ["replay", str(lab.folder / "run.mcap")])
     assert "identical, bit for bit" in replayed.stdout + replayed.stderr
@@ -70,7 +74,7 @@ def test_devices_with_other_serial_numbers_are_another_arms(lab: Lab, file: Path
     result = lab.run("--history", str(file))
     assert result.exit_code == BUS_MISSING
     (line,) = complaints(result)
-    assert "serial 4711 is not the" in line
+    assert "serial number 4711 is not the 2" in line
     assert line.endswith(f"of history {file}: it is another arm's")
     assert file.read_bytes() == before
 
@@ -82,7 +86,7 @@ def test_devices_with_other_serial_numbers_are_another_arms(lab: Lab, file: Path
         ("is_payload = false", "is_payload = true", "certificate 1 is not as it was written: its digest is another"),
         ("certificates = [", "certificate = [", "did you mean `certificates`?"),
         ("format = 1", "format = 2", "`format` = 2 is above 1"),
-        ('date_utc = "', 'date_utc = "x', ": certificate 1: date_utc is not like 2026-01-31T12:00:00Z"),
+        ('date_utc = "', 'date_utc = "x', "arm.toml: certificate 1: date_utc is not like 2026-01-31T12:00:00Z"),
     ],
 )
 def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(
@@ -93,6 +97,36 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(
         assert result.exit_code == USAGE
         (line,) = complaints(result)
         assert says in line
+
+
+def test_devices_that_were_edited_are_noticed_by_the_first_digest(file: Path) -> None:
+    file.write_text(file.read_text().replace("serial = 2", "serial = 3", 1))
+    with pytest.raises(ConfigError, match="certificate 1 is not as it was written"):
+        read_history(file)
+
+
+def test_a_certificate_is_not_added_to_what_another_arm_has_made_meanwhile(lab: Lab, first_history: str) -> None:
+    path = lab.folder / "arm.toml"
+    used = use_history(path, wall_ns())
+    path.write_text(first_history)
+    devices = read_history(path).devices
+    mine = [Identity(**asdict(replace(device, serial=device.serial + 100))) for device in devices]
+    with pytest.raises(ConfigError, match=r"serial number 101 is not the 1 of history .*: it is another arm's"):
+        used.add((), mine, Origin("2026-11-22T10:00:00Z", "run.mcap", "P", "1"))
+    assert path.read_text() == first_history
+
+
+def test_a_scheme_without_certificates_has_no_history(lab: Lab) -> None:
+    lab.settings_file.write_text(SHORT_RUN)
+    result = lab.run("--history", str(lab.folder / "arm.toml"))
+    assert result.exit_code == USAGE
+    assert complaints(result) == ["adacd-hil: --history: scheme 'paper' certifies nothing"]
+
+
+def test_the_picture_does_not_replace_the_history(file: Path, first_history: str) -> None:
+    result = CliRunner().invoke(cli, ["history", str(file), "--plot", str(file)])
+    assert result.exit_code == USAGE
+    assert file.read_text() == first_history
 
 
 def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(file: Path) -> None:
@@ -163,5 +197,5 @@ def test_before_a_first_run_the_user_says_that_nobody_touches_the_arm(
 
     result = CliRunner().invoke(command, input=answer)
     assert ("started" in result.stdout) is is_started
+    assert result.exit_code == (0 if is_started else 1)
     assert "this is the arm's first run" in result.stderr
-    assert FAILURE == 1

@@ -2,74 +2,23 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from bus_lab import BUS_MISSING, OFFSET, SHORT_RUN, USAGE, Lab, complaints
 from experiment_runs import adacd_hil
 
-from adacd_hil.cli.main import cli
-from adacd_hil.clock import Clock
-from adacd_hil.config import parse
 from adacd_hil.control.tare_file import read_tare
-from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.wire.bus import Bus, EmbeddedBus
-from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import Scenario
 
 pytestmark = pytest.mark.slow
 
-FAILURE, USAGE, BUS_MISSING = 1, 2, 5
-OFFSET = (0.3, -0.2)
+FAILURE = 1
 REST_CYCLES = 200  # before the drives are enabled
-ON_BUS = ("-i", "embedded", "-c", "embedded", "--clock", "lockstep")
-SHORT_RUN = '[operator]\nscript = [{at_s = 0.2, request = "finish"}]\n'
-
-
-class Lab:
-    """A folder, and an emulated arm that is there whenever a command opens the bus."""
-
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.folder = folder
-        self.scenario: dict[str, Any] = {"start_deg": [-30.0, -60.0], "torque_offset_Nm": list(OFFSET)}
-        self.serials: dict[int, int] = {}
-        self.tare_file = folder / "tare.toml"
-        self.settings_file = folder / "settings.toml"
-        self.settings_file.write_text(SHORT_RUN)
-        monkeypatch.setattr("adacd_hil.cli.connection.open_bus", self._open_bus)
-        monkeypatch.setattr("adacd_hil.cli.run.drop_old_frames", lambda bus, interface: None)
-        monkeypatch.setattr("adacd_hil.cli.connection.is_virtual", lambda interface, channel: True)
-
-    def _open_bus(self, interface: str, channel: str, clock: Clock, *_: object) -> Bus:
-        bus = EmbeddedBus(clock)
-        bench = Bench(parse(Scenario, self.scenario), load_codec(), bus.deliver)
-        for index, serial in self.serials.items():
-            bench.devices[index].serve(0x1018, 4, lambda serial=serial: serial)
-        bus.attach(bench.on_frame)
-        bench.boot()
-        return bus
-
-    def tare(self, *arguments: str) -> Result:
-        return CliRunner().invoke(cli, ["tare", *ON_BUS, "--seconds", "0.3", "--out", str(self.tare_file), *arguments])
-
-    def run(self, *arguments: str) -> Result:
-        config = ("--config", str(self.settings_file), "--out", str(self.folder))
-        return CliRunner().invoke(cli, ["run", *ON_BUS, "--json", *config, *arguments])
-
-    @property
-    def log(self) -> RunLog:
-        return read_log(self.folder / "run.mcap")
 
 
 @pytest.fixture
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
     return Lab(tmp_path, monkeypatch)
-
-
-def complaints(result: Result) -> list[str]:
-    return [line for line in result.stderr.splitlines() if line.startswith("adacd-hil:")]
 
 
 def test_a_tare_is_measured_stored_and_printed(lab: Lab) -> None:

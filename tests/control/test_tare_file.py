@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.clock import format_date
 from adacd_hil.config import ConfigError, load_settings
 from adacd_hil.control.tare_file import (
     PoseRecord,
     SensorRecord,
     Tare,
-    format_date,
     read_tare,
     use_tare,
     write_tare,

@@ -40,8 +40,8 @@ def test_an_arm_that_nobody_touches_is_certified_as_ever_and_its_certificate_say
     outputs = loop.run_until(SchemeState.MONITOR)
     learnt_s = PERIOD_S * sum(output.state in (SchemeState.ADAPT, SchemeState.CERTIFY) for output in outputs)
     assert learnt_s == pytest.approx(2.25, abs=0.01)
-    assert loop.said("history") == []
-    assert loop.said("certificate")[0].endswith(f"; friction and inertia: no more than in the certificate of {DATE}")
+    assert loop.said("touch") == []
+    assert loop.said("certificate")[0].endswith(f"; friction and inertia: within what the certificate of {DATE} allows")
 
 
 @pytest.mark.parametrize(
@@ -59,8 +59,8 @@ def test_a_hand_from_before_the_first_motion_is_more_than_the_last_certificate_s
     loop = HeldLoop(known(THETA["P"]))
     loop.theta = THETA["P"] + hand
     assert SchemeState.MONITOR not in states(loop.run(6000))
-    assert re.search(rf"{named} than in the certificate of {DATE}, bound 0\.\d\d\d", loop.said("history")[0])
-    assert "`accept` says that nobody touches the arm, which has changed" in loop.said("history")[0]
+    assert re.search(rf"{named} than in the certificate of {DATE}, bound 0\.\d\d\d", loop.said("touch")[0])
+    assert "`accept` says that nobody touches the arm, which has changed" in loop.said("touch")[0]
     loop.theta = THETA["P"]
     loop.recover()
     for name in ("a1", "F_c1", "F_v2"):
@@ -81,7 +81,7 @@ def test_an_arm_that_has_changed_is_certified_at_the_users_word_and_carries_it()
     loop.run(4000)
     loop.request = Request.ACCEPT
     loop.recover()
-    assert loop.said("history")[-1] == (
+    assert loop.said("touch")[-1] == (
         f"the user says that nobody touches the arm: the certificate of {DATE} is not compared"
     )
     assert loop.said("certificate")[0].endswith(f"; {BY_WORD}the certificate of {DATE}")
@@ -90,7 +90,7 @@ def test_an_arm_that_has_changed_is_certified_at_the_users_word_and_carries_it()
 def test_less_is_the_arms():
     loop = HeldLoop(known(THETA["P"] + added(F_c1=0.3, F_v2=0.1, a1=0.1)))
     loop.recover()
-    assert loop.said("history") == []
+    assert loop.said("touch") == []
 
 
 def test_a_payload_that_is_announced_is_not_compared():
@@ -101,7 +101,7 @@ def test_a_payload_that_is_announced_is_not_compared():
     loop.theta = THETA["P"] + PAYLOAD_1KG
     loop.request = Request.PAYLOAD_CHANGED
     loop.recover()
-    assert loop.said("history") == []
+    assert loop.said("touch") == []
     assert loop.said("certificate")[1].endswith(THIS_RUN_ONLY)
     first, second = loop.pipeline.certificates
     assert (first.is_payload, second.is_payload) == (False, True)

@@ -14,13 +14,14 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.log.stretch import begin_of_log
+from adacd_hil.records import CERTIFICATE_EVENTS
 from adacd_hil.wire.codec import Codec, parse_codec
 
 FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
 TOPICS: Final = (*FRAME_TOPICS, "/scheme", "/cycle", "/contact", "/events")
 CYCLES_PER_PIECE: Final = 20_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
-_SAID: Final = _SAID_BEFORE_ANCHORS | {"anchor", "touch", "certificate", "revoked"}
+_SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
 """Names of the events that the scheme itself says."""
 
 
