@@ -854,6 +854,10 @@ class TareSettings:
         5.0, unit="K", low=0.0, high=200.0, meaning="how far the temperature may be from that of the tare"
     )
 
+    def drift_variance(self, age_s: float) -> float:
+        """Return by how much a sensor's zero may have moved in so long, as a variance in Nm²."""
+        return (self.drift_Nm_K * self.temperature_K) ** 2 + self.drift_Nm_sqrt_s**2 * age_s
+
 
 @dataclass(frozen=True)
 class HistorySettings:
@@ -866,6 +870,12 @@ class HistorySettings:
     friction_std_Nm: tuple[float, ...] = setting((), unit="Nm", low=0.0, high=1000.0, meaning="their deviations")
     inertia_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=-1000.0, high=1000.0, meaning="a1, a2, a3")
     inertia_std_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=0.0, high=1000.0, meaning="their deviations")
+    offset_Nm: tuple[float, ...] = setting(
+        (), unit="Nm", low=-1000.0, high=1000.0, meaning="zero of each torque sensor, arm.torque_offset_Nm included"
+    )
+    offset_std_Nm: tuple[float, ...] = setting(
+        (), unit="Nm", low=0.0, high=1000.0, meaning="their deviations, drift since the certificate included"
+    )
     friction_share: float = setting(
         0.2, low=0.0, high=10.0, meaning="how far friction differs from run to run, a deviation, share of it"
     )
@@ -877,6 +887,8 @@ class HistorySettings:
             ("friction_std_Nm", self.friction_std_Nm, 3 * JOINTS),
             ("inertia_kgm2", self.inertia_kgm2, 3),
             ("inertia_std_kgm2", self.inertia_std_kgm2, 3),
+            ("offset_Nm", self.offset_Nm, JOINTS),
+            ("offset_std_Nm", self.offset_std_Nm, JOINTS),
         ):
             wanted = count if self.is_known else 0
             if len(values) != wanted:

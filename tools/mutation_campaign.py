@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
 from mutation_seeds import Seeds, make_seeds  # noqa: E402
-from mutations import Mutation, mutate_blf, mutate_bytes, mutate_mcap, mutate_text  # noqa: E402
+from mutations import Mutation, mutate_blf, mutate_bytes, mutate_history, mutate_mcap, mutate_text  # noqa: E402
 
 MOST_BYTES = 300 * 10**6
 """Beyond what the program itself takes, which is 0.2 GB."""
@@ -136,6 +136,14 @@ KINDS = {
     "map": Kind(mutate_text, (Command("adacd-hil identify CSV --map FILE --watch CSV", (0, 1, 2, 3)),)),
     "urdf": Kind(mutate_text, (Command("adacd-hil identify CSV --map USES_URDF", (0, 1, 2, 3)),)),
     "tare": Kind(mutate_text, (Command(f"adacd-hil run {NO_BUS} --tare FILE --config paper --out OUT", (2, 5)),)),
+    "history": Kind(
+        mutate_history,
+        (
+            Command("adacd-hil history FILE", (0, 2)),
+            Command("adacd-hil history FILE --plot OUT/x.png --json", (0, 2), is_heavy=True),
+            Command(f"adacd-hil run {NO_BUS} --history FILE --config certified --out OUT", (2, 5)),
+        ),
+    ),
     "bytes": Kind(mutate_bytes, (Command("adacd-hil budget --config FILE", (0, 1, 2)),)),
 }
 """`bytes`: a configuration as if it were binary."""

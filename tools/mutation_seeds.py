@@ -1,7 +1,7 @@
 """The files that the mutation campaign begins with: one of each kind, as it should be, small."""
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
@@ -9,6 +9,8 @@ import numpy as np
 
 from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.config import load_settings, to_toml
+from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.control.history_file import FORMAT, CertificateRecord, History, devices_digest
 from adacd_hil.log.editing.cut import Stretch, cut
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import read_frames
@@ -157,6 +159,7 @@ def make_seeds(folder: Path, is_light: bool) -> Seeds:
         "map": [EXAMPLE / "map.toml"],
         "urdf": [EXAMPLE / "planar-arm.urdf"],
         "tare": _texts(folder, "tare", TARE),
+        "history": _texts(folder, "history", to_toml(_history())),
         **_frame_logs(folder, short),
     }
     files["bytes"] = files["toml"][:1]
@@ -168,6 +171,23 @@ def _texts(folder: Path, name: str, *texts: str) -> list[Path]:
     for path, text in zip(paths, texts, strict=True):
         path.write_text(text)
     return paths
+
+
+def _history() -> History:
+    """Return the history of an arm with two runs."""
+    names = ("Drive1", "Drive2", "Sensor1", "Sensor2")
+    devices = tuple(DeviceRecord(name, node_id, 1, 2, 3, node_id) for node_id, name in enumerate(names, start=1))
+    digest, records = devices_digest(devices), []
+    for month in (1, 2):
+        record = CertificateRecord(
+            date_utc=f"2026-0{month}-01T12:00:00Z", log="run.mcap", profile="P", version="0.1.0", parameters=(0.1,) * 7,
+            friction_Nm=(0.1,) * 6, friction_std_Nm=(0.01,) * 6, inertia_kgm2=(0.2, 0.05, 0.02),
+            inertia_std_kgm2=(0.001,) * 3, offset_Nm=(0.01, -0.02), offset_std_Nm=(0.003, 0.002), is_payload=False,
+            text="torque offsets anchored",
+        )  # fmt: skip
+        digest = record.digest_after(digest)
+        records.append(replace(record, digest=digest))
+    return History(FORMAT, devices, tuple(records))
 
 
 def _scenarios() -> list[Path]:

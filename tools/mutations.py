@@ -1,4 +1,4 @@
-"""Mutations of files: of text, of bytes, and of MCAP and BLF from the inside, where checksums fit again.
+"""Mutations of files: of text, of bytes, and of MCAP, BLF and histories from the inside, where checksums fit again.
 
 Each takes bytes and a generator and gives other bytes. The same seed gives the same file.
 """
@@ -13,6 +13,10 @@ from collections.abc import Callable, Sequence
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
+
+from adacd_hil.config import ConfigError, parse, parse_toml
+from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.control.history_file import CertificateRecord, devices_digest
 
 Mutation = Callable[[bytes, random.Random], bytes]
 
@@ -33,6 +37,23 @@ def mutate_text(data: bytes, rng: random.Random) -> bytes:
     """Change a text in one to four places."""
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         data = rng.choice(_TEXT)(data, rng)
+    return data
+
+
+def mutate_history(data: bytes, rng: random.Random) -> bytes:
+    """Change an arm's history in one to four places; of what can still be read, the digests fit again."""
+    data = mutate_text(data, rng)
+    try:
+        table = parse_toml(data)
+        devices = [parse(DeviceRecord, device) for device in table["devices"]]
+        records = [parse(CertificateRecord, record) for record in table["certificates"]]
+    except (ConfigError, LookupError, TypeError):
+        return data
+    digest = devices_digest(devices)
+    for record in records:
+        old, digest = record.digest, record.digest_after(digest)
+        if old:
+            data = data.replace(old.encode(), digest.encode(), 1)
     return data
 
 

@@ -39,7 +39,7 @@ from side_by_side import (
 )
 from timing_clock import STEPS_S, run_clock, show_clock
 from timing_disk import DISK_CASES, STOPPED_S, run_disk, show_disk
-from timing_hogs import run_hogs, show_hogs
+from timing_hogs import finish_hogs, run_hogs, show_hogs
 from timing_hour import CONTACT_S, finish_hour, run_hour, show_hour
 
 from adacd_hil.wire.codec import contract_folder
@@ -111,6 +111,9 @@ COMMANDS: dict[str, tuple[Measurement, Callable[[dict[str, Any]], str]]] = {
     "clock": (run_clock, show_clock),
 }
 
+FINISHES = {"hour": finish_hour, "hogs": finish_hogs}
+"""What is made of a result outside of a guest."""
+
 
 def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     """Read the command line; exits with 2 on a usage error."""
@@ -173,8 +176,11 @@ def main(argv: Sequence[str]) -> int:
     if status or not raw.exists():
         return status or 1
     result = json.loads(raw.read_text())
-    if chosen.command == "hour":
-        result = finish_hour(chosen, result)
+    try:
+        result = FINISHES[chosen.command](chosen, result) if chosen.command in FINISHES else result
+    except TimingError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 1
     date = time.strftime("%Y-%m-%d %H:%M")
     machine = f"{platform.machine()}, {os.cpu_count()} CPUs, Python {platform.python_version()}, {date}"
     text = f"{chosen.command}; {machine}\n{show(result)}\n"

@@ -3,9 +3,9 @@
 import argparse
 import contextlib
 import os
+import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -41,6 +41,7 @@ FOLLOWED = ("torque-rate", "stop-not-latched")
 """Rules about what follows what; where cycles are missing in between, nobody knows."""
 STAY_S = 1.0
 """A stay in REACT or STOPPED takes less in these runs."""
+_SCENARIO = "contacts.toml"
 BURN = "while True: pass"
 SCRUB = """
 import os, sys
@@ -70,23 +71,33 @@ def hogs(processors: int, disks: int, folder: Path) -> Iterator[list["subprocess
 
 
 def run_hogs(chosen: argparse.Namespace) -> dict[str, Any]:
-    """Run the host for some minutes beside hogs. Raises TimingError."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        scenario_path = folder / "contacts.toml"
-        lasts_s = chosen.minutes * 60.0
-        contacts = write_contacts(scenario_path, lasts_s, chosen.every)
-        config = patient_config(folder, chosen.base, chosen.period_us, chosen.settings)
-        with ExitStack() as stack:
-            options = ("--scenario", str(scenario_path), "--clock", chosen.clock, "--out", str(folder))
-            stack.enter_context(emulator(CHANNEL, *options, folder=folder))
-            begun = stack.enter_context(running(host_run(CHANNEL, folder, config), folder))
-            stack.enter_context(hogs(chosen.processors, chosen.disks, folder))
-            end_s = time.monotonic() + lasts_s
-            while time.monotonic() < end_s and begun.process.poll() is None:
-                time.sleep(0.2)
-            status = begun.end() if begun.process.poll() is None else begun.process.returncode
-        return {**describe(folder, config, scenario_path), "contacts": contacts, "status": status, "said": begun.told}
+    """Run the host for some minutes beside hogs, in a new folder of `chosen.out`. Raises TimingError."""
+    folder = _folder(chosen)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    lasts_s = chosen.minutes * 60.0
+    contacts = write_contacts(folder / _SCENARIO, lasts_s, chosen.every)
+    config = patient_config(folder, chosen.base, chosen.period_us, chosen.settings)
+    with ExitStack() as stack:
+        options = ("--scenario", str(folder / _SCENARIO), "--clock", chosen.clock, "--out", str(folder))
+        stack.enter_context(emulator(CHANNEL, *options, folder=folder))
+        begun = stack.enter_context(running(host_run(CHANNEL, folder, config), folder))
+        stack.enter_context(hogs(chosen.processors, chosen.disks, folder))
+        end_s = time.monotonic() + lasts_s
+        while time.monotonic() < end_s and begun.process.poll() is None:
+            time.sleep(0.2)
+        status = begun.end() if begun.process.poll() is None else begun.process.returncode
+    return {"config": config.name, "contacts": contacts, "status": status, "said": begun.told}
+
+
+def finish_hogs(chosen: argparse.Namespace, result: dict[str, Any]) -> dict[str, Any]:
+    """Judge the run, outside of a guest: all frames of 10 min take more memory than one has. Raises TimingError."""
+    folder = _folder(chosen)
+    return result | describe(folder, folder / result["config"], folder / _SCENARIO)
+
+
+def _folder(chosen: argparse.Namespace) -> Path:
+    return Path(chosen.out) / "run"
 
 
 def describe(folder: Path, config: Path, scenario_path: Path) -> dict[str, Any]:

@@ -17,13 +17,14 @@ from functools import partial
 
 import numpy as np
 from property_campaign import parse_seeds
-from touch_trials import KINDS, Trial, play
+from touch_trials import AFTER_S, KINDS, Trial, play
 
 from adacd_hil.cli.table import format_table
 
 LARGE_NM, WRONG_NM = 0.1, 0.05
 WRONG_SHARE = 0.01
 BACK_S, BACK_SHARE = 5.0, 0.92
+NEVER_SHARE = 0.01
 WITHHELD_SHARE = 0.01
 
 
@@ -31,6 +32,9 @@ def touched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
     """Return name, value, bound of each figure, and whether it is within."""
     judged = [max(trial.errors_Nm, default=0.0) for trial in trials if not trial.is_excused]
     wrong, large = sum(error > WRONG_NM for error in judged), sum(error > LARGE_NM for error in judged)
+    by_word = sum(max(trial.by_word_Nm, default=0.0) > WRONG_NM for trial in trials if not trial.is_excused)
+    never = sum(trial.back_after_s is None for trial in trials if trial.is_released and not trial.fault)
+    released = sum(trial.is_released and not trial.fault for trial in trials)
     waited = [trial for trial in trials if trial.is_released and trial.is_reported and not trial.fault]
     back = sum(trial.back_after_s is not None and trial.back_after_s <= BACK_S for trial in waited)
     apart = "hands like a joint from before 0.5 s apart"
@@ -43,6 +47,8 @@ def touched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
             "92 %",
             back >= BACK_SHARE * len(waited),
         ),
+        (f"not back within {AFTER_S:g} s", f"{never} of {released}", "1 %", never <= NEVER_SHARE * released),
+        (f"by the user's word, off by > {WRONG_NM:g} Nm", f"{by_word} of {len(judged)}", "", True),
     ]
 
 

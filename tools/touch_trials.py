@@ -20,6 +20,7 @@ from planar_arm import THETA
 from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme import certified_kernel
 from adacd_hil.scheme.belief import payload_direction
+from adacd_hil.scheme.certificate_watch import BY_WORD
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.2)
@@ -71,7 +72,10 @@ class Hand:
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one arm. Times in s; errors_Nm: of each certificate since the touch began, on the paper's motion."""
+    """What came of one arm. Times in s; errors_Nm: of each certificate since the touch began, on the paper's motion.
+
+    by_word_Nm: of those that carry the user's word, who acknowledges every stop, also one that names what has changed.
+    """
 
     seed: int
     arm: str
@@ -81,6 +85,7 @@ class Trial:
     is_withheld: bool
     certified_s: float | None
     errors_Nm: tuple[float, ...]
+    by_word_Nm: tuple[float, ...]
     back_after_s: float | None
     is_released: bool
     fault: str
@@ -198,6 +203,7 @@ def play(seed: int, is_touched: bool) -> Trial:
     loop.run_until(SchemeState.ADAPT)
     begun, state = loop.cycle, SchemeState.ADAPT
     errors: list[float] = []
+    by_word: list[float] = []
     is_reported, certified_s, back_after_s, fault = False, None, None, ""
     while (at_s := (loop.cycle - begun) * PERIOD_S) < until_s and back_after_s is None and not fault:
         if hand is not None and begins_s <= at_s < ends_s:
@@ -209,12 +215,14 @@ def play(seed: int, is_touched: bool) -> Trial:
         is_reported |= state is SchemeState.REACT and before is not state and at_s >= begins_s
         if state is SchemeState.MONITOR and before is SchemeState.CERTIFY and (hand is None or at_s > begins_s):
             certified_s = at_s if certified_s is None else certified_s
-            errors.append(float(np.abs(paper_rows() @ (loop.pipeline._memory[0]["theta"] - loop.truth)).max()))
+            error_Nm = float(np.abs(paper_rows() @ (loop.pipeline._memory[0]["theta"] - loop.truth)).max())
+            (by_word if BY_WORD in loop.said("certificate")[-1] else errors).append(error_Nm)
         if hand is not None and at_s > ends_s and state is SchemeState.MONITOR:
             back_after_s = at_s - ends_s
         fault = output.fault.name if state is SchemeState.FAULT else ""
     return Trial(
         seed, loop.arm, "none" if hand is None else hand.kind, hand is not None and hand.is_like_a_joint_from_the_start,
-        is_reported, bool(loop.said("anchor") or loop.said("touch")), certified_s, tuple(errors), back_after_s,
-        is_released=np.isfinite(ends_s), fault=fault,
+        is_reported, bool(loop.said("anchor") or loop.said("touch")), certified_s, tuple(errors), tuple(by_word),
+        back_after_s,
+        is_released=bool(np.isfinite(ends_s)), fault=fault,
     )  # fmt: skip

@@ -8,6 +8,7 @@ compute digests, too.
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ from adacd_hil.scheme.last_certificate import Certificate
 
 HISTORY_NAME = "history.toml"
 FORMAT = 1
+_LARGEST = 1000.0
 _FUTURE_NS = 360_000_000_000
 """How far ahead of this machine's clock a certificate may be dated."""
 
@@ -38,12 +40,16 @@ class CertificateRecord:
     profile: str = setting(meaning="arm profile of the configuration")
     version: str = setting(meaning="of adacd-hil")
     parameters: tuple[float, ...] = setting(meaning="a1 … F_c2, and those of gravity")
-    friction_Nm: tuple[float, ...] = setting(unit="Nm", meaning="of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2")
-    friction_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, meaning="their deviations")
-    inertia_kgm2: tuple[float, ...] = setting(unit="kg m²", meaning="a1, a2, a3")
-    inertia_std_kgm2: tuple[float, ...] = setting(unit="kg m²", low=0.0, meaning="their deviations")
-    offset_Nm: tuple[float, ...] = setting(unit="Nm", meaning="of the torque sensors, beside the configuration's")
-    offset_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, meaning="their deviations")
+    friction_Nm: tuple[float, ...] = setting(
+        unit="Nm", low=-_LARGEST, high=_LARGEST, meaning="of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2"
+    )
+    friction_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, high=_LARGEST, meaning="their deviations")
+    inertia_kgm2: tuple[float, ...] = setting(unit="kg m²", low=-_LARGEST, high=_LARGEST, meaning="a1, a2, a3")
+    inertia_std_kgm2: tuple[float, ...] = setting(unit="kg m²", low=0.0, high=_LARGEST, meaning="their deviations")
+    offset_Nm: tuple[float, ...] = setting(
+        unit="Nm", low=-_LARGEST, high=_LARGEST, meaning="of the torque sensors, the configuration's included"
+    )
+    offset_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, high=_LARGEST, meaning="their deviations")
     is_payload: bool = setting(meaning="with a payload that was announced in the run")
     text: str = setting(meaning="what anchors it, and what friction and inertia are known by")
     digest: str = setting("", meaning="SHA-256 of the digest before (of the devices at first) and of all above")
@@ -60,6 +66,8 @@ class CertificateRecord:
             friction_std_Nm=self.friction_std_Nm,
             inertia_kgm2=self.inertia_kgm2,
             inertia_std_kgm2=self.inertia_std_kgm2,
+            offset_Nm=self.offset_Nm,
+            offset_std_Nm=self.offset_std_Nm,
         )
 
     def digest_after(self, before: str) -> str:
@@ -131,11 +139,15 @@ def _parse(path: Path, text: bytes) -> History:
 
 @dataclass(frozen=True)
 class UsedHistory:
-    """The history that a run uses and adds to. `text`: the file as it was; `history` None: there was none yet."""
+    """The history that a run uses and adds to.
+
+    `text`: the file as it was; `history` None: there was none yet. `age_s`: of its last certificate.
+    """
 
     path: Path
     text: bytes
     history: History | None
+    age_s: float = 0.0
 
     @property
     def is_first_run(self) -> bool:
@@ -148,10 +160,13 @@ class UsedHistory:
         return (f"{self.path}: the arm's first run, nothing is known of its friction",) if self.is_first_run else ()
 
     def apply(self, settings: Settings) -> Settings:
-        """Return settings whose `history` is the last certificate."""
+        """Return settings whose `history` is the last certificate, with how far the sensors may have drifted since."""
         if self.history is None:
             return settings
-        return dataclasses.replace(settings, history=self.history.last.known(settings.history))
+        known = self.history.last.known(settings.history)
+        drifted = settings.tare.drift_variance(self.age_s)
+        std_Nm = tuple(math.sqrt(std**2 + drifted) for std in known.offset_std_Nm)
+        return dataclasses.replace(settings, history=dataclasses.replace(known, offset_std_Nm=std_Nm))
 
     def check_devices(self, identities: Sequence[Identity]) -> Event:
         """Return what goes to the log's events. Raises DeviceError unless the devices are those of the history."""
@@ -209,4 +224,4 @@ def use_history(path: Path, now_ns: int) -> UsedHistory:
     ahead_ns = date_ns(history.last.date_utc) - now_ns
     if ahead_ns > _FUTURE_NS:
         raise ConfigError(f"history {path}: its last certificate is {ahead_ns / 3.6e12:.1f} h ahead of this clock")
-    return UsedHistory(path, text, history)
+    return UsedHistory(path, text, history, max(-ahead_ns, 0) * 1e-9)

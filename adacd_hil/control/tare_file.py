@@ -148,7 +148,7 @@ class UsedTare:
 
     def offset_std_Nm(self, drift: TareSettings) -> tuple[float, float]:
         """Return the standard deviation of the offsets now: as measured, and what has drifted since."""
-        drifted = (drift.drift_Nm_K * drift.temperature_K) ** 2 + drift.drift_Nm_sqrt_s**2 * self.age_s
+        drifted = drift.drift_variance(self.age_s)
         first, second = (
             math.sqrt(error**2 + (spread / 2.0) ** 2 + drifted)
             for error, spread in zip(self.tare.standard_error_Nm, self.tare.spread_Nm, strict=True)

@@ -7,7 +7,8 @@ knowledge from elsewhere. An anchor judges the fitted offset and never pulls it:
               torque, so the reading is the offset, whoever leans. What the motor side can hold, `holding_Nm`, is the
               most by which a lean shifts it; where that is not known the reading says nothing.
     TARE      the zero of the configuration, where a tare says how well it is known.
-    ACCEPTED  what the user has accepted in place of both.
+    ACCEPTED  what the user has accepted in place of all.
+    LAST      what the arm's last certificate found, asked of a joint that no other anchor bounds.
 
 The fitted offset o must keep to each anchor a that there is:
 
@@ -16,7 +17,7 @@ The fitted offset o must keep to each anchor a that there is:
 u P_oo: the belief's variance in the unit of its residuals; b² t: drift since; 0.1 F_c: friction that differs by
 direction looks like an offset. Before the drives are enabled the reading at rest must keep to the tare likewise.
 
-Shapes: anchor_Nm, anchor_std, bound_Nm (3, n), inf where there is none; judged_Nm (n,): what was compared last with
+Shapes: anchor_Nm, anchor_std, bound_Nm (4, n), inf where there is none; judged_Nm (n,): what was compared last with
 them; holding_Nm (n,), inf where not known.
 """
 
@@ -28,9 +29,9 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 
-REST, TARE, ACCEPTED = range(3)
-KINDS = 3
-NAMES = ("the reading at rest", "the tare", "the user's word")
+REST, TARE, ACCEPTED, LAST = range(4)
+KINDS = 4
+NAMES = ("the reading at rest", "the tare", "the user's word", "the last certificate")
 SIGMAS = 4.0
 """Two joints, two-sided: 1.3e-4 of clean arms, each time that it is asked."""
 REST_STD_NM = 0.004
@@ -42,9 +43,15 @@ ASYMMETRY = 0.1
 
 
 def constants_of(settings: Settings) -> dict[str, Vector]:
-    """Return what the kernel needs to know: `holding_Nm`, `zero_std_Nm` (n,), `zero_drift_Nm2_s`, `rest_cycles`."""
-    arm = settings.arm
+    """Return what the kernel needs to know: `zero_drift_Nm2_s`, `rest_cycles`, and the following (n,).
+
+    `holding_Nm`; `zero_Nm`, `zero_std_Nm`: of the configuration; `last_zero_Nm`, `_std_Nm`: of the last certificate.
+    """
+    arm, history = settings.arm, settings.history
     return {
+        "zero_Nm": np.array(arm.torque_offset_Nm),
+        "last_zero_Nm": np.array(history.offset_Nm if history.is_known else arm.torque_offset_Nm),
+        "last_zero_std_Nm": _or_unknown(history.offset_std_Nm if history.is_known else None),
         "holding_Nm": _or_unknown(arm.holding_torque_Nm),
         "zero_std_Nm": _or_unknown(arm.torque_offset_std_Nm),
         "zero_drift_Nm2_s": np.array(settings.tare.drift_Nm_sqrt_s**2),
@@ -52,14 +59,16 @@ def constants_of(settings: Settings) -> dict[str, Vector]:
     }
 
 
-def _or_unknown(values: tuple[float, float] | None) -> Vector:
+def _or_unknown(values: tuple[float, ...] | None) -> Vector:
     return np.full(JOINTS, np.inf) if values is None else np.array(values)
 
 
 def begin(k: Any, m: Any) -> None:
-    """Fill the anchors before the first sample: the tare alone."""
+    """Fill the anchors before the first sample: the tare, and the last certificate."""
     m["anchor_std"][:] = np.inf
     m["anchor_std"][TARE] = k["zero_std_Nm"]
+    m["anchor_Nm"][LAST] = k["last_zero_Nm"] - k["zero_Nm"]
+    m["anchor_std"][LAST] = k["last_zero_std_Nm"]
 
 
 @compiled
@@ -117,7 +126,8 @@ def is_within(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
         fitted = min(m["unit"][i], 1.0) * P[base + i, base + i] + friction**2 + MODEL_STD_NM**2
         for kind in range(KINDS):
             std, slack = m["anchor_std"][kind, i], k["holding_Nm"][i] if kind == REST else 0.0
-            m["bound_Nm"][kind, i] = SIGMAS * np.sqrt(fitted + std**2 + drift) + slack if std != np.inf else np.inf
+            is_asked = std != np.inf and (kind != LAST or np.min(m["bound_Nm"][:LAST, i]) > k["beta_Nm"])
+            m["bound_Nm"][kind, i] = SIGMAS * np.sqrt(fitted + std**2 + drift) + slack if is_asked else np.inf
             is_within = is_within and abs(theta[base + i] - m["anchor_Nm"][kind, i]) <= m["bound_Nm"][kind, i]
     return bool(is_within)
 

@@ -15,6 +15,7 @@ THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
 BY_WORD = "friction and inertia: by this run and the user's word, against "
 _THE_RUN = "what the run had learnt before"
+_TAKEN_BACK = "the certificate that was taken back"
 _CHANGED = "no one model explains the whole fit: something has touched the arm or let go while it was learnt"
 _BEGINS_ANEW = "no certificate, learning begins anew"
 
@@ -124,13 +125,16 @@ class CertificateWatch:
         return Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}")
 
     def revoke(self) -> Event:
-        """Take in that the user takes the certificate back."""
+        """Take in, before what was kept is forgotten, that the user takes the certificate back."""
+        if self._memory["has_kept"]:
+            self._vouched_against = _THE_RUN
         self._take_back()
         return Event("warning", "revoked", "at the user's word the arm is learnt anew")
 
     def _take_back(self) -> None:
         if self._is_standing:
             self._certified.pop()
+            self._vouched_against = _TAKEN_BACK
         self._is_standing = False
 
     def push(self, torque_Nm: Vector) -> Event:

@@ -32,6 +32,7 @@ from adacd_hil.scheme import (
     detector,
     doubt,
     earlier,
+    fit_samples,
     friction,
     last_certificate,
     refinement,
@@ -248,6 +249,7 @@ def new_memory(settings: Settings) -> Structured:
         "judged_Nm": joint,
         # what was known earlier
         **earlier.shapes_of(count),
+        **fit_samples.shapes_of(count),
         **last_certificate.shapes_of(),
         **doubt.shapes_of(),
         "withheld_by": (),
@@ -316,6 +318,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     _use_belief(m)
     belief.discard(m)
     earlier.begin(m)
+    fit_samples.begin(m)
     m["unit"][:] = 1.0
     m["samples"] = 0.0
     m["recovering_cycles"] = 0.0
@@ -372,7 +375,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
     if is_fresh:
         m["anchor_age_s"] += out["period_s"][0]
-        m["kept_age_s"] += out["period_s"][0]
+        m["kept_age_s"][:] += out["period_s"][0]
         if mode & MEASURE:
             _measure_noise(k, m, out["tau_J"])
             anchor.measure(k, m, out["tau_J"], observation & _AT_REST != 0)
@@ -552,6 +555,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
         _use_belief(m)
         earlier.follow(k, m)
+        fit_samples.keep(m, m["W_f"][_FIT], m["tau_f"][_FIT])
     if not (is_free and _gather_evidence(k, m, out)):
         return 0
     m["withheld_by"] = _contradicted_by(k, m)
@@ -563,7 +567,7 @@ def _contradicted_by(k: Any, m: Any) -> int:
     """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
     if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
         return ANCHOR
-    if not earlier.is_steady(m):
+    if not (earlier.is_steady(m) and earlier.is_explained(k, m)):
         return CHANGED
     if not earlier.is_no_more(k, m):
         return MORE

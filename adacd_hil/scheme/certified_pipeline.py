@@ -276,9 +276,9 @@ class CertifiedPipeline(RunsBatches):
         """Take back the certificate: nothing is known of the arm, and nothing is fed forward."""
         self._is_payload = self._has_certificate = False
         self._theta_ff = np.zeros(self._theta_ff.size)
+        self._events.append(self._watch.revoke())
         earlier.forget(self._memory[0])
         self._paper.begin_adaptation()
-        self._events.append(self._watch.revoke())
 
     def _forget_if_disturbed(self, state: SchemeState) -> None:
         """Once a contact that interrupted an adaptation is reported, forget what this adaptation has learnt.

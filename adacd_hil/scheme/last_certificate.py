@@ -30,7 +30,8 @@ class Certificate(NamedTuple):
     """What a certificate says of the arm, as it was when it was certified.
 
     parameters: a1 … F_c2, and those of gravity where there are any (p,); friction_Nm, their deviations (6,): joint 1 at
-    `earlier.SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,); offset_Nm (n,): of the torque sensors.
+    `earlier.SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,); offset_Nm (n,): of the torque sensors, the configuration's
+    included.
     """
 
     parameters: tuple[float, ...]
@@ -118,7 +119,7 @@ def certificate_of(k: Any, theta: Vector, P: Vector, is_payload: bool, text: str
         friction_std_Nm=tuple(std[:first].tolist()),
         inertia_kgm2=tuple(values[first:].tolist()),
         inertia_std_kgm2=tuple(std[first:].tolist()),
-        offset_Nm=tuple(theta[offsets].tolist()),
+        offset_Nm=tuple((k["zero_Nm"] + theta[offsets]).tolist()),
         offset_std_Nm=tuple(np.sqrt(np.diag(P)[offsets]).tolist()),
         is_payload=is_payload,
         text=text,

@@ -4,15 +4,25 @@ import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bus_lab import BUS_MISSING, SHORT_RUN, USAGE, Lab, complaints
 from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.run import ask_first_run
-from adacd_hil.clock import wall_ns
-from adacd_hil.config import ConfigError, parse_toml
-from adacd_hil.control.history_file import FORMAT, History, Origin, UsedHistory, read_history, use_history
+from adacd_hil.clock import date_ns, wall_ns
+from adacd_hil.config import ConfigError, load_settings, parse_toml, to_toml
+from adacd_hil.control.history_file import (
+    FORMAT,
+    CertificateRecord,
+    History,
+    Origin,
+    UsedHistory,
+    devices_digest,
+    read_history,
+    use_history,
+)
 from adacd_hil.device.network import Identity
 
 pytestmark = pytest.mark.slow
@@ -145,6 +155,40 @@ def test_a_certificate_that_lacks_values_is_refused_though_its_digest_is_right(f
         replace(last, friction_Nm=last.friction_Nm[1:])
     with pytest.raises(ValueError, match="inertia_kgm2 has 3 values, 0 expected"):
         replace(last, date_utc="", friction_Nm=(), friction_std_Nm=())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("offset_Nm", (0.0,), "offset_Nm has 1 values, 2 expected"),
+        ("offset_std_Nm", (0.1, 0.1, 0.1), "offset_std_Nm has 3 values, 2 expected"),
+        ("friction_Nm", (1e9,) * 6, "`certificates[0].friction_Nm[0]` = 1000000000.0 Nm is above 1000 Nm"),
+    ],
+)
+def test_values_that_no_arm_has_are_refused_though_their_digest_is_right(
+    file: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: tuple[float, ...], says: str
+) -> None:
+    found = read_history(file)
+    with monkeypatch.context() as forger:
+        forger.setattr(CertificateRecord, "__post_init__", lambda self: None)
+        forged = replace(found.last, **{old: new})  # type: ignore[arg-type]
+        forged = replace(forged, digest=forged.digest_after(devices_digest(found.devices)))
+        file.write_text(to_toml(History(FORMAT, found.devices, (forged,))))
+    with pytest.raises(ConfigError) as caught:
+        read_history(file)
+    assert says in str(caught.value)
+
+
+def test_the_older_a_certificate_the_less_its_zero_is_known(file: Path) -> None:
+    last = read_history(file).last
+    settings = load_settings("certified")
+    fresh, old = (
+        use_history(file, date_ns(last.date_utc) + round(age_s * 1e9)).apply(settings).history.offset_std_Nm
+        for age_s in (0.0, 30 * 86400.0)
+    )
+    warmed, walked = 1e-3 * 5.0, 2e-5 * (30 * 86400.0) ** 0.5
+    np.testing.assert_allclose(fresh, np.hypot(last.offset_std_Nm, warmed))
+    np.testing.assert_allclose(old, np.hypot(fresh, walked))
 
 
 def test_a_certificate_of_the_future_is_refused(file: Path) -> None:

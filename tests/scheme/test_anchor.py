@@ -103,6 +103,64 @@ def test_an_untouched_arm_is_certified_at_once_whatever_its_offset():
     assert np.abs(loop.offset_error_Nm).max() < 0.02
 
 
+def with_last(settings, offset_Nm=(0.0, 0.0)):
+    """Return settings with a last certificate that knows the sensors' zeros, and any friction and inertia."""
+    history = replace(
+        settings.history,
+        date_utc="2026-11-22T10:00:00Z",
+        friction_Nm=(10.0,) * 6,
+        friction_std_Nm=(0.1,) * 6,
+        inertia_kgm2=(10.0,) * 3,
+        inertia_std_kgm2=(0.1,) * 3,
+        offset_Nm=offset_Nm,
+        offset_std_Nm=(0.005, 0.005),
+    )
+    return replace(settings, history=history)
+
+
+def test_where_nothing_else_anchors_an_offset_the_last_certificate_does():
+    loop = TouchedLoop(with_last(UNKNOWN, (0.1, 0.0)), (0.1, 0.0))
+    loop.run_until(SchemeState.ENABLE)
+    leant = loop.lean(0, 0.3, 3.5)
+    assert SchemeState.MONITOR not in {output.state for output in leant}
+    assert re.search(
+        r"joint 1 has a fitted torque offset of -0\.[12]\d\d Nm, by the last certificate it is 0\.100 ± 0\.0\d\d Nm: "
+        "somebody leans on it, or the sensor has moved",
+        loop.said("anchor")[0],
+    )
+    loop.recover()
+    assert np.abs(loop.offset_error_Nm).max() < LARGEST_ERROR_NM
+    (text,) = loop.said("certificate")
+    assert re.search(r"joint 1 to ± 0\.0\d\d Nm by the last certificate; joint 2 to ± 0\.0\d\d Nm by the last", text)
+
+
+def test_the_last_certificates_zero_counts_from_the_configurations():
+    configured = replace(with_last(UNKNOWN, (0.4, -0.3)), arm=replace(UNKNOWN.arm, torque_offset_Nm=(0.3, -0.4)))
+    loop = TouchedLoop(configured, (0.1, 0.1))  # what the loop measures has the configuration's subtracted
+    loop.run_until(SchemeState.MONITOR)
+    assert loop.said("anchor") == []
+    (certificate,) = loop.pipeline.certificates
+    np.testing.assert_allclose(certificate.offset_Nm, (0.4, -0.3), atol=0.02)
+
+
+@pytest.mark.parametrize("settings", [FREE, TARED])
+def test_a_sensor_that_has_moved_since_the_last_certificate_is_believed_where_something_nearer_anchors_it(settings):
+    loop = TouchedLoop(with_last(settings, (0.5, -0.5)))
+    loop.run_until(SchemeState.MONITOR)
+    assert loop.said("anchor") == []
+    assert "last certificate; joint" not in loop.said("certificate")[0]
+
+
+def test_the_user_may_say_that_the_sensor_has_moved_since_the_last_certificate():
+    loop = TouchedLoop(with_last(UNKNOWN, (0.5, 0.0)))
+    loop.run(3500)
+    assert "by the last certificate it is 0.500" in loop.said("anchor")[0]
+    loop.request = Request.ACCEPT
+    loop.run_until(SchemeState.MONITOR)
+    assert "joint 1 to ± 0.0" in loop.said("certificate")[0]
+    assert np.abs(loop.offset_error_Nm).max() < 0.02
+
+
 def test_a_payload_is_learnt_with_the_anchor_of_the_start():
     loop = TouchedLoop(FREE, (0.1, 0.0))
     loop.run_until(SchemeState.MONITOR)

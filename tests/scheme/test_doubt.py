@@ -11,6 +11,7 @@ from test_earlier import FREE, HeldLoop, added
 
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme import certified_kernel, doubt
+from adacd_hil.scheme.certificate_watch import BY_WORD
 from adacd_hil.scheme.doubt import Doubt
 
 PAYLOAD, COULOMB1 = range(2)
@@ -78,6 +79,7 @@ def test_friction_that_is_not_the_certified_one_is_named_and_learnt_at_a_word(ha
     loop.recover()
     assert loop.error_of("F_c1") < 0.02
     assert loop.error_of("F_v2") < 0.02
+    assert loop.said("certificate")[1].endswith(f"; {BY_WORD}the certificate that was taken back")
 
 
 def test_a_contact_that_never_ends_has_an_exit():
@@ -98,6 +100,7 @@ def test_a_contact_that_never_ends_has_an_exit():
     loop.request = Request.ACCEPT
     loop.recover()
     assert abs(loop.offset_error_Nm[0]) < 0.03
+    assert loop.said("certificate")[1].endswith(f"; {BY_WORD}the certificate that was taken back")
 
 
 @pytest.mark.long

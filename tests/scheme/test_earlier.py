@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from excited_arm import NAMES, PERIOD_S, SETTINGS, TouchedLoop
+from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
@@ -168,21 +169,22 @@ def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
 class Compared:
     """A kernel's memory with a fit and something kept, both known to `std` in every parameter."""
 
-    def __init__(self, settings=FREE, std=0.005):
+    def __init__(self, settings=FREE, std=0.01):
         self.k, self.m = certified_kernel.constants_of(settings)[0], certified_kernel.new_memory(settings)[0]
-        self.m["P_belief"] = self.m["P_kept"] = std**2 * np.eye(len(NAMES))
-        self.m["belief"] = self.m["kept"] = 0.1
-        self.m["fit_square"], self.m["fit_rows"], self.m["kept_unit"], self.m["has_kept"] = 1.0, 4.0, 1.0, 1.0
+        self.m["P_belief"] = std**2 * np.eye(len(NAMES))
+        self.m["belief"] = 0.1
+        self.m["fit_square"], self.m["fit_rows"] = 1.0, 4.0
+        earlier._keep(self.m, self.m["belief"], self.m["P_belief"], 1.0, 0.0)
         self.m["bound_Nm"] = np.inf if settings is UNKNOWN else 0.04
 
     def agrees_with(self, name, change):
-        self.m["belief"] = self.m["kept"]
+        self.m["belief"] = 0.1
         self.m["belief"][NAMES.index(name)] += change
         return earlier.is_no_more(self.k, self.m)
 
 
 def test_more_is_a_touch_and_less_is_the_arms():
-    limit_Nm = earlier.SIGMAS * 0.005 * np.sqrt(2.0 * (1.0 + 0.2**2))
+    limit_Nm = earlier.SIGMAS * 0.01 * np.sqrt(2.0 * (1.0 + 0.2**2))
     compared = Compared()
     assert limit_Nm > earlier.FRICTION_NM
     assert compared.agrees_with("F_c1", 0.99 * limit_Nm)
@@ -210,8 +212,8 @@ def test_an_offset_counts_both_ways_and_where_something_anchors_it_shows_that_wh
 
 def test_what_the_prior_alone_says_judges_nothing():
     prior = Compared()
-    prior.m["P_kept"] = np.diag(certified_kernel.new_memory(FREE)[0]["P_belief"].diagonal())
-    prior.m["kept_unit"] = earlier.SMALLEST_UNIT
+    prior.m["P_kept"][0] = np.diag(certified_kernel.new_memory(FREE)[0]["P_belief"].diagonal())
+    prior.m["kept_unit"][0] = earlier.SMALLEST_UNIT
     assert prior.agrees_with("F_c1", 1.0)
     assert prior.agrees_with("a1", 1.0)
 
@@ -220,7 +222,7 @@ def test_what_the_prior_alone_says_judges_nothing():
 def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share, is_steady):
     compared = Compared(std=0.01)
     m = compared.m
-    m["has_kept"], m["steps_used"], m["steps_theta"][0] = 0.0, 1.0, 0.1
+    m["has_kept"], m["kept"], m["steps_used"], m["steps_theta"][0] = 0.0, 0.0, 1.0, 0.1
     m["steps_P"][0] = 0.02**2 * np.eye(len(NAMES))
     m["steps_square"][0], m["steps_rows"][0], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
     added_variance = (1.0 + earlier.REGULAR) * 0.02**2 - 0.01**2
@@ -228,14 +230,48 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     assert earlier.is_steady(m) is is_steady
     assert bool(m["has_kept"]) is not is_steady
     if not is_steady:
-        assert (m["kept"] == 0.1).all()
+        assert (m["kept"][0] == 0.1).all()
 
 
-def test_the_step_kept_is_from_before_the_contact():
+def test_the_steps_kept_are_from_before_the_contact():
     loop = HeldLoop(FREE)
     loop.learn(1.1)
     m = loop.pipeline._memory[0]
-    steps = int(m["steps_used"])
+    steps, of_steps = int(m["steps_used"]), m["steps_theta"].copy()
     loop.lean(0, 3.0, 0.05)
     assert m["has_kept"] == 1.0
-    assert (m["kept"] == m["steps_theta"][steps - earlier.BACK]).all() or m["steps_used"] == 0.0
+    assert m["kept_count"] == steps - earlier.BACK + 1 > 2
+    assert (m["kept"][: steps - earlier.BACK + 1] == of_steps[: steps - earlier.BACK + 1]).all()
+
+
+def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
+    compared = Compared()
+    m, compared_with = compared.m, compared.m["belief"].copy()
+    for touched, std in ((0.3, 0.01), (0.0, 1.0)):  # one that has learnt the hand, one that knows nothing
+        compared_with[NAMES.index("F_c1")] = 0.1 + touched
+        earlier._keep(m, compared_with, std**2 * np.eye(len(NAMES)), 1.0, 1.0)
+    m["kept_age_s"][0] = 7.0
+    assert not compared.agrees_with("F_c1", 0.3)
+    (line,) = earlier.describe_more(compared.k, m)
+    assert line.startswith("friction of joint 1 at 0.2 rad/s is 0.300 Nm more than 7.0 s ago, bound 0.05")
+
+
+def test_a_kept_belief_that_was_leant_on_is_forgotten_and_the_others_go_on_judging():
+    compared = Compared(std=1e-5)
+    leant = compared.m["belief"].copy()
+    leant[NAMES.index("offset1")] += 0.3
+    earlier._keep(compared.m, leant, 1e-10 * np.eye(len(NAMES)), 1.0, 0.0)
+    assert not compared.agrees_with("F_c1", 0.04)
+    assert compared.m["kept_unit"][:2].tolist() == [1.0, 0.0]
+    assert compared.m["has_kept"] == 1.0
+
+
+@pytest.mark.parametrize(("begins_s", "drag_Nm"), long_but(1, [(0.87, 0.14), (0.55, 0.27)]))
+def test_a_drag_that_the_first_fit_has_learnt_half_of_is_not_certified_by_the_second(begins_s, drag_Nm):
+    loop = HeldLoop(FREE, theta=THETA["S"], seed=83115)
+    loop.learn(begins_s)
+    outputs = loop.hold(added(F_c2=drag_Nm), 6.0)
+    assert SchemeState.MONITOR not in states(outputs)
+    assert re.search(r"friction of joint 2 at [\d.]+ rad/s is 0\.\d\d\d Nm more than", loop.said("touch")[-1])
+    loop.recover()
+    assert loop.error_of("F_c2") < 0.02

@@ -30,6 +30,8 @@ def known(theta, settings=FREE):
         friction_std_Nm=(0.005,) * 6,
         inertia_kgm2=tuple(theta[:3]),
         inertia_std_kgm2=(0.001,) * 3,
+        offset_Nm=(0.0, 0.0),
+        offset_std_Nm=(0.01, 0.01),
     )
     return replace(settings, history=history)
 

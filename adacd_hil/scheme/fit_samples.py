@@ -1,0 +1,91 @@
+"""Samples of a fit, kept so that the model it has come to is asked whether it explains each of them.
+
+A touch that came and went while little was known is a small part of a fit, and its model passes a test on new motion:
+what the touch has bent shows elsewhere. But the samples of that time don't agree with the model. So a fit counts only
+if
+
+    |tau_f - W_f theta| <= LIMIT_NM + LIMIT_SHARE rms
+
+of every sample and joint, rms: of the residuals of its better half. Not asked of a payload's fit.
+
+Shapes: p parameters, n joints, s samples of room; samples_W (s, n, p), samples_tau (s, n). When there is no room left
+every second sample goes, and half as many come.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import JOINTS, Vector
+
+ROOM = 128
+FIRST_EVERY = 3.0
+"""Of the samples that are learnt, every 4 ms: 1.5 s fill the room."""
+LIMIT_NM = 0.045
+LIMIT_SHARE = 9.0
+"""Of 280 untouched arms, wide ones included, the worst came to 0.7 of the limit, half of them to 0.17."""
+
+
+def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name, of a model with this many parameters."""
+    return {
+        "samples_W": (ROOM, JOINTS, count),
+        "samples_tau": (ROOM, JOINTS),
+        "samples_kept": (),
+        "samples_every": (),
+        "samples_left_out": (),
+    }
+
+
+@compiled
+def begin(m: Any) -> None:
+    """Begin a fit."""
+    m["samples_kept"] = 0.0
+    m["samples_every"] = FIRST_EVERY
+    m["samples_left_out"] = 0.0
+
+
+@compiled
+def keep(m: Any, W_f: Vector, tau_f: Vector) -> None:
+    """Take in a sample that is learnt. W_f (n, p), tau_f (n,)."""
+    m["samples_left_out"] += 1.0
+    if m["samples_left_out"] < m["samples_every"]:
+        return
+    m["samples_left_out"] = 0.0
+    kept, room = int(m["samples_kept"]), m["samples_tau"].shape[0]
+    if kept == room:
+        kept = room // 2
+        for s in range(kept):
+            m["samples_W"][s] = m["samples_W"][2 * s]
+            m["samples_tau"][s] = m["samples_tau"][2 * s]
+        m["samples_every"] *= 2.0
+    m["samples_W"][kept] = W_f
+    m["samples_tau"][kept] = tau_f
+    m["samples_kept"] = kept + 1.0
+
+
+@compiled
+def first_unexplained(m: Any) -> int:
+    """Return which of the fit's learnt samples, from 0, is the first that its belief doesn't explain; -1: none is."""
+    kept, first = int(m["samples_kept"]), -1
+    if m["is_payload"] != 0.0 or kept < 2:
+        return first
+    squares, half = np.zeros(2), kept // 2
+    for s in range(2 * half):
+        for i in range(m["samples_tau"].shape[1]):
+            squares[s // half] += _residual(m, s, i) ** 2
+    limit = LIMIT_NM + LIMIT_SHARE * np.sqrt(np.min(squares) / (half * m["samples_tau"].shape[1]))
+    for s in range(kept - 1, -1, -1):
+        for i in range(m["samples_tau"].shape[1]):
+            if not abs(_residual(m, s, i)) <= limit:
+                first = s
+    return first if first < 0 else int(first * m["samples_every"])
+
+
+@compiled
+def _residual(m: Any, s: int, joint: int) -> float:
+    w, r = m["samples_W"][s, joint], m["samples_tau"][s, joint]
+    for j in range(w.shape[0]):
+        r -= w[j] * m["belief"][j]
+    return float(r)

@@ -1,0 +1,77 @@
+"""A fit's model must explain each of its samples: a short touch among them bends it, and stands out."""
+
+import numpy as np
+import pytest
+from excited_arm import NAMES, PERIOD_S
+from planar_arm import THETA
+from test_earlier import FREE, HeldLoop, states
+
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme import certified_kernel, fit_samples
+
+
+class Fit:
+    """A kernel's memory with a fit that explains what it has learnt, but for noise of 0.01 Nm."""
+
+    def __init__(self, learnt=300):
+        self.m = certified_kernel.new_memory(FREE)[0]
+        fit_samples.begin(self.m)
+        random = np.random.default_rng(1)
+        self.W = random.standard_normal((learnt, 2, len(NAMES)))
+        self.tau = self.W @ self.m["belief"] + 0.01 * random.standard_normal((learnt, 2))
+
+    @property
+    def first(self):
+        for W, tau in zip(self.W, self.tau, strict=True):
+            fit_samples.keep(self.m, W, tau)
+        return fit_samples.first_unexplained(self.m)
+
+
+def test_a_fit_that_explains_its_samples_has_none_that_stands_out():
+    assert Fit().first == -1
+
+
+@pytest.mark.parametrize(("share", "is_explained"), [(0.9, True), (1.15, False)])
+def test_a_sample_stands_out_by_the_residual_of_the_better_half(share, is_explained):
+    fit = Fit()
+    limit_Nm = fit_samples.LIMIT_NM + fit_samples.LIMIT_SHARE * 0.01
+    fit.tau[29, 1] = fit.W[29, 1] @ fit.m["belief"] - share * limit_Nm
+    assert (fit.first == -1) is is_explained
+
+
+def test_the_first_of_a_touchs_samples_is_named():
+    fit = Fit()
+    fit.tau[100:150] += 1.0
+    assert fit.first == pytest.approx(100, abs=fit_samples.FIRST_EVERY)
+
+
+def test_a_long_fit_is_kept_in_the_same_room_from_its_beginning_to_its_end():
+    fit = Fit(learnt=3000)
+    fit.tau[:90] += 1.0
+    assert fit.first == 0
+    kept, every = int(fit.m["samples_kept"]), fit.m["samples_every"]
+    assert fit_samples.ROOM // 2 <= kept <= fit_samples.ROOM
+    assert kept * every == pytest.approx(3000, abs=2 * every)
+    fit = Fit(learnt=3000)
+    fit.tau[2900:] += 1.0
+    assert fit.first == pytest.approx(2900, abs=2 * every)
+
+
+def test_a_payloads_fit_is_not_asked():
+    fit = Fit()
+    fit.m["is_payload"] = 1.0
+    fit.tau[98:104] += 5.0
+    assert fit.first == -1
+
+
+def test_a_lean_of_a_tenth_of_a_second_at_the_start_is_named_and_not_certified():
+    loop = HeldLoop(FREE, theta=THETA["M"], seed=91161)
+    loop.run_until(SchemeState.ADAPT)
+    outputs = loop.lean(0, -1.2, 0.11)
+    outputs += loop.run(round(2.3 / PERIOD_S))
+    assert SchemeState.MONITOR not in states(outputs)
+    assert "no one model explains the whole fit" in loop.said("touch")[0]
+    outputs = loop.run_until(SchemeState.MONITOR)
+    assert len(outputs) * PERIOD_S < 2.0
+    assert np.abs(loop.offset_error_Nm).max() < 0.02
+    assert loop.error_of("F_c1") < 0.02
