@@ -59,7 +59,9 @@ FRICTION_NM = 0.03
 OFFSET_NM = 0.03
 INERTIA_KGM2 = 0.006
 INERTIA_SHARE = 0.03
-"""Less than these, and less than this share of an inertia, is nothing. a2 is not asked: a mass shows in a1 and a3."""
+"""Less than these, and less than this share of an inertia, is nothing."""
+NOT_ASKED_KGM2 = 1000.0
+"""Of a2: a mass shows in a1 and a3, and what else touches the arm bends a2."""
 SMALLEST_UNIT = 0.1
 """Least unit of the variances; the rest of it as `sensitivity` has it."""
 _INERTIAS = ("a1", "a2", "a3")
@@ -80,7 +82,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
     return {
         "compared": rows,
         "compared_floor": np.array(
-            [FRICTION_NM] * len(friction) + [INERTIA_KGM2, np.inf, INERTIA_KGM2] + [OFFSET_NM] * JOINTS
+            [FRICTION_NM] * len(friction) + [INERTIA_KGM2, NOT_ASKED_KGM2, INERTIA_KGM2] + [OFFSET_NM] * JOINTS
         ),
         "compared_share": np.repeat((0.0, INERTIA_SHARE, 0.0), (len(friction), len(inertia), JOINTS)),
         "compared_prior": rows**2 @ prior_std**2,
@@ -309,6 +311,8 @@ def _compare(k: Any, m: Any, n: int, q: int, unit: float) -> tuple[float, float]
         if row[j] != 0.0:
             before += row[j] * m["kept"][n, j]
             now += row[j] * m["belief"][j]
+    if q < FRICTIONS + INERTIAS:
+        before = max(before, 0.0)  # who pushes the arm on looks like less than none
     known = split(variance_of(row, m["P_kept"][n]), prior, m["kept_unit"][n])
     fitted = split(variance_of(row, m["P_belief"]), prior, unit)
     floor = max(k["compared_floor"][q], k["compared_share"][q] * abs(before))

@@ -256,6 +256,13 @@ def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
     assert line.startswith("friction of joint 1 at 0.2 rad/s is 0.300 Nm more than 7.0 s ago, bound 0.05")
 
 
+def test_no_arm_has_less_friction_than_none_whatever_a_touched_belief_says():
+    compared = Compared(std=0.1)
+    compared.m["kept"][0, NAMES.index("F_c1")] = -0.6
+    assert compared.agrees_with("F_c1", 0.0)
+    assert not compared.agrees_with("F_c1", 0.6)
+
+
 def test_a_kept_belief_that_was_leant_on_is_forgotten_and_the_others_go_on_judging():
     compared = Compared(std=1e-5)
     leant = compared.m["belief"].copy()
