@@ -12,7 +12,7 @@ import touch_campaign
 import touch_trials
 from touch_trials import Hand, HandLoop, Trial
 
-GOOD = Trial(1, "P", "lean", False, True, False, 2.25, (0.01,), 2.0, True, "")
+GOOD = Trial(1, "P", "lean", False, True, False, 2.25, (0.01,), (), 2.0, True, "")
 
 
 def met(figures):
@@ -70,7 +70,9 @@ def test_an_arm_that_nobody_touches_is_certified_and_is_within_the_bounds():
         ({"errors_Nm": (0.01, 0.06)}, {"off by > 0.05 Nm, hands like a joint from before 0.5 s apart"}),
         ({"errors_Nm": (0.2,), "is_excused": True}, set()),
         ({"back_after_s": 5.1}, {"back within 5 s of the release"}),
-        ({"back_after_s": None}, {"back within 5 s of the release"}),
+        ({"back_after_s": None}, {"back within 5 s of the release", "not back within 12 s"}),
+        ({"back_after_s": None, "is_reported": False}, {"not back within 12 s"}),
+        ({"by_word_Nm": (0.2,)}, set()),
         ({"back_after_s": None, "is_released": False}, set()),
     ],
 )
