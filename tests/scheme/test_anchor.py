@@ -148,7 +148,7 @@ def test_a_sensor_that_has_moved_since_the_last_certificate_is_believed_where_so
     loop = TouchedLoop(with_last(settings, (0.5, -0.5)))
     loop.run_until(SchemeState.MONITOR)
     assert loop.said("anchor") == []
-    assert "last certificate; joint" not in loop.said("certificate")[0]
+    assert "by the last certificate" not in loop.said("certificate")[0]
 
 
 def test_the_user_may_say_that_the_sensor_has_moved_since_the_last_certificate():
