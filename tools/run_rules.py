@@ -250,7 +250,7 @@ def torque_needs_enabled_drives(case: Case) -> Iterator[Violation]:
 def enabling_needs_rest(case: Case) -> Iterator[Violation]:
     """Find attempts that ask a drive for Operation enabled before the arm has rested for the commissioning time.
 
-    Rest is judged by all right feedback frames of that time.
+    Rest is judged by all right feedback frames of that time; where some fault changes their values, by the truth.
     """
     bounds = case.bounds
     least = round(bounds.rest_s / case.period_s)
@@ -267,7 +267,11 @@ def enabling_needs_rest(case: Case) -> Iterator[Violation]:
                 yield Violation("enabled-too-early", case.t_s(int(commands.sight.t_ns[first])), text)
             feedback = case.wire[f"Drive{joint + 1}Feedback"]
             is_before = feedback.is_right & (feedback.place < place) & (feedback.cycle >= cycle - least)
-            fastest = float(np.abs(feedback.signals["velocity"][is_before]).max(initial=0.0))
+            speed = feedback.signals["velocity"][is_before]
+            first_row, last_row = np.maximum(case.truth.at_sync(np.array([cycle - least, cycle])), 0).tolist()
+            if case.has_value_fault(first_row, last_row):
+                speed = case.truth["dq"][first_row : last_row + 1, joint]
+            fastest = float(np.abs(speed).max(initial=0.0))
             if fastest > bounds.rest_rad_s:
                 text = f"joint {joint + 1} moved at {fastest:.3f} rad/s within {bounds.rest_s:g} s before"
                 yield Violation("enabled-in-motion", case.t_s(int(commands.sight.t_ns[first])), text)

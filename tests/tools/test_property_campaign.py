@@ -144,6 +144,10 @@ BROKEN: dict[str, tuple[Made, str]] = {
         Made(velocity_rad_s=lambda k: 0.1 if k == 150 else 0.0, torque=_ends_at(590)),
         "enabled-in-motion",
     ),
+    "enabled in motion that a fault hides": (
+        Made(torque=_ends_at(590), scenario=_STICK, faults=lambda k: int(k < 200), true_speed=lambda k: 0.1 * (k < 200)),
+        "enabled-in-motion",
+    ),
     "too much": (Made(torque=lambda k: min(160 * max(k - 240, 0), 1002) if k < 590 else 0), "torque-limit"),
     "too fast": (Made(torque=lambda k: 170 if k == 400 else _ends_at(590, 1)(k)), "torque-rate"),
     "torque after a quick stop": (
@@ -245,6 +249,12 @@ def test_what_breaks_a_rule_is_named(name: str) -> None:
 
 
 ALLOWED: dict[str, Made] = {
+    "motion that a fault has made up, and the truth doesn't know": Made(
+        velocity_rad_s=lambda k: 67109.0 if k == 150 else 0.0,
+        torque=_ends_at(590),
+        scenario=_STICK,
+        faults=lambda k: int(k == 150),
+    ),
     "torque that falls blindly": Made(
         torque=lambda k: 3 if k == 402 else _ends_at(590)(k), has_feedback=lambda k: not 400 <= k <= 402
     ),
