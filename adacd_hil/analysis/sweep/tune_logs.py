@@ -6,6 +6,7 @@ other tenth of its time, and its contacts alternate.
 
 import dataclasses
 import hashlib
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,19 +129,24 @@ class _Cycles(NamedTuple):
 
 
 class _Index:
-    """Gathers the cycles of a log."""
+    """Gathers the cycles of a log, in arrays that grow where they are: joined in the end, they would be there twice."""
 
     def __init__(self) -> None:
-        self._parts: list[_Cycles] = []
+        self._cycle, self._t_ns, self._state = array("q"), array("q"), array("B")
 
     def add(self, scheme: Series) -> None:
         """Take in the next piece of /scheme."""
-        cycle, state = scheme["cycle"].astype(np.int64).reshape(-1), scheme["state"].reshape(-1).astype(np.uint8)
-        self._parts.append(_Cycles(cycle, scheme.t_ns, state))
+        self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
+        self._t_ns.frombytes(scheme.t_ns.tobytes())
+        self._state.frombytes(scheme["state"].astype(np.uint8).tobytes())
 
     def joined(self) -> _Cycles:
-        """Give all of them."""
-        return _Cycles(*(np.concatenate(columns) for columns in zip(*self._parts, strict=True)))
+        """Give all of them; nothing can be added after that."""
+        return _Cycles(
+            np.frombuffer(self._cycle, np.int64),
+            np.frombuffer(self._t_ns, np.int64),
+            np.frombuffer(self._state, np.uint8),
+        )
 
 
 def _begins(motion: LoggedMotion, index: _Cycles) -> list[int]:
