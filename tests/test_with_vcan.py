@@ -33,6 +33,22 @@ identifier, length, data = FRAME.unpack(near.recv(FRAME.size))
 print(f"{identifier:x} {length} {data.hex()}")
 """
 
+SUM_IN_TWO_THREADS = """
+import threading, time
+import numpy as np
+until_s = time.monotonic() + 1.5
+def add_up(seed):
+    values = np.random.default_rng(seed).random(1 << 16)
+    expected = values.sum()
+    while time.monotonic() < until_s:
+        sums[seed].append(values.sum() == expected)
+sums = [], []
+threads = [threading.Thread(target=add_up, args=(seed,)) for seed in range(2)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(all(sums[0]), all(sums[1]), min(map(len, sums)) > 100)
+"""
+
 
 def start(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
     """Start the launcher with separate output pipes."""
@@ -117,6 +133,12 @@ def test_two_processes_exchange_a_frame_over_vcan0(bus: None) -> None:
 
 
 @pytest.mark.slow
+def test_each_thread_keeps_its_vector_registers(bus: None) -> None:
+    status, stdout, stderr = run("--", sys.executable, "-c", SUM_IN_TWO_THREADS)
+    assert (status, stderr) == (0, b"")
+    assert stdout == b"True True True\n"
+
+
 def test_a_missing_command_gives_127(bus: None) -> None:
     status, _, _ = run("--", "no-such-command")
     assert status == STATUS_NOT_FOUND
