@@ -16,7 +16,10 @@ THIS_RUN_ONLY = "friction and inertia: by this run only"
 BY_WORD = "friction and inertia: by this run and the user's word, against "
 _THE_RUN = "what the run had learnt before"
 _TAKEN_BACK = "the certificate that was taken back"
-_CHANGED = "no one model explains the whole fit: something has touched the arm or let go while it was learnt"
+_CHANGED = (
+    "no one model explains the whole fit: something has touched the arm or let go while it was learnt, or the arm does "
+    "what the model doesn't know"
+)
 _BEGINS_ANEW = "no certificate, learning begins anew"
 
 

@@ -567,7 +567,7 @@ def _contradicted_by(k: Any, m: Any) -> int:
     """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
     if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
         return ANCHOR
-    if not (earlier.is_steady(m) and earlier.is_explained(k, m)):
+    if not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(m)):
         return CHANGED
     if not earlier.is_no_more(k, m):
         return MORE

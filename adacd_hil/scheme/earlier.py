@@ -8,7 +8,12 @@ What tells it apart is that the arm was known without it before.
     (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' <= STEADY u
 
 u: mean square of its residuals over that of the settings. More, and something has touched the arm or let go meanwhile;
-likewise if the model doesn't explain each of its samples (`fit_samples`).
+likewise if the model doesn't explain each of its samples (`fit_samples`). And what came later must come to the same
+torque by itself, on all samples:
+
+    |W_f (theta_late - theta)| <= LATER_NM + LATER_SHARE rms,   theta_late - theta = P (P_0 - P)^-1 (theta - theta_0)
+
+rms as in `fit_samples`. This sees a weak touch of the beginning, when theta_0 is not known well enough to differ.
 
 **Over a touch** the fit's earlier beliefs are *kept*: all those of a while before a contact interrupted it, or of
 before a change; where a test has refuted the model, all of them and the model. When the touch began is not known, so a
@@ -40,6 +45,8 @@ from adacd_hil.scheme.sensitivity import LARGEST_UNIT, UNIT_PEAK
 
 STEADY = 200.0
 """Squared distance over u at which a fit has changed. 200 untouched arms, wide ones included: 113 at most."""
+LATER_NM = 0.02
+LATER_SHARE = 2.0
 SMALLEST_SQUARE = 0.015
 """Least u of a fit that is asked whether it has changed."""
 REGULAR = 0.01
@@ -108,6 +115,7 @@ def shapes_of(count: int) -> dict[str, tuple[int, ...]]:
         "P_kept": (KEPT, count, count),
         "kept_unit": (KEPT,),
         "kept_age_s": (KEPT,),
+        "later": (count,),
         "change": quantities,
         "change_limit": quantities,
         "change_age_s": quantities,
@@ -225,10 +233,46 @@ def is_explained(k: Any, m: Any) -> bool:
 
 
 @compiled
+def is_borne_out(m: Any) -> bool:
+    """Tell whether the fit's later samples alone come to its torque; if not, keep all that it had come to on the way.
+
+    Not asked of a payload's fit.
+    """
+    used, steps = int(m["steps_used"]), m["steps_rows"].shape[0]
+    if m["is_payload"] != 0.0:
+        return True
+    limit_Nm = LATER_NM + LATER_SHARE * fit_samples.better_rms(m)
+    for number in range(max(used - steps, 0), used):
+        if not (_find_later(m, number % steps) and fit_samples.largest_torque(m, m["later"]) <= limit_Nm):
+            if m["has_kept"] == 0.0:
+                _keep_steps(m, used - 1)
+            return False
+    return True
+
+
+@compiled
+def _find_later(m: Any, s: int) -> bool:
+    """Fill `later` (p,): the model of the samples since step s less the belief; False if there is none."""
+    if not _distance(m, s) < np.inf:
+        return False
+    L, x, later = m["scratch"], m["v"], m["later"]
+    for j in range(x.shape[0] - 1, -1, -1):
+        for n in range(j + 1, x.shape[0]):
+            x[j] -= L[n, j] * x[n]
+        x[j] /= L[j, j]
+    for j in range(x.shape[0]):
+        later[j] = 0.0
+        for n in range(x.shape[0]):
+            later[j] += m["P_belief"][j, n] * x[n] / np.sqrt(m["steps_P"][s, n, n])
+    return True
+
+
+@compiled
 def _distance(m: Any, s: int) -> float:
     """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of the belief and its step s; inf if there is none.
 
-    By a Cholesky decomposition, in units of the square roots of P_0's diagonal.
+    By a Cholesky decomposition, in units of the square roots of P_0's diagonal. Leaves its lower half in `scratch`, and
+    in `v` the vector whose square the distance is.
     """
     L, x = m["scratch"], m["v"]
     for j in range(x.shape[0]):

@@ -6,7 +6,8 @@ if
 
     |tau_f - W_f theta| <= LIMIT_NM + LIMIT_SHARE rms
 
-of every sample and joint, rms: of the residuals of its better half. Not asked of a payload's fit.
+of every sample and joint, rms: of the residuals of its better half. Not asked of a payload's fit. They are also the
+motion on which other models are compared with the fit's, see `earlier`.
 
 Shapes: p parameters, n joints, s samples of room; samples_W (s, n, p), samples_tau (s, n). When there is no room left
 every second sample goes, and half as many come.
@@ -71,16 +72,35 @@ def first_unexplained(m: Any) -> int:
     kept, first = int(m["samples_kept"]), -1
     if m["is_payload"] != 0.0 or kept < 2:
         return first
-    squares, half = np.zeros(2), kept // 2
-    for s in range(2 * half):
-        for i in range(m["samples_tau"].shape[1]):
-            squares[s // half] += _residual(m, s, i) ** 2
-    limit = LIMIT_NM + LIMIT_SHARE * np.sqrt(np.min(squares) / (half * m["samples_tau"].shape[1]))
+    limit = LIMIT_NM + LIMIT_SHARE * better_rms(m)
     for s in range(kept - 1, -1, -1):
         for i in range(m["samples_tau"].shape[1]):
             if not abs(_residual(m, s, i)) <= limit:
                 first = s
     return first if first < 0 else int(first * m["samples_every"])
+
+
+@compiled
+def better_rms(m: Any) -> float:
+    """Return the root mean square of the residuals, Nm, of the earlier or later half of the samples, the smaller."""
+    squares, half = np.zeros(2), int(m["samples_kept"]) // 2
+    for s in range(2 * half):
+        for i in range(m["samples_tau"].shape[1]):
+            squares[s // half] += _residual(m, s, i) ** 2
+    return float(np.sqrt(np.min(squares) / max(half * m["samples_tau"].shape[1], 1)))
+
+
+@compiled
+def largest_torque(m: Any, theta: Vector) -> float:
+    """Return the largest |W_f theta| over the samples and joints, Nm. theta (p,)."""
+    largest = 0.0
+    for s in range(int(m["samples_kept"])):
+        for i in range(m["samples_tau"].shape[1]):
+            torque = 0.0
+            for j in range(theta.shape[0]):
+                torque += m["samples_W"][s, i, j] * theta[j]
+            largest = max(largest, abs(torque))
+    return float(largest)
 
 
 @compiled

@@ -233,6 +233,53 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
         assert (m["kept"][0] == 0.1).all()
 
 
+class Halves:
+    """A fit of 1 s that knows each parameter to 0.01, and knew it to 0.014 after its first step."""
+
+    def __init__(self):
+        self.m = certified_kernel.new_memory(FREE)[0]
+        count = len(NAMES)
+        self.m["P_belief"] = 0.01**2 * np.eye(count)
+        self.m["samples_W"][:3], self.m["samples_tau"][:3] = np.eye(2, count), self.m["belief"][:2]
+        self.m["samples_kept"] = 3.0
+        self.m["steps_used"] = 2.0
+        self.m["steps_theta"][:2] = self.m["belief"]
+        self.m["steps_P"][0] = 2.0 * self.m["P_belief"]
+        self.m["steps_P"][1] = 1.5 * self.m["P_belief"]
+
+
+def test_the_model_of_the_later_samples_is_that_of_their_own_information():
+    fit = Halves()
+    change = np.linspace(-0.02, 0.03, len(NAMES))
+    fit.m["steps_theta"][0] -= change
+    assert earlier._find_later(fit.m, 0)
+    P, P_0 = fit.m["P_belief"], (1.0 + earlier.REGULAR) * fit.m["steps_P"][0]
+    alone = np.linalg.solve(
+        np.linalg.inv(P) - np.linalg.inv(P_0),
+        np.linalg.solve(P, fit.m["belief"]) - np.linalg.solve(P_0, fit.m["steps_theta"][0]),
+    )
+    assert fit.m["later"] == pytest.approx(alone - fit.m["belief"], rel=1e-9)
+
+
+@pytest.mark.parametrize(("share", "is_borne_out"), [(0.97, True), (1.03, False)])
+def test_later_samples_that_come_to_another_torque_do_not_bear_the_fit_out(share, is_borne_out):
+    fit = Halves()
+    # equal information on both sides: the later samples are as far from the whole as the earlier ones
+    fit.m["steps_theta"][0, 1] -= share * earlier.LATER_NM * (1.0 + 2.0 * earlier.REGULAR)
+    assert earlier.is_borne_out(fit.m) is is_borne_out
+    assert fit.m["kept_count"] == (0.0 if is_borne_out else 2.0)
+    fit.m["is_payload"] = 1.0
+    assert earlier.is_borne_out(fit.m)
+
+
+def test_a_fit_with_noise_may_differ_by_more():
+    fit = Halves()
+    fit.m["steps_theta"][0, 1] -= 1.4 * earlier.LATER_NM
+    assert not earlier.is_borne_out(fit.m)
+    fit.m["samples_tau"][:3] += 0.25 * earlier.LATER_NM
+    assert earlier.is_borne_out(fit.m)
+
+
 def test_the_steps_kept_are_from_before_the_contact():
     loop = HeldLoop(FREE)
     loop.learn(1.1)

@@ -145,7 +145,7 @@ BROKEN: dict[str, tuple[Made, str]] = {
         "enabled-in-motion",
     ),
     "enabled in motion that a fault hides": (
-        Made(torque=_ends_at(590), scenario=_STICK, faults=lambda k: int(k < 200), true_speed=lambda k: 0.1 * (k < 200)),
+        Made(torque=_ends_at(590), scenario=_STICK, faults=lambda k: int(k < 200), true_speed=lambda k: 0.1),
         "enabled-in-motion",
     ),
     "too much": (Made(torque=lambda k: min(160 * max(k - 240, 0), 1002) if k < 590 else 0), "torque-limit"),

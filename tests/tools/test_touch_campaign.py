@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from long_cases import long_but
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import touch_campaign
@@ -61,6 +62,18 @@ def test_an_arm_that_nobody_touches_is_certified_and_is_within_the_bounds():
     trial = touch_trials.play(1, is_touched=False)
     assert trial.certified_s == pytest.approx(2.25, abs=0.01)
     assert all(met(touch_campaign.untouched_figures([trial])).values())
+
+
+@pytest.mark.parametrize("seed", long_but(1, [97165, 97039]))
+def test_a_weak_touch_of_the_first_half_second_bends_no_certificate(seed):
+    """A spring of 6.5 N/m for 0.33 s, a lean of 0.13 Nm for 0.5 s; certified with 0.21 and 0.10 Nm, were they not seen.
+
+    What came after them comes to another torque by itself.
+    """
+    trial = touch_trials.play(seed, is_touched=True)
+    assert trial.is_withheld
+    assert max(trial.errors_Nm) < touch_campaign.WRONG_NM
+    assert trial.back_after_s < touch_campaign.BACK_S
 
 
 @pytest.mark.parametrize(
