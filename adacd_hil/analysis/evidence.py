@@ -13,6 +13,7 @@ from adacd_hil.analysis.beside import Beside, larger
 from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.analysis.run import CertifiedStream, Run
 from adacd_hil.analysis.sections import Section, rows_of
+from adacd_hil.analysis.smallest_push import SmallestPush
 from adacd_hil.analysis.touches import bank_channels
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, SchemeState, Vector
@@ -46,7 +47,7 @@ class Evidence:
 
     margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
     says what anchors all its offsets; logs from before there were anchors say nothing. revoked: why certificates were
-    taken back, in order.
+    taken back, in order. smallest_push: None where nothing was armed.
     """
 
     tests: dict[str, int]
@@ -57,6 +58,7 @@ class Evidence:
     paper_beside: Beside | None
     is_anchored: bool
     revoked: tuple[str, ...]
+    smallest_push: SmallestPush | None
 
     @property
     def smallest_margin(self) -> float | None:
@@ -72,8 +74,9 @@ def evaluate_certified(
     margins: dict[str, tuple[ChannelMargin, ...]],
     promotions: int,
     beside: Beside | None,
+    smallest_push: SmallestPush | None,
 ) -> Evidence:
-    """Judge a run of the certified scheme. margins, promotions: of all its cycles, see `untouched`."""
+    """Judge a run of the certified scheme. margins, promotions, smallest_push: of all its cycles, see `untouched`."""
     adaptations = [section for section in sections if section.kind == "adaptation"]
     stays = {section.label: _tests(run, section) for section in adaptations}
     return Evidence(
@@ -85,6 +88,7 @@ def evaluate_certified(
         paper_beside=beside,
         is_anchored=all(event.level == "info" for _, event in run.events if event.name == "certificate"),
         revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
+        smallest_push=smallest_push,
     )
 
 

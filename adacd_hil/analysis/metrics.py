@@ -81,6 +81,12 @@ class Metrics:
     verdict: str
     is_clean: bool
 
+    @property
+    def false_alarm_bound_per_h(self) -> float | None:
+        """Upper 95 % bound of the certified scheme's false alarms by counting; None where nobody knows the truth."""
+        push = None if self.evidence is None else self.evidence.smallest_push
+        return None if push is None or self.false_alarms is None else push.false_alarm_bound_per_h(self.false_alarms)
+
 
 class Gathered(NamedTuple):
     """What takes all cycles of a run to say."""
@@ -146,7 +152,9 @@ def _evidence(run: Run, sections: tuple[Section, ...], untouched: Untouched) -> 
     beside = None
     if run.beside is not None and untouched.beside is not None:
         beside = evaluate_beside(run, run.beside, sections, untouched.beside)
-    return evaluate_certified(run, run.certified, sections, untouched.margins, untouched.promotions, beside)
+    return evaluate_certified(
+        run, run.certified, sections, untouched.margins, untouched.promotions, beside, untouched.smallest_push
+    )
 
 
 def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:

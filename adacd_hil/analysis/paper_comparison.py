@@ -125,6 +125,7 @@ def compare_with_paper(
     rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
     margin = evidence.smallest_margin
     rows.append(("Smallest threshold / residual", "–", "–", "–" if margin is None else f"{margin:.2f}"))
+    rows.append(("Smallest push found within 100 ms, joints 1 / 2", "–", "–", _push_text(evidence)))
     rows.append(("Control rate", "1 kHz", rate, rate))
     return _of_what_was_played(run, [PaperRow(*row) for row in rows])
 
@@ -175,6 +176,16 @@ def _threshold_text(evidence: Evidence, detections: list[str]) -> str:
     """Say where the thresholds of the slowest channel lie: the smallest and the largest median of a section."""
     found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
     return f"{min(found):.3f} to {max(found):.3f} Nm" if found else "–"
+
+
+def _push_text(evidence: Evidence) -> str:
+    """Say how small a push is surely found, in the middle and at the worst moment."""
+    if evidence.smallest_push is None:
+        return "–"
+    median, worst = (
+        " / ".join(f"{joint[name]:.2f}" for joint in evidence.smallest_push.push_Nm) for name in ("p50", "max")
+    )
+    return f"median {median}, at worst {worst} Nm"
 
 
 def _median_text(delays_ms: list[float]) -> str:

@@ -71,18 +71,25 @@ def filtered(tau_ext: Vector, cycle: Cycles, period_s: float, a_rad_s: float) ->
 def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
     """Give the delay of a torque step behind two first-order low-passes; None if it never crosses.
 
-    The response 1 - (b e^(-a t) - a e^(-b t)) / (b - a) rises steadily, so that bisection finds the crossing.
+    The response rises steadily, so that bisection finds the crossing.
     """
     if not abs(tau_ext_Nm) > threshold_Nm:
         return None
-    wanted, a = threshold_Nm / abs(tau_ext_Nm), a_rad_s
-    b = b_rad_s if b_rad_s != a_rad_s else b_rad_s * (1.0 + 1e-6)
-    low_s, high_s = 0.0, 40.0 / min(a, b)
+    wanted = threshold_Nm / abs(tau_ext_Nm)
+    low_s, high_s = 0.0, 40.0 / min(a_rad_s, b_rad_s)
     for _ in range(60):
         middle_s = 0.5 * (low_s + high_s)
-        response = 1.0 - (b * math.exp(-a * middle_s) - a * math.exp(-b * middle_s)) / (b - a)
-        low_s, high_s = (middle_s, high_s) if response < wanted else (low_s, middle_s)
+        is_below = step_response(middle_s, a_rad_s, b_rad_s) < wanted
+        low_s, high_s = (middle_s, high_s) if is_below else (low_s, middle_s)
     return high_s
+
+
+def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> float:
+    """Give what a low-pass, or two in a row, shows of a step of 1: 1 - (b e^(-a t) - a e^(-b t)) / (b - a)."""
+    if b_rad_s is None:
+        return 1.0 - math.exp(-a_rad_s * after_s)
+    a, b = a_rad_s, b_rad_s if b_rad_s != a_rad_s else b_rad_s * (1.0 + 1e-6)
+    return 1.0 - (b * math.exp(-a * after_s) - a * math.exp(-b * after_s)) / (b - a)
 
 
 @dataclass(frozen=True)

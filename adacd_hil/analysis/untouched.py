@@ -16,6 +16,7 @@ from adacd_hil.analysis.detections import Detection, find_detections
 from adacd_hil.analysis.evidence import ChannelMargin, MarginGatherer
 from adacd_hil.analysis.run import Mask, Run
 from adacd_hil.analysis.sections import Section, rows_of, split_sections
+from adacd_hil.analysis.smallest_push import PushGatherer, SmallestPush
 from adacd_hil.analysis.touches import Touch, true_contacts
 from adacd_hil.records import SchemeState, Vector
 
@@ -31,12 +32,16 @@ class Residual:
 
 @dataclass(frozen=True)
 class Untouched:
-    """What was gathered, by section. promotions: refined models that took over; beside: None where none ran."""
+    """What was gathered, by section. promotions: refined models that took over; beside: None where none ran.
+
+    smallest_push: None of the paper's scheme, and where nothing was armed.
+    """
 
     residuals: dict[str, Residual]
     margins: dict[str, tuple[ChannelMargin, ...]]
     promotions: int
     beside: Reached | None
+    smallest_push: SmallestPush | None
 
 
 def gather_untouched(run: Run, pieces: Iterable[Run]) -> Untouched:
@@ -62,6 +67,7 @@ class UntouchedGatherer:
         self._residuals: dict[str, _Largest] = {}
         self._margins: dict[str, MarginGatherer] = {}
         self._done: dict[str, tuple[ChannelMargin, ...]] = {}
+        self._push = PushGatherer(run.settings)
         self._promotions = 0
         self._promoted = 0.0  # the count so far
         self._beside = None if run.beside is None else BesideGatherer(run, self._sections, touches)
@@ -106,6 +112,9 @@ class UntouchedGatherer:
         if chosen.any():
             margin = self._margins.setdefault(section.label, MarginGatherer(piece.settings))
             margin.add(piece.certified.tau_ext[rows][chosen], threshold[chosen])
+        armed = chosen & (piece.state[rows] == SchemeState.MONITOR)
+        if armed.any():
+            self._push.add(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
         """Sum up a section that nothing will be added to: its values need not be kept."""
@@ -125,7 +134,7 @@ class UntouchedGatherer:
         residuals = {label: self._residuals[label].residual() for label in labels if label in self._residuals}
         margins = {label: self._done[label] for label in labels if label in self._done}
         beside = None if self._beside is None else self._beside.reached()
-        return Untouched(residuals, margins, self._promotions, beside)
+        return Untouched(residuals, margins, self._promotions, beside, self._push.smallest_push())
 
 
 class _Largest:

@@ -39,6 +39,7 @@ def report_json(
             "contacts": [dataclasses.asdict(contact) for contact in metrics.contacts],
             "false_alarms": metrics.false_alarms,
             "false_alarms_s": metrics.false_alarms_s,
+            "false_alarm_bound_per_h": metrics.false_alarm_bound_per_h,
             "missed": metrics.missed,
             "parameters": metrics.parameters,
             "payload_kg": metrics.payload_kg,

@@ -19,6 +19,7 @@ from adacd_hil.analysis.report.tables import (
     margins_table,
     paper_table,
     parameters_table,
+    push_table,
     run_table,
     sections_table,
 )
@@ -44,7 +45,7 @@ def report_page(
         figures.get("fig5", ""),
         wrap_section("Paper against measured" if has_paper(metrics) else "Measured", paper_table(metrics)),
         wrap_section("Sections", sections_table(metrics, run)),
-        wrap_section("Margins", margins_table(metrics.evidence)),
+        wrap_section("Margins", margins_table(metrics.evidence), push_table(metrics)),
         wrap_section("Contacts", figures.get("contacts", ""), contacts_table(metrics), contact_cards(metrics, run)),
         wrap_section("Model identification", adaptations, parameters_table(metrics, run), further_table(metrics)),
         traces,

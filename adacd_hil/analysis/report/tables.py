@@ -51,6 +51,30 @@ def margins_table(evidence: Evidence | None) -> str:
     return make_table(head, rows, left=(0, 2)) + f'<p class="note">{note}</p>'
 
 
+def push_table(metrics: Metrics) -> str:
+    """Write how small a push is surely found, and the threshold in force."""
+    push = None if metrics.evidence is None else metrics.evidence.smallest_push
+    if push is None:
+        return ""
+    names = {"p50": "median", "p99": "99 %", "max": "worst"}
+    head = ("joint 1 / joint 2, Nm", *names.values())
+    rows: list[Sequence[Cell]] = [
+        (what, *(pair_text([joint[name] for joint in joints], 3) for name in names))
+        for what, joints in (("smallest push found within 100 ms", push.push_Nm), ("in force", push.threshold_Nm))
+    ]
+    note = (
+        f"Over {60.0 * push.hours:.2f} min of MONITOR in which nothing touches the arm. Push: a constant external "
+        "torque that some filter is over its threshold with after 100 ms, whatever its sign, with the residual of that "
+        "moment against it, if thresholds and residual stay as they are meanwhile. What is as large as at the worst "
+        "moment is found at each. In force: the smallest threshold of all filters."
+    )
+    bound = metrics.false_alarm_bound_per_h
+    if bound is not None:
+        alarms = f"{metrics.false_alarms or 'No'} false alarm{'' if metrics.false_alarms == 1 else 's'}"
+        note += f" {alarms} in that time: by counting alone, at most {bound:.3g} per hour at 95 %."
+    return make_table(head, rows) + f'<p class="note">{note}</p>'
+
+
 def _first_and_worst(evidence: Evidence) -> dict[str, tuple[ChannelMargin, ...]]:
     """Choose the first sections, and the one with the smallest margin."""
     labels = list(evidence.margins)

@@ -1,0 +1,77 @@
+"""How small a push is found in time: by thresholds and residuals that are known."""
+
+import math
+
+import numpy as np
+import pytest
+from hand_made_run import A, C, M, make_certified_run, make_run, react, touch
+
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.report.tables import push_table
+
+SLOWEST = 0.612758  # what 10 and then 200 rad/s show of a step after 0.1 s: 1 - (200 e^-1 - 10 e^-20) / 190
+
+
+def only_the_slowest(run, threshold_Nm=0.05):
+    run.certified.threshold[:] = 100.0
+    run.certified.threshold[:, 0] = threshold_Nm
+    return run
+
+
+def smallest_push(run):
+    return evaluate(run).evidence.smallest_push
+
+
+def test_a_push_is_as_small_as_the_step_that_is_over_a_threshold_in_time():
+    found = smallest_push(only_the_slowest(make_certified_run()))
+    assert [joint["p50"] for joint in found.push_Nm] == pytest.approx([0.05 / SLOWEST] * 2, rel=1e-5)
+    assert [joint["max"] for joint in found.threshold_Nm] == [0.05, 0.05]
+
+
+def test_the_channel_that_finds_it_with_the_least_counts():
+    run = only_the_slowest(make_certified_run())
+    run.certified.threshold[:, -1, 1] = 0.06  # bare, 200 rad/s: all of the step after 0.1 s
+    first, second = smallest_push(run).push_Nm
+    assert first["p50"] == pytest.approx(0.05 / SLOWEST, rel=1e-5)
+    assert second["p50"] == pytest.approx(0.06, rel=1e-5)
+
+
+def test_a_residual_is_against_the_push_whatever_its_sign():
+    run = only_the_slowest(make_certified_run())
+    run.certified.tau_ext[2000, 0, 0], run.certified.tau_ext[2500, 0, 1] = 0.02, -0.03
+    found = smallest_push(run)
+    assert [joint["max"] for joint in found.push_Nm] == pytest.approx([0.07 / SLOWEST, 0.08 / SLOWEST], rel=1e-5)
+
+
+def test_only_armed_cycles_that_nothing_touches_count():
+    run = make_certified_run((A, 1000), (C, 500), (M, 4000))
+    run.certified.threshold[:1500] = 5.0
+    touch(run, 3000, 100, (5.0, 0.0))
+    run.certified.tau_ext[3000:3050] = 5.0
+    found = smallest_push(react(run, 3002, 50))
+    assert found.push_Nm[0]["max"] == pytest.approx(0.1)
+    is_free = np.ones(4000, np.bool_)
+    is_free[1500 : 1500 + 100 + 1000] = False  # the touch, and ten time constants of the slowest filter
+    assert found.hours * 3600.0 == pytest.approx(is_free.sum() * 1e-3, abs=0.01)
+
+
+def test_what_was_never_armed_says_nothing():
+    assert smallest_push(make_certified_run((A, 1000))) is None
+    assert push_table(evaluate(make_certified_run((A, 1000)))) == ""
+    assert push_table(evaluate(make_run())) == ""
+
+
+def test_the_rate_of_false_alarms_is_bounded_by_counting():
+    metrics = evaluate(make_certified_run())
+    hours = metrics.evidence.smallest_push.hours
+    assert metrics.false_alarm_bound_per_h == pytest.approx(-math.log(0.05) / hours)
+    alarmed = evaluate(react(make_certified_run(), 3000, 20))
+    assert alarmed.false_alarm_bound_per_h > 1.5 * metrics.false_alarm_bound_per_h
+    assert "No false alarms in that time: by counting alone, at most" in push_table(metrics)
+    assert "1 false alarm in that time" in push_table(alarmed)
+
+
+def test_without_the_truth_nobody_knows_what_a_false_alarm_was():
+    metrics = evaluate(make_certified_run(has_truth=False))
+    assert metrics.false_alarm_bound_per_h is None
+    assert "false alarm" not in push_table(metrics)
