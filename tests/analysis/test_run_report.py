@@ -104,7 +104,8 @@ def test_a_report_names_its_pictures(report):
 
 KEYS = {
     "": "schema verdict is_clean time_zero adaptation_s sections frozen_residual_max_Nm contacts false_alarms "
-    "false_alarms_s false_alarm_bound_per_h missed parameters payload_kg certified fault cycle timing data log stretch paper run",
+    "false_alarms_s false_alarm_bound_per_h missed parameters payload_kg certified fault cycle timing data log stretch "
+    "paper run",
     "sections.A": "label kind start_s end_s is_complete duration_s",
     "frozen_residual_max_Nm.B": "identified cad cycles",
     "contacts.0": "number section state link onset_s end_s is_armed detected_s delay_ms law_ms ideal_ms link_at_alarm "
