@@ -329,13 +329,16 @@ def _torque_after(case: Case, place: int, cycles: int) -> tuple[float, str] | No
 
 
 def a_device_that_drops_out_ends_torque(case: Case) -> Iterator[Violation]:
-    """Find torque on a joint after a device has said that it no longer works, before the devices boot again."""
+    """Find torque on a joint after a device has said that it no longer works, before the devices boot again.
+
+    A drive that the host itself no longer wants enabled works.
+    """
     bounds = case.bounds
     for joint in JOINTS:
         places, is_enabled = case.enabled(joint)
         attempt = case.wire.attempt(places)
         drops = np.flatnonzero(~is_enabled[1:] & is_enabled[:-1] & (attempt[1:] == attempt[:-1])) + 1
-        for at in drops:
+        for at in drops[_is_wanted(case.commands[joint], places[drops])]:
             found = _torque_after(case, int(places[at]), bounds.status_cycles)
             if found:
                 yield Violation("torque-after-drive-fault", found[0], f"drive {joint + 1} has dropped out: {found[1]}")
@@ -350,6 +353,12 @@ def a_device_that_drops_out_ends_torque(case: Case) -> Iterator[Violation]:
         if found:
             yield Violation("torque-after-departure", found[0], f"{text}: {found[1]}")
             break
+
+
+def _is_wanted(commands: _Commands, places: Ints) -> Bools:
+    """Tell of each place whether the last command to the drive before it wants it enabled."""
+    before = np.searchsorted(commands.sight.place, places) - 1
+    return np.asarray((before >= 0) & (commands.controlword[np.maximum(before, 0)] == ENABLE_OPERATION))
 
 
 HARMLESS_CODES = (0x0000, 0x6320, 0x8200, 0x8210, 0x8240)

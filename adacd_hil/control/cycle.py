@@ -281,6 +281,8 @@ class Cycle:
         if output.state is SchemeState.REACT and output.contact is None:
             lateness = self._watch.deadline.describe()
             return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {lateness}")
+        if output.state is SchemeState.COMMISSION and output.previous_state is SchemeState.ENABLE:
+            return Event("warning", "supervisor", f"{text}: the arm moves before all its drives are enabled")
         if output.state is not SchemeState.FAULT:
             return Event("info", "supervisor", text)
         details = "; ".join([output.fault.name, *self._faults.describe(output.fault)])

@@ -1,9 +1,9 @@
 """The scheme's state machine: what raises the events of its table, `adacd_hil.scheme.transitions`.
 
-INIT -> COMMISSION -> ENABLE -> ADAPT (-> CERTIFY) -> MONITOR; a contact in any of ENABLE, ADAPT, CERTIFY, MONITOR and
-PAYLOAD -> REACT, and from there back; MONITOR or STOPPED -> PAYLOAD -> ADAPT; any -> FAULT, which is latched. A pair
-that is not in the table leaves the state as it is. One event per cycle: the first that applies in the order of
-`SchemeEvent`, so a fault outranks everything.
+INIT -> COMMISSION -> ENABLE -> ADAPT (-> CERTIFY) -> MONITOR; motion in ENABLE -> COMMISSION; a contact in any of
+ENABLE, ADAPT, CERTIFY, MONITOR and PAYLOAD -> REACT, and from there back; MONITOR or STOPPED -> PAYLOAD -> ADAPT;
+any -> FAULT, which is latched. A pair that is not in the table leaves the state as it is. One event per cycle: the
+first that applies in the order of `SchemeEvent`, so a fault outranks everything.
 
 A collision is latched: REACT -> STOPPED until the user acknowledges. So are a host that was late, a contact that has
 grown into a collision, and one that has lasted too long. Any other contact clears itself: REACT -> where it came from.
@@ -28,6 +28,9 @@ from adacd_hil.scheme.transitions import TRANSITIONS, SchemeEvent, next_state
 REST_HOLD_S = 0.05
 """How long |dq| stays below the rest velocity until the arm counts as at rest. At the reversal of a withdrawal with
 700 °/s² it stays below 0.05 rad/s for 8 ms: a margin of 6."""
+
+UNREST_S = 0.02
+"""How long an arm may move while its drives are asked to enable: one whose brakes have opened sags until it is held."""
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
@@ -118,6 +121,8 @@ def _calm_in(state: SchemeState) -> tuple[int, int]:
         watched |= _WITHHELD
     if state is SchemeState.COMMISSION:
         expected |= int(ArmFinding.COMPLETE) | _REST_UNLOADED
+    if state is SchemeState.ENABLE:
+        expected |= _AT_REST
     return watched | expected, expected
 
 
@@ -150,6 +155,7 @@ class Supervisor:
         self._blind_limit = settings.blind_cycles
         self._commission_cycles = settings.commission_cycles
         self._rest_cycles = round(REST_HOLD_S / period_s)
+        self._unrest_cycles = max(round(UNREST_S / period_s), 1)
         self._clear_cycles = round(settings.reaction.clear_s / period_s)
         self._patience_cycles = round(settings.reaction.patience_s / period_s)
         self._rebound_cycles = round(settings.reaction.rebound_s / period_s)
@@ -174,6 +180,7 @@ class Supervisor:
         self._learning_cycles = 0
         self._commissioned_cycles = 0
         self._still_cycles = 0
+        self._moving_cycles = 0
         self._cleared_cycles = 0
         self._blind_cycles = 0
         self._stale_cycles = 0
@@ -223,6 +230,7 @@ class Supervisor:
         self._phase_cycles += arm.periods
         self._learning_cycles += arm.periods if self._state in _LEARNING else 0
         self._still_cycles = self._still_cycles + 1 if observation & _AT_REST else 0
+        self._moving_cycles = 0 if observation & _AT_REST else self._moving_cycles + 1
         self._cleared_cycles = 0 if observation & _ANY_CONTACT else self._cleared_cycles + 1
         self._blind_cycles = self._blind_cycles + 1 if observation & _UNSEEN else 0
         is_stale = max(*arm.age_q, *arm.age_tau_J) > 1
@@ -287,6 +295,7 @@ class Supervisor:
         self._blind_cycles = _run_at_end(observations & _UNSEEN != 0, self._blind_cycles)
         self._stale_cycles = 0  # where it counts, a stale value is not calm
         self._still_cycles = _run_at_end(observations & _AT_REST != 0, self._still_cycles)
+        self._moving_cycles = _run_at_end(observations & _AT_REST == 0, self._moving_cycles)
         self._cleared_cycles = _run_at_end(observations & _ANY_CONTACT == 0, self._cleared_cycles)
         if self._state is SchemeState.COMMISSION:
             self._commissioned_cycles += observations.size
@@ -378,13 +387,19 @@ class Supervisor:
                 event = self._settled(is_still, goes_on)
             case SchemeState.PAYLOAD if is_still and Request.PAYLOAD_CHANGED in self._pending:
                 event = SchemeEvent.PAYLOAD_CHANGED
-            case SchemeState.ENABLE if arm.is_enabled:
-                event = SchemeEvent.ENABLED
+            case SchemeState.ENABLE:
+                event = self._enabled(arm)
             case SchemeState.COMMISSION if self._is_commissioned(arm, observation):
                 event = SchemeEvent.COMMISSIONED
             case SchemeState.INIT if arm.is_complete:
                 event = SchemeEvent.COMPLETE
         return event
+
+    def _enabled(self, arm: ArmState) -> SchemeEvent:
+        """Return how ENABLE ends in this cycle, or none."""
+        if arm.is_enabled:
+            return SchemeEvent.ENABLED
+        return SchemeEvent.MOVED if self._moving_cycles >= self._unrest_cycles else SchemeEvent.NONE
 
     def _settled(self, is_still: bool, goes_on: bool) -> SchemeEvent:
         """Return how REACT ends in this cycle, or none."""

@@ -31,6 +31,7 @@ class SchemeEvent(IntEnum):
     PAYLOAD_CHANGED = 16  # the user has changed the payload and the arm is at rest
     REVOKED = 17  # the user takes back what is known of the arm, or acknowledges that it is doubted
     DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
+    MOVED = 19  # the arm moves before all its drives are enabled
 
 
 class Back(Enum):
@@ -51,12 +52,14 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COMMISSIONED: SchemeState.ENABLE,
         },
-        # Drives are asked to enable. Out: both have; too late is a fault; a contact once they have.
+        # Drives are asked to enable. Out: both have; an arm that moves meanwhile must lie still again; too late is a
+        # fault; a contact once they have.
         SchemeState.ENABLE: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
             SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.ENABLED: SchemeState.ADAPT,
+            SchemeEvent.MOVED: SchemeState.COMMISSION,
         },
         # Moves and learns. Out: eq. (15) with evidence; a fit to be tested; a contact; too late is a fault.
         SchemeState.ADAPT: {

@@ -8,26 +8,26 @@ from smooth_motion import settings_with
 
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
-from adacd_hil.scheme.supervisor import REST_HOLD_S, Supervisor
+from adacd_hil.scheme.supervisor import REST_HOLD_S, UNREST_S, Supervisor
 from adacd_hil.scheme.transitions import TRANSITIONS, SchemeEvent, next_state
 
 # What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens, "back"
 # the state from which REACT was entered.
 EVENTS = (
     "FAULT COLLISION CONTACT LATE COMPLETE COMMISSIONED ENABLED ADAPTED FITTED CERTIFIED REFUTED "
-    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED REVOKED DOUBTED"
+    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED REVOKED DOUBTED MOVED"
 )
 EXPECTED = """
-INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .        .        .
-COMMISSION  FAULT  .      .      .      .           ENABLE  .      .        .        .        .      .        .     .     .        .        .        .
-ENABLE      FAULT  REACT  REACT  .      .           .       ADAPT  .        .        .        .      .        .     .     .        .        .        .
-ADAPT       FAULT  REACT  REACT  .      .           .       .      MONITOR  CERTIFY  .        .      .        .     .     .        .        .        .
-CERTIFY     FAULT  REACT  REACT  .      .           .       .      .        .        MONITOR  ADAPT  .        .     .     .        .        .        .
-MONITOR     FAULT  REACT  REACT  REACT  .           .       .      .        .        .        .      .        .     .     PAYLOAD  .        .        STOPPED
-REACT       FAULT  .      .      .      .           .       .      .        .        .        .      STOPPED  back  .     .        .        .        .
-STOPPED     FAULT  .      .      .      .           .       .      .        .        .        .      .        .     back  PAYLOAD  ADAPT    ADAPT    .
-PAYLOAD     FAULT  REACT  REACT  .      .           .       .      .        .        .        .      .        .     .     .        ADAPT    .        .
-FAULT       .      .      .      .      .           .       .      .        .        .        .      .        .     .     .        .        .        .
+INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .        .        .         .
+COMMISSION  FAULT  .      .      .      .           ENABLE  .      .        .        .        .      .        .     .     .        .        .        .         .
+ENABLE      FAULT  REACT  REACT  .      .           .       ADAPT  .        .        .        .      .        .     .     .        .        .        .         COMMISSION
+ADAPT       FAULT  REACT  REACT  .      .           .       .      MONITOR  CERTIFY  .        .      .        .     .     .        .        .        .         .
+CERTIFY     FAULT  REACT  REACT  .      .           .       .      .        .        MONITOR  ADAPT  .        .     .     .        .        .        .         .
+MONITOR     FAULT  REACT  REACT  REACT  .           .       .      .        .        .        .      .        .     .     PAYLOAD  .        .        STOPPED         .
+REACT       FAULT  .      .      .      .           .       .      .        .        .        .      STOPPED  back  .     .        .        .        .         .
+STOPPED     FAULT  .      .      .      .           .       .      .        .        .        .      .        .     back  PAYLOAD  ADAPT    ADAPT    .         .
+PAYLOAD     FAULT  REACT  REACT  .      .           .       .      .        .        .        .      .        .     .     .        ADAPT    .        .         .
+FAULT       .      .      .      .      .           .       .      .        .        .        .      .        .     .     .        .        .        .         .
 """  # noqa: E501
 ORIGINS = ("ENABLE", "ADAPT", "CERTIFY", "MONITOR", "PAYLOAD")
 
@@ -76,6 +76,7 @@ SETTINGS = settings_with(
     bus={"max_age_cycles": 3},
 )
 REST_CYCLES = round(REST_HOLD_S / SETTINGS.bus.period_s)
+UNREST_CYCLES = round(UNREST_S / SETTINGS.bus.period_s)
 CLEAR_CYCLES = 200
 PATIENCE_CYCLES = 3000
 RESTING = Observation.AT_REST | Observation.UNLOADED
@@ -249,6 +250,23 @@ def test_one_bad_cycle_begins_commissioning_anew(arm, observation):
     assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
 
 
+def test_an_arm_that_moves_before_its_drives_are_enabled_must_lie_still_again():
+    run = run_in(SchemeState.ENABLE)
+    assert run.step(DISABLED, cycles=UNREST_CYCLES - 1) is SchemeState.ENABLE
+    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
+    assert run.step(DISABLED, cycles=UNREST_CYCLES - 1) is SchemeState.ENABLE
+    assert run.step(DISABLED) is SchemeState.COMMISSION
+    assert run.step(DISABLED, observation=RESTING, cycles=19) is SchemeState.COMMISSION
+    assert run.step(DISABLED, observation=RESTING) is SchemeState.ENABLE
+    assert run.step(observation=RESTING) is SchemeState.ADAPT
+
+
+def test_an_arm_that_sags_until_its_drives_hold_it_is_enabled():
+    run = run_in(SchemeState.ENABLE)
+    assert run.step(DISABLED, cycles=UNREST_CYCLES - 1) is SchemeState.ENABLE
+    assert run.step() is SchemeState.ADAPT
+
+
 def test_a_cycle_without_all_its_data_does_not_count_and_begins_nothing_anew():
     run = run_in(SchemeState.COMMISSION)
     run.step(DISABLED, observation=RESTING, cycles=19)
@@ -309,8 +327,9 @@ def test_the_host_s_own_checks_ask_for_a_fault_of_an_arm_that_may_have_torque(re
 def test_a_phase_that_takes_too_long_faults(state, cycles, reason):
     run = run_in(state)
     arm = DISABLED if reason in (FaultReason.COMMISSION_TIMEOUT, FaultReason.ENABLE_TIMEOUT) else GOOD
-    assert run.step(arm, cycles=cycles - 1) is state
-    assert run.step(arm) is SchemeState.FAULT
+    observation = RESTING if state is SchemeState.ENABLE else Observation.NONE
+    assert run.step(arm, observation=observation, cycles=cycles - 1) is state
+    assert run.step(arm, observation=observation) is SchemeState.FAULT
     assert run.supervisor.fault is reason
 
 
