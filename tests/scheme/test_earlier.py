@@ -10,7 +10,7 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme import certified_kernel, earlier
+from adacd_hil.scheme import certified_kernel, earlier, later_samples
 from adacd_hil.scheme.certificate_watch import BY_WORD
 
 FREE = replace(
@@ -44,6 +44,10 @@ class HeldLoop(TouchedLoop):
     def error_of(self, name):
         place = NAMES.index(name)
         return abs(self.pipeline._memory[0]["theta"][place] - self.theta[place])
+
+
+def distance_to_step(m, s):
+    return later_samples.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
 
 
 def states(outputs):
@@ -162,7 +166,7 @@ def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
     assert learnt_s == pytest.approx(2.25, abs=0.01)
     assert loop.said("touch") == []
     m = loop.pipeline._memory[0]
-    furthest = max(earlier._distance(m, s) for s in range(int(m["steps_used"])))
+    furthest = max(distance_to_step(m, s) for s in range(int(m["steps_used"])))
     assert furthest < 0.5 * earlier.STEADY * earlier.SMALLEST_SQUARE
 
 
@@ -225,7 +229,7 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     m["has_kept"], m["kept"], m["steps_used"], m["steps_theta"][0] = 0.0, 0.0, 1.0, 0.1
     m["steps_P"][0] = 0.02**2 * np.eye(len(NAMES))
     m["steps_square"][0], m["steps_rows"][0], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
-    added_variance = (1.0 + earlier.REGULAR) * 0.02**2 - 0.01**2
+    added_variance = (1.0 + later_samples.REGULAR) * 0.02**2 - 0.01**2
     m["belief"][INERTIA] += share * np.sqrt(earlier.STEADY * earlier.SMALLEST_SQUARE * added_variance)
     assert earlier.is_steady(m) is is_steady
     assert bool(m["has_kept"]) is not is_steady
@@ -234,50 +238,110 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
 
 
 class Halves:
-    """A fit of 1 s that knows each parameter to 0.01, and knew it to 0.014 after its first step."""
+    """A fit whose steps had each half of its information, or less; all its samples are of parameters 0 and 1 alone."""
 
-    def __init__(self):
+    def __init__(self, steps_used=2):
         self.m = certified_kernel.new_memory(FREE)[0]
         count = len(NAMES)
-        self.m["P_belief"] = 0.01**2 * np.eye(count)
+        random = np.random.default_rng(5)
+        root = random.standard_normal((count, count))
+        self.m["P_belief"] = 0.01**2 * (np.eye(count) + root @ root.T / count)
         self.m["samples_W"][:3], self.m["samples_tau"][:3] = np.eye(2, count), self.m["belief"][:2]
         self.m["samples_kept"] = 3.0
-        self.m["steps_used"] = 2.0
-        self.m["steps_theta"][:2] = self.m["belief"]
-        self.m["steps_P"][0] = 2.0 * self.m["P_belief"]
-        self.m["steps_P"][1] = 1.5 * self.m["P_belief"]
+        self.m["steps_used"] = steps_used
+        self.m["steps_theta"][:] = self.m["belief"]
+        self.m["steps_P"][:] = 2.0 * self.m["P_belief"]
+
+    def differ(self, step, change):
+        """Let a step have had other parameters; return how far its later samples then are from the belief (p,)."""
+        self.m["steps_theta"][step] -= change
+        P, P_0 = self.m["P_belief"], (1.0 + later_samples.REGULAR) * self.m["steps_P"][step]
+        alone = np.linalg.solve(
+            np.linalg.inv(P) - np.linalg.inv(P_0),
+            np.linalg.solve(P, self.m["belief"]) - np.linalg.solve(P_0, self.m["steps_theta"][step]),
+        )
+        return alone - self.m["belief"]
 
 
 def test_the_model_of_the_later_samples_is_that_of_their_own_information():
     fit = Halves()
-    change = np.linspace(-0.02, 0.03, len(NAMES))
-    fit.m["steps_theta"][0] -= change
-    assert earlier._find_later(fit.m, 0)
-    P, P_0 = fit.m["P_belief"], (1.0 + earlier.REGULAR) * fit.m["steps_P"][0]
-    alone = np.linalg.solve(
-        np.linalg.inv(P) - np.linalg.inv(P_0),
-        np.linalg.solve(P, fit.m["belief"]) - np.linalg.solve(P_0, fit.m["steps_theta"][0]),
-    )
-    assert fit.m["later"] == pytest.approx(alone - fit.m["belief"], rel=1e-9)
+    root = 0.005 * np.random.default_rng(6).standard_normal((len(NAMES), 4))
+    fit.m["steps_P"][0] += root @ root.T
+    alone = fit.differ(0, np.linspace(-0.02, 0.03, len(NAMES)))
+    m = fit.m
+    assert later_samples.find(m, m["steps_theta"][0], m["steps_P"][0], m["belief"], m["P_belief"])
+    assert m["later"] == pytest.approx(alone, rel=1e-6)
 
 
+@pytest.mark.parametrize("steps_used", [2, 11])
 @pytest.mark.parametrize(("share", "is_borne_out"), [(0.97, True), (1.03, False)])
-def test_later_samples_that_come_to_another_torque_do_not_bear_the_fit_out(share, is_borne_out):
-    fit = Halves()
-    # equal information on both sides: the later samples are as far from the whole as the earlier ones
-    fit.m["steps_theta"][0, 1] -= share * earlier.LATER_NM * (1.0 + 2.0 * earlier.REGULAR)
+def test_later_samples_that_come_to_another_torque_do_not_bear_the_fit_out(share, is_borne_out, steps_used):
+    fit = Halves(steps_used)
+    unit = np.zeros(len(NAMES))
+    unit[1] = 1.0
+    far = np.abs(Halves().differ(0, unit)[:2]).max()
+    fit.differ(0, share * earlier.LATER_NM / far * unit)
     assert earlier.is_borne_out(fit.m) is is_borne_out
-    assert fit.m["kept_count"] == (0.0 if is_borne_out else 2.0)
+    assert fit.m["kept_count"] == (0.0 if is_borne_out else min(steps_used, earlier.STEPS))
     fit.m["is_payload"] = 1.0
     assert earlier.is_borne_out(fit.m)
 
 
 def test_a_fit_with_noise_may_differ_by_more():
     fit = Halves()
-    fit.m["steps_theta"][0, 1] -= 1.4 * earlier.LATER_NM
+    unit = np.eye(len(NAMES))[1]
+    fit.differ(0, 1.4 * earlier.LATER_NM / np.abs(Halves().differ(0, unit)[:2]).max() * unit)
     assert not earlier.is_borne_out(fit.m)
     fit.m["samples_tau"][:3] += 0.25 * earlier.LATER_NM
     assert earlier.is_borne_out(fit.m)
+
+
+class Kept(Halves):
+    """Four kept beliefs that agree, each with half of the information of the next."""
+
+    def __init__(self):
+        super().__init__()
+        m, P = self.m, self.m["P_belief"].copy()
+        m["kept_count"], m["has_kept"], m["apart_n"] = 0.0, 0.0, 1.0
+        for n in range(4):
+            earlier._keep(m, m["belief"].copy(), 2.0 ** (3 - n) * P, 0.25, 0.0)
+        self.std = 0.5 * np.sqrt(P[1, 1])  # of parameter 1, in the last
+
+    def compared(self):
+        for _ in range(6):
+            earlier._compare_kept(self.m)
+        return np.flatnonzero(self.m["kept_unit"][:4]).tolist()
+
+
+def test_kept_beliefs_that_agree_stay_and_each_pair_is_compared_once():
+    kept = Kept()
+    pairs = []
+    for _ in range(6):
+        pairs.append((int(kept.m["apart_s"]), int(kept.m["apart_n"])))
+        earlier._compare_kept(kept.m)
+    assert pairs == [(0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3)]
+    assert kept.m["apart_n"] == 4.0
+    assert kept.compared() == [0, 1, 2, 3]
+
+
+def test_beliefs_that_a_touch_has_come_into_are_forgotten_and_the_others_go_on_judging():
+    kept = Kept()
+    kept.m["kept"][2:, 1] += 100.0 * kept.std
+    assert kept.compared() == [0, 1]
+    kept = Kept()
+    kept.m["kept"][2, 1] += 100.0 * kept.std
+    assert kept.compared() == [0, 1, 3]
+
+
+def test_a_difference_that_is_small_or_not_known_forgets_nothing():
+    kept = Kept()
+    kept.m["P_kept"] *= 1e-4  # well known
+    kept.m["kept"][3, 1] += 0.2 * later_samples.APART_NM
+    assert kept.compared() == [0, 1, 2, 3]
+    kept = Kept()
+    kept.m["P_kept"] *= 1e4  # hardly known
+    kept.m["kept"][3, 1] += 2.0 * later_samples.APART_NM
+    assert kept.compared() == [0, 1, 2, 3]
 
 
 def test_the_steps_kept_are_from_before_the_contact():

@@ -64,6 +64,7 @@ def test_an_arm_that_nobody_touches_is_certified_and_is_within_the_bounds():
     assert all(met(touch_campaign.untouched_figures([trial])).values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", long_but(1, [97165, 97039]))
 def test_a_weak_touch_of_the_first_half_second_bends_no_certificate(seed):
     """A spring of 6.5 N/m for 0.33 s, a lean of 0.13 Nm for 0.5 s; certified with 0.21 and 0.10 Nm, were they not seen.
@@ -74,6 +75,24 @@ def test_a_weak_touch_of_the_first_half_second_bends_no_certificate(seed):
     assert trial.is_withheld
     assert max(trial.errors_Nm) < touch_campaign.WRONG_NM
     assert trial.back_after_s < touch_campaign.BACK_S
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", long_but(1, [103087, 101062]))
+def test_what_was_learnt_with_a_hand_on_the_arm_judges_nothing_after_it_has_gone(seed):
+    """A lean of 0.7 Nm for 0.4 s from the start, one of 0.8 Nm from 0.5 to 6.8 s: beliefs that they bent were kept."""
+    trial = touch_trials.play(seed, is_touched=True)
+    assert trial.back_after_s < touch_campaign.BACK_S
+    assert max(trial.errors_Nm) < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", long_but(1, [103081, 103187]))
+def test_what_was_learnt_before_a_hand_came_goes_on_judging(seed):
+    """A drag of 0.25 Nm from 0.6 s on, a payload of 0.24 kg from 1.1 s on, each on a wide arm and without end."""
+    trial = touch_trials.play(seed, is_touched=True)
+    assert trial.is_withheld
+    assert trial.errors_Nm == trial.by_word_Nm == ()
 
 
 @pytest.mark.parametrize(
