@@ -1116,6 +1116,7 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
 
 
 def _load_table(name_or_file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Read a configuration and all that it extends; a relative path is taken from the file that names it."""
     if name_or_file in seen:
         raise ConfigError(f"configuration {name_or_file} extends itself")
     if len(seen) > _LONGEST_CHAIN:
@@ -1128,6 +1129,8 @@ def _load_table(name_or_file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]
     extended = table.pop("extends", "paper")
     if not isinstance(extended, str):
         raise ConfigError(f"`extends` = {extended!r} must be the name of a configuration or a file")
+    if extended not in builtin_names() and Path(extended).suffix:
+        extended = str(path.parent / extended)
     return merge(_load_table(extended, (*seen, name_or_file)), table)
 
 

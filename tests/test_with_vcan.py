@@ -34,19 +34,18 @@ print(f"{identifier:x} {length} {data.hex()}")
 """
 
 SUM_IN_TWO_THREADS = """
-import threading, time
+import threading
 import numpy as np
-until_s = time.monotonic() + 1.5
 def add_up(seed):
     values = np.random.default_rng(seed).random(1 << 16)
     expected = values.sum()
-    while time.monotonic() < until_s:
+    for _ in range(20000):
         sums[seed].append(values.sum() == expected)
 sums = [], []
 threads = [threading.Thread(target=add_up, args=(seed,)) for seed in range(2)]
 for thread in threads: thread.start()
 for thread in threads: thread.join()
-print(all(sums[0]), all(sums[1]), min(map(len, sums)) > 100)
+print(all(sums[0]), all(sums[1]))
 """
 
 
@@ -136,9 +135,10 @@ def test_two_processes_exchange_a_frame_over_vcan0(bus: None) -> None:
 def test_each_thread_keeps_its_vector_registers(bus: None) -> None:
     status, stdout, stderr = run("--", sys.executable, "-c", SUM_IN_TWO_THREADS)
     assert (status, stderr) == (0, b"")
-    assert stdout == b"True True True\n"
+    assert stdout == b"True True\n"
 
 
+@pytest.mark.slow
 def test_a_missing_command_gives_127(bus: None) -> None:
     status, _, _ = run("--", "no-such-command")
     assert status == STATUS_NOT_FOUND

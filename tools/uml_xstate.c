@@ -14,7 +14,7 @@
 
 enum { ROOM = 1 << 16 };
 
-typedef long Ptrace(int, pid_t, void *, void *);
+typedef long Ptrace(enum __ptrace_request, ...);
 
 static Ptrace *next;
 static unsigned char whole[ROOM] __attribute__((aligned(64)));  // the kernel has little stack, and one thread

@@ -49,10 +49,12 @@ def _cause(run: Run, t_ns: int) -> str:
 
 
 def find_causes(run: Run) -> tuple[str, ...]:
-    """List what ended attempts without a fault, each once."""
+    """List what ended attempts, or the log, without a fault, each once."""
     said = [
         logged.event.message for logged in run.events if logged.event.name == _RUN and logged.event.level == "error"
     ]
+    if run.broken_off:
+        said.append(run.broken_off)
     return tuple(dict.fromkeys(map(_shortened, said)))
 
 

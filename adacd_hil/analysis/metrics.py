@@ -40,7 +40,7 @@ from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_rea
 from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.analysis.untouched import Residual, Untouched, gather_untouched
 from adacd_hil.analysis.verdict import give_verdict, is_margin_below_1, is_revoked
-from adacd_hil.records import PARAMETER_NAMES
+from adacd_hil.records import PARAMETER_NAMES, SchemeState
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,15 @@ class Metrics:
     paper: tuple[PaperRow, ...]
     verdict: str
     is_clean: bool
+    armed_false_alarms: int | None  # of them those in MONITOR
 
     @property
     def false_alarm_bound_per_h(self) -> float | None:
-        """Upper 95 % bound of the certified scheme's false alarms by counting; None where nobody knows the truth."""
+        """Upper 95 % bound of the certified scheme's rate of false alarms in MONITOR, by counting; None: not known."""
         push = None if self.evidence is None else self.evidence.smallest_push
-        return None if push is None or self.false_alarms is None else push.false_alarm_bound_per_h(self.false_alarms)
+        if push is None or self.armed_false_alarms is None:
+            return None
+        return push.false_alarm_bound_per_h(self.armed_false_alarms)
 
 
 class Gathered(NamedTuple):
@@ -112,7 +115,9 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         if section.kind == "adaptation"
     }
     has_truth = run.truth is not None
-    false_s = tuple(d.detected_s for d, owner in zip(detections, owners, strict=True) if owner is None)
+    unexplained = [d for d, owner in zip(detections, owners, strict=True) if owner is None]
+    false_s = tuple(detection.detected_s for detection in unexplained)
+    armed_false = sum(run.state[detection.row - 1] == SchemeState.MONITOR for detection in unexplained)
     missed = sum(contact.is_armed and contact.detected_s is None for contact in contacts)
     faults, causes, data = find_faults(run), find_causes(run), gathered.data
     payload_kg = _payloads(run, sections)
@@ -143,6 +148,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         is_clean=is_identified
         and missed == 0
         and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
+        armed_false_alarms=armed_false if has_truth else None,
     )
 
 

@@ -125,7 +125,7 @@ def compare_with_paper(
     rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
     margin = evidence.smallest_margin
     rows.append(("Smallest threshold / residual", "–", "–", "–" if margin is None else f"{margin:.2f}"))
-    rows.append(("Smallest push found within 100 ms, joints 1 / 2", "–", "–", _push_text(evidence)))
+    rows.append(("Smallest push found within 100 ms, estimated, joints 1 / 2", "–", "–", _push_text(evidence)))
     rows.append(("Control rate", "1 kHz", rate, rate))
     return _of_what_was_played(run, [PaperRow(*row) for row in rows])
 
@@ -179,7 +179,7 @@ def _threshold_text(evidence: Evidence, detections: list[str]) -> str:
 
 
 def _push_text(evidence: Evidence) -> str:
-    """Say how small a push is surely found, in the middle and at the worst moment."""
+    """Say how small a push is found, in the middle and at the worst moment."""
     if evidence.smallest_push is None:
         return "–"
     median, worst = (

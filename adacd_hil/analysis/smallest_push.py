@@ -4,7 +4,8 @@ A channel whose response to a step of 1 is g after `WITHIN_S` is then over its t
 
     |tau_ext| > (h + |r|) / g
 
-with r what it shows without the push. Of all channels the least counts. The threshold *in force* is the least h. Both
+with r what it shows without the push. A bare channel counts only if the smoothed one of its filter is over AGREES h as
+well (`scheme.sensitivity`). Of all channels the least counts. The threshold *in force* is the least h. Both
 stand for the cycles in MONITOR in which nothing touches the arm, and assume that h and r stay as they are meanwhile. So
 what a moment says is an estimate: of 300 pushes 2 % larger than at their moment 247 were found in 100 ms, the others as
 h rose. Of 300 as large as at the worst moment all were, after 59 ms at most.
@@ -20,6 +21,7 @@ from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.analysis.touches import bank_channels, step_response
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.sensitivity import AGREES
 
 WITHIN_S: Final = 0.1
 """The slowest filter is at 0.63 of a step by then, without its smoothing."""
@@ -44,12 +46,16 @@ class PushGatherer:
     def __init__(self, settings: Settings) -> None:
         channels = bank_channels(settings)
         self._response = np.array([step_response(WITHIN_S, cutoff, smoothing) for cutoff, smoothing in channels])
+        self._filters = len(settings.certified.cutoffs_rad_s)
         self._period_s = settings.bus.period_s
         self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
 
     def add(self, tau_ext: Vector, threshold: Vector) -> None:
         """Take in residuals and thresholds (k, channels, 2), k > 0."""
-        push = ((threshold + np.abs(tau_ext)) / self._response[:, None]).min(axis=1)
+        found = (threshold + np.abs(tau_ext)) / self._response[:, None]
+        agreed = (AGREES * threshold + np.abs(tau_ext)) / self._response[:, None]
+        bare = np.maximum(found[:, self._filters :], agreed[:, 1 : self._filters])
+        push = np.concatenate((found[:, : self._filters], bare), axis=1).min(axis=1)
         in_force = threshold.min(axis=1)
         for joint in range(JOINTS):
             self._push[joint].add(push[:, joint])

@@ -16,7 +16,10 @@ from adacd_hil.config import RequestSettings, Settings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
+from adacd_hil.log.errors import LogError
 from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
+from adacd_hil.output_files import in_words
+from adacd_hil.records import SchemeState
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench import Bench
 from firmware_sim.contracts import playable_contract
@@ -139,8 +142,25 @@ def play(
         progress("drawing the report")
         from adacd_hil.analysis.report.report import write_report  # what draws takes longest to import
 
-        report = write_report(summary.log.path, truth_path, folder.path)
+        try:
+            report = write_report(summary.log.path, truth_path, folder.path)
+        except (OSError, LogError) as error:
+            status = exit_code(summary)
+            if status is ExitCode.OK:
+                raise
+            what = f"{_ending(summary)}; nor can the report be written: {in_words(error)}"
+            raise CommandError(what, status) from None
         progress(f"report: {folder.path / 'report.html'}")
     if summary.error:
         raise CommandError(summary.error, exit_code(summary))
     return report, exit_code(summary)
+
+
+def _ending(summary: SessionSummary) -> str:
+    """Say how a run ended that has no report."""
+    result = summary.result
+    if summary.error or result is None:
+        return summary.error or "no cycle was run"
+    if result.state is SchemeState.FAULT:
+        return f"the run ended in FAULT ({result.fault.name})"
+    return f"log {summary.log.path} lacks something"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.analysis.excitation import Figures, Limits, NoExcitationError, Search
-from adacd_hil.cli.exit_codes import CommandError
+from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
@@ -36,6 +36,8 @@ class Outcome(NamedTuple):
 
 def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> Outcome:
     """Search, and write what was found where asked for. Raises ConfigError, CommandError."""
+    if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
+        raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
     task = Search(load_settings(config, profile))
     clock, progress = MonotonicClock(), Progress()
     end_ns = clock.now_ns() + round(1e9 * seconds)

@@ -14,6 +14,7 @@ from adacd_hil.output_files import replace_file
 if TYPE_CHECKING:
     from adacd_hil.control.history_file import History
 
+_PNG = b"\x89PNG\r\n\x1a\n"
 _MIDDLE = slice(1, None, 3)
 """Of friction at 0.2, 0.6, 1.2 rad/s, joint by joint: at 0.6 rad/s."""
 
@@ -34,6 +35,8 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
     if plot is not None:
         if plot.exists() and plot.samefile(file):
             raise CommandError(f"--plot {plot} is the history itself; give another name", ExitCode.USAGE)
+        if plot.is_file() and plot.stat().st_size and not plot.read_bytes().startswith(_PNG):
+            raise CommandError(f"--plot {plot} is there already and no PNG; give another name", ExitCode.USAGE)
         replace_file(plot, _as_png(found))
     print(json.dumps(dataclasses.asdict(found), indent=2) if as_json else _as_text(found))
     return ExitCode.OK

@@ -100,7 +100,13 @@ def _replay_one(
     progress: Any,
 ) -> _Result:
     from adacd_hil.analysis.replay.replay import contacts_beside, replay_source
-    from adacd_hil.analysis.replay.what_if import apply_settings, keep_facts, parse_changes, parse_variations
+    from adacd_hil.analysis.replay.what_if import (
+        apply_settings,
+        keep_facts,
+        parse_changes,
+        parse_variations,
+        refuse_facts,
+    )
     from adacd_hil.config import load_settings
     from adacd_hil.control.operator import ScriptedOperator
 
@@ -110,6 +116,8 @@ def _replay_one(
     config, profile, _ = configured
     if config is not None and not is_alone:
         base = keep_facts(own, load_settings(config, profile or own.arm.profile))
+    for asked in (parse_changes(changes), *(parse_variations(vary) if vary else ())):
+        refuse_facts(asked)
     base = apply_settings(base, parse_changes(changes))
     variants = {_name(choice): apply_settings(base, choice) for choice in parse_variations(vary)} if vary else {}
     if not variants and base != own:
@@ -151,7 +159,7 @@ def _name(choice: dict[str, str]) -> str:
 
 def _code(replays: "list[Replay]") -> ExitCode:
     own = replays[0]
-    if own.mismatch_count:
+    if own.mismatch_count or not own.cycles:
         return ExitCode.FAILURE
     return ExitCode.OK if own.is_whole else ExitCode.PARTIAL
 
@@ -159,6 +167,8 @@ def _code(replays: "list[Replay]") -> ExitCode:
 def _verdict(own: "Replay") -> str:
     if own.mismatch_count:
         return f"{own.mismatch_count} values differ from the log's"
+    if not own.cycles:
+        return "no cycle in it can be replayed"
     if own.compared == 0:
         return "nothing to compare with"
     exact = "bit for bit" if own.tolerance == 0.0 else f"within {own.tolerance:g} of each field's scale"

@@ -92,6 +92,14 @@ def test_a_detection_without_contact_is_a_false_alarm_in_every_state(row):
     assert evaluate(react(make_certified_run(), row, 20)).false_alarms == 1
 
 
+def test_a_log_that_ended_as_nobody_meant_it_to_is_not_good():
+    run = make_certified_run()
+    assert evaluate(run).is_clean
+    metrics = evaluate(replace(run, broken_off="control process died"))
+    assert not metrics.is_clean
+    assert metrics.verdict.startswith("The run was broken off: control process died")
+
+
 def margin_of(run, label, channel):
     return evaluate(run).evidence.margins[label][channel].margin
 

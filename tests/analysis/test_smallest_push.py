@@ -8,6 +8,7 @@ from hand_made_run import A, C, M, make_certified_run, make_run, react, touch
 
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.tables import push_table
+from adacd_hil.scheme.sensitivity import AGREES
 
 SLOWEST = 0.612758  # what 10 and then 200 rad/s show of a step after 0.1 s: 1 - (200 e^-1 - 10 e^-20) / 190
 
@@ -31,9 +32,17 @@ def test_a_push_is_as_small_as_the_step_that_is_over_a_threshold_in_time():
 def test_the_channel_that_finds_it_with_the_least_counts():
     run = only_the_slowest(make_certified_run())
     run.certified.threshold[:, -1, 1] = 0.06  # bare, 200 rad/s: all of the step after 0.1 s
+    run.certified.threshold[:, 2, 1] = 0.1  # and smoothed, which has to agree
     first, second = smallest_push(run).push_Nm
     assert first["p50"] == pytest.approx(0.05 / SLOWEST, rel=1e-5)
     assert second["p50"] == pytest.approx(0.06, rel=1e-5)
+
+
+def test_a_bare_channel_finds_nothing_unless_the_smoothed_one_agrees():
+    run = only_the_slowest(make_certified_run(), 0.2)
+    run.certified.threshold[:, -1, 0] = 0.06
+    run.certified.threshold[:, 2, 0] = 0.25
+    assert smallest_push(run).push_Nm[0]["p50"] == pytest.approx(AGREES * 0.25, rel=1e-5)
 
 
 def test_a_residual_is_against_the_push_whatever_its_sign():
@@ -69,6 +78,13 @@ def test_the_rate_of_false_alarms_is_bounded_by_counting():
     assert alarmed.false_alarm_bound_per_h > 1.5 * metrics.false_alarm_bound_per_h
     assert "No false alarms in that time: by counting alone, at most" in push_table(metrics)
     assert "1 false alarm in that time" in push_table(alarmed)
+
+
+def test_an_alarm_while_the_arm_learns_is_none_of_those():
+    metrics = evaluate(react(make_certified_run((A, 1000), (C, 500), (M, 4000)), 500, 20))
+    assert metrics.false_alarms == 1
+    assert "No false alarms in that time" in push_table(metrics)
+    assert metrics.false_alarm_bound_per_h == pytest.approx(3.0 / metrics.evidence.smallest_push.hours, rel=0.01)
 
 
 def test_without_the_truth_nobody_knows_what_a_false_alarm_was():

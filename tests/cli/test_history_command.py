@@ -139,6 +139,17 @@ def test_the_picture_does_not_replace_the_history(file: Path, first_history: str
     assert file.read_text() == first_history
 
 
+def test_the_picture_replaces_an_earlier_one_and_nothing_else(file: Path, first_history: str) -> None:
+    picture, other = file.with_name("arm.png"), file.with_name("other.toml")
+    other.write_text(first_history)
+    for _ in range(2):
+        assert CliRunner().invoke(cli, ["history", str(file), "--plot", str(picture)]).exit_code == 0
+    result = CliRunner().invoke(cli, ["history", str(file), "--plot", str(other)])
+    assert result.exit_code == USAGE
+    assert "is there already and no PNG" in result.stderr
+    assert other.read_text() == first_history
+
+
 def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(file: Path) -> None:
     found = read_history(file)
     second = replace(found.last, date_utc="2030-01-01T00:00:00Z")

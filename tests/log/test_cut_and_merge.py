@@ -47,6 +47,22 @@ def log_path(tmp_path):
     return write(tmp_path / "run.mcap", chunks=chunks, times=frame_times, summary=summary)
 
 
+@pytest.mark.parametrize("name", ["bus.log", "arm.toml", "bus.blf"])
+def test_what_no_log_command_has_made_is_not_replaced(log_path, tmp_path, name):
+    (tmp_path / name).write_text("(1.0) can0 123#00\n")
+    with pytest.raises(LogError, match="is no result of these commands"):
+        cut(log_path, tmp_path / name, Stretch(0.040, 0.1205))
+    assert (tmp_path / name).read_text() == "(1.0) can0 123#00\n"
+    for _ in range(2):  # a result is
+        cut(log_path, tmp_path / "out.mcap", Stretch(0.040, 0.1205))
+
+
+def test_a_result_is_not_named_like_a_part_of_the_log_beside_it(log_path, tmp_path):
+    with pytest.raises(LogError, match="would be taken for a part of the log beside it"):
+        cut(log_path, tmp_path / "run_001.mcap", Stretch(0.040, 0.1205))
+    cut(log_path, tmp_path / "other_001.mcap", Stretch(0.040, 0.1205))
+
+
 def test_a_stretch_has_its_cycles_whole_and_all_that_explains_them(log_path, tmp_path):
     out = tmp_path / "out.mcap"
     done = cut(log_path, out, Stretch(0.040, 0.1205))

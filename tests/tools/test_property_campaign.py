@@ -130,6 +130,11 @@ def _pushed(begin: int, end: int, torque_Nm: float = 1.0) -> Callable[[int], flo
 
 _STICK = parse(Scenario, {"faults": [{"kind": "stick", "node": "sensor1", "signal": "torque", "at_s": 0.1}]})
 
+_STUCK_DRIVES = parse(
+    Scenario,
+    {"faults": [{"kind": "stick", "node": node, "signal": "velocity", "at_s": 0.1} for node in ("drive1", "drive2")]},
+)
+
 BROKEN: dict[str, tuple[Made, str]] = {
     "torque before the status": (Made(torque=lambda k: 10 if 231 <= k < 590 else 0), "torque-before-enabled"),
     "torque while one drive is in another mode": (
@@ -145,7 +150,16 @@ BROKEN: dict[str, tuple[Made, str]] = {
         "enabled-in-motion",
     ),
     "enabled in motion that a fault hides": (
-        Made(torque=_ends_at(590), scenario=_STICK, faults=lambda k: int(k < 200), true_speed=lambda k: 0.1),
+        Made(torque=_ends_at(590), scenario=_STUCK_DRIVES, faults=lambda k: 3 * (k < 200), true_speed=lambda k: 0.1),
+        "enabled-in-motion",
+    ),
+    "enabled in motion beside a fault of a sensor": (
+        Made(
+            velocity_rad_s=lambda k: 0.1 if k == 150 else 0.0,
+            torque=_ends_at(590),
+            scenario=_STICK,
+            faults=lambda k: 1,
+        ),
         "enabled-in-motion",
     ),
     "too much": (Made(torque=lambda k: min(160 * max(k - 240, 0), 1002) if k < 590 else 0), "torque-limit"),
@@ -252,8 +266,8 @@ ALLOWED: dict[str, Made] = {
     "motion that a fault has made up, and the truth doesn't know": Made(
         velocity_rad_s=lambda k: 67109.0 if k == 150 else 0.0,
         torque=_ends_at(590),
-        scenario=_STICK,
-        faults=lambda k: int(k == 150),
+        scenario=_STUCK_DRIVES,
+        faults=lambda k: 3 * (k == 150),
     ),
     "torque that falls blindly": Made(
         torque=lambda k: 3 if k == 402 else _ends_at(590)(k), has_feedback=lambda k: not 400 <= k <= 402

@@ -45,6 +45,14 @@ def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     return parse(Settings, table)
 
 
+def refuse_facts(changes: Mapping[str, str]) -> None:
+    """Raise ConfigError if a key is what made the numbers of a log: no other value can be given to it afterwards."""
+    facts = {f"arm.{name}" for name in _FACTS} | {"bus.period_us", "realtime.sample_period"}
+    for key in changes:
+        if key in facts or key.startswith("devices."):
+            raise ConfigError(f"`{key}` made the numbers of the log; a replay can't change it")
+
+
 def _known_keys() -> dict[str, Any]:
     """Return the type of every key."""
     return dict(_keys(Settings, ""))

@@ -26,10 +26,13 @@ from adacd_hil.analysis.run import Run, StretchOfRun, Truth
 from adacd_hil.analysis.timing import CycleColumns, columns_of_series
 from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap_file import ENDING_KEY
 from adacd_hil.log.reader import Series, check_states
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.log.stretch import WHOLE, Stretch, start_of_log
+from adacd_hil.log.summary import PLANNED_ENDINGS
 from adacd_hil.records import JOINTS
+from adacd_hil.terminal import one_line
 
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
 """Of a run's log, what a report reads."""
@@ -141,6 +144,9 @@ class _Reading:
     def _done(self, run: Run, gathered: Gathered | None) -> ReadRun:
         """Give what was read."""
         stream, truth = self._read, self._truth
+        ending = stream.summary.get(ENDING_KEY, "")
+        if ending and ending not in PLANNED_ENDINGS:
+            run = replace(run, broken_off=one_line(ending))
         problems = [stream.problem, "" if truth is None else truth.problem]
         is_complete = stream.is_complete and (truth is None or truth.is_complete)
         source = Source(self._path.name, "; ".join(filter(None, problems)), is_complete)

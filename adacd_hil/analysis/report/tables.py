@@ -52,7 +52,7 @@ def margins_table(evidence: Evidence | None) -> str:
 
 
 def push_table(metrics: Metrics) -> str:
-    """Write how small a push is surely found, and the threshold in force."""
+    """Write how small a push is found, and the threshold in force."""
     push = None if metrics.evidence is None else metrics.evidence.smallest_push
     if push is None:
         return ""
@@ -60,7 +60,10 @@ def push_table(metrics: Metrics) -> str:
     head = ("joint 1 / joint 2, Nm", *names.values())
     rows: list[Sequence[Cell]] = [
         (what, *(pair_text([joint[name] for joint in joints], 3) for name in names))
-        for what, joints in (("smallest push found within 100 ms", push.push_Nm), ("in force", push.threshold_Nm))
+        for what, joints in (
+            ("smallest push found within 100 ms, estimated", push.push_Nm),
+            ("in force", push.threshold_Nm),
+        )
     ]
     note = (
         f"Over {60.0 * push.hours:.2f} min of MONITOR in which nothing touches the arm. Push: a constant external "
@@ -70,7 +73,8 @@ def push_table(metrics: Metrics) -> str:
     )
     bound = metrics.false_alarm_bound_per_h
     if bound is not None:
-        alarms = f"{metrics.false_alarms or 'No'} false alarm{'' if metrics.false_alarms == 1 else 's'}"
+        count = metrics.armed_false_alarms
+        alarms = f"{count or 'No'} false alarm{'' if count == 1 else 's'}"
         note += f" {alarms} in that time: by counting alone, at most {bound:.3g} per hour at 95 %."
     return make_table(head, rows) + f'<p class="note">{note}</p>'
 

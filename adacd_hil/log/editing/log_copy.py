@@ -22,6 +22,7 @@ from adacd_hil.log.editing.info import read_info
 from adacd_hil.log.editing.record_scan import read_header
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import LIBRARY, PRODUCT, ROS_PROFILE, SUMMARY_METADATA
+from adacd_hil.log.parts import is_part_name
 from adacd_hil.log.summary import COPY_ENDINGS
 from adacd_hil.output_files import Replacement
 
@@ -185,6 +186,10 @@ class _Target:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._position = 0
+        if is_part_name(path):
+            raise LogError(f"log {path} would be taken for a part of the log beside it; give another name")
+        if path.is_file() and not path.is_symlink() and path.stat().st_size and not _is_copy(path):
+            raise LogError(f"log {path} can't be created: what is there is no result of these commands")
         try:
             self._replacement = Replacement(path, is_log=_is_copy(path))
             self._file = self._replacement.beside.open("wb")
