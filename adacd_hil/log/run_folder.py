@@ -70,7 +70,10 @@ def _refusal(path: Path) -> LogExistsError:
 
 
 def _is_failed_start(path: Path) -> bool:
-    """Tell whether a log, ended as it should, has no cycle. Raises LogExistsError for one that is being written."""
+    """Tell whether a log has nothing, or, ended as it should, no cycle.
+
+    Raises LogExistsError for one that is being written.
+    """
     try:
         check_unused(path)
     except InUseError as error:
@@ -83,4 +86,5 @@ def _is_failed_start(path: Path) -> bool:
         info = read_info(path)
     except LogError:
         return False
-    return bool(info.metadata) and info.ending == "closed" and not info.problems and not info.cycles
+    has_no_cycle = info.ending == "closed" and not info.cycles
+    return bool(info.metadata) and not info.problems and (has_no_cycle or not info.messages)

@@ -1,8 +1,13 @@
 """A log takes the place of nothing; only a start that failed makes room for the next."""
 
+import contextlib
 import os
+import subprocess
+import sys
+import time
 
 import pytest
+from hang import HANG_S
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
 from adacd_hil.config import LogSettings
@@ -86,6 +91,22 @@ def test_the_log_of_a_start_that_failed_is_kept_aside(tmp_path):
     assert record(path, make_run(3)).is_complete
     assert [(tmp_path / f"failed-start-{number}.mcap").read_bytes() for number in (1, 2)] == failed
     assert len(read_log(path).scheme) == 3
+
+
+def test_a_log_with_nothing_in_it_is_kept_aside_though_its_host_was_killed(tmp_path):
+    path = tmp_path / "truth.mcap"
+    dies = (
+        "import os, sys; from pathlib import Path; from adacd_hil.log.recorder import Recorder;"
+        "Recorder(Path(sys.argv[1]), metadata={'name': 'made'}, is_truth=True); os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-c", dies, str(path)], check=False, timeout=HANG_S)
+    for _ in range(6000):  # its writer ends it
+        with contextlib.suppress(LogExistsError):
+            check_free(path)
+            break
+        time.sleep(0.01)
+    assert record(path, make_run(3)).is_complete
+    assert (tmp_path / "failed-start-1.mcap").exists()
 
 
 def test_a_log_without_cycles_whose_end_is_missing_is_not_taken_for_a_start_that_failed(tmp_path):
