@@ -62,7 +62,7 @@ def push_table(metrics: Metrics) -> str:
         (what, *(pair_text([joint[name] for joint in joints], 3) for name in names))
         for what, joints in (
             ("smallest push found within 100 ms, estimated", push.push_Nm),
-            ("in force", push.threshold_Nm),
+            ("threshold in force", push.threshold_Nm),
         )
     ]
     note = (
