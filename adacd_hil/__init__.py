@@ -1,8 +1,18 @@
 """Online adaptation and collision detection for torque-sensed arms on CAN."""
 
-from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
 
-try:
-    __version__ = version("adacd-hil")
-except PackageNotFoundError:  # imported from a source tree that was never installed
-    __version__ = "0+unknown"
+if TYPE_CHECKING:
+    __version__: str
+else:
+
+    def __getattr__(name: str) -> str:
+        """Look `__version__` up when it is asked for: that takes longer than all that comes before `cli/start.py`."""
+        if name != "__version__":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("adacd-hil")
+        except PackageNotFoundError:  # imported from a source tree that was never installed
+            return "0+unknown"

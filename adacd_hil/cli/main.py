@@ -367,7 +367,7 @@ cli.add_command(tune)
 
 
 def main() -> NoReturn:
-    """Enter here from the console script: run the command line and exit with a documented status."""
+    """Run the command line and exit with a documented status; `adacd_hil.cli.start` comes here."""
     open_terminals()
     try:
         code = cli.main(prog_name="adacd-hil", standalone_mode=False)

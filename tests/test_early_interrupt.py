@@ -1,0 +1,45 @@
+"""Ctrl-C while a program still imports what it is made of ends it without a traceback."""
+
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]["scripts"]
+INTERRUPT = """
+import importlib, signal, sys
+module, function = sys.argv[1].split(":")
+place, sys.argv[1:] = sys.argv[2], ["--version"]
+class Interrupting:
+    def find_spec(self, name, path, target=None):
+        if name == place:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+getattr(importlib.import_module(module), function)()
+"""
+ENDS = {"adacd-hil": (130, b"adacd-hil: interrupted\n"), "firmware-sim": (0, b"")}
+
+
+def interrupted(program: str, place: str, **given: object) -> "subprocess.CompletedProcess[bytes]":
+    """Start a program as its console script does, with a Ctrl-C when it imports a module."""
+    command = [sys.executable, "-c", INTERRUPT, SCRIPTS[program], place]
+    return subprocess.run(command, capture_output=True, check=False, **given)  # type: ignore[call-overload,no-any-return]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", ["MAIN", "click", "numpy", "importlib.metadata"])
+@pytest.mark.parametrize("program", ENDS)
+def test_ctrl_c_during_imports_ends_as_later(program: str, place: str) -> None:
+    main = {"adacd-hil": "adacd_hil.cli.main", "firmware-sim": "firmware_sim.main"}[program]
+    done = interrupted(program, place.replace("MAIN", main))
+    assert (done.returncode, done.stdout, done.stderr) == (ENDS[program][0], b"", ENDS[program][1])
+
+
+@pytest.mark.slow
+def test_ctrl_c_is_ignored_where_it_was() -> None:
+    done = interrupted("adacd-hil", "numpy", preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.startswith(b"adacd-hil, version ")
