@@ -18,6 +18,8 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LOG_MAGIC = b"\x89MCAP0\r\n"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCKS = Path("/proc/locks")
+_PIECE = 1 << 20
+_ANOTHER = "another one is there already, which is left as it is"
 
 
 class InUseError(Exception):
@@ -127,6 +129,32 @@ def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
     replacement.commit(is_durable)
 
 
+@contextmanager
+def placing(path: Path, dated_lines: int = 0) -> Iterator[Path]:
+    """Yield the path of a new file that takes the place of none but an empty one, or of the same already.
+
+    For what leaves no mark of who made it: another one may be a user's own. dated_lines: so many at the beginning may
+    differ, as with the date of writing. See `Replacement`. Raises FileExistsError when the block has ended and another
+    one is there, OSError.
+    """
+    with replacing(path) as beside:
+        yield beside
+        if path.is_file() and path.stat().st_size and not _is_same(path, beside, dated_lines):
+            raise FileExistsError(errno.EEXIST, _ANOTHER, str(path))
+
+
+def _is_same(one: Path, other: Path, dated_lines: int) -> bool:
+    """Compare two files from behind their first lines on."""
+    with one.open("rb") as left, other.open("rb") as right:
+        for _ in range(dated_lines):
+            left.readline(_PIECE)
+            right.readline(_PIECE)
+        while piece := left.read(_PIECE):
+            if piece != right.read(len(piece)):
+                return False
+        return not right.read(1)
+
+
 def replace_file(path: Path, content: bytes | str) -> None:
     """Write a whole file in one step, text as UTF-8; see `Replacement`. Raises OSError."""
     with replacing(path) as beside:
@@ -165,7 +193,7 @@ def place_file(path: Path, content: bytes) -> None:
     except FileExistsError:
         if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
             return
-        raise FileExistsError(errno.EEXIST, "another one is there already, which is left as it is", str(path)) from None
+        raise FileExistsError(errno.EEXIST, _ANOTHER, str(path)) from None
     try:
         with os.fdopen(descriptor, "wb") as file:
             file.write(content)

@@ -49,7 +49,11 @@ dbc_option = click.option(
 )
 
 
-@click.command("export")
+@click.command(
+    "export",
+    epilog="Exit status: 0 done; 1 the recording can't be read or lacks a topic, or a file is in the way; 2 wrong "
+    "usage or contract; 3 the recording is damaged, or a disk is full; 130 interrupted.",
+)
 @click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Of the output.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the tables, or file of the frames.")
@@ -80,8 +84,8 @@ def export(
 ) -> ExitCode:
     """Write what a recording holds as tables (Parquet, CSV) or its frames as BLF, ASC or candump log.
 
-    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the target can't hold is counted on stderr. Exit
-    status 3 when the recording itself is damaged.
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the target can't hold is counted on stderr. Tables
+    replace tables; a file of frames replaces none but the same.
     """
     if kind in TABLES and (can_ids or only != "both"):
         raise CommandError(f"--only and --id choose frames, {kind} holds tables; use --topic", ExitCode.USAGE)

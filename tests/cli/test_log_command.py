@@ -123,6 +123,22 @@ def test_info_of_a_cut_log_shows_what_is_there(recorded, tmp_path):
         assert topic["bytes"] in (None, sizes[topic["topic"]]), topic
 
 
+@pytest.mark.parametrize("text", ["hello\n", "", "(1.000000) can0 123#11\n" * 100])
+def test_info_of_another_file_is_an_error(tmp_path, text):
+    (tmp_path / "x.mcap").write_text(text)
+    code, out, err = call("info", tmp_path / "x.mcap")
+    assert (code, out, err) == (1, "", f"adacd-hil: {tmp_path / 'x.mcap'} is not an MCAP file\n")
+
+
+def test_info_of_a_log_without_its_beginning_shows_what_is_there(recorded, tmp_path):
+    (tmp_path / "x.mcap").write_bytes(b"spoilt.." + recorded.read_bytes()[8:])
+    code, out, _ = call("info", tmp_path / "x.mcap", "--json")
+    assert (code, json.loads(out)[0]["cycles"]) == (0, 200)
+    (tmp_path / "x.mcap").write_bytes(b"spoilt.." + recorded.read_bytes()[8:-30])
+    code, out, _ = call("info", tmp_path / "x.mcap", "--json")
+    assert (code, json.loads(out)[0]["cycles"]) == (3, 200)
+
+
 def test_cut_takes_a_stretch_by_time_or_contact(recorded, tmp_path):
     out = tmp_path / "out.mcap"
     code, text, _ = call("cut", recorded, "--from", "0.05", "--until", "0.1", "--out", out, "--json")

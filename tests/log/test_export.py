@@ -15,6 +15,7 @@ from recorded_run import CODEC, make_run, record
 from test_can_io import all_kinds, content, write
 
 from adacd_hil.cli.log_export import export
+from adacd_hil.log.chunked_file import MAGIC
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.can_messages import TimedMessage, to_messages
 from adacd_hil.log.formats.export import choose_topics, export_tables
@@ -306,3 +307,64 @@ def test_a_recording_is_not_overwritten(tmp_path):
     done = command(tmp_path / "x.log", "--format", "candump")
     assert (done.exit_code, "is the recording itself" in done.stderr) == (2, True)
     assert (tmp_path / "x.log").read_text() == "(1.000000) can0 123#11 R\n"
+
+
+@pytest.mark.parametrize("kind", ["candump", "asc", "blf"])
+def test_frames_replace_nothing_but_the_same_frames(log, tmp_path, kind):
+    path = tmp_path / "bus.rec"
+    for _ in range(2):
+        assert command(log, "--format", kind, "--out", path).exit_code == 0
+    whole = path.read_bytes()
+    done = command(log, "--format", kind, "--out", path, "--only", "devices")
+    assert (done.exit_code, path.read_bytes()) == (1, whole)
+    assert done.stderr.splitlines()[-1].endswith(
+        "bus.rec can't be written: another one is there already, which is left as it is"
+    )
+    path.write_bytes(b"")
+    assert command(log, "--format", kind, "--out", path).exit_code == 0
+    assert [file.name for file in tmp_path.iterdir()] == ["bus.rec"]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_tables_replace_tables_and_nothing_else(log, tmp_path, kind):
+    for _ in range(2):
+        assert command(log, "--format", kind, "--topic", "cycle", "--out", tmp_path).exit_code == 0
+    path = tmp_path / f"cycle.{kind}"
+    path.write_text("timestamp,arbitration_id\n")
+    done = command(log, "--format", kind, "--topic", "cycle", "--out", tmp_path)
+    assert (done.exit_code, path.read_text()) == (1, "timestamp,arbitration_id\n")
+    (complaint,) = done.stderr.splitlines()
+    assert complaint.endswith(f"{path} can't be written: what is there is no table of this command")
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "line"),
+    [
+        ("none.mcap", None, "none.mcap can't be read: No such file or directory"),
+        ("text.mcap", b"hello", "text.mcap is not an MCAP file"),
+        ("cut.mcap", MAGIC, "cut.mcap has no topic that can be read"),
+        ("none.log", None, "none.log can't be read: No such file or directory"),
+        (
+            "bus.log",
+            b"(1.000000) can0 123#11\n",
+            "bus.log has frames only, and their contract arm.dbc has no topic Drive1Feedbak, did you mean",
+        ),
+    ],
+)
+def test_topics_are_told_of_those_that_a_recording_can_have(tmp_path, name, data, line):
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    done = command(tmp_path / name, "--format", "csv", "--topic", "Drive1Feedbak")
+    assert done.exit_code == 1
+    (complaint,) = done.stderr.splitlines()
+    assert line in complaint
+
+
+def test_topics_of_frames_are_no_tables(log):
+    done = command(log, "--format", "csv", "--topic", "to_can_bus")
+    assert done.exit_code == 1
+    assert "topic /to_can_bus holds frames, which become no table: --format candump, blf or asc" in done.stderr
+
+
+def test_the_help_has_the_exit_statuses():
+    assert "Exit status: 0 done; 1 " in " ".join(command("--help").stdout.split())

@@ -25,7 +25,7 @@ from adacd_hil.log.editing.record_scan import RawRecord, parse
 from adacd_hil.log.editing.salvage import Salvage
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, FIELDS_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.mcap_walk import MESSAGE_HEAD
+from adacd_hil.log.mcap_walk import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.ros_types import LOG, unpack_log
 from adacd_hil.log.summary import DROPPED_KEY, count_frames, number
@@ -77,18 +77,23 @@ class LogInfo:
 
 
 def read_info(path: Path) -> LogInfo:
-    """Look at the log whose first part is `path`, with all its parts. Raises LogError when a file can't be read."""
+    """Look at the log whose first part is `path`, with all its parts.
+
+    Raises LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
+    """
     try:
         parts = find_parts(path) or {0: path}
     except OSError:
         parts = {0: path}
     info = LogInfo(path, files=len(parts))
     view = _View(info)
+    is_mcap = False
     missing = [part for part in range(max(parts)) if part not in parts]
     for part in parts.values():
         try:
             with open_input(part) as file:
                 info.size_bytes += part.stat().st_size
+                is_mcap |= file.read(len(MAGIC)) == MAGIC
                 view.take(part, file)
         except OSError as error:
             raise LogError(f"log {part} can't be read: {error.strerror}") from None
@@ -96,6 +101,8 @@ def read_info(path: Path) -> LogInfo:
         missing.append(max(parts) + 1)
     info.problems += [f"{part_path(path, part).name} is missing" for part in missing]
     view.sum_up()
+    if not (is_mcap or info.topics or info.attachments or info.metadata or info.summary):
+        raise LogError(f"{path} is not an MCAP file")
     return info
 
 

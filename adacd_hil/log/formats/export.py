@@ -1,5 +1,6 @@
 """Recordings to tables: topics of our logs as they are, and frames of any recording decoded by a contract."""
 
+import contextlib
 import fnmatch
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -46,27 +47,42 @@ def export_tables(
     decodes the frames of recordings that have no decoded topics. progress: is told the rows so far.
     Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
     """
-    topics = _topics(path) if path.suffix.lower() == ".mcap" else []
-    topics = [topic for topic in topics if topic.rsplit("/", 1)[-1] not in _RAW]
+    is_mcap = path.suffix.lower() == ".mcap"
+    defined = _topics(path) if is_mcap else []
+    raw = [topic for topic in defined if topic.rsplit("/", 1)[-1] in _RAW]
+    topics = [topic for topic in defined if topic not in raw]
     if topics:
-        return _export_topics(path, out, kind, choose_topics(topics, wanted), progress)
+        return _export_topics(path, out, kind, choose_topics(topics, wanted, raw), progress)
+    if is_mcap and wanted and not raw:
+        raise LogError(f"{path} has no topic that can be read")
     return _export_frames(path, out, kind, wanted, codec, progress)
 
 
-def choose_topics(topics: Collection[str], wanted: Collection[str]) -> list[str]:
-    """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest."""
+def choose_topics(
+    topics: Collection[str], wanted: Collection[str], raw: Collection[str] = (), owner: str = "the log"
+) -> list[str]:
+    """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest.
+
+    raw: topics of frames, of which no table is made. owner: who has the topics, for the error.
+    """
     if not wanted:
         return list(topics)
     chosen: list[str] = []
     for pattern in wanted:
-        slashed = "/" + pattern.strip("/")
-        found = [t for t in topics if any(fnmatch.fnmatchcase(t, form) for form in (slashed, DECODED + pattern))]
+        found = _matching(topics, pattern)
         if not found:
-            near = nearest_name(slashed, topics)
+            if frames := _matching(raw, pattern):
+                raise LogError(f"topic {frames[0]} holds frames, which become no table: --format candump, blf or asc")
+            near = nearest_name("/" + pattern.strip("/"), topics) or nearest_name(DECODED + pattern, topics)
             hint = f"did you mean {near}" if near else f"there are {', '.join(topics)}"
-            raise LogError(f"the log has no topic {pattern}, {hint}")
+            raise LogError(f"{owner} has no topic {pattern}, {hint}")
         chosen += found
     return list(dict.fromkeys(chosen))
+
+
+def _matching(topics: Collection[str], pattern: str) -> list[str]:
+    forms = ("/" + pattern.strip("/"), DECODED + pattern)
+    return [topic for topic in topics if any(fnmatch.fnmatchcase(topic, form) for form in forms)]
 
 
 def _export_topics(
@@ -87,8 +103,9 @@ def _export_topics(
 def _export_frames(
     path: Path, out: Path, kind: str, wanted: Collection[str], codec: Codec, progress: Callable[[int], None]
 ) -> TableSummary:
-    chosen = choose_topics([DECODED + name for name in codec.messages], wanted)
     source = open_frames(path)
+    owner = f"{path} has frames only, and their contract {codec.path.name}"
+    chosen = choose_topics([DECODED + name for name in codec.messages], wanted, owner=owner)
     pieces = iter(source)
     with Tables(out, kind, {"contract": codec.path.name}) as tables:
         for frames in pieces:
@@ -100,12 +117,16 @@ def _export_frames(
 
 
 def _topics(path: Path) -> list[str]:
-    """List the topics that the first chunk of an MCAP file defines."""
+    """List the topics that the first chunk of an MCAP file defines. Raises LogError when it is none."""
     topics: list[str] = []
     try:
-        with open_input(path) as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                return []
+        file = open_input(path)
+    except OSError as error:
+        raise LogError(f"log {path} can't be read: {error.strerror}") from None
+    with file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise LogError(f"{path} is not an MCAP file")
+        with contextlib.suppress(OSError, LogError, ChunkError):  # who reads the log says what is wrong with it
             for record in scan(file):
                 if not isinstance(record, RawRecord):
                     break
@@ -116,6 +137,4 @@ def _topics(path: Path) -> list[str]:
                     channels = (found for found in contents.definitions if found.opcode == Opcode.CHANNEL)
                     topics += [parse(channel.opcode, channel.body).topic for channel in channels]
                     break
-    except (OSError, LogError, ChunkError):
-        pass  # who reads the log says what is wrong with it
     return list(dict.fromkeys(topics))

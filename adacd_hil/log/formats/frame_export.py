@@ -18,12 +18,14 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import FrameSource
-from adacd_hil.output_files import replacing
+from adacd_hil.output_files import placing
 
 _MS_NS = 1_000_000
 _US_NS = 1_000
 _OLDEST_BLF_NS = 631_152_000 * 1_000_000_000
 """Before it BLF has no date: python-can takes it for a clock of its own."""
+_DATED_LINES = {"asc": 1}
+"""The first line of ASC has the date of writing."""
 _HALF_NS_S = 0.25e-9
 """Keeps a product that python-can cuts to whole ns from falling below them."""
 
@@ -61,12 +63,13 @@ def export_frames(
 
     `has_direction`: candump says of each frame whether it was sent; BLF and ASC always do.
 
-    Raises LogError when the recording can't be read or the file not be written.
+    Raises LogError when the recording can't be read or the file not be written, as where another one is that isn't the
+    same.
     """
     losses: Counter[str] = Counter()
     count = 0
     try:
-        with replacing(path) as beside, closing(_open(kind, beside, has_direction)) as target:
+        with placing(path, _DATED_LINES.get(kind, 0)) as beside, closing(_open(kind, beside, has_direction)) as target:
             for frames in pieces:
                 for what, is_lost in target.write(frames, source.channels, source.epoch_ns):
                     losses[what] += int(np.count_nonzero(is_lost))

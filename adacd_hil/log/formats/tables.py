@@ -6,6 +6,7 @@ and reasons are the numbers that the schemas name.
 """
 
 import csv
+import errno
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
+from adacd_hil.input_files import open_input
 from adacd_hil.log.decoding import Decoder
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedEvent, Series
@@ -26,6 +28,9 @@ from adacd_hil.wire.codec import Codec
 
 _LONGEST_STEM = 60
 """Letters of the name of a file, so that it has room in 255 bytes."""
+
+_HEADS = {"csv": b"t_ns,", "parquet": b"PAR1"}
+"""How the tables begin that are made here."""
 
 Columns = Mapping[str, Any]
 """Columns of a table by name, of equal length: arrays or lists."""
@@ -102,6 +107,7 @@ class Tables:
         path = self._paths.get(topic) or self._path(topic)
         try:
             if topic not in self._tables:
+                self._check_replaceable(path)
                 beside = self._files.enter_context(replacing(path))
                 table = _Csv(beside) if self._kind == "csv" else _Parquet(beside, self._metadata)
                 self._tables[topic] = self._files.enter_context(closing(table))
@@ -112,6 +118,15 @@ class Tables:
         except OSError as error:
             raise LogError(f"{path} can't be written: {error.strerror or error}") from None
         self.rows[path] += len(columns["t_ns"])
+
+    def _check_replaceable(self, path: Path) -> None:
+        """Raise OSError when another's file is there: tables replace tables, and a recording may be a CSV file."""
+        if not path.is_file() or not path.stat().st_size:
+            return
+        head = _HEADS[self._kind]
+        with open_input(path) as file:
+            if file.read(len(head)) != head:
+                raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
 
     def _path(self, topic: str) -> Path:
         """Name the file of a topic: one of its own, whatever others have called their topics."""
