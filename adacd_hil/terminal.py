@@ -1,8 +1,8 @@
 """Standard output and error of both programs: the one door through which text reaches a terminal, a pipe or a file.
 
 Nothing that a file or the bus says controls a terminal: control characters are escaped as in JSON, which reads them
-back. A reader that goes away, as `head` does, is no error. An output that blocks holds nobody up once the user has
-asked for the end.
+back; within a line of ours (`in_line`) so are the ends of lines, or it could say lines of its own. A reader that goes
+away, as `head` does, is no error. An output that blocks holds nobody up once the user has asked for the end.
 """
 
 import contextlib
@@ -39,6 +39,11 @@ def plain(text: str) -> str:
     return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
+def in_line(text: str) -> str:
+    """Escape control characters as `plain` does, and tabs and newlines, too: a text stays within the line it is in."""
+    return plain(text).replace("\n", "\\u000a").replace("\t", "\\u0009")
+
+
 def one_line(text: object) -> str:
     """Put a text into one line, free of control characters and not longer than anybody reads."""
     line = plain(" ".join(str(text).split()))
@@ -57,11 +62,14 @@ def terminal_columns() -> int | None:
 def fit_table(lines: Sequence[Sequence[str]], right: Sequence[int] = (), width: int | None = None) -> list[str]:
     """Align lines of cells; columns in `right` to the right. A table wider than `width` is told in parts.
 
+    A cell is one line, whatever is in it.
+
     Each part begins with the first column and has as many of the others as there is room for. Where one alone has no
     room its cells are parted between words, on lines of their own.
     """
     if not lines:
         return []
+    lines = [[in_line(cell) for cell in line] for line in lines]
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     if width is None or sum(widths) + len(_GAP) * (len(widths) - 1) <= width or len(widths) == 1:
         return _aligned(lines, range(len(widths)), widths, right)

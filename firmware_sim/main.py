@@ -18,7 +18,7 @@ from adacd_hil.log.run_folder import TRUTH_NAME, check_free
 from adacd_hil.output_files import in_words, tidied
 from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
-from adacd_hil.terminal import one_line, open_terminals
+from adacd_hil.terminal import in_line, one_line, open_terminals
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError, load_codec
 from adacd_hil.wire.node_offset import move_contract
@@ -175,7 +175,7 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
     if as_json:
         print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
     else:
-        print("\n".join(line for finding in findings for line in finding.lines))
+        print("\n".join(in_line(line) for finding in findings for line in finding.lines))
     return ExitCode.USAGE if any(finding.problems for finding in findings) else ExitCode.OK
 
 

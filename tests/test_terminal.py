@@ -10,6 +10,7 @@ import subprocess
 import sys
 import termios
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -18,8 +19,9 @@ from hang import HANG_S
 from long_cases import long_but
 
 from adacd_hil.cli.monitor import Screen
+from adacd_hil.cli.progress import Progress
 from adacd_hil.log.reader import read_log
-from adacd_hil.terminal import fit_table, one_line, plain, terminal_columns
+from adacd_hil.terminal import fit_table, in_line, one_line, plain, terminal_columns
 from firmware_sim.truth import TruthLog
 
 OK, USAGE, PARTIAL, INTERRUPTED = 0, 2, 3, 130
@@ -53,6 +55,21 @@ def test_control_characters_are_escaped_and_nothing_else(text: str, shown: str) 
 def test_an_error_is_one_line_that_can_be_read() -> None:
     assert one_line("a\n  b\x1b\r\n") == "a b\\u001b"
     assert one_line("9" * 10**6) == "9" * 2000 + " …"
+
+
+def test_what_is_within_a_line_ends_none() -> None:
+    assert in_line("good\nerror: forged\r\n\tx\x1b[2J") == ("good\\u000aerror: forged\\u000d\\u000a\\u0009x\\u001b[2J")
+    assert fit_table([("name", "text"), ("a\nb", "c"), ("d", "\x1b[2Je\tf")]) == [
+        "name      text",
+        "a\\u000ab  c",
+        "d         \\u001b[2Je\\u0009f",
+    ]
+
+
+def test_progress_is_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    with closing(Progress()) as progress:
+        progress("arm \n0.000 s  forged")
+    assert capsys.readouterr().err == "arm \\u000a0.000 s  forged\n"
 
 
 def test_a_table_that_is_redrawn_moves_the_cursor_by_its_own_sequences_only(monkeypatch: pytest.MonkeyPatch) -> None:

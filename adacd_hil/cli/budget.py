@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.config import load_settings
 from adacd_hil.device.contract import find_contract, load_contract
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, share_bus, us
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.response_time import Response
@@ -77,7 +78,7 @@ def as_text(judgement: Judgement) -> str:
     lines = [f"{budget.contract.name}, {budget.period_us} µs, {rates}", "", *_table(budget), "", *_LEGEND, ""]
     for title, finding in findings:
         lines += textwrap.wrap(finding, _WIDTH, initial_indent=f"{title:14}", subsequent_indent=" " * 14)
-    return "\n".join(lines)
+    return "\n".join(in_line(line) for line in lines)
 
 
 def _table(budget: Budget) -> list[str]:

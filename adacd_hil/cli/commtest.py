@@ -25,6 +25,7 @@ from adacd_hil.log.run_folder import check_free
 from adacd_hil.output_files import replace_file
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import BusError
 from adacd_hil.wire.codec import Codec
@@ -268,4 +269,4 @@ def _findings(described: dict[str, Any]) -> list[str]:
 
 
 def _progress(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    print(in_line(line), file=sys.stderr, flush=True)

@@ -12,6 +12,7 @@ from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.cli.progress import Progress
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.records import Location
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_comparison import LogComparison
@@ -52,7 +53,7 @@ def _as_text(found: "LogComparison") -> str:
     from adacd_hil.cli.table import format_table
 
     names = [str(found.first.path), str(found.second.path)]
-    lines = [f"1: {names[0]}", f"2: {names[1]}", "", *found.notes]
+    lines = [in_line(line) for line in (f"1: {names[0]}", f"2: {names[1]}", "", *found.notes)]
     if not found.stretch.is_whole:
         lines.append(f"of 1 {found.stretch.text}; of 2 as long after motion start")
     if found.is_same:

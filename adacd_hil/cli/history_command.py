@@ -10,6 +10,7 @@ import click
 from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
 from adacd_hil.output_files import replace_file
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.control.history_file import History
@@ -81,4 +82,4 @@ def _as_text(found: "History") -> str:
             ]
         )
     table = format_table(head, rows, right=(1, 2, 3, 4, 5))
-    return f"devices by serial number: {devices}\nfriction F at 0.6 rad/s\n{table}"
+    return f"{in_line(f'devices by serial number: {devices}')}\nfriction F at 0.6 rad/s\n{table}"

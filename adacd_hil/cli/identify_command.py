@@ -10,6 +10,7 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
 from adacd_hil.output_files import replace_file
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.foreign.recording_identification import Identified, Watched
@@ -120,7 +121,8 @@ def _as_text(found: "Identified") -> str:
 
 
 def _describe(watched: "Watched") -> str:
-    lines = ["", f"{watched.recording.path}: {len(watched.contacts)} contacts in {watched.recording.duration_s:.1f} s"]
+    name = in_line(str(watched.recording.path))
+    lines = ["", f"{name}: {len(watched.contacts)} contacts in {watched.recording.duration_s:.1f} s"]
     if watched.touches is not None:
         found = watched.touches - (watched.missed or 0)
         lines[-1] += f"; {found} of {watched.touches} touches found, {watched.false_contacts} false"

@@ -10,6 +10,7 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.log_export import export
 from adacd_hil.cli.options import explained, json_option, stretch_options
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.log.stretch import Stretch
@@ -19,7 +20,7 @@ _out_option = click.option("--out", type=click.Path(path_type=Path, dir_okay=Fal
 
 
 def _tell(line: str) -> None:
-    print(line, file=sys.stderr)
+    print(in_line(line), file=sys.stderr)
 
 
 @click.group("log")
@@ -127,7 +128,7 @@ def cut(
     done = cut_log(log, out or default_out(log), stretch, topics, _tell)
     result = {"out": str(done.out), "from_s": _finite(stretch.start_s), "until_s": _finite(stretch.end_s)}
     result["messages"] = done.messages
-    print(json.dumps(result, indent=2) if as_json else f"{done.out}: {done.messages} messages")
+    print(json.dumps(result, indent=2) if as_json else in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK
 
 
@@ -149,7 +150,7 @@ def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) ->
     if done.shared and not has_prefix:
         _tell(f"topics of more than one log, told apart by their channels only: {', '.join(done.shared)}")
     result = {"out": str(done.out), "logs": list(done.names), "messages": done.messages, "shared": list(done.shared)}
-    print(json.dumps(result, indent=2) if as_json else f"{done.out}: {done.messages} messages")
+    print(json.dumps(result, indent=2) if as_json else in_line(f"{done.out}: {done.messages} messages"))
     return ExitCode.OK
 
 

@@ -9,6 +9,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.wire.codec import Codec
@@ -100,7 +101,7 @@ def export(
         out = out or log.with_suffix(_SUFFIXES.get(kind, f".{kind}"))
         described, problem = _export_frames(log, out, kind, only, can_ids, codec, has_direction)
     if problem:
-        print(f"warning: {problem}", file=sys.stderr)
+        print(in_line(f"warning: {problem}"), file=sys.stderr)
     print(json.dumps(described | {"problem": problem}, indent=2) if as_json else described["text"])
     return ExitCode.PARTIAL if problem else ExitCode.OK
 
@@ -122,7 +123,7 @@ def _export_tables(
     from adacd_hil.log.formats.export import export_tables
 
     summary = export_tables(log, out, kind, topics, codec, _Teller("rows"))
-    lines = [f"{path}: {rows} rows" for path, rows in summary.rows.items()]
+    lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
     described = {
         "files": {str(path): rows for path, rows in summary.rows.items()},
         "text": "\n".join(lines) or "nothing to export",
@@ -144,12 +145,12 @@ def _export_frames(
     source = open_frames(log)
     summary = export_frames(source, choice.pieces(source), out, kind, _Teller("frames"), has_direction)
     for loss in summary.losses:
-        print(f"{kind}: {loss}", file=sys.stderr)
+        print(in_line(f"{kind}: {loss}"), file=sys.stderr)
     described = {
         "file": str(out),
         "frames": summary.frames,
         "losses": list(summary.losses),
-        "text": f"{out}: {summary.frames} frames",
+        "text": in_line(f"{out}: {summary.frames} frames"),
     }
     return described, source.problem
 

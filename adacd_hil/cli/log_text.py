@@ -6,6 +6,7 @@ from adacd_hil.cli.table import format_table
 from adacd_hil.log.check.check import Check
 from adacd_hil.log.editing.info import LogInfo
 from adacd_hil.log.editing.recover import Recovery
+from adacd_hil.terminal import in_line
 
 _TOLD_FAULTS = 5
 
@@ -49,6 +50,7 @@ def info_as_text(info: LogInfo) -> str:
     if len(info.faults) > _TOLD_FAULTS:
         lines.append(f"  and {len(info.faults) - _TOLD_FAULTS} more")
     lines += [f"problem: {problem}" for problem in info.problems]
+    lines = [in_line(line) for line in lines]
     rows = [
         (topic.topic, topic.type, str(topic.messages), f"{topic.rate_hz:.1f}", _bytes(topic.bytes))
         for topic in info.topics
@@ -57,7 +59,8 @@ def info_as_text(info: LogInfo) -> str:
     if rows:
         lines += ["", format_table(("topic", "type", "messages", "per s", "bytes"), rows, right=(2, 3, 4))]
     if info.attachments:
-        lines += ["", "attached: " + ", ".join(f"{name} ({size})" for name, size in info.attachments.items())]
+        names = ", ".join(f"{name} ({size})" for name, size in info.attachments.items())
+        lines += ["", in_line(f"attached: {names}")]
     if info.metadata:
         lines += ["", format_table(("", ""), [(key, text) for key, text in info.metadata.items()])]
     return "\n".join(lines)
@@ -93,7 +96,8 @@ def check_as_text(check: Check) -> str:
     if left_out:
         lines.append(f"and {left_out} more of these")
     verdict = "clean" if not check.errors + check.warnings else f"{check.errors} errors, {check.warnings} warnings"
-    return "\n".join([*lines, f"{check.path}: {verdict}; {check.messages} messages in {check.files} files"])
+    lines.append(f"{check.path}: {verdict}; {check.messages} messages in {check.files} files")
+    return "\n".join(in_line(line) for line in lines)
 
 
 def recovery_as_json(recovery: Recovery) -> dict[str, Any]:
@@ -122,4 +126,5 @@ def recovery_as_text(recovery: Recovery) -> str:
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
     lost = recovery.describe_loss()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
-    return "\n".join([*lines, f"lost: {lost}" if lost else "nothing was lost"])
+    lines.append(f"lost: {lost}" if lost else "nothing was lost")
+    return "\n".join(in_line(line) for line in lines)

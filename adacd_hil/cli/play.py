@@ -19,6 +19,7 @@ from adacd_hil.log.formats.frame_choice import FrameChoice
 from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.log.formats.recorded_frames import is_sendable
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import Bus, BusError, is_virtual, open_bus
 from adacd_hil.wire.playback import PlayedFrame, play, repeat
 
@@ -134,7 +135,7 @@ def as_text(described: dict[str, Any]) -> str:
         lines.append(f"{described['unsendable']} frames can't be sent: remote, error or short FD frames")
     if described["problem"]:
         lines.append(f"warning: {described['problem']}")
-    return "\n".join(lines)
+    return "\n".join(in_line(line) for line in lines)
 
 
 def may_move_an_arm(interface: str, channel: str) -> bool:

@@ -4,6 +4,8 @@ import queue
 import sys
 import threading
 
+from adacd_hil.terminal import in_line
+
 
 class Progress:
     """Prints lines in order; `close` waits for the last one, but not for ever."""
@@ -21,7 +23,7 @@ class Progress:
 
     def _print(self) -> None:
         while (line := self._lines.get()) is not None:
-            print(line, file=sys.stderr, flush=True)
+            print(in_line(line), file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Print what is queued and end."""

@@ -9,6 +9,7 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option, stretch_options
 from adacd_hil.log.run_folder import log_in
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.replay import Replay
@@ -187,6 +188,7 @@ def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, 
     if own.mismatch_count > shown:
         lines.append(f"  … {own.mismatch_count} in all: " + _counts(own))
     lines += [f"  {note}" for note in own.notes]
+    lines = [in_line(line) for line in lines]
     if not names and own.compared:
         return "\n".join(lines)
     head = ["", "original", *names]

@@ -31,6 +31,7 @@ from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.run_folder import LOG_NAME
+from adacd_hil.terminal import in_line, one_line
 from adacd_hil.wire.budget import check_budget
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.can_interface import CanInterface
@@ -126,7 +127,7 @@ def run_on_bus(
             described["history"] = history.add(summary.certificates, summary.identities, origin)
         except (OSError, ConfigError) as error:
             described["history_error"] = str(error)
-            print(f"adacd-hil: the certificate is not in the history: {error}", file=sys.stderr)
+            print(in_line(f"adacd-hil: the certificate is not in the history: {error}"), file=sys.stderr)
             code = ExitCode.PARTIAL if code is ExitCode.OK else code
     return described, code
 
@@ -149,7 +150,7 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
     described: dict[str, Any] = {"log": str(summary.log.path), "scheduler": summary.grant.scheduler}
     if summary.error:
         described["error"] = summary.error
-        print(f"adacd-hil: {summary.error}", file=sys.stderr)
+        print(f"adacd-hil: {one_line(summary.error)}", file=sys.stderr)
     if summary.result is not None:
         described |= {
             "cycles": summary.result.cycles,
@@ -179,4 +180,4 @@ def as_text(result: dict[str, Any]) -> str:
         for what, shares in (("no frame in time", data["no_new_data"]), ("repeated frames", data["repeated"])):
             lines += [f"{name}: {what} in {share:.2%} of the cycles" for name, share in shares.items() if share]
         lines += [f"over its limit: {line}" for line in data["excesses"]]
-    return "\n".join(lines)
+    return "\n".join(in_line(line) for line in lines)

@@ -9,6 +9,7 @@ from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.device.network import Master
 from adacd_hil.device.survey import Node, Survey, compare, expected_nodes, message_name, survey
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.traffic import Talk
 
@@ -23,7 +24,7 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
     with connection.bus(clock, codec.is_fd) as bus:
         expected = expected_nodes(Master(settings, codec, bus).slaves, codec)
         told = {node.node_id for node in expected if node.layout_digest is not None}
-        found = survey(bus, clock, listen_s, lambda line: print(line, file=sys.stderr, flush=True), told)
+        found = survey(bus, clock, listen_s, lambda line: print(in_line(line), file=sys.stderr, flush=True), told)
     described = describe(found, compare(found, expected), codec)
     is_right = not any(row["verdict"] not in ("", "unexpected") for row in described["nodes"])
     return described, ExitCode.OK if is_right else ExitCode.BUS_MISSING
@@ -107,7 +108,7 @@ def as_text(described: dict[str, Any]) -> str:
         has_answers = any(node["is_present"] for node in nodes)
         what = "the nodes answered, and sent nothing by themselves" if has_answers else "nothing was heard"
         parts.append(f"{what} in {described['duration_s']:g} s")
-    return "\n\n".join([*parts, f"{_contract(described)}\n{_summary(described)}"])
+    return "\n\n".join([*parts, f"{in_line(_contract(described))}\n{_summary(described)}"])
 
 
 def _node_row(node: dict[str, Any]) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
 from adacd_hil.log.run_folder import LOG_NAME
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.plan import Plan
@@ -97,7 +98,8 @@ def sweep(
         "elapsed_s": round(outcome.elapsed_s, 3),
         "rows_per_s": round(outcome.computed / outcome.elapsed_s, 2) if outcome.elapsed_s else None,
     }
-    print(json.dumps(result, indent=2) if as_json else "\n".join(f"{key}: {value}" for key, value in result.items()))
+    lines = (in_line(f"{key}: {value}") for key, value in result.items())
+    print(json.dumps(result, indent=2) if as_json else "\n".join(lines))
     return ExitCode.PARTIAL if outcome.failed else ExitCode.OK
 
 

@@ -17,6 +17,7 @@ from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import refuse_company
+from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import SilenceError
 
 
@@ -55,7 +56,7 @@ class StoredTare:
             lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))
         kept = "" if self.backup is None else f"; the one before is {self.backup}"
         lines.append(f"{self.path}{kept}")
-        return "\n".join(lines)
+        return "\n".join(in_line(line) for line in lines)
 
 
 def tare_on_bus(

@@ -10,6 +10,7 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.output_files import replace_file
+from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.tune import Candidate, Tuning
@@ -107,7 +108,7 @@ def _as_text(found: "Tuning") -> str:
         "The logs' scheme, replayed with the thresholds chosen:",
         format_table(columns, [_row(candidate) for candidate in found.candidates]),
         "",
-        *(f"Note: {note}" for note in found.notes),
+        *(in_line(f"Note: {note}") for note in found.notes),
     ]
     if found.best is None:
         lines.append("No candidate is fit; nothing is suggested.")

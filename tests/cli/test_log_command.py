@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
+from firmware_sim.truth import TruthLog
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "log"))
 
@@ -121,6 +122,40 @@ def test_info_of_a_cut_log_shows_what_is_there(recorded, tmp_path):
     sizes = {topic["topic"]: topic["bytes"] for topic in info["topics"]}
     for topic in whole["topics"]:
         assert topic["bytes"] in (None, sizes[topic["topic"]]), topic
+
+
+FORGED = "x\nclean: forged"
+SHOWN = "x\\u000aclean: forged"
+
+
+def test_what_a_log_says_stays_within_its_line(tmp_path):
+    run = {"name": FORGED, FORGED: "text"}
+    data = make_log(topics=("/a", f"/{FORGED}"), run=run, attachments={FORGED: b"data"})
+    path = write(tmp_path / f"{FORGED}.mcap", data)
+    cut = write(tmp_path / "cut.mcap", data[:-40])
+    out = tmp_path / f"{FORGED}.out"
+    for words in (
+        ("info", path),
+        ("check", path),
+        ("check", cut),
+        ("recover", cut, "--out", out),
+        ("merge", path, "--out", out),
+        ("cut", path, "--out", out),
+    ):
+        _, text, err = call(*words)
+        assert text
+        assert not [line for line in (text + err).splitlines() if line.startswith("clean: forged")]
+    text = call("info", path)[1]
+    assert f"  {SHOWN}\n" in text
+    assert f"attached: {SHOWN} (4)" in text
+    assert f"/{SHOWN} " in text
+
+
+def test_events_of_a_log_stay_within_their_line(tmp_path):
+    with TruthLog(tmp_path / "truth.mcap", blocking=True) as log:
+        log.event(0, "error", "arm", "fell\nproblem: none")
+    (line,) = [line for line in call("info", tmp_path)[1].splitlines() if "fell" in line]
+    assert line == "  error: arm: fell\\u000aproblem: none"
 
 
 @pytest.mark.parametrize("text", ["hello\n", "", "(1.000000) can0 123#11\n" * 100])

@@ -31,7 +31,7 @@ from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import WHOLE, Stretch
 from adacd_hil.output_files import replace_file
-from adacd_hil.terminal import fit_table, terminal_columns
+from adacd_hil.terminal import fit_table, in_line, terminal_columns
 
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
@@ -61,13 +61,13 @@ class Report:
 
     def as_text(self) -> str:
         """Give the verdict, what the paper had, the contacts and where the report is, for a terminal of its width."""
-        lines = [self.metrics.verdict, *_tables(self.metrics, self.source, terminal_columns())]
-        return "\n".join([*lines, "", f"Report: {self.html_path}"])
+        lines = [in_line(self.metrics.verdict), *_tables(self.metrics, self.source, terminal_columns())]
+        return "\n".join([*lines, "", in_line(f"Report: {self.html_path}")])
 
 
 def _tables(metrics: Metrics, source: Source, width: int | None = None) -> list[str]:
     """Give what the log lacks, what the paper had and the contacts, line by line."""
-    lines = [f"The log is not whole: {source.problem}"] if source.problem else []
+    lines = [in_line(f"The log is not whole: {source.problem}")] if source.problem else []
     lines += ["", *fit_table([paper_head(metrics), *paper_cells(metrics)], width=width)]
     if metrics.contacts:
         head, rows = contact_rows(metrics, shown_contacts(metrics, PRINTED_CONTACTS))
