@@ -1010,21 +1010,27 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read one TOML file. Raises ConfigError when it is missing, no regular file, too large or not TOML."""
+def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
+    """Read one TOML file; `kind` says what it is in errors.
+
+    Raises ConfigError when it is missing, no regular file, too large or not TOML.
+    """
     try:
         return parse_toml(read_input(path, _MOST_TOML_BYTES))
     except FileNotFoundError:
-        raise ConfigError(f"configuration {path} does not exist") from None
+        raise ConfigError(f"{kind} {path} does not exist") from None
     except (OSError, ConfigError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ConfigError(f"configuration {path}: {reason}") from None
+        raise ConfigError(f"{kind} {path}: {reason}") from None
 
 
 def parse_toml(text: bytes | str) -> dict[str, Any]:
-    """Read TOML, tables at most 16 deep and integers of 64 bits. Raises ConfigError with what is wrong."""
+    """Read TOML, tables at most 16 deep and integers of 64 bits. Raises ConfigError with what is wrong.
+
+    A byte order mark at the beginning, which editors on Windows write, is left out.
+    """
     try:
-        text = text if isinstance(text, str) else text.decode("utf-8")
+        text = (text if isinstance(text, str) else text.decode("utf-8")).removeprefix("\ufeff")
         if _TOO_DEEP.search(text):  # such a key takes its reader a time that goes by the square
             raise RecursionError
         table = tomllib.loads(text)

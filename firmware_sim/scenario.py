@@ -174,7 +174,7 @@ def load_scenario(name_or_file: str, profile: str | None = None, seed: int | Non
 def read_table(name_or_file: str) -> dict[str, Any]:
     """Read a scenario's TOML, unchecked but for its syntax. Raises ConfigError."""
     path = find_toml("scenario", name_or_file, _builtin_folder())
-    table = read_toml(path)
+    table = read_toml(path, "scenario")
     table.setdefault("name", path.stem)
     return table
 

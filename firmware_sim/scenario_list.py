@@ -81,7 +81,7 @@ def check(file: str, codec: Codec) -> Finding:
 
 def _in_file(problem: str, file: str) -> str:
     """Take the file's name off a problem that begins with it."""
-    return problem.removeprefix(f"configuration {file}").removeprefix(":").strip()
+    return problem.removeprefix(f"scenario {file}").removeprefix(":").strip()
 
 
 def _checked(scenario: Scenario, codec: Codec) -> str:

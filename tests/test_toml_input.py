@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.config import ConfigError, load_settings, parse_toml, read_toml
+from adacd_hil.control.tare_file import read_tare
+from adacd_hil.device.profile import load_profile
 from firmware_sim.scenario import load_scenario
 
 DEEP = 100_000
@@ -115,3 +118,32 @@ def test_a_fifo_or_a_device_is_no_configuration_and_no_scenario(load, tmp_path):
     for name in (str(fifo), "/dev/zero", "/dev/stdin"):
         with pytest.raises(ConfigError, match="it is no regular file"):
             load(name)
+
+
+@pytest.mark.parametrize(
+    ("kind", "read"),
+    [
+        ("configuration", lambda path: load_settings(str(path))),
+        ("scenario", lambda path: load_scenario(str(path))),
+        ("map", read_map),
+        ("tare", read_tare),
+        ("device profile", lambda path: load_profile(str(path), "drive")),
+    ],
+)
+def test_an_error_says_what_kind_of_file_it_is_of(kind, read, tmp_path):
+    path = tmp_path / "x.toml"
+    with pytest.raises(ConfigError, match=rf"^{kind} {path} does not exist"):
+        read(path)
+    path.write_text("[broken\n")
+    with pytest.raises(ConfigError, match=rf"^{kind} {path}: Expected"):
+        read(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(ConfigError, match=rf"^{kind} {path}: it is a folder"):
+        read(path)
+
+
+def test_a_byte_order_mark_is_left_out(tmp_path):
+    (tmp_path / "x.toml").write_bytes(b"\xef\xbb\xbf[filter]\r\na_rad_s = 12.5\r\n")
+    assert load_settings(str(tmp_path / "x.toml")).filter.a_rad_s == 12.5
+    assert parse_toml("\ufeffa = 1") == {"a": 1}

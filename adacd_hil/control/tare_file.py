@@ -101,7 +101,7 @@ def read_tare(path: Path) -> Tare:
     """Read a tare file. Raises ConfigError."""
     if not path.exists():
         raise ConfigError(f"tare {path} does not exist; `adacd-hil tare` makes one")
-    table = read_toml(path)
+    table = read_toml(path, "tare")
     try:
         return parse(Tare, table)
     except ConfigError as error:

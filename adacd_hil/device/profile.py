@@ -285,8 +285,9 @@ def load_profile(name_or_file: str, kind: str) -> Profile:
     Raises ConfigError for an unknown name or key, a value outside its bounds, an EDS that isn't there, another kind.
     """
     path = find_toml("device profile", name_or_file, _builtin_folder())
+    table = read_toml(path, "device profile")
     try:
-        settings = parse(ProfileSettings, read_toml(path))
+        settings = parse(ProfileSettings, table)
     except ConfigError as error:
         raise ConfigError(f"device profile {name_or_file}: {error}") from None
     if settings.kind != kind:

@@ -140,7 +140,7 @@ _SECTIONS = {
 
 def read_map(path: Path) -> RecordingMap:
     """Read a map and the URDF that it names. Raises ConfigError."""
-    table = read_toml(path)
+    table = read_toml(path, "map")
     unknown = [key for key in table if key not in (*_SECTIONS, "scheme")]
     if unknown:
         raise ConfigError(f"{path}: unknown section `{unknown[0]}`; known: {', '.join((*_SECTIONS, 'scheme'))}")
