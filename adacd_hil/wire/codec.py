@@ -8,6 +8,7 @@ A message of more than 8 bytes is a CAN FD frame and says so in the DBC (VFrameF
 11898-1 has a data length code for.
 """
 
+import logging
 import re
 import struct
 import zlib
@@ -29,6 +30,8 @@ from adacd_hil.wire.e2e import (
     Protection,
 )
 
+logging.getLogger("cantools").addHandler(logging.NullHandler())  # it tells a terminal what is refused here in a line
+
 _FORMATS = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h"} | {
     (32, False): "I",
     (32, True): "i",
@@ -37,6 +40,8 @@ _FORMATS = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h"} 
 }
 CLASSIC_BYTES = 8
 FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
+_MOST_MESSAGES = 1000
+"""Of a contract: to judge their budget takes 3 s, and four times that for twice as many."""
 E2E_SIGNALS = ("e2e_crc", "e2e_counter", "e2e_status")
 _E2E_BITS = {
     Protection.PROFILE_2: ((0, 8), (8, 4), (12, 4)),
@@ -282,6 +287,22 @@ def _lay_out(message: Message, signals: list[Signal]) -> tuple[struct.Struct, tu
     return struct.Struct(format_text), tuple(codecs)
 
 
+def _check_messages(database: Database) -> None:
+    """Refuse messages that share a name or an identifier, of which the last would silently count, and too many."""
+    by_name: dict[str, Message] = {}
+    by_id: dict[tuple[int, bool], Message] = {}
+    for message in database.messages:
+        first = by_id.setdefault((message.frame_id, message.is_extended_frame), message)
+        if by_name.setdefault(message.name, message) is not message:
+            raise CodecError(f"message {message.name} is defined more than once")
+        if first is not message:
+            raise CodecError(
+                f"messages {first.name} and {message.name} have the same identifier 0x{message.frame_id:X}"
+            )
+    if len(by_name) > _MOST_MESSAGES:
+        raise CodecError(f"{len(by_name)} messages are more than {_MOST_MESSAGES}")
+
+
 class Codec:
     """All messages of one DBC."""
 
@@ -357,6 +378,7 @@ def parse_codec(text: bytes, path: Path) -> Codec:
     if not isinstance(database, Database):
         raise CodecError(f"DBC {path} holds no CAN messages")
     try:
+        _check_messages(database)
         return Codec(database, path, text)
     except CodecError as error:
         raise CodecError(f"DBC {path}: {error}") from None

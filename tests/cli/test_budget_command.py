@@ -1,6 +1,8 @@
 """The budget command: its verdict as exit status, its table, its JSON, its complaints."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -177,3 +179,39 @@ def test_bad_input_is_one_line(arguments: tuple[str, ...], line: str) -> None:
 def test_the_help_says_what_the_exit_status_means() -> None:
     said = " ".join(budget("--help").stdout.split())
     assert "Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC." in said
+
+
+ARM = (Path(__file__).parents[2] / "dbc" / "arm.dbc").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (2 * ARM, "message Nmt is defined more than once"),
+        (200 * ARM, "message Nmt is defined more than once"),
+        (ARM.replace(" Drive2Emcy:", " Drive1Emcy:"), "message Drive1Emcy is defined more than once"),
+        (
+            ARM.replace("BO_ 130 Drive2Emcy", "BO_ 129 Drive2Emcy"),
+            "Drive1Emcy and Drive2Emcy have the same identifier 0x81",
+        ),
+        (
+            ARM
+            + "".join(
+                f'\nBO_ {1 << 31 | number} M{number}: 1 Host\n SG_ a : 0|8@1+ (1,0) [0|0] "" X\n'
+                for number in range(1000)
+            ),
+            "1029 messages are more than 1000",
+        ),
+    ],
+    ids=["twice", "200 times", "a name", "an identifier", "too many"],
+)
+def test_messages_that_are_defined_twice_or_too_many_are_one_line(text: str, line: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.dbc"
+    path.write_text(text)
+    command = [sys.executable, "-c", "from adacd_hil.cli.main import main; main()", "budget", "--dbc", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (USAGE, "")
+    (complaint,) = done.stderr.splitlines()
+    assert complaint.startswith(f"adacd-hil: DBC {path}: ")
+    assert line in complaint
