@@ -1080,7 +1080,7 @@ def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
     if name_or_file in names:
         return Path(str(folder / f"{name_or_file}.toml"))
     path = Path(name_or_file)
-    if not path.suffix and not exists(path):
+    if not name_or_file or (not path.suffix and not exists(path)):
         nearest = nearest_name(name_or_file, names)
         some = ", ".join(names) if len(names) <= _MOST_NAMES else f"{len(names)}, such as {', '.join(names[:3])}"
         hint = f"; did you mean {nearest!r}?" if nearest else f"; built in: {some}"

@@ -186,6 +186,15 @@ def _create_beside(path: Path) -> Path:
     raise AssertionError
 
 
+def dangling_link(path: Path) -> Path | None:
+    """Find the link on the way to a path, or the path itself, that leads to nothing; None where there is none."""
+    for place in (path, *path.parents):
+        with contextlib.suppress(OSError):
+            if place.is_symlink() and not place.exists():
+                return place
+    return None
+
+
 def place_file(path: Path, content: bytes) -> None:
     """Write a file that is new, or the same already. Raises FileExistsError for another one, OSError."""
     try:

@@ -13,6 +13,7 @@ import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.config import ConfigError
+from adacd_hil.given_path import WrittenPath
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.run_folder import TRUTH_NAME, check_free
 from adacd_hil.output_files import in_words, tidied
@@ -80,9 +81,7 @@ def cli() -> None:
 )
 @click.option("--profile", type=click.Choice(list(ARMS)), help="Arm; default: the scenario's.")
 @click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
-@click.option(
-    "--out", type=click.Path(path_type=Path, file_okay=False), help=f"Folder for {TRUTH_NAME}; default: no log."
-)
+@click.option("--out", type=WrittenPath(file_okay=False), help=f"Folder for {TRUTH_NAME}; default: no log.")
 @click.option("--once", "is_once", is_flag=True, help="End with the first host that starts the nodes and goes.")
 @click.option("--json", "as_json", is_flag=True, help="Print how it went as JSON on stdout.")
 def run(

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from adacd_hil.clock import MonotonicClock
+from adacd_hil.given_path import GivenPath
 from adacd_hil.log.editing.attached import run_metadata
 from adacd_hil.log.errors import LogError
 from adacd_hil.scheduling import freeze_garbage, request_realtime
@@ -32,7 +33,7 @@ _QUIET_SCENARIO = "idle"
     epilog="Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus failed, the recording is "
     "damaged or of another contract); 2 wrong usage; 5 bus missing.",
 )
-@click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("log", type=GivenPath(dir_okay=False))
 @on_bus
 @click.option(
     "--answers-only", is_flag=True, help="Leave the answers to SYNC to somebody else on the bus, such as canplayer."

@@ -10,6 +10,7 @@ import click
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.cli.progress import Progress
+from adacd_hil.given_path import GivenPath
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.records import Location
 from adacd_hil.terminal import in_line
@@ -26,8 +27,8 @@ _EPILOG = (
 
 
 @click.command(epilog=_EPILOG)
-@click.argument("first", type=click.Path(path_type=Path))
-@click.argument("second", type=click.Path(path_type=Path))
+@click.argument("first", type=GivenPath())
+@click.argument("second", type=GivenPath())
 @json_option
 @explained
 @stretch_options

@@ -9,6 +9,7 @@ import click
 
 from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.output_files import replace_file
 from adacd_hil.terminal import in_line
 
@@ -21,8 +22,8 @@ _MIDDLE = slice(1, None, 3)
 
 
 @click.command(epilog=EPILOG)
-@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="Draw it, as PNG.")
+@click.argument("file", type=GivenPath(dir_okay=False))
+@click.option("--plot", type=WrittenPath(dir_okay=False), help="Draw it, as PNG.")
 @json_option
 @explained
 def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:

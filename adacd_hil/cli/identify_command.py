@@ -9,6 +9,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.output_files import replace_file
 from adacd_hil.terminal import in_line
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from adacd_hil.analysis.foreign.recording_identification import Identified, Watched
     from adacd_hil.analysis.foreign.recording_import import Recording
 
-_FILE = click.Path(path_type=Path, dir_okay=False)
+_FILE = GivenPath(dir_okay=False)
 
 
 @click.command(
@@ -29,7 +30,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--watch", multiple=True, type=_FILE, help="Recording in which to look for contacts; repeatable.")
 @click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
 @click.option("--until", "end_s", type=float, default=float("inf"), help="Fit until this time, s; default: the end.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for pictures and identify.json.")
+@click.option("--out", type=WrittenPath(file_okay=False), help="Folder for pictures and identify.json.")
 @json_option
 @explained
 def identify(

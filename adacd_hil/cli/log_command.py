@@ -10,13 +10,14 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.log_export import export
 from adacd_hil.cli.options import explained, json_option, stretch_options
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.log.stretch import Stretch
 
-_log_argument = click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
-_out_option = click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE")
+_log_argument = click.argument("log", type=GivenPath(dir_okay=False))
+_out_option = click.option("--out", type=WrittenPath(dir_okay=False), metavar="FILE")
 
 
 def _tell(line: str) -> None:
@@ -29,7 +30,7 @@ def log() -> None:
 
 
 @log.command(epilog="Exit status: 0 done; 1 a log can't be read; 2 wrong usage; 3 a log is cut or lacks a part.")
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, required=True, type=GivenPath())
 @json_option
 @explained
 def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
@@ -50,7 +51,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 
 
 @log.command(epilog="Exit status: 0 clean; 1 an error, or a log can't be read; 2 wrong usage; 3 warnings only.")
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, required=True, type=GivenPath())
 @json_option
 @explained
 def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
@@ -137,8 +138,8 @@ def _finite(value: float) -> float | str | None:
 
 
 @log.command(epilog="Exit status: 0 done; 1 a log is damaged or can't be read; 2 wrong usage.")
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default=Path("merged.mcap"), show_default=True)
+@click.argument("logs", nargs=-1, required=True, type=GivenPath(dir_okay=False))
+@click.option("--out", type=WrittenPath(dir_okay=False), default=Path("merged.mcap"), show_default=True)
 @click.option("--prefix", "has_prefix", is_flag=True, help="Put each log's name before its topics, as /NAME/topic.")
 @json_option
 @explained

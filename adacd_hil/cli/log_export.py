@@ -9,6 +9,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ only_option = click.option(
     help="Whose frames: by the contract, else by their direction.",
 )
 dbc_option = click.option(
-    "--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the log's, else the arm's."
+    "--dbc", type=GivenPath(dir_okay=False), help="The contract; default: the log's, else the arm's."
 )
 
 
@@ -55,9 +56,9 @@ dbc_option = click.option(
     epilog="Exit status: 0 done; 1 the recording can't be read or lacks a topic, or a file is in the way; 2 wrong "
     "usage or contract; 3 the recording is damaged, or a disk is full; 130 interrupted.",
 )
-@click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("log", type=GivenPath(dir_okay=False))
 @click.option("--format", "kind", type=click.Choice([*TABLES, *FRAMES]), required=True, help="Of the output.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the tables, or file of the frames.")
+@click.option("--out", type=WrittenPath(), help="Folder of the tables, or file of the frames.")
 @click.option(
     "--topic", "topics", multiple=True, metavar="TOPIC", help="For tables: a topic, or a pattern such as 'decoded/*'."
 )

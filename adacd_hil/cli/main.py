@@ -30,6 +30,7 @@ from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
 from adacd_hil.cli.sweep_command import sweep
 from adacd_hil.cli.tune_command import tune
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import open_terminals
 
 if TYPE_CHECKING:
@@ -84,10 +85,10 @@ def demo(
 
 @cli.command(epilog=EPILOG)
 @on_bus
-@click.option("--tare", type=click.Path(path_type=Path, dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
+@click.option("--tare", type=GivenPath(dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
 @click.option(
     "--history",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=WrittenPath(dir_okay=False),
     help="What the arm's runs have certified; the last is compared with, and this run's are added.",
 )
 @run_folder_option("run")
@@ -122,7 +123,7 @@ def run(
 @click.option("--poses", type=click.IntRange(1, 50), help="Poses to measure in; default: tare.poses.")
 @click.option("--seconds", type=click.FloatRange(0.1, 600.0), help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default=Path("tare.toml"), show_default=True)
+@click.option("--out", type=WrittenPath(dir_okay=False), default=Path("tare.toml"), show_default=True)
 @clock_option(default="realtime")
 @json_option
 def tare(
@@ -147,8 +148,8 @@ def tare(
 
 
 @cli.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder; default: beside each log.")
+@click.argument("logs", nargs=-1, required=True, type=GivenPath())
+@click.option("--out", type=WrittenPath(file_okay=False), help="Folder; default: beside each log.")
 @json_option
 @explained
 @stretch_options
@@ -172,7 +173,7 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "St
 
 
 @cli.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, required=True, type=GivenPath())
 @click.option(
     "--rate-per-h",
     type=click.FloatRange(1e-6, 1e4),
@@ -180,10 +181,10 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "St
     show_default=True,
     help="Wanted false alarms per hour of a detector.",
 )
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the thresholds here, as TOML.")
+@click.option("--out", type=WrittenPath(dir_okay=False), help="Write the thresholds here, as TOML.")
 @click.option(
     "--report",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=WrittenPath(file_okay=False),
     help="Compare the detectors; JSON, PNG and SVG go here.",
 )
 @json_option
@@ -220,7 +221,7 @@ def thresholds(
     help="How long to begin new climbs; the one under way is ended.",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Where the climbs begin.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write a configuration with it here.")
+@click.option("--out", type=WrittenPath(dir_okay=False), help="Write a configuration with it here.")
 @json_option
 @explained
 def excitation(
@@ -299,7 +300,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 @click.option(
     "--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: nothing holds the arm."
 )
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for a log; default: none.")
+@click.option("--out", type=WrittenPath(file_okay=False), help="Folder for a log; default: none.")
 @json_option
 def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
     """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.

@@ -11,6 +11,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.config import ConfigError, builtin_names
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.output_files import in_words, is_disk_full
 from adacd_hil.terminal import one_line
@@ -74,7 +75,7 @@ def run_folder_option(name: str) -> Callable[..., Any]:
     """Give a command the option for the folder of its run; where it isn't given, `runs/NAME` leads to the last one."""
     return click.option(
         "--out",
-        type=click.Path(path_type=Path, file_okay=False),
+        type=WrittenPath(file_okay=False),
         help=f"Folder, without a log so far; default: a new one by date, to which runs/latest and runs/{name} lead.",
     )
 
@@ -106,9 +107,7 @@ def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]
 
 
 _BUS_OPTIONS = (  # last first: click lists them the other way round
-    click.option(
-        "--dbc", type=click.Path(path_type=Path, dir_okay=False), help="The contract; default: the configuration's."
-    ),
+    click.option("--dbc", type=GivenPath(dir_okay=False), help="The contract; default: the configuration's."),
     profile_option,
     config_option,
     click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."),

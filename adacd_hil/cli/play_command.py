@@ -9,10 +9,11 @@ import click
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
 from adacd_hil.cli.log_export import contract_of, dbc_option, id_option, only_option
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.given_path import GivenPath
 
 
 @click.command("play", epilog=EPILOG)
-@click.argument("log", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("log", type=GivenPath(dir_okay=False))
 @click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan.")
 @click.option("-c", "--channel", required=True, help="Channel of that interface, such as vcan0.")
 @click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")

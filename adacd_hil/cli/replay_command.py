@@ -8,6 +8,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option, stretch_options
+from adacd_hil.given_path import GivenPath
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.terminal import in_line
 
@@ -26,17 +27,15 @@ _MOST_COLUMNS = 6
 
 
 @click.command(epilog=_EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, required=True, type=GivenPath())
 @click.option(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Change a setting, such as filter.a_rad_s=50."
 )
 @click.option("--vary", multiple=True, metavar="KEY=A,B,C", help="Replay once for each value; of several, every pair.")
 @click.option("--config", metavar="NAME|FILE", help="Settings as a whole; needed for recordings without a log.")
 @profile_option
-@click.option("--dbc", type=click.Path(path_type=Path, dir_okay=False), help="Contract of a recording without a log.")
-@click.option(
-    "--against", type=click.Path(path_type=Path), help="Log of the run that a recording is of, to compare with."
-)
+@click.option("--dbc", type=GivenPath(dir_okay=False), help="Contract of a recording without a log.")
+@click.option("--against", type=GivenPath(), help="Log of the run that a recording is of, to compare with.")
 @click.option("--tolerance", type=click.FloatRange(0.0, 1.0), help="Of real values; default: 0 on the same machine.")
 @click.option("--shown", type=click.IntRange(min=0), default=20, show_default=True, help="Mismatches to print.")
 @json_option

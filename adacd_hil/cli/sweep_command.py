@@ -10,20 +10,21 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.plan import Plan
 
-_FILE = click.Path(path_type=Path, dir_okay=False)
+_FILE = GivenPath(dir_okay=False)
 
 
 @click.command(
     epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` says why; 1 the cluster is "
     "lost, or the folder can't be written; 2 wrong usage or configuration; 130 interrupted: the same command goes on."
 )
-@click.argument("logs", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, type=GivenPath())
 @click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Play this scenario instead; repeatable.")
 @click.option("--seeds", default="1", show_default=True, metavar="N|A:B", help="Seeds of the scenarios, A to B.")
 @click.option("--vary", multiple=True, metavar="KEY=A,B,...", help="A setting's values; every combination is a row.")
@@ -39,7 +40,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--tls-ca-file", type=_FILE, help="Of tls://: who signs the cluster's certificates; PEM.")
 @click.option("--tls-cert", type=_FILE, help="Of tls://: the certificate to show; PEM.")
 @click.option("--tls-key", type=_FILE, help="Of tls://: its key, where the certificate's file lacks it; PEM.")
-@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the results.")
+@click.option("--out", required=True, type=WrittenPath(file_okay=False), help="Folder of the results.")
 @json_option
 @explained
 def sweep(

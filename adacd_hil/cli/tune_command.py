@@ -8,6 +8,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
+from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.output_files import replace_file
 from adacd_hil.terminal import in_line
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     epilog="Exit status: 0 found, and the half to check on shows the wanted rate; 3 it can't show it, or no candidate "
     "is fit; 1 a log can't be read, or has no motion that counts; 2 wrong usage or configuration; 130 interrupted."
 )
-@click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("logs", nargs=-1, required=True, type=GivenPath())
 @click.option(
     "--rate-per-h",
     type=click.FloatRange(1e-6, 1e4),
@@ -31,10 +32,8 @@ if TYPE_CHECKING:
     help="Wanted false alarms per hour.",
 )
 @click.option("--config", metavar="NAME|FILE", help="Settings to start from and to extend; default: the logs' own.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the suggested configuration here.")
-@click.option(
-    "--report", type=click.Path(path_type=Path, file_okay=False), help="Folder for tune.json and the figures."
-)
+@click.option("--out", type=WrittenPath(dir_okay=False), help="Write the suggested configuration here.")
+@click.option("--report", type=WrittenPath(file_okay=False), help="Folder for tune.json and the figures.")
 @json_option
 @explained
 @stretch_options

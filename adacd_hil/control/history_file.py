@@ -20,7 +20,7 @@ from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.input_files import read_input
-from adacd_hil.output_files import replacing
+from adacd_hil.output_files import dangling_link, replacing
 from adacd_hil.records import Event
 from adacd_hil.scheme.last_certificate import Certificate
 
@@ -217,6 +217,8 @@ class Origin(NamedTuple):
 
 def use_history(path: Path, now_ns: int) -> UsedHistory:
     """Read the arm's history for a run; none yet is a first run. Raises ConfigError when it can't be used."""
+    if (link := dangling_link(path)) is not None:  # a history that has moved: nothing says that nothing is known
+        raise ConfigError(f"history {path}: link {link} leads to {link.readlink()}, which is not there")
     if not path.exists():
         return UsedHistory(path, b"", None)
     text = read_input(path)

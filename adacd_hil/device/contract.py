@@ -105,7 +105,7 @@ def find_contract(name: str) -> Path:
     if (folder / f"{name}.dbc").is_file():
         return folder / f"{name}.dbc"
     path = Path(name)
-    if path.suffix or path.exists():
+    if name and (path.suffix or path.exists()):
         return path
     known = sorted(path.stem for path in folder.glob("*.dbc"))
     nearest = nearest_name(name, known)
