@@ -11,7 +11,6 @@ from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.config import ExcitationSettings, builtin_names, load_settings, to_toml
-from adacd_hil.output_files import replace_file
 
 _LABELS = (
     ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),
@@ -35,7 +34,7 @@ class Outcome(NamedTuple):
 
 
 def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> Outcome:
-    """Search, and write what was found where asked for. Raises ConfigError, CommandError."""
+    """Search; `out` is where it will be written. Raises ConfigError, CommandError."""
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
     task = Search(load_settings(config, profile))
@@ -48,14 +47,7 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
     finally:
         progress.close()
     present = task.figures(task.present) if task.present.period_s else None
-    outcome = Outcome(config, present, task.figures(found), task.limits, found)
-    if out is not None:
-        try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(out, as_toml(outcome))
-        except OSError as error:
-            raise CommandError(f"{out} can't be written: {error.strerror}") from None
-    return outcome
+    return Outcome(config, present, task.figures(found), task.limits, found)
 
 
 def as_toml(outcome: Outcome) -> str:

@@ -28,8 +28,10 @@ from adacd_hil.cli.options import (
 )
 from adacd_hil.cli.play_command import play
 from adacd_hil.cli.replay_command import replay
+from adacd_hil.cli.result_file import tell, tried
 from adacd_hil.cli.sweep_command import sweep
 from adacd_hil.cli.tune_command import tune
+from adacd_hil.config import to_toml
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import open_terminals
 
@@ -203,10 +205,15 @@ def thresholds(
     Each comes with what limits it, and with the rate that half of the motion predicts for the other half. --from and
     --until choose a stretch of each log.
     """
+    from adacd_hil.analysis.detector_comparison import write_comparison
     from adacd_hil.cli import thresholds as command
 
-    found, comparison = command.find(logs, rate_per_h, out, report, stretch)
-    print(command.as_json(found, comparison) if as_json else command.as_text(found, comparison))
+    with tried(out):
+        found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
+        said = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
+        tell(said, out, to_toml(found), as_json)
+    if report is not None and comparison is not None:
+        write_comparison(comparison, report)
     return ExitCode.OK
 
 
@@ -233,8 +240,9 @@ def excitation(
     """
     from adacd_hil.cli import excitation as command
 
-    outcome = command.search(config, profile, seconds, seed, out)
-    print(command.as_json(outcome) if as_json else command.as_text(outcome))
+    with tried(out):
+        outcome = command.search(config, profile, seconds, seed, out)
+        tell(command.as_json(outcome) if as_json else command.as_text(outcome), out, command.as_toml(outcome), as_json)
     return ExitCode.OK
 
 

@@ -5,37 +5,27 @@ import json
 from contextlib import closing
 from pathlib import Path
 
-from adacd_hil.analysis.detector_comparison import Comparison, compare_detectors, write_comparison
+from adacd_hil.analysis.detector_comparison import Comparison, compare_detectors
 from adacd_hil.analysis.false_alarms import TooLittleMotionError
 from adacd_hil.analysis.thresholds import Thresholds, thresholds_of_logs
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table
-from adacd_hil.config import to_toml
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.log.stretch import WHOLE, Stretch
-from adacd_hil.output_files import replace_file
 
 
 def find(
-    logs: tuple[Path, ...], rate_per_h: float, out: Path | None, report: Path | None, stretch: Stretch = WHOLE
+    logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: Stretch = WHOLE
 ) -> tuple[Thresholds, Comparison | None]:
-    """Find the thresholds, write them and the comparison where asked for. Raises LogError, CommandError."""
+    """Find the thresholds, and compare the detectors where asked for. Raises LogError, CommandError."""
     paths = [log_in(given) for given in logs]
     try:
         with closing(Progress()) as progress:
             thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
-        comparison = None if report is None else compare_detectors(statistics, rate_per_h)
+        comparison = compare_detectors(statistics, rate_per_h) if is_compared else None
     except TooLittleMotionError as error:
         raise CommandError(str(error), ExitCode.FAILURE) from None
-    if report is not None and comparison is not None:
-        write_comparison(comparison, report)
-    if out is not None:
-        try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(out, to_toml(thresholds))
-        except OSError as error:
-            raise CommandError(f"{out} can't be written: {error.strerror}", ExitCode.FAILURE) from None
     return thresholds, comparison
 
 

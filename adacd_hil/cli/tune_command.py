@@ -8,9 +8,9 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
+from adacd_hil.cli.result_file import tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.run_folder import log_in
-from adacd_hil.output_files import replace_file
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -62,30 +62,25 @@ def tune(
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
         raise CommandError("a log is given twice: what is chosen on it can't be checked on it", ExitCode.USAGE)
-    base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
-    progress = Progress()
-    try:
-        found = find(paths, rate_per_h, config, progress, stretch)
-    except TooLittleMotionError as error:
-        raise CommandError(str(error), ExitCode.FAILURE) from None
-    finally:
-        progress.close()
+    with tried(out):
+        base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
+        progress = Progress()
+        try:
+            found = find(paths, rate_per_h, config, progress, stretch)
+        except TooLittleMotionError as error:
+            raise CommandError(str(error), ExitCode.FAILURE) from None
+        finally:
+            progress.close()
+        said = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
+        if base is None or found.best is None:
+            print(said)
+        else:
+            tell(said, out, suggested_toml(found, found.best, *base), as_json)
     if report is not None:
         from adacd_hil.analysis.sweep.tune_figures import write_tuning
 
         write_tuning(found, report)
-    if out is not None and base is not None and found.best is not None:
-        _write(out, suggested_toml(found, found.best, *base))
-    print(json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found))
     return ExitCode.OK if found.is_shown else ExitCode.PARTIAL
-
-
-def _write(out: Path, text: str) -> None:
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(out, text)
-    except OSError as error:
-        raise CommandError(f"{out} can't be written: {error.strerror}", ExitCode.FAILURE) from None
 
 
 def _as_text(found: "Tuning") -> str:

@@ -1,0 +1,96 @@
+"""A search whose result can't be written is not begun, or tells what it has found."""
+
+import errno
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from adacd_hil.cli.exit_codes import CommandError
+from adacd_hil.cli.main import cli
+from adacd_hil.cli.result_file import tell, tried
+from adacd_hil.config import ExcitationSettings, parse, parse_toml
+from adacd_hil.output_files import is_disk_full
+
+PARTIAL, FAILURE = 3, 1
+SMALL = """extends = 'certified'
+[certified]
+learn_every = 20
+[excitation]
+period_s = 2.4
+cosine = [[-0.04, 0.01], [-0.04, 0.01]]
+sine = [[0.0, 0.0], [0.0, 0.0]]
+"""
+
+
+def test_a_place_is_tried_and_left_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "old.toml").write_text("kept")
+    for out in (tmp_path / "old.toml", tmp_path / "new" / "newer" / "x.toml"):
+        with tried(out):
+            assert not list(out.parent.glob(".*"))
+    assert [path.name for path in tmp_path.iterdir()] == ["old.toml"]
+    assert (tmp_path / "old.toml").read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    ("out", "reason"),
+    [
+        ("file/x.toml", ".*file is no folder"),
+        ("", "it is a folder"),
+        ("/proc/none/x.toml", "No such file or directory"),
+    ],
+)
+def test_a_place_that_takes_no_file_is_said_before_the_search(out: str, reason: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(CommandError, match=rf"can't be written: {reason}"), tried(tmp_path / out):
+        raise AssertionError("searched")
+
+
+def fill(path: Path, content: str) -> None:
+    """Stand for `replace_file` on a disk that has become full."""
+    raise OSError(errno.ENOSPC, "No space left on device", f".{path.name}.part")
+
+
+@pytest.mark.parametrize("has_all", [False, True])
+def test_what_was_found_is_told_where_it_can_not_be_written(
+    has_all: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("adacd_hil.cli.result_file.replace_file", fill)
+    out = tmp_path / "x.toml"
+    with pytest.raises(CommandError) as raised:
+        tell("the table", out, "a = 1\n", has_all)
+    assert str(raised.value) == f"{out} can't be written: No space left on device; what was found is printed above"
+    assert is_disk_full(raised.value)
+    assert capsys.readouterr().out == ("the table\n" if has_all else "the table\n\na = 1\n")
+
+
+@pytest.mark.parametrize("words", [("excitation",), ("tune", "none.mcap"), ("thresholds", "none.mcap")])
+def test_each_search_tries_its_place(words: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = CliRunner().invoke(cli, [*words, "--out", str(tmp_path / "file" / "x.toml")])
+    assert (done.exit_code, done.stdout) == (FAILURE, "")
+    (complaint,) = done.stderr.splitlines()
+    assert f"x.toml can't be written: {tmp_path / 'file'} is no folder" in complaint
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("json_words", [(), ("--json",)], ids=["text", "json"])
+def test_an_excitation_that_has_no_room_is_not_lost(
+    json_words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("adacd_hil.cli.result_file.replace_file", fill)
+    monkeypatch.chdir(tmp_path)
+    Path("small.toml").write_text(SMALL)
+    words = ["excitation", "--config", "small.toml", "--seconds", "0", "--out", "found.toml", *json_words]
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == PARTIAL, done.stderr
+    assert done.stderr.splitlines()[-1] == (
+        "adacd-hil: found.toml can't be written: No space left on device; what was found is printed above"
+    )
+    if json_words:
+        found = json.loads(done.stdout)["excitation"]
+    else:
+        found = parse_toml(done.stdout[done.stdout.index("extends = ") :])["excitation"]
+    assert parse(ExcitationSettings, found).period_s > 0.0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["small.toml"]
