@@ -7,6 +7,7 @@ concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 import configparser
 import io
 import logging
+import re
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +40,19 @@ _UNFORESEEN = (
 """What canopen raises when an answer isn't what it expects: it trusts lengths, toggle bits and types."""
 _ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index: CiA 301, table 22
 
+_EDS_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x19\x1b-\x1f\x7f]")
+"""All but tab, the ends of lines and the end of a file under DOS."""
+_EDS_OBJECT = re.compile("[0-9A-Fa-f]{4}(?:[Ss]ub[0-9A-Fa-f]+)?")
+_EDS_INTEGERS = {
+    form
+    for number in canopen.objectdictionary.INTEGER_TYPES
+    if number != canopen.objectdictionary.BOOLEAN
+    for form in (str(number), f"0X{number:X}", f"0X{number:02X}", f"0X{number:04X}")
+}
+_EDS_NUMBERS = ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
+_EDS_NUMBER = re.compile(r"(?i:\s*(?:\$NODEID\s*\+?)?\s*[-+]?\s*(?:0x[0-9a-f]+|[0-9]+)?\s*(?:\+?\s*\$NODEID)?\s*)")
+"""CiA 306, 4.5.1: decimal, octal or hexadecimal, the node id before or after it."""
+
 # canopen reports what it also raises; the raised form is ours to print.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 logging.getLogger("canopen").propagate = False
@@ -58,15 +72,42 @@ class Variable(NamedTuple):
 
 
 def read_eds(path: Path, node_id: int) -> Any:
-    """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`. Raises ConfigError."""
+    """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`. Raises ConfigError.
+
+    canopen leaves out what it can't read as a number: without its default an object is not looked at.
+    """
     try:
-        stream = io.StringIO(read_input(path).decode("utf-8", "replace"))
+        text = read_input(path).decode("utf-8", "replace").removeprefix("\ufeff")
+        _check_eds(text)
+        stream = io.StringIO(text)
         stream.name = "object dictionary.eds"
         return canopen.import_od(stream, node_id)
     except OSError as error:
         raise ConfigError(f"EDS {path}: {error.strerror}") from None
+    except ConfigError as error:
+        raise ConfigError(f"EDS {path}: {error}") from None
     except (*_UNFORESEEN, configparser.Error, RecursionError) as error:
         raise ConfigError(f"EDS {path}: {' '.join(str(error).split()) or repr(error)}") from None
+
+
+def _check_eds(text: str) -> None:
+    """Refuse control characters, and values of integers that are no numbers. Raises ConfigError, configparser.Error."""
+    if found := _EDS_CONTROL.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        raise ConfigError(f"line {line} has the control character 0x{ord(found[0]):02X}")
+    eds = configparser.RawConfigParser(inline_comment_prefixes=(";",))
+    eds.optionxform = str  # type: ignore[assignment,method-assign]
+    eds.read_string(text, "object dictionary.eds")
+    for section in eds.sections():
+        if not _EDS_OBJECT.fullmatch(section):
+            continue
+        entries = eds[section]
+        if entries.get("DataType", "").strip().upper() not in _EDS_INTEGERS:
+            continue
+        for key in _EDS_NUMBERS:
+            value = entries.get(key, "")
+            if value and not _EDS_NUMBER.fullmatch(value):
+                raise ConfigError(f"[{section}] {key} = {value[:40]!r} is no integer")
 
 
 def find_variable(objects: Any, index: int, sub: int) -> Variable | None:

@@ -5,9 +5,13 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError, load_settings, parse
+from adacd_hil.device.canopen_bus import read_eds
 from adacd_hil.device.profile import ObjectName, ProfileSettings, load_profile, parse_object, profile_names
+from adacd_hil.wire.codec import contract_folder
 
 SENSOR = """
 kind = "sensor"
@@ -150,3 +154,52 @@ def test_two_devices_cant_share_a_node_id(tmp_path: Path) -> None:
     path.write_text("[devices]\ndrive_node = [1, 3]\n")
     with pytest.raises(ConfigError, match="node ids 1, 3, 3, 4 of drives and sensors must differ"):
         load_settings(str(path))
+
+
+EDS = (contract_folder() / "torque_sensor.eds").read_text()
+VENDOR = "[1018sub1]"
+
+
+def with_default(value: str) -> str:
+    """Give the sensor's EDS with another default of its vendor id."""
+    head, section, tail = EDS.partition(VENDOR)
+    assert section
+    return head + section + tail.replace("DefaultValue=0x41444143", f"DefaultValue={value}", 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (with_default("0x4144zz"), r"\[1018sub1\] DefaultValue = '0x4144zz' is no integer"),
+        (with_default("ten"), r"\[1018sub1\] DefaultValue = 'ten' is no integer"),
+        (with_default("1e5"), r"\[1018sub1\] DefaultValue = '1e5' is no integer"),
+        (with_default("1\nLowLimit=--1"), r"\[1018sub1\] LowLimit = '--1' is no integer"),
+        (EDS.replace("VendorName=", "VendorName=\x1b[2J", 1), r"line \d+ has the control character 0x1B"),
+        (EDS.encode("utf-16-le").decode("latin-1"), "line 1 has the control character 0x00"),
+    ],
+)
+def test_what_canopen_would_read_over_in_an_eds_is_one_line(text: str, line: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.eds"
+    path.write_text(text, newline="")
+    with pytest.raises(ConfigError, match=rf"^EDS {path}: {line}$"):
+        read_eds(path, 3)
+
+
+NUMBERS = ("", "0", "-5", "010", "0X41", "$NODEID+0x180", "0x180 + $NODEID", "$NODEID", "0x1 ; say")
+
+
+@pytest.mark.parametrize("value", NUMBERS)
+def test_numbers_as_vendors_write_them_are_read(value: str, tmp_path: Path) -> None:
+    (tmp_path / "x.eds").write_bytes(b"\xef\xbb\xbf" + with_default(value).encode())
+    assert read_eds(tmp_path / "x.eds", 3)[0x1018][1].name
+
+
+def test_the_budget_names_an_eds_that_it_cant_read(tmp_path: Path) -> None:
+    (tmp_path / "torque_sensor.eds").write_text(with_default("ten"))
+    profile_file(tmp_path, (Path(str(resources.files("adacd_hil"))) / "device_profiles/adacd-sensor.toml").read_text())
+    (tmp_path / "c.toml").write_text('[devices]\nsensor = ["mine.toml", "mine.toml"]\n')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        done = CliRunner().invoke(cli, ["budget", "--config", "c.toml"])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == "adacd-hil: EDS torque_sensor.eds: [1018sub1] DefaultValue = 'ten' is no integer\n"
