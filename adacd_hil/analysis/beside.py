@@ -101,6 +101,7 @@ class BesideGatherer:
         self._sections = sections
         self._windows = [(touch.onset_s, forgotten_s(run, touch, a, threshold)) for touch in touches]
         self._finish_cycle = run.finish_cycle
+        self._span = None if run.truth is None else run.truth.span
         self._pause_s = SETTLING_TIME_CONSTANTS / a
         self._end_s = float(run.time_s()[-1]) if run.cycle.size else 0.0
         self._adaptations = [
@@ -124,6 +125,8 @@ class BesideGatherer:
         over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
         unexplained = over if self._finish_cycle is None else over & (piece.cycle < self._finish_cycle)
         unexplained = unexplained.copy()
+        if self._span is not None:  # of what the emulator didn't record nobody knows
+            unexplained &= (piece.cycle >= self._span[0]) & (piece.cycle <= self._span[1])
         for number, (start_s, end_s) in enumerate(self._windows):
             if start_s > time_s[-1] or end_s < time_s[0]:
                 continue

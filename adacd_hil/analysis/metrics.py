@@ -115,7 +115,11 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         if section.kind == "adaptation"
     }
     has_truth = run.truth is not None
-    unexplained = [d for d, owner in zip(detections, owners, strict=True) if owner is None]
+    unexplained = [
+        d
+        for d, owner in zip(detections, owners, strict=True)
+        if owner is None and (run.truth is None or run.truth.covers(int(run.cycle[d.row])))
+    ]
     false_s = tuple(detection.detected_s for detection in unexplained)
     armed_false = sum(run.state[detection.row - 1] == SchemeState.MONITOR for detection in unexplained)
     missed = sum(contact.is_armed and contact.detected_s is None for contact in contacts)

@@ -37,6 +37,12 @@ class Truth:
     force_N: Vector | None = None  # size of the contact force (m,)
     time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
     model_cycle: Cycles | None = None
+    span: tuple[int, int] | None = None
+    """First and last cycle that the emulator recorded, whichever are kept; None: all."""
+
+    def covers(self, cycle: int) -> bool:
+        """Whether the emulator recorded what was true in a cycle."""
+        return self.span is None or self.span[0] <= cycle <= self.span[1]
 
     def model_row(self, cycle: int) -> int | None:
         """Give the row of payload and parameters in a cycle; None without any."""

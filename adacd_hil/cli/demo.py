@@ -7,17 +7,18 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from adacd_hil.analysis.foreign_truth import config_digest
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.run_folder import run_folder
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import RequestSettings, Settings, load_settings
+from adacd_hil.config import RequestSettings, Settings, load_settings, to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
+from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME
 from adacd_hil.output_files import in_words
 from adacd_hil.records import SchemeState
 from adacd_hil.wire.bus import Bus, EmbeddedBus
@@ -86,7 +87,8 @@ def run_embedded(
     embedded = EmbeddedBus(clock)
     bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
     out.mkdir(parents=True, exist_ok=True)
-    with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", scenario=scenario) as truth:
+    host = {CONFIG_DIGEST_KEY: config_digest(to_toml(settings))}
+    with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", metadata=host, scenario=scenario) as truth:
         try:
             bench = Bench(
                 scenario, codec, embedded.deliver, contract=contract, on_truth=truth.write, on_event=truth.event

@@ -123,7 +123,7 @@ def _replay_one(
     if not variants and base != own:
         variants = {", ".join(filter(None, [config or "", *changes])): base}
     progress(f"replaying {given}" + (f" with {len(variants)} other settings" if variants else ""))
-    truth = contacts_beside(log_in(against or given))
+    truth = contacts_beside(log_in(against or given), progress)
     settings: list[Settings] = [own, *variants.values()]
     replays = replay_source(source, settings, truth, progress, tolerance, ScriptedOperator, shown, stretch=stretch)
     return given, replays, list(variants)

@@ -15,6 +15,8 @@ LOG_NAME = "run.mcap"
 """The host's log."""
 TRUTH_NAME = "truth.mcap"
 """The emulator's."""
+CONFIG_DIGEST_KEY = "host_config_sha256"
+"""Metadata of the emulator's log where the host is in the same process: of its configuration."""
 _FAILED_NAME = "failed-start-{}.mcap"
 
 

@@ -424,7 +424,7 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
 def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
     (first,) = contacts_beside(log)
     later = [first, dataclasses.replace(first, attempt=1), dataclasses.replace(first, attempt=2)]
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda _: tuple(later))
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: tuple(later))
     monkeypatch.setattr(tune_logs, "_begins", lambda *_: [0, 241])
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
@@ -453,7 +453,7 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
     contacts = contacts_beside(log)
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda _: contacts * 3)
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: contacts * 3)
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 

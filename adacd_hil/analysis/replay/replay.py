@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.foreign_truth import foreign_truth
 from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.replay.attempts import Stretch
 from adacd_hil.analysis.replay.outcome import Adaptation, ContactOutcome, OutcomeGatherer, Transition
@@ -129,9 +130,9 @@ def replay(
     script_of: plays the user of a configuration; with it, the requests of a run that nobody typed into are compared.
     """
     source = LogSource(path)
-    return replay_source(source, [settings or source.settings], contacts_beside(path), progress, tolerance, script_of)[
-        0
-    ]
+    return replay_source(
+        source, [settings or source.settings], contacts_beside(path, progress), progress, tolerance, script_of
+    )[0]
 
 
 def replay_many(
@@ -146,13 +147,23 @@ def replay_many(
 
     Raises LogError, ConfigError, CodecError.
     """
-    return replay_source(LogSource(path), variants, contacts_beside(path), progress, watch=watch, stretch=stretch)
+    return replay_source(
+        LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
+    )
 
 
-def contacts_beside(path: Path) -> tuple[TrueContact, ...] | None:
-    """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError."""
+def contacts_beside(path: Path, progress: Progress = lambda _: None) -> tuple[TrueContact, ...] | None:
+    """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError.
+
+    That of another run is left out, and `progress` is told why.
+    """
     truth = path.with_name(TRUTH_NAME)
-    return read_contacts(truth) if truth.exists() else None
+    if not truth.exists():
+        return None
+    if problem := foreign_truth(path, truth):
+        progress(f"{problem}; it is left out")
+        return None
+    return read_contacts(truth)
 
 
 class _Player:

@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.analysis.detections import find_detections
+from adacd_hil.analysis.foreign_truth import foreign_truth
 from adacd_hil.analysis.metrics import Gathered
 from adacd_hil.analysis.replay.source import settings_of
 from adacd_hil.analysis.report.cut_points import settling_s, widen
@@ -28,6 +29,7 @@ from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import ENDING_KEY
 from adacd_hil.log.reader import Series, check_states
+from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.log.stretch import WHOLE, Stretch, start_of_log
 from adacd_hil.log.summary import PLANNED_ENDINGS
@@ -71,10 +73,12 @@ def read_run(
 ) -> ReadRun:
     """Read a log, or a stretch of it, and the emulator's truth if there is one. Raises LogError, ConfigError.
 
+    The truth of another run is left out, and said to be a problem of the source.
     full_cycles: of a log with more, some are kept.
     """
-    truth = None if truth_path is None else read_truth(truth_path, full_cycles)
-    reading = _Reading(log_path, truth, progress)
+    problem = "" if truth_path is None else foreign_truth(log_path, truth_path)
+    truth = None if truth_path is None or problem else read_truth(truth_path, full_cycles)
+    reading = _Reading(log_path, truth, progress, problem)
     if not stretch.is_whole:
         return reading.read_stretch(stretch, full_cycles)
     return reading.read_whole(full_cycles) or reading.read_long(*reading.outline())
@@ -83,8 +87,9 @@ def read_run(
 class _Reading:
     """Reads one log, as often as it takes."""
 
-    def __init__(self, path: Path, truth: TruthRows | None, progress: Progress) -> None:
+    def __init__(self, path: Path, truth: TruthRows | None, progress: Progress, truth_problem: str = "") -> None:
         self._path = path
+        self._truth_problem = truth_problem
         self._truth = truth
         self._progress = progress
         stream = LogStream(path, RUN_TOPICS)
@@ -100,7 +105,9 @@ class _Reading:
             metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
         if self._truth is not None:
             emulator = self._truth.metadata.items()
-            metadata |= {f"emulator_{key}": value for key, value in emulator if key not in metadata}
+            metadata |= {
+                f"emulator_{key}": value for key, value in emulator if key not in (*metadata, CONFIG_DIGEST_KEY)
+            }
         nothing = np.empty((0, JOINTS))
         empty = Run(
             cycle=np.empty(0, np.int64),
@@ -147,8 +154,9 @@ class _Reading:
         ending = stream.summary.get(ENDING_KEY, "")
         if ending and ending not in PLANNED_ENDINGS:
             run = replace(run, broken_off=one_line(ending))
-        problems = [stream.problem, "" if truth is None else truth.problem]
-        is_complete = stream.is_complete and (truth is None or truth.is_complete)
+        of_truth = self._truth_problem or _unjudged(run)
+        problems = [stream.problem, "" if truth is None else truth.problem, of_truth]
+        is_complete = stream.is_complete and not of_truth and (truth is None or truth.is_complete)
         source = Source(self._path.name, "; ".join(filter(None, problems)), is_complete)
         if run.stretch is None:
             run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
@@ -255,6 +263,13 @@ def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth |
         force_N=None if truth.force_N is None else truth.force_N[rows],
         time_s=truth.time_s[rows],
     )
+
+
+def _unjudged(run: Run) -> str:
+    """Say in one line how many detections the truth can't judge, because it begins later or ends before; "" if none."""
+    truth = run.truth
+    outside = [d for d in find_detections(run) if truth is not None and not truth.covers(int(run.cycle[d.row]))]
+    return f"the truth doesn't cover {len(outside)} detections, which are not judged" if outside else ""
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:

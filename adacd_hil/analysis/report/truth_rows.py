@@ -26,6 +26,7 @@ _BEGINNING: Final = (10_000, 1_000)
 _PLENTY: Final = 1_000_000
 _ENDING: Final = 1_000
 _BUCKET: Final = 100
+_NEVER: Final = 1 << 62
 _HELD: Final = 30_000
 """Rows of one contact that wait at most until those in the middle are chosen."""
 
@@ -50,6 +51,7 @@ class TruthRows(NamedTuple):
     metadata: Mapping[str, str]
     problem: str
     is_complete: bool
+    span: tuple[tuple[int, int], tuple[int, int]] | None = None  # attempt and cycle of the first and the last row
 
 
 _ROW: Final = np.dtype(
@@ -81,6 +83,7 @@ class _Gathering:
         self._kept: list[NDArray[Any]] = []
         self._kept_rows = 0
         self._contact = _OneContact(_BEGINNING[0])
+        self._first: NDArray[Any] | None = None
         self._last: NDArray[Any] | None = None  # the row before
         self._models: list[tuple[NDArray[Any], ...]] = []  # attempt, cycle, payload, theta
         self._model: tuple[NDArray[Any], ...] | None = None
@@ -90,6 +93,7 @@ class _Gathering:
         if not len(truth):
             return
         rows = self._rows(truth)
+        self._first = rows[:1] if self._first is None else self._first
         self._add_models(truth, rows)
         self.count += len(rows)
         if not self._is_long and self.count > self._most_rows:
@@ -170,7 +174,12 @@ class _Gathering:
             metadata=stream.metadata,
             problem=stream.problem,
             is_complete=stream.is_complete,
+            span=None if self._first is None or self._last is None else (_place(self._first), _place(self._last)),
         )
+
+
+def _place(row: NDArray[Any]) -> tuple[int, int]:
+    return int(row["attempt"][0]), int(row["cycle"][0])
 
 
 class _OneContact:
@@ -233,7 +242,17 @@ def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None
         force_N=None if rows.force_N is None else rows.force_N[of_host],
         time_s=None if time_s is None else time_s[of_host],
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
+        span=_host_span(rows, begins),
     )
+
+
+def _host_span(rows: TruthRows, begins: Cycles) -> tuple[int, int] | None:
+    """Give the first and the last cycle that the truth has; one that goes on after this log has no last one."""
+    if rows.span is None:
+        return None
+    attempts, cycles = (np.array(column) for column in zip(*rows.span, strict=True))
+    first, last = host_cycles(cycles, attempts, begins).tolist()
+    return first, last if attempts[1] < len(begins) else _NEVER
 
 
 def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:

@@ -98,7 +98,7 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: Stret
     parts = _Index()
     motion = read_motion(path, stretch, progress, parts.add)
     index = parts.joined()
-    contacts = contacts_beside(path)
+    contacts = contacts_beside(path, progress)
     blocks = -(-len(index.t_ns) // round(BLOCK_S / motion.period_s))
     tenths = np.arange(blocks) * _TENTHS // blocks
     is_chosen_on = np.full(blocks, place % 2 == 0) if count > 1 else tenths % 2 == 0

@@ -1,0 +1,127 @@
+"""A truth of another run is left out; what a truth doesn't cover isn't judged."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hand_made_run import record, record_truth, touched_run
+
+from adacd_hil.analysis.foreign_truth import config_digest, foreign_truth
+from adacd_hil.analysis.replay.replay import contacts_beside
+from adacd_hil.analysis.report import truth_rows
+from adacd_hil.analysis.report.reading import read_run
+from adacd_hil.analysis.report.report import write_report
+from adacd_hil.analysis.report.truth_rows import TruthRows
+from adacd_hil.analysis.run import Run
+from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.config import to_toml
+from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY
+from firmware_sim.scenario import load_scenario
+from firmware_sim.truth import TruthLog
+
+CONFIG = 'name = "mine"\n[filter]\na_rad_s = 10.0\n'
+
+
+def make_logs(
+    folder: Path, host: dict[str, str], emulator: dict[str, str], seed: int | None = None
+) -> tuple[Path, Path]:
+    """Write the logs of a run of which nothing counts but who says what; seed: of an attached scenario."""
+    log, truth = folder / "run.mcap", folder / "truth.mcap"
+    Recorder(log, attachments={"config.toml": CONFIG.encode()}, metadata=host, blocking=True).close()
+    scenario = None if seed is None else load_scenario("idle", seed=seed)
+    TruthLog(truth, blocking=True, metadata=emulator, scenario=scenario).close()
+    return log, truth
+
+
+@pytest.mark.parametrize(
+    ("host", "emulator", "seed", "reason"),
+    [
+        ({}, {}, None, ""),
+        ({}, {"scenario": "idle", "seed": "1"}, None, ""),  # on a bus the host doesn't know
+        ({"scenario": "idle", "seed": "1"}, {}, None, ""),
+        ({"scenario": "idle", "seed": "1"}, {"scenario": "idle", "seed": "1"}, None, ""),
+        ({"scenario": "idle", "seed": "4"}, {}, 4, ""),
+        ({"scenario": "idle", "seed": "4"}, {}, 5, "its seed is 5, the log's 4"),
+        ({"scenario": "paper", "seed": "4"}, {}, 4, "its scenario is idle, the log's paper"),
+        ({"scenario": "idle"}, {"scenario": "paper"}, None, "its scenario is paper, the log's idle"),
+        ({}, {CONFIG_DIGEST_KEY: config_digest(CONFIG)}, None, ""),
+        ({}, {CONFIG_DIGEST_KEY: config_digest(f"{CONFIG}[realtime]\ncpu = 'any'\n")}, None, ""),
+        ({}, {CONFIG_DIGEST_KEY: config_digest("name = 'x'")}, None, "its host had another configuration"),
+    ],
+)
+def test_logs_tell_runs_apart_by_what_was_played(
+    host: dict[str, str], emulator: dict[str, str], seed: int | None, reason: str, tmp_path: Path
+) -> None:
+    log, truth = make_logs(tmp_path, host, emulator, seed)
+    assert foreign_truth(log, truth) == (f"{truth} is of another run: {reason}" if reason else "")
+    told: list[str] = []
+    assert contacts_beside(log, told.append) == (None if reason else ())
+    assert told == ([f"{truth} is of another run: {reason}; it is left out"] if reason else [])
+
+
+def recorded(folder: Path, run: Run) -> tuple[Path, Path]:
+    """Write both logs of a run."""
+    record(folder / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
+    record_truth(folder / "truth.mcap", run)
+    return folder / "run.mcap", folder / "truth.mcap"
+
+
+def with_truth_of(run: Run, rows: slice) -> Run:
+    """Give a run whose truth has some of its rows only."""
+    assert run.truth is not None
+    names = ("cycle", "tau_ext", "contact_link", "contact_index", "payload_kg", "theta", "force_N")
+    return dataclasses.replace(
+        run, truth=dataclasses.replace(run.truth, **{name: getattr(run.truth, name)[rows] for name in names})
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("full_cycles", [500_000, 100], ids=["short", "long"])
+@pytest.mark.parametrize(
+    ("rows", "false_alarms", "unjudged"), [(slice(None), 1, 0), (slice(3000), 0, 2), (slice(3000, None), 1, 1)]
+)
+def test_what_comes_before_or_after_the_truth_is_not_judged(
+    rows: slice, false_alarms: int, unjudged: int, full_cycles: int, tmp_path: Path
+) -> None:
+    run, gathered, source = read_run(*recorded(tmp_path, with_truth_of(touched_run(), rows)), full_cycles=full_cycles)
+    from adacd_hil.analysis.metrics import evaluate
+
+    assert evaluate(run, gathered).false_alarms == false_alarms
+    said = f"the truth doesn't cover {unjudged} detections, which are not judged" if unjudged else ""
+    assert (source.problem, source.is_complete) == (said, not unjudged)
+
+
+@pytest.mark.slow
+def test_a_report_without_the_truth_of_another_run_says_so(tmp_path: Path) -> None:
+    log, _ = recorded(tmp_path, touched_run())
+    (tmp_path / "truth.mcap").unlink()
+    TruthLog(tmp_path / "truth.mcap", blocking=True, metadata={"scenario": "idle"}).close()
+    report = write_report(log, tmp_path / "truth.mcap", tmp_path / "out")
+    assert report.metrics.false_alarms is None
+    assert not report.is_complete
+    assert "truth.mcap is of another run: its scenario is idle, the log's paper" in report.as_text()
+
+
+@pytest.mark.slow
+def test_a_demo_writes_logs_of_one_run(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text("lasts_s = 0.3\n")
+    for name, seed in (("a", 1), ("b", 2)):
+        run_embedded(resolve("paper", str(tmp_path / "short.toml"), None, seed), "lockstep", tmp_path / name)
+    for name in "ab":
+        assert foreign_truth(tmp_path / name / "run.mcap", tmp_path / name / "truth.mcap") == ""
+    assert "its seed is 2" in foreign_truth(tmp_path / "a" / "run.mcap", tmp_path / "b" / "truth.mcap")
+
+
+def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() -> None:
+    nothing = np.zeros(1, np.int64)
+    rows = TruthRows(
+        nothing, nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), None, nothing, nothing, np.zeros(1),
+        np.zeros((1, 7)), {}, "", True, ((0, 3), (1, 50)),
+    )  # fmt: skip
+    one, both = (truth_rows.host_truth(rows, np.array(begins), 1000, None) for begins in ([0], [0, 480]))
+    assert one is not None
+    assert both is not None
+    assert (one.covers(2), one.covers(3), one.covers(900)) == (False, True, True)
+    assert both.span == (3, 530)
