@@ -5,6 +5,7 @@ back; within a line of ours (`in_line`) so are the ends of lines, or it could sa
 away, as `head` does, is no error. An output that blocks holds nobody up once the user has asked for the end.
 """
 
+import _thread
 import contextlib
 import errno
 import io
@@ -30,6 +31,7 @@ _PATIENCE_POLLS = 5
 """How long a blocked output is waited for after the user has asked for the end: 0.5 s."""
 _NOBODY_READS = (errno.EPIPE, errno.EIO)
 """The other end of the pipe is closed, the terminal has hung up."""
+_MOMENT_S = 0.02
 _PIECE = 1024
 """Bytes that a pipe or a terminal takes without blocking when it is ready: POSIX has PIPE_BUF of at least 512."""
 
@@ -239,6 +241,27 @@ def open_terminals() -> None:
     sys.stderr = Terminal(2, "standard error", is_needed=False)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored, as in the background
         signal.signal(signal.SIGINT, _interrupt)
+        sys.unraisablehook = _ask_again
+
+
+def is_interrupted(error: BaseException | None) -> bool:
+    """Tell whether Ctrl-C is behind an error: a compiled module that is being imported makes an ImportError of it."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _ask_again(lost: "sys.UnraisableHookArgs") -> None:
+    """Interrupt again, a moment later, where a Ctrl-C came in what raises nothing, as when compiled code is loaded."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    again = threading.Timer(_MOMENT_S, _thread.interrupt_main)
+    again.daemon = True
+    with contextlib.suppress(RuntimeError):  # the process ends anyway
+        again.start()
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

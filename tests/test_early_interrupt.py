@@ -38,6 +38,31 @@ def test_ctrl_c_during_imports_ends_as_later(program: str, place: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (ENDS[program][0], b"", ENDS[program][1])
 
 
+IMPORT_ERROR = """
+import sys
+from adacd_hil.cli.main import main
+class Failing:
+    def find_spec(self, name, path, target=None):
+        if name == "matplotlib":
+            try:
+                raise {cause}
+            except BaseException as error:
+                raise ImportError("initialization failed") from error
+sys.meta_path.insert(0, Failing())
+sys.argv[1:] = ["report", "none.mcap"]
+main()
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_that_an_import_turns_into_an_error_ends_as_any_other() -> None:
+    for cause, status in (("KeyboardInterrupt", 130), ("ValueError", 1)):
+        command = [sys.executable, "-c", IMPORT_ERROR.format(cause=cause)]
+        done = subprocess.run(command, capture_output=True, check=False)
+        assert done.returncode == status
+        assert (done.stderr == b"adacd-hil: interrupted\n") == (status == 130)
+
+
 @pytest.mark.slow
 def test_ctrl_c_is_ignored_where_it_was() -> None:
     done = interrupted("adacd-hil", "numpy", preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))

@@ -224,6 +224,31 @@ def test_a_stopped_terminal_ends_with_ctrl_c() -> None:
     os.close(ours)
 
 
+LOSE_INTERRUPT = """
+import ctypes, signal
+from adacd_hil.terminal import open_terminals
+open_terminals()
+lost = []
+def interrupt():
+    lost.append(1)
+    signal.raise_signal(signal.SIGINT)
+    lost.append(2)
+try:
+    ctypes.CFUNCTYPE(None)(interrupt)()
+    assert lost == [1]
+    for _ in range(10**8):  # some seconds
+        pass
+except KeyboardInterrupt:
+    print("ended")
+"""
+
+
+def test_ctrl_c_in_what_raises_nothing_is_not_lost_and_no_traceback() -> None:
+    command = [sys.executable, "-c", LOSE_INTERRUPT]
+    done = subprocess.run(command, capture_output=True, check=False, timeout=HANG_S)
+    assert (done.returncode, done.stdout, done.stderr) == (OK, b"ended\n", b"")
+
+
 WIDE = [("name", "count", "words", "more"), ("first", "1", "one two three four", "x" * 20), ("2nd", "22", "", "y")]
 
 

@@ -33,7 +33,7 @@ from adacd_hil.cli.sweep_command import sweep
 from adacd_hil.cli.tune_command import tune
 from adacd_hil.config import to_toml
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.terminal import open_terminals
+from adacd_hil.terminal import is_interrupted, open_terminals
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -387,4 +387,8 @@ def main() -> NoReturn:
         code = ExitCode.INTERRUPTED
     except OSError as error:  # help that can't be written
         code = complain(error)
+    except ImportError as error:
+        if not is_interrupted(error):
+            raise
+        code = complain(KeyboardInterrupt())
     sys.exit(code)
