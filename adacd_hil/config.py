@@ -446,7 +446,7 @@ REACTIONS = tuple(reaction.name.lower() for reaction in Reaction)
 """What can be done about a contact, as a configuration says it."""
 
 
-FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width")
+FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
 """Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.friction`."""
 
 _KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
@@ -469,7 +469,12 @@ class CertifiedSettings:
     noise_sigmas: float = setting(6.5, low=1.0, high=50.0, meaning="threshold in deviations of the torque's noise")
     model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold in deviations of the model")
     friction_terms: tuple[str, ...] = setting(
-        ("stribeck",), choices=FRICTION_TERMS, meaning="friction beyond viscous and Coulomb"
+        ("stribeck", "load", "dahl_short", "dahl_long"),
+        choices=FRICTION_TERMS,
+        meaning="friction beyond viscous and Coulomb",
+    )
+    dahl_rad: tuple[float, float] = setting(
+        (0.001, 0.004), unit="rad", low=1e-6, high=1.0, meaning="bristle lengths of dahl_short and dahl_long"
     )
     still_rad_s: float = setting(
         0.002,
@@ -497,7 +502,7 @@ class CertifiedSettings:
         meaning=f"how far it may wander in a second of motion: {_KINDS}",
     )
     model_error: tuple[float, ...] = setting(
-        (0.01, 0.01, 0.01, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
+        (0.003, 0.01, 0.01, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
     )
     payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="what a payload at the tip may weigh")
     payload_inertia_std: float = setting(
@@ -513,7 +518,7 @@ class CertifiedSettings:
         (1.4, 0.45), unit="s", low=0.05, high=600.0, meaning="shortest fit: of the arm, of a payload"
     )
     test_s: tuple[float, float] = setting(
-        (0.85, 0.4), unit="s", low=0.05, high=600.0, meaning="test of the frozen model: of the arm, with a payload"
+        (0.6, 0.35), unit="s", low=0.05, high=600.0, meaning="test of the frozen model: of the arm, with a payload"
     )
     beta_Nm: float = setting(
         0.1, unit="Nm", low=1e-3, high=100.0, meaning="test: largest |tau_ext_hat| of the slowest filter"

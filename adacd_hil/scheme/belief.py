@@ -14,7 +14,7 @@ direction g by sigma_m² g g', and a little in each inertia for what is no point
 
 **Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
 
-Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R (h, n).
+Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_still (h, n).
 """
 
 from typing import Any
@@ -25,6 +25,8 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme import estimator
 
+SLOW_RAD_S = 0.02
+"""Speed below which noise decides what friction is expected."""
 _SWEEPS = 200
 """Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
 _SETTLED = 1e-9
@@ -58,11 +60,11 @@ def wander(drift_std: Vector, elapsed_s: float, P: Vector) -> None:
 
 
 @compiled
-def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector) -> bool:
+def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector, still: Vector) -> bool:
     """Put this sample into the ring, and correct the belief by the one that has waited long enough, if one has.
 
     W_f (n, p), tau_f (n,): of the filter that is learnt from. held (n,): torque in it that friction may have held at
-    standstill, Nm. Return whether the belief has changed.
+    standstill, Nm; still (n,): share of standstill in it. Return whether the belief has changed.
     """
     m["since_learnt"] += 1.0
     if m["since_learnt"] < k["learn_every"]:
@@ -82,6 +84,8 @@ def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector) -> bool:
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W_f
+    for i in range(still.shape[0]):
+        m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > SLOW_RAD_S else 1.0
     m["ring_tau"][place] = tau_f
     for i in range(tau_f.shape[0]):
         m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + held[i] ** 2)

@@ -35,9 +35,11 @@ from adacd_hil.scheme import (
     fit_samples,
     friction,
     last_certificate,
+    lost_samples,
     refinement,
     regressor,
     sensitivity,
+    tail,
     termination,
 )
 from adacd_hil.scheme.kernel import Structured, block_dtype, is_filled, keep_sample, put_between
@@ -76,8 +78,10 @@ _EIGENVALUE_EVERY = 64
 WIDE = 1
 """Filter of the bank whose output, with the filter undone, is the external torque of contact reports: undoing a faster
 one would bring back the noise that it let through."""
-_FIT = 0
-"""Filter of the bank that is learnt from: the slow one, whose noise is least."""
+_SLOW = 0
+"""Filter of the bank by which a model is tested and reported: the slow one, whose noise is least."""
+_LEARNT = 1
+"""Filter of the bank that is learnt from: faster than that, so its samples are soon independent, and reversals show."""
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
@@ -99,6 +103,14 @@ def prior_of(settings: Settings) -> Vector:
     return _by_kind((0.0, 0.0, 0.0, 0.0, 0.0, settings.certified.lag_s, 0.0), parameter_names(settings))
 
 
+def prior_std_of(settings: Settings) -> Vector:
+    """Return how far an arm of which nothing is known may be from that (p,)."""
+    names = parameter_names(settings)
+    shares = [next((share for term, share in friction.SHARES.items() if name.startswith(term)), 1.0) for name in names]
+    std: Vector = _by_kind(settings.certified.prior_std, names) * np.array(shares)
+    return std
+
+
 def constants_of(settings: Settings) -> Structured:
     """Put the settings into the form that the compiled step reads."""
     certified, names = settings.certified, parameter_names(settings)
@@ -110,7 +122,7 @@ def constants_of(settings: Settings) -> Structured:
     theta_cad = np.zeros(len(names))
     theta_cad[: len(settings.arm.cad_theta)] = settings.arm.cad_theta
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
-    correlated = 2.0 / (cutoff[_FIT] * period_s * certified.learn_every)
+    correlated = 2.0 / (cutoff[_LEARNT] * period_s * certified.learn_every)
     values: dict[str, Any] = {
         "period_s": period_s,
         "cutoff": cutoff,
@@ -123,9 +135,10 @@ def constants_of(settings: Settings) -> Structured:
         "width_rad_s": certified.coulomb_width_rad_s,
         "stribeck_rad_s": certified.stribeck_rad_s,
         "terms": [FRICTION_TERMS.index(term) for term in certified.friction_terms],
+        "dahl_rad": certified.dahl_rad,
         "theta_cad": theta_cad,
         "prior": prior_of(settings),
-        "prior_std": _by_kind(certified.prior_std, names),
+        "prior_std": prior_std_of(settings),
         "enough_std": _by_kind(certified.enough_std, names),
         "drift_std": _by_kind(certified.drift_std, names),
         "model_error": _by_kind(certified.model_error, names),
@@ -149,10 +162,12 @@ def constants_of(settings: Settings) -> Structured:
         **sensitivity.noise_constants(certified, period_s),
         **anchor.constants_of(settings),
         **doubt.constants_of(settings, len(names)),
-        **earlier.constants_of(settings, _by_kind(certified.prior_std, names)),
+        **earlier.constants_of(settings, prior_std_of(settings)),
         **last_certificate.constants_of(settings),
+        **tail.constants_of(settings),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
+        "noise_sigmas": certified.noise_sigmas,
         "still_rad_s": certified.still_rad_s,
         "standstill_share": certified.standstill_share,
         "collision_Nm": settings.detector.collision_Nm,
@@ -205,6 +220,7 @@ def new_memory(settings: Settings) -> Structured:
         "ring_W": (waiting, *columns),
         "ring_tau": (waiting, JOINTS),
         "ring_R": (waiting, JOINTS),
+        "ring_still": (waiting, JOINTS),
         "ring_used": (),
         "ring_next": (),
         "since_learnt": (),
@@ -233,13 +249,18 @@ def new_memory(settings: Settings) -> Structured:
         "r": (filter_count, JOINTS),
         "y": (channel_count, JOINTS),
         "h": (channel_count, JOINTS),
+        "h_model": (channel_count, JOINTS),
         "still": (filter_count, JOINTS),
         "still_smooth": (filter_count, JOINTS),
         "doubt": (filter_count, JOINTS),
+        "bent": (2, JOINTS),
         "rest_samples": (),
         "rest_tau": joint,
         "rest_square": joint,
         "roughness": joint,
+        "has_sample": (),
+        "torque_step_Nm": joint,
+        "torque_pull_Nm": joint,
         # anchors of the offsets
         "rest_count": (),
         "anchor_age_s": (),
@@ -252,6 +273,8 @@ def new_memory(settings: Settings) -> Structured:
         **fit_samples.shapes_of(count),
         **last_certificate.shapes_of(),
         **doubt.shapes_of(),
+        **tail.shapes_of(channel_count),
+        **lost_samples.shapes_of(filter_count),
         "withheld_by": (),
         "dq_old": joint,
         "ddq_old": joint,
@@ -261,7 +284,7 @@ def new_memory(settings: Settings) -> Structured:
         "used": joint,
         "peak_share": joint,
         "hold": joint,
-        "held": joint,
+        "held": (filter_count, JOINTS),
         # contact
         "history": (contact.WIDE_SAMPLES + 1, JOINTS),
         "wide_sigma": joint,
@@ -274,8 +297,7 @@ def new_memory(settings: Settings) -> Structured:
     memory["unit"] = 1.0
     memory["strain"] = 1.0
     state = memory[0]
-    prior_std = _by_kind(certified.prior_std, parameter_names(settings))
-    prior = prior_of(settings)
+    prior, prior_std = prior_of(settings), prior_std_of(settings)
     belief.begin(prior, prior_std, state["belief"], state["P_belief"])
     belief.begin(prior, prior_std, state["theta"], state["P"])
     constants = constants_of(settings)[0]
@@ -339,6 +361,7 @@ def begin_test(constants: Structured, memory: Structured) -> None:
     belief.keep_non_negative(first_viscous, last_coulomb, m["belief"], m["P_belief"])
     _use_belief(m)
     belief.discard(m)
+    tail.begin(m)
     m["tested"] = 0.0
     m["test_limit_Nm"] = certificate.test_limit_Nm(k, earlier.late_square(m))
     m["dq_low"][:] = np.inf
@@ -390,6 +413,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
         observation |= _WITHHELD
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
+        lost_samples.count(m, observation & _UNSEEN != 0)
     else:
         out["threshold"][:] = np.inf
         out["threshold_bank"][:] = np.inf
@@ -441,22 +465,26 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     """
     nominal_s: float = k["period_s"]
     period_s: float = out["period_s"][0]
-    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s)
+    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, lost_samples.MOST_FILLED)
     if is_seen:
         _choose_rates(k, m, period_s / steps)
         for between in range(1, steps):
             put_between(m["last"], out["q"], out["dq"], out["tau_J"], between / steps, m["between"])
             m["is_steady"] = 0.0
             _take_sample(k, m, m["between"][0], m["between"][1], m["between"][2], True, out["tau_ext_wide_hat"])
+    lost_samples.follow(k, m, out["dq"], max(steps, 1), period_s, is_seen)
+    if m["has_sample"] != 0.0:
+        sensitivity.follow_torque_step(k, m, out["tau_J"])
+    m["has_sample"] = 1.0
     m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
     _take_sample(k, m, out["q"], out["dq"], out["tau_J"], is_seen, out["tau_ext_wide_hat"])
     m["has_gap"] = 0.0
     keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
-    out["tau_f"][:] = m["tau_f"][_FIT]
-    detector.predict(m["W_f"][_FIT], k["theta_cad"], out["tau_f_cad"])
+    out["tau_f"][:] = m["tau_f"][_SLOW]
+    detector.predict(m["W_f"][_SLOW], k["theta_cad"], out["tau_f_cad"])
     for i in range(out["q"].shape[0]):
-        out["tau_ext_hat"][i] = m["r"][_FIT, i]
-        out["tau_f_hat"][i] = m["r"][_FIT, i] + out["tau_f"][i]
+        out["tau_ext_hat"][i] = m["r"][_SLOW, i]
+        out["tau_f_hat"][i] = m["r"][_SLOW, i] + out["tau_f"][i]
         out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
     return bool(is_seen)
 
@@ -492,7 +520,7 @@ def _take_sample(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector, is_seen: 
     if m["is_steady"] != 0.0:
         sensitivity.follow_velocity_noise(k, m, dq)
     sensitivity.follow_standstill(dq, k["still_rad_s"], k["decay"], k["smoothing"], m["still"], m["still_smooth"])
-    sensitivity.follow_friction(k, m, _FIT)
+    sensitivity.follow_friction(k, m)
     contact.undo_filter(m["r"][WIDE], k["decay"][WIDE], m["history"], tau_ext_wide_hat)
 
 
@@ -506,7 +534,8 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
         m["Y_h"][i, first_coulomb + i] = friction.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
         m["Y_h"][i, base + i] = 1.0
     speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
-    friction.fill_terms(dq, tau_J, k["terms"], speeds, base + 2 * count, m["Y_h"])
+    friction.bend(dq, k["period_s"], k["still_rad_s"], k["dahl_rad"], m["bent"])
+    friction.fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
     regressor.fill_mass_matrix(q, m["theta"], m["M"])
 
 
@@ -515,7 +544,7 @@ def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
     """Compare with the thresholds; return CONTACT, COLLISION and the joints that are over, if any."""
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m["h"])
-        out["threshold"][:] = m["h"][_FIT]
+        out["threshold"][:] = m["h"][_SLOW]
         sensitivity.fill_wide(k, m, WIDE)
     joints = sensitivity.joints_over(m["y"], m["h"])
     if not joints:
@@ -538,7 +567,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         m["recovering_cycles"] -= 1.0
     is_free = m["recovering_cycles"] == 0.0
     if is_touched and is_free_before and mode & (LEARN | TEST):
-        sensitivity.strain(m)
+        sensitivity.strain(m, sensitivity.LARGEST_STRAIN)
         if mode & LEARN:
             earlier.keep_before_contact(m)
         else:
@@ -547,15 +576,18 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         doubt.begin(k, m)
     if not is_free:
         belief.discard(m)
+        tail.discard(m)
+    elif mode & (TEST | REFINE):
+        tail.follow(k, m)
     if mode & TEST:
         return _test(k, m, out["dq"])
     if mode & REFINE:
         _refine(k, m, is_free)
         return 0
-    if is_free and belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
+    if is_free and belief.learn(k, m, m["W_f"][_LEARNT], m["tau_f"][_LEARNT], m["held"][_LEARNT], m["still"][_LEARNT]):
         _use_belief(m)
         earlier.follow(k, m)
-        fit_samples.keep(m, m["W_f"][_FIT], m["tau_f"][_FIT])
+        fit_samples.keep(m, m["W_f"][_SLOW], m["tau_f"][_SLOW])
     if not (is_free and _gather_evidence(k, m, out)):
         return 0
     m["withheld_by"] = _contradicted_by(k, m)
@@ -567,7 +599,7 @@ def _contradicted_by(k: Any, m: Any) -> int:
     """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
     if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
         return ANCHOR
-    if not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(m)):
+    if not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(k, m)):
         return CHANGED
     if not earlier.is_no_more(k, m):
         return MORE
@@ -582,10 +614,10 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     """
     m["tested"] += 1.0
     termination.widen(dq, m["dq_low"], m["dq_high"])
-    sensitivity.follow_unit(k, m, _FIT, k["unit_test_share"])
+    sensitivity.follow_unit(k, m, _SLOW, k["unit_test_share"])
     has_moved = True
     for i in range(dq.shape[0]):
-        if not (abs(m["r"][_FIT, i]) <= m["test_limit_Nm"]):
+        if not (abs(m["r"][_SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
             return _REFUTED
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
@@ -604,9 +636,9 @@ def _refine(k: Any, m: Any, is_free: bool) -> None:
     """Learn on beside the model in use, and let what was learnt take over after its test."""
     if not is_free:
         return
-    sensitivity.follow_unit(k, m, _FIT, k["unit_share"])
+    sensitivity.follow_unit(k, m, _SLOW, k["unit_share"])
     sensitivity.relax(k, m)
-    if belief.learn(k, m, m["W_f"][_FIT], m["tau_f"][_FIT], m["held"]):
+    if belief.learn(k, m, m["W_f"][_LEARNT], m["tau_f"][_LEARNT], m["held"][_LEARNT], m["still"][_LEARNT]):
         belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])
     refinement.test_candidate(k, m)
 
@@ -616,7 +648,7 @@ def _gather_evidence(k: Any, m: Any, out: Any) -> bool:
     """Take this sample into the evidence and tell whether it is complete and the model can be an arm's."""
     termination.widen(out["q"], m["q_low"], m["q_high"])
     termination.widen(out["dq"], m["dq_low"], m["dq_high"])
-    termination.add_information(m["W_f"][_FIT], k["period_s"], m["information"])
+    termination.add_information(m["W_f"][_SLOW], k["period_s"], m["information"])
     if m["samples"] % _EIGENVALUE_EVERY == _EIGENVALUE_EVERY - 1:
         smallest, largest = termination.eigenvalue_range(m["information"], k["scale"], m["scratch"])
         m["excitation"] = smallest

@@ -7,7 +7,17 @@ included,
 
     size = Σ r w / Σ w²,    share = (Σ r w)² / (Σ w² Σ r²),    sigma = RESIDUAL_NM sqrt(correlated / Σ w²)
 
-Shapes: c (h, p), sums (h,).
+From r and w goes what the torque explains that a joint held at rest before, which the filter forgets with its share s
+of standstill: r - s Σ r s / Σ s², w likewise.
+
+Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each within
+HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at OFTEN_PER_H than at
+RARELY_PER_H by 1000 : 1. Three in seven minutes are.
+
+An arm that meets the next contact AT_REST_S after going on would never move far enough to tell what it is: the
+thresholds of the joints that showed it double, MOST_STRAIN times at most, and fall back as in `sensitivity`.
+
+Shapes: c (h, p), sums (h,), of the share of standstill (h, n) and (n,).
 """
 
 from collections import deque
@@ -19,7 +29,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
-from adacd_hil.scheme import belief
+from adacd_hil.scheme import belief, sensitivity
 
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""
@@ -40,8 +50,13 @@ PLAUSIBLE = 4.0
 """Deviations of the prior that a friction is at most."""
 AT_ONCE_S = 3.0
 """Another error than a payload strikes again so soon after the arm goes on; a person may wait."""
+AT_REST_S, MOST_STRAIN = 0.2, 4.0
+MANY, HELD_S = 8, 0.3
+WEAK = 1.5
+"""Of 1100 pushes of 0.1 to 3 Nm and 30 to 800 ms some in a hundred come to less."""
+RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
 _FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
-RESTING = 0.2
+RESTING = 0.6
 """Share of standstill in a filter's memory from which on a joint counts as resting."""
 
 
@@ -57,41 +72,67 @@ def constants_of(settings: Settings, count: int) -> dict[str, Vector]:
 def shapes_of() -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name."""
     causes = (1 + len(_FRICTIONS) * JOINTS,)
-    return {"cause_rw": causes, "cause_ww": causes, "contact_rr": ()}
+    each = (JOINTS,)
+    return {
+        "cause_rw": causes, "cause_ww": causes, "cause_ws": (*causes, JOINTS),
+        "contact_rr": (), "contact_peak": (), "contact_rs": each, "contact_ss": each,
+    }  # fmt: skip
+
+
+@compiled
+def _clear(m: Any) -> None:
+    m["cause_rw"][:] = 0.0
+    m["cause_ww"][:] = 0.0
+    m["cause_ws"][:] = 0.0
+    m["contact_rs"][:] = 0.0
+    m["contact_ss"][:] = 0.0
+    m["contact_rr"] = 0.0
+    m["contact_peak"] = 0.0
 
 
 @compiled
 def begin(k: Any, m: Any) -> None:
     """Begin a contact, with the samples that were held back."""
-    m["cause_rw"][:] = 0.0
-    m["cause_ww"][:] = 0.0
-    m["contact_rr"] = 0.0
+    _clear(m)
+    _follow_peak(m)
     for s in range(int(m["ring_used"])):
         for i in range(m["ring_tau"].shape[1]):
-            if m["ring_R"][s, i] != np.inf:
-                _add(k, m, m["ring_W"][s, i], m["ring_tau"][s, i], k["learn_every"])
+            if m["ring_still"][s, i] < RESTING:
+                _add(k, m, i, m["ring_W"][s, i], m["ring_tau"][s, i], m["ring_still"][s, i], k["learn_every"])
 
 
 @compiled
 def weigh(k: Any, m: Any) -> None:
     """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
+    _follow_peak(m)
     for i in range(m["tau_f"].shape[1]):
-        if m["still"][FILTER, i] < RESTING:
-            _add(k, m, m["W_f"][FILTER, i], m["tau_f"][FILTER, i], 1.0)
+        if m["still"][FILTER, i] < RESTING and abs(m["dq_old"][i]) > belief.SLOW_RAD_S:
+            _add(k, m, i, m["W_f"][FILTER, i], m["tau_f"][FILTER, i], m["still"][FILTER, i], 1.0)
 
 
 @compiled
-def _add(k: Any, m: Any, w: Vector, tau: float, weight: float) -> None:
+def _follow_peak(m: Any) -> None:
+    for c in range(m["y"].shape[0]):
+        for i in range(m["y"].shape[1]):
+            m["contact_peak"] = max(m["contact_peak"], abs(m["y"][c, i]) / m["h"][c, i])
+
+
+@compiled
+def _add(k: Any, m: Any, i: int, w: Vector, tau: float, still: float, weight: float) -> None:
+    """Take in one row w (p,) of joint i."""
     r = -tau
     for j in range(w.shape[0]):
         r += w[j] * m["theta"][j]
     m["contact_rr"] += weight * r * r
+    m["contact_rs"][i] += weight * r * still
+    m["contact_ss"][i] += weight * still * still
     for h in range(m["cause_rw"].shape[0]):
         left = 0.0
         for j in range(w.shape[0]):
             left -= w[j] * k["causes"][h, j]
         m["cause_rw"][h] += weight * r * left
         m["cause_ww"][h] += weight * left * left
+        m["cause_ws"][h, i] += weight * left * still
 
 
 class Verdict(NamedTuple):
@@ -102,11 +143,15 @@ class Verdict(NamedTuple):
 
 
 class _Weighed(NamedTuple):
-    """One contact's sums (h,). waited_s: from when the arm went on to its begin; ended_s: when it was over."""
+    """One contact's sums (h,). waited_s: from when the arm went on to its begin; ended_s: when it was over.
+
+    peak: largest residual over its threshold; 0 of none.
+    """
 
     rw: Vector
     ww: Vector
     rr: float
+    peak: float
     waited_s: float
     ended_s: float
 
@@ -121,10 +166,18 @@ class Doubt:
         self._contacts: deque[_Weighed] = deque(maxlen=MOST)
         self._monitored_s = 0.0
         self._waited_s = 0.0
+        self._log_odds, self._weak = 0.0, 0
+
+    def compile(self) -> None:
+        """Call what is compiled once, on a copy, so that nothing compiles later."""
+        memory = self._memory.copy()
+        _clear(memory)
+        sensitivity.strain(memory, MOST_STRAIN)
 
     def forget(self) -> None:
         """Begin with a new certificate."""
         self._contacts.clear()
+        self._log_odds, self._weak = 0.0, 0
 
     def go_on(self, cycle: int) -> None:
         """Take in that the arm monitors from this cycle on."""
@@ -133,20 +186,21 @@ class Doubt:
     def begin(self, cycle: int, is_touched: bool) -> None:
         """Take in that the arm reacts, to a touch or, as where the host is late, to none."""
         self._waited_s = cycle * self._period_s - self._monitored_s
+        likelier = (OFTEN_PER_H - RARELY_PER_H) / 3600.0 * self._waited_s
+        self._log_odds = max(self._log_odds - likelier, 0.0)
+        if is_touched and self._waited_s < AT_REST_S:
+            sensitivity.strain(self._memory, MOST_STRAIN)
         if not is_touched:
-            for name in ("cause_rw", "cause_ww", "contact_rr"):
-                self._memory[name] = 0.0
+            _clear(self._memory)
 
     def end(self, cycle: int) -> Verdict | None:
         """Take in that it has ended; return what the last ones look like, if they have one cause."""
         now_s = cycle * self._period_s
         m = self._memory
-        self._contacts.append(
-            _Weighed(m["cause_rw"].copy(), m["cause_ww"].copy(), float(m["contact_rr"]), self._waited_s, now_s)
-        )
+        self._contacts.append(_weighed(m, self._waited_s, now_s))
         while self._contacts[0].ended_s < now_s - WITHIN_S:
             self._contacts.popleft()
-        return self._payload() or self._other()
+        return self._payload() or self._other() or self._unexplained()
 
     def _payload(self) -> Verdict | None:
         for count in range(FEWEST_LOADED, len(self._contacts) + 1):
@@ -168,9 +222,27 @@ class Doubt:
             ww = sum(contact.ww[h] for contact in last)
             if size is not None and abs(size) > SURE * self._sigma(ww) and self._can_be(h, size):
                 joint, kind = divmod(h - 1, len(_FRICTIONS))
-                sigma = 2.0 * self._sigma(ww)
+                ww = sum(contact.ww[h] for contact in last[1:])  # the first may have begun with the change
+                size, sigma = sum(contact.rw[h] for contact in last[1:]) / ww, 2.0 * self._sigma(ww)
                 return Verdict(f"{len(last)} contacts look like {_words(kind, joint, size, sigma)}", is_payload=False)
         return None
+
+    def _unexplained(self) -> Verdict | None:
+        """Count a weak contact; return what is to be said if no person is likely to touch so."""
+        last = list(self._contacts)[-MANY:]
+        if 0.0 < last[-1].peak < WEAK and last[-1].waited_s >= AT_REST_S:
+            self._log_odds += np.log(OFTEN_PER_H / RARELY_PER_H)
+            self._weak += 1
+        text = ""
+        if len(last) == MANY and max(contact.waited_s for contact in last[1:]) < HELD_S:
+            text = f"{MANY} contacts came within {HELD_S:g} s of going on each"
+        elif self._log_odds > np.log(ODDS):
+            text = f"{self._weak} contacts came to less than {WEAK:g} times their threshold"
+        if not text:
+            return None
+        return Verdict(
+            f"{text}, and no one error explains them: a light touch, or the arm has changed", is_payload=False
+        )
 
     def _can_be(self, h: int, size: float) -> bool:
         """Tell whether an arm may have so much more of a friction than the model: none has less than none."""
@@ -194,6 +266,16 @@ class Doubt:
 
     def _sigma(self, ww: float) -> float:
         return float(RESIDUAL_NM * np.sqrt(self._correlated / ww))
+
+
+def _weighed(m: Any, waited_s: float, now_s: float) -> _Weighed:
+    """Return a contact's sums, less what the torque that each joint has held at rest explains of them."""
+    ss = np.maximum(m["contact_ss"], 1e-12)
+    rs, ws = m["contact_rs"], m["cause_ws"]
+    rw = m["cause_rw"] - ws @ (rs / ss)
+    ww = np.maximum(m["cause_ww"] - (ws * ws) @ (1.0 / ss), 0.0)
+    rr = float(m["contact_rr"] - np.sum(rs * rs / ss))
+    return _Weighed(rw, ww, rr, float(m["contact_peak"]), waited_s, now_s)
 
 
 def _explained(contacts: list[_Weighed], h: int) -> float:

@@ -50,6 +50,8 @@ from adacd_hil.scheme.sensitivity import LARGEST_UNIT, UNIT_PEAK
 
 STEADY = 200.0
 """Squared distance over u at which a fit has changed. 200 untouched arms, wide ones included: 113 at most."""
+LEARNT_SHARE = 2.5
+"""How many times the rms of the learnt residuals, of their better part, it may differ beside that."""
 LATER_NM = 0.02
 """Of 220 untouched arms, wide ones included, the worst came to 0.95 of this, half of them to 0.35."""
 APART_STEPS = 6
@@ -61,7 +63,7 @@ STEPS = 8
 """The fit's own earlier beliefs: how far apart, and how many."""
 KEPT = STEPS + 1
 """How many beliefs may be kept: the steps, and a model that its test has refuted."""
-BACK = 2
+BACK = 1
 """Steps before a contact of which the last is kept: a touch begins before it is seen."""
 SIGMAS = 3.5
 """Of 160 untouched arms, wide ones included, no step differed from the whole fit by more than 2.1."""
@@ -224,14 +226,20 @@ def is_steady(m: Any) -> bool:
     used, steps = int(m["steps_used"]), m["steps_rows"].shape[0]
     for number in range(used - 1, max(used - steps, 0) - 1, -1):
         s = number % steps
-        early = m["steps_square"][s] / max(m["steps_rows"][s], 1.0)
-        late = (m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0)
         distance = later_samples.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
-        if not distance <= STEADY * max(min(early, late), SMALLEST_SQUARE):
+        if not distance <= STEADY * max(_better_square(m, s), SMALLEST_SQUARE):
             if m["has_kept"] == 0.0:
                 _keep_steps(m, number)
             return False
     return True
+
+
+@compiled
+def _better_square(m: Any, s: int) -> float:
+    """Return u of the residuals up to step s, or of those after it, the smaller."""
+    early = m["steps_square"][s] / max(m["steps_rows"][s], 1.0)
+    late = (m["fit_square"] - m["steps_square"][s]) / max(m["fit_rows"] - m["steps_rows"][s], 1.0)
+    return float(min(early, late))
 
 
 @compiled
@@ -244,7 +252,7 @@ def is_explained(k: Any, m: Any) -> bool:
 
 
 @compiled
-def is_borne_out(m: Any) -> bool:
+def is_borne_out(k: Any, m: Any) -> bool:
     """Tell whether the fit's later samples alone come to its torque; if not, keep all that it had come to on the way.
 
     Not asked of a payload's fit.
@@ -255,8 +263,9 @@ def is_borne_out(m: Any) -> bool:
     limit_Nm = LATER_NM + later_samples.RMS_SHARE * fit_samples.better_rms(m)
     for number in range(max(used - steps, 0), used):
         s = number % steps
+        noise_Nm = LEARNT_SHARE * k["residual_Nm"] * np.sqrt(_better_square(m, s))
         is_found = later_samples.find(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
-        if not (is_found and fit_samples.largest_torque(m, m["later"]) <= limit_Nm):
+        if not (is_found and fit_samples.largest_torque(m, m["later"]) <= limit_Nm + noise_Nm):
             if m["has_kept"] == 0.0:
                 _keep_steps(m, used - 1)
             return False

@@ -18,7 +18,10 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import FRICTION_TERMS
 from adacd_hil.records import Vector
 
-STRIBECK, LOAD, ASYMMETRIC, WIDTH = range(len(FRICTION_TERMS))
+STRIBECK, LOAD, ASYMMETRIC, WIDTH, DAHL_SHORT, DAHL_LONG = range(len(FRICTION_TERMS))
+
+SHARES = {"load": 0.25, "dahl": 0.5}
+"""Of the prior of further friction, by how a term's name begins; of the others all of it."""
 
 
 @compiled
@@ -30,12 +33,28 @@ def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
 
 
 @compiled
+def bend(dq: Vector, period_s: float, still_rad_s: float, dahl_rad: Vector, bent: Vector) -> None:
+    """Take the bristles of each length (2,) over one period: `bent` (2, n) from -1 to 1, where they slide."""
+    for length in range(bent.shape[0]):
+        for i in range(dq.shape[0]):
+            if abs(dq[i]) >= still_rad_s:
+                sign = np.sign(dq[i])
+                bent[length, i] = sign + (bent[length, i] - sign) * np.exp(-abs(dq[i]) * period_s / dahl_rad[length])
+
+
+@compiled
 def fill_terms(
-    dq: Vector, tau_J: Vector, terms: Vector, speeds: tuple[float, float, float], first_column: int, Y_h: Vector
+    dq: Vector,
+    tau_J: Vector,
+    terms: Vector,
+    speeds: tuple[float, float, float],
+    bent: Vector,
+    first_column: int,
+    Y_h: Vector,
 ) -> None:
     """Fill the columns of the optional terms, numbers as in `FRICTION_TERMS`, from `first_column` on.
 
-    speeds: still, width w and v_s, rad/s.
+    speeds: still, width w and v_s, rad/s. bent (2, n): of the bristles, see `bend`.
     """
     count = dq.shape[0]
     still_rad_s, width_rad_s, stribeck_rad_s = speeds
@@ -48,6 +67,8 @@ def fill_terms(
                 value = sign * abs(tau_J[i])
             elif terms[position] == ASYMMETRIC:
                 value = abs(sign)
+            elif terms[position] == DAHL_SHORT or terms[position] == DAHL_LONG:
+                value = bent[0 if terms[position] == DAHL_SHORT else 1, i] - sign
             else:
                 x = dq[i] / width_rad_s if width_rad_s > 0.0 else 0.0
                 value = -x / np.cosh(min(abs(x), 300.0)) ** 2

@@ -52,9 +52,12 @@ MOST_FILLED = 4
 
 
 @compiled
-def is_filled(steps: int, period_s: float, nominal_s: float) -> bool:
-    """Tell whether a sample follows the one before it near enough. steps: periods between them, taking period_s."""
-    if not 1 <= steps <= MOST_FILLED + 1:
+def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
+    """Tell whether a sample follows the one before it near enough. steps: periods between them, taking period_s.
+
+    most: missing samples that may be put on the line between them.
+    """
+    if not 1 <= steps <= most + 1:
         return False
     return bool(_SHORTEST_SHARE * nominal_s * steps <= period_s <= _LONGEST_SHARE * nominal_s * steps)
 
@@ -243,7 +246,7 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
     a, b = c["a_rad_s"], c["b_rad_s"]
     nominal_s: float = c["period_s"]
     period_s: float = out["period_s"][0]
-    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s)
+    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
         decay, old, new = c["decay"], c["weight_old"], c["weight_new"]

@@ -1,9 +1,10 @@
 """The thresholds of the certified scheme: what each channel of the bank may show without a contact.
 
-    h = e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)²) + F_c s
+    h = max(e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)² + G) + pull, tail) + F_c s
 
 - sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
   that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
+  Its steps add their own noise and pull (`follow_torque_step`).
 - nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
   counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.335 (s / 200) /
   (1 + a / 600) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
@@ -13,6 +14,7 @@
   too: a bound, since |F x| <= F |x|.
 - R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
 - e: 1, or more of a joint that has shown contacts while the arm learnt (`strain`).
+- G: what lost samples leave open (`lost_samples`). tail: floor by the largest residual seen (`tail`).
 - s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
   where it is in the model, and as much more as these are uncertain.
 
@@ -53,7 +55,7 @@ LARGEST_UNIT = 9.0
 """Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
 UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
-UNIT_TEST_S = 0.6
+UNIT_TEST_S = 0.3
 """The same while a frozen model is tested: begun with a unit of 1 it ends near a quarter of it if all is well."""
 
 _SMOOTHED_SHARE = 0.335 / 200.0
@@ -68,9 +70,10 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
     width = np.concatenate([a * s / (a + s), a[1:]])
     share = np.concatenate([_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), np.ones(a.size - 1)])
     nu = certified.velocity_noise_rad_s * np.concatenate([a, a[1:]]) * np.minimum(share, 1.0)
-    sigma_squared = certified.torque_noise_Nm**2 * 0.5 * period_s * width
+    gain = certified.noise_sigmas**2 * 0.5 * period_s * width
     return {
-        "torque_variance": certified.noise_sigmas**2 * sigma_squared,
+        "torque_variance": certified.torque_noise_Nm**2 * gain,
+        "torque_gain": gain,
         "velocity_variance": nu**2,
         "velocity_noise_rad_s": np.array(certified.velocity_noise_rad_s),
         "roughness_share": np.array(period_s / ROUGHNESS_S),
@@ -94,6 +97,20 @@ def follow_standstill(
 
 
 @compiled
+def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
+    """Take one sample into the sensors' step L (n,), the smallest change ever seen, and how far it pulls their mean.
+
+    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most.
+    """
+    for i in range(tau_J.shape[0]):
+        change = abs(tau_J[i] - m["last"][2, i])
+        if change > 0.0 and (m["torque_step_Nm"][i] == 0.0 or change < m["torque_step_Nm"][i]):
+            m["torque_step_Nm"][i] = change
+            variance = k["torque_noise_Nm"] ** 2 * m["roughness"][i]
+            m["torque_pull_Nm"][i] = change / np.pi * np.exp(-2.0 * np.pi**2 * variance / change**2)
+
+
+@compiled
 def follow_velocity_noise(k: Any, m: Any, dq: Vector) -> None:
     """Take one sample without a gap into the roughness (n,) of the velocity: its noise over the settings', squared.
 
@@ -113,7 +130,7 @@ def follow_velocity_noise(k: Any, m: Any, dq: Vector) -> None:
 
 
 @compiled
-def strain(m: Any) -> None:
+def strain(m: Any, largest: float) -> None:
     """Doubt the thresholds of the joints that are over theirs now: a contact while learning may be the model's failure.
 
     Once it may be a hand; again and again it is what no parameter explains, such as backlash. Then the arm is armed
@@ -122,7 +139,7 @@ def strain(m: Any) -> None:
     for i in range(m["strain"].shape[0]):
         for c in range(m["y"].shape[0]):
             if not (abs(m["y"][c, i]) <= m["h"][c, i]):
-                m["strain"][i] = min(STRAIN * m["strain"][i], LARGEST_STRAIN)
+                m["strain"][i] = min(STRAIN * m["strain"][i], max(largest, m["strain"][i]))
                 break
 
 
@@ -141,10 +158,13 @@ def relax(k: Any, m: Any) -> None:
 
 @compiled
 def follow_unit(k: Any, m: Any, fit: int, share: float) -> None:
-    """Take one sample without contact into the unit (n,) of the belief's variances; share: what it counts."""
+    """Take one sample without contact into the unit (n,) of the belief's variances; share: what it counts.
+
+    fit: filter by whose residual. In a faster one the velocity's noise would count as the model's error.
+    """
     for i in range(m["unit"].shape[0]):
         w = m["W_f"][fit, i]
-        believed = k["residual_Nm"] ** 2 + m["held"][i] ** 2
+        believed = k["residual_Nm"] ** 2 + m["held"][fit, i] ** 2
         for j in range(w.shape[0]):
             row = 0.0
             for n in range(w.shape[0]):
@@ -169,22 +189,23 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
         for c in range(filters):
             g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
             m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
-            h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i], hold * m["still_smooth"][c, i])
+            h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i]) + hold * m["still_smooth"][c, i]
             if c > 0:
                 bare = filters + c - 1
-                h[bare, i] = _threshold(k, m, bare, i, momentum, g, hold * m["still"][c, i])
+                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * m["still"][c, i]
 
 
 @compiled
-def follow_friction(k: Any, m: Any, fit: int) -> None:
-    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in filter `fit` now, Nm.
+def follow_friction(k: Any, m: Any) -> None:
+    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in each filter (C, n) now, Nm.
 
     Friction at rest is no noise that averages out: of a joint that mostly rested it is inf, so nothing is learnt.
     """
     for i in range(m["hold"].shape[0]):
         m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i)
-        share = m["still"][fit, i]
-        m["held"][i] = m["hold"][i] * share if share < RESTING else np.inf
+        for c in range(m["held"].shape[0]):
+            share = m["still"][c, i]
+            m["held"][c, i] = m["hold"][i] * share if share < RESTING else np.inf
 
 
 @compiled
@@ -200,9 +221,14 @@ def _static_friction(k: Any, m: Any, joint: int) -> float:
 
 
 @compiled
-def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float, held: float) -> float:
+def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float) -> float:
+    """Return a channel's threshold but for standstill, and keep what it is without the floor."""
+    filters = m["lost"].shape[0]
+    lost = m["lost"][channel if channel < filters else channel - filters + 1, joint]
     noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
-    return float(m["strain"][joint] * np.sqrt(noise + g * g) + held)
+    noise += k["torque_gain"][channel] * m["torque_step_Nm"][joint] ** 2 / 12.0 + lost
+    m["h_model"][channel, joint] = m["strain"][joint] * np.sqrt(noise + g * g) + m["torque_pull_Nm"][joint]
+    return float(max(m["h_model"][channel, joint], m["tail_Nm"][channel, joint]))
 
 
 @compiled

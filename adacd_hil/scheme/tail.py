@@ -1,0 +1,96 @@
+"""The tail of the residuals: no threshold is below what the largest residual seen lets expect for an hour.
+
+A threshold follows from noise and from what the belief leaves open. What is neither, a friction that sticks at one
+place or a sensor that errs, shows as a residual that comes near. With excursions above a level that die out like a
+Gaussian's, nu of them a second that are independent, and the largest of T seconds known, the largest of 1 / RATE is
+
+    m(T) = sqrt(ln(nu / RATE) / ln(nu T)) times that,    nu = cut-off / pi,    T >= 1 s, m <= LARGEST
+
+The largest counts when its block is over and the one after it: what is held back from a contact is no residual. More
+than the threshold without this floor it never is, so who pushes a little below the threshold again and again raises it
+by m at most. It is forgotten over FORGOTTEN_S of motion.
+
+Shapes: peak, peak_now, peak_last, tail_Nm (2 C - 1, n). Units: Nm.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, Vector
+
+RATE_HZ = 1.0 / 3600.0
+"""Excursions over the floor that are expected: one an hour."""
+LARGEST = 3.0
+FORGOTTEN_S = 600.0
+BLOCK_S = 0.064
+"""Longer than a touch is held back before it is seen."""
+MOVING = 0.05
+"""Share of standstill in a filter's memory below which friction is what the model says it is."""
+
+
+def constants_of(settings: Settings) -> dict[str, Vector]:
+    """Return `excursions_Hz` (2 C - 1,) and `block_cycles`."""
+    a = np.array(settings.certified.cutoffs_rad_s)
+    return {
+        "excursions_Hz": np.concatenate([a, a[1:]]) / np.pi,
+        "block_cycles": np.array(max(round(BLOCK_S / settings.bus.period_s), 1)),
+    }
+
+
+def shapes_of(channels: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    each = (channels, JOINTS)
+    return {"peak": each, "peak_now": each, "peak_last": each, "tail_Nm": each, "block_used": (), "tail_s": ()}
+
+
+@compiled
+def begin(m: Any) -> None:
+    """Begin with a model that no residual has been seen of."""
+    m["peak"][:] = 0.0
+    m["tail_Nm"][:] = 0.0
+    m["tail_s"] = 0.0
+    discard(m)
+
+
+@compiled
+def discard(m: Any) -> None:
+    """Throw away the residuals of the last block and the one under way: a contact is near."""
+    m["peak_now"][:] = 0.0
+    m["peak_last"][:] = 0.0
+    m["block_used"] = 0.0
+
+
+@compiled
+def follow(k: Any, m: Any) -> None:
+    """Take in one sample without contact."""
+    filters = m["r"].shape[0]
+    for c in range(m["y"].shape[0]):
+        still = m["still_smooth"][c] if c < filters else m["still"][c - filters + 1]
+        for i in range(m["y"].shape[1]):
+            if still[i] < MOVING:
+                seen = min(abs(m["y"][c, i]), m["h_model"][c, i])
+                m["peak_now"][c, i] = max(m["peak_now"][c, i], seen)
+    m["block_used"] += 1.0
+    if m["block_used"] < k["block_cycles"]:
+        return
+    block_s = m["block_used"] * k["period_s"]
+    m["block_used"] = 0.0
+    if np.any(m["peak_last"] > 0.0):
+        m["tail_s"] += block_s
+    for c in range(m["y"].shape[0]):
+        factor = _factor(k["excursions_Hz"][c], m["tail_s"])
+        for i in range(m["y"].shape[1]):
+            m["peak"][c, i] = max(m["peak"][c, i] * (1.0 - block_s / FORGOTTEN_S), m["peak_last"][c, i])
+            m["tail_Nm"][c, i] = factor * m["peak"][c, i]
+            m["peak_last"][c, i] = m["peak_now"][c, i]
+            m["peak_now"][c, i] = 0.0
+
+
+@compiled
+def _factor(excursions_Hz: float, seen_s: float) -> float:
+    """Return m(T)."""
+    share = np.log(excursions_Hz / RATE_HZ) / np.log(max(excursions_Hz * max(seen_s, 1.0), 1.01))
+    return float(min(np.sqrt(max(share, 1.0)), LARGEST))
