@@ -48,6 +48,10 @@ PARAMETER_UNITS = {
     "asymmetric2": "Nm",
     "width1": "Nm",
     "width2": "Nm",
+    "dahl_short1": "Nm",
+    "dahl_short2": "Nm",
+    "dahl_long1": "Nm",
+    "dahl_long2": "Nm",
 }
 
 
