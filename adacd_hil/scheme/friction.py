@@ -4,12 +4,16 @@
     load         sgn(dq) |tau_J|                friction in proportion to the transmitted torque, Nm/Nm
     asymmetric   |sgn(dq)|                      half the difference of the two directions' Coulomb friction, Nm
     width        -x / cosh²(x), x = dq / w      a width of tanh that is not w, to first order: F_c log(width / w), Nm
+    dahl_short   z - sgn(dq)                    what Coulomb friction lacks after a reversal, until bristles of a length
+    dahl_long                                   d have bent the other way: z' = dq (1 - z sgn(dq)) / d, Nm
 
 sgn stands for tanh(dq / w), or with w = 0 for the sign itself, 0 of a joint that may stand still (no `width` then).
 One parameter per joint and term, in the order of the settings. While a joint moves its asymmetry looks like an offset
 of its torque sensor; only rest tells the two apart.
 
-Shapes: dq, tau_J (n,); Y_h (n, p).
+Bristles don't bend while a joint may stand still. Two lengths together stand for those between them.
+
+Shapes: dq, tau_J (n,); bent (2, n): z of the short and of the long ones; Y_h (n, p).
 """
 
 import numpy as np
