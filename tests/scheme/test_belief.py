@@ -45,6 +45,13 @@ def test_nothing_is_expected_of_an_arm_but_the_velocity_s_usual_lag():
     np.testing.assert_array_equal(prior()["belief"], expected)
 
 
+def test_of_further_friction_load_may_be_a_quarter_and_bristles_half():
+    further = SETTINGS.certified.prior_std[-1]
+    std = dict(zip(NAMES, np.sqrt(np.diag(prior()["P_belief"])), strict=True))
+    shares = {"stribeck1": 1.0, "load2": 0.25, "dahl_short1": 0.5, "dahl_long2": 0.5}
+    assert {name: std[name] / further for name in shares} == pytest.approx(shares)
+
+
 def test_what_is_learnt_is_the_closed_form_of_every_fourth_sample_that_has_waited():
     """P = (P0^-1 + sum W' W / R)^-1, theta = P (P0^-1 theta0 + sum W' tau / R).
 
@@ -56,7 +63,7 @@ def test_what_is_learnt_is_the_closed_form_of_every_fourth_sample_that_has_waite
     theta0, P0 = m["belief"].copy(), m["P_belief"].copy()
     teach(m, W_f, tau_f, held)
     learnt = slice(EVERY - 1, len(W_f) - WAITING * EVERY, EVERY)
-    a, learn_s = SETTINGS.certified.cutoffs_rad_s[0], EVERY * 1e-3  # noise through a filter is correlated over 2 / a
+    a, learn_s = SETTINGS.certified.cutoffs_rad_s[1], EVERY * 1e-3  # noise through a filter is correlated over 2 / a
     R = (SETTINGS.certified.residual_Nm**2 + held[learnt] ** 2) * 2.0 / (a * learn_s)
     information = np.linalg.inv(P0) + np.einsum("nij,ni,nik->jk", W_f[learnt], 1.0 / R, W_f[learnt])
     correlation = np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W_f[learnt], tau_f[learnt] / R)
@@ -65,8 +72,8 @@ def test_what_is_learnt_is_the_closed_form_of_every_fourth_sample_that_has_waite
 
 
 def test_samples_closer_than_their_noise_changes_count_for_less_but_never_for_more_than_one():
-    a = SETTINGS.certified.cutoffs_rad_s[0]
-    for every, correlated in ((EVERY, 2.0 / (a * EVERY * 1e-3)), (100, 2.0), (300, 1.0)):
+    a = SETTINGS.certified.cutoffs_rad_s[1]
+    for every, correlated in ((EVERY, 2.0 / (a * EVERY * 1e-3)), (20, 2.0), (60, 1.0)):
         settings = replace(SETTINGS, certified=replace(SETTINGS.certified, learn_every=every))
         assert float(certified_kernel.constants_of(settings)["correlated"][0]) == pytest.approx(correlated)
 

@@ -9,7 +9,7 @@ from adacd_hil.scheme import certified_kernel, refinement
 CONSTANTS = certified_kernel.constants_of(SETTINGS)
 K = CONSTANTS[0]
 COUNT = len(NAMES)
-TRUE = np.array([0.4, 0.07, 0.04, 0.1, 0.05, 0.1, 0.08, 0.02, -0.01, 0.001, 0.001, 0.0, 0.0])
+TRUE = np.concatenate([[0.4, 0.07, 0.04, 0.1, 0.05, 0.1, 0.08, 0.02, -0.01, 0.001, 0.001], np.zeros(COUNT - 11)])
 CYCLES = 20
 
 

@@ -35,7 +35,7 @@ def known_arm(seed=1):
 
 def thresholds_of(m):
     h = np.zeros((len(CHANNELS), 2))
-    sensitivity.follow_friction(K, m, 0)
+    sensitivity.follow_friction(K, m)
     sensitivity.fill_thresholds(K, m, h)
     return h
 
@@ -261,8 +261,9 @@ def units_after(share, count, unit=1.0):
     """Return the unit after samples whose squared residual is this share (2,) of what is believed."""
     m = known_arm()
     m["unit"][:] = unit
-    m["held"][:] = 0.0, 0.3
-    believed = CERTIFIED.residual_Nm**2 + m["held"] ** 2 + np.einsum("ij,jk,ik->i", m["W_f"][0], m["P"], m["W_f"][0])
+    m["held"][:] = [[0.0, 0.3], [0.1, 0.2], [0.4, 0.0]]
+    believed = CERTIFIED.residual_Nm**2 + m["held"][0] ** 2
+    believed += np.einsum("ij,jk,ik->i", m["W_f"][0], m["P"], m["W_f"][0])
     m["r"][0] = np.sqrt(share * believed)
     for _ in range(count):
         sensitivity.follow_unit(K, m, 0, K["unit_share"])
