@@ -4,21 +4,32 @@ import numpy as np
 import pytest
 
 from adacd_hil.config import FRICTION_TERMS
-from adacd_hil.scheme.friction import ASYMMETRIC, LOAD, STRIBECK, WIDTH, fill_terms, smooth_sign
+from adacd_hil.scheme.friction import (
+    ASYMMETRIC,
+    DAHL_LONG,
+    DAHL_SHORT,
+    LOAD,
+    STRIBECK,
+    WIDTH,
+    bend,
+    fill_terms,
+    smooth_sign,
+)
 
 STILL, NO_WIDTH, V_S = 0.002, 0.0, 0.05
 DQ, TAU_J = np.array([0.04, -0.3]), np.array([-2.0, 3.0])
+BENT = np.array([[0.5, -1.0], [-0.4, 0.2]])
 
 
-def columns(terms, dq=DQ, tau_J=TAU_J, width=NO_WIDTH, first_column=3):
+def columns(terms, dq=DQ, tau_J=TAU_J, width=NO_WIDTH, bent=BENT, first_column=3):
     Y_h = np.zeros((2, first_column + 2 * len(terms)))
-    fill_terms(dq, tau_J, np.array(terms, float), (STILL, width, V_S), first_column, Y_h)
+    fill_terms(dq, tau_J, np.array(terms, float), (STILL, width, V_S), bent, first_column, Y_h)
     return Y_h[:, first_column:]
 
 
 def test_the_numbers_of_the_terms_are_their_places_in_the_settings():
-    names = [FRICTION_TERMS[term] for term in (STRIBECK, LOAD, ASYMMETRIC, WIDTH)]
-    assert names == ["stribeck", "load", "asymmetric", "width"]
+    names = [FRICTION_TERMS[term] for term in (STRIBECK, LOAD, ASYMMETRIC, WIDTH, DAHL_SHORT, DAHL_LONG)]
+    assert names == ["stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long"]
 
 
 @pytest.mark.parametrize(
@@ -27,6 +38,8 @@ def test_the_numbers_of_the_terms_are_their_places_in_the_settings():
         (STRIBECK, [np.exp(-0.64), -np.exp(-36.0)]),
         (LOAD, [2.0, -3.0]),
         (ASYMMETRIC, [1.0, 1.0]),
+        (DAHL_SHORT, [-0.5, 0.0]),
+        (DAHL_LONG, [-1.4, 1.2]),
     ],
 )
 def test_each_term_has_a_column_per_joint(term, expected):
@@ -40,7 +53,7 @@ def test_the_columns_follow_the_order_of_the_settings():
 
 def test_columns_before_the_first_are_left_alone():
     Y_h = np.full((2, 7), 9.0)
-    fill_terms(DQ, TAU_J, np.array([1.0]), (STILL, NO_WIDTH, V_S), 5, Y_h)
+    fill_terms(DQ, TAU_J, np.array([1.0]), (STILL, NO_WIDTH, V_S), BENT, 5, Y_h)
     np.testing.assert_array_equal(Y_h[:, :5], 9.0)
 
 
@@ -77,3 +90,87 @@ def test_a_joint_that_may_stand_still_has_no_direction_unless_it_is_smooth(dq, w
 
 def test_a_joint_that_stands_still_has_no_column():
     np.testing.assert_array_equal(columns([STRIBECK, LOAD, ASYMMETRIC], dq=np.zeros(2)), 0.0)
+
+
+PERIOD_S, FINE = 1e-3, 50
+LENGTHS_RAD = np.array([0.001, 0.004])
+
+
+def swing(fastest_rad_s, t_s):
+    return fastest_rad_s * np.sin(2.0 * np.pi * t_s - 0.3)
+
+
+def dahl_friction(length_rad, fastest_rad_s, samples):
+    """Return z (n,) of z' = dq (1 - z sgn(dq)) / d at each sample of a swing, by steps of a fiftieth of a period."""
+    z, step_s, at_samples = -1.0, PERIOD_S / FINE, []
+    t_s = (np.arange(samples * FINE) + 0.5) * step_s - PERIOD_S
+    for k, dq in enumerate(swing(fastest_rad_s, t_s).tolist()):
+        z += step_s * (dq - z * abs(dq)) / length_rad
+        if k % FINE == FINE - 1:
+            at_samples.append(z)
+    return np.array(at_samples)
+
+
+def seen_columns(fastest_rad_s, samples):
+    """Return the sign and the columns of both lengths (n, 3) of the same swing, sampled."""
+    bent, rows = np.full((2, 1), -1.0), []
+    for dq in swing(fastest_rad_s, np.arange(samples) * PERIOD_S)[:, None]:
+        bend(dq, PERIOD_S, STILL, LENGTHS_RAD, bent)
+        both = np.zeros((1, 2))
+        fill_terms(dq, np.zeros(1), np.array([DAHL_SHORT, DAHL_LONG], float), (STILL, NO_WIDTH, V_S), bent, 0, both)
+        rows.append([smooth_sign(dq[0], STILL, NO_WIDTH), *both[0]])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("fastest_rad_s", [0.05, 0.3, 1.5])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_dahl_friction_is_coulomb_friction_and_as_much_of_its_column(place, fastest_rad_s):
+    """The faster, the further a joint turns within the sample in which it turns round."""
+    F_c, columns_of = 0.4, seen_columns(fastest_rad_s, 1500)
+    friction_Nm = F_c * dahl_friction(LENGTHS_RAD[place], fastest_rad_s, 1500)
+    left = friction_Nm - F_c * (columns_of[:, 0] + columns_of[:, 1 + place])
+    assert np.abs(left).max() < 0.07 * F_c
+    assert np.sqrt(np.mean(left**2)) < 0.012 * F_c
+    without = friction_Nm - F_c * columns_of[:, 0]
+    assert np.abs(without).max() > 1.9 * F_c
+    learnt, *_ = np.linalg.lstsq(columns_of[:, [0, 1 + place]], friction_Nm)
+    np.testing.assert_allclose(learnt, [F_c, F_c], rtol=0.035)
+
+
+@pytest.mark.parametrize("fastest_rad_s", [0.05, 0.3, 1.5])
+def test_bristles_of_a_length_between_the_two_are_a_mixture_of_them(fastest_rad_s):
+    columns_of, friction = seen_columns(fastest_rad_s, 1500), dahl_friction(0.002, fastest_rad_s, 1500)
+    learnt, *_ = np.linalg.lstsq(columns_of, friction)
+    np.testing.assert_allclose(learnt, [1.0, 0.55, 0.5], atol=0.07)
+    left, without = friction - columns_of @ learnt, friction - columns_of[:, 0]
+    assert np.abs(left).max() < 0.11
+    assert np.sqrt(np.mean(left**2)) < 0.09 * np.sqrt(np.mean(without**2))
+
+
+@pytest.mark.parametrize("dq", [0.3, -0.3])
+def test_bristles_bend_over_the_way_not_the_time_and_in_steady_sliding_the_column_is_nothing(dq):
+    """After the way d from the opposite direction 2 / e of the reversal is left."""
+    by_steps, at_once = np.full((2, 2), -np.sign(dq)), np.full((2, 2), -np.sign(dq))
+    way_s = LENGTHS_RAD[1] / abs(dq)
+    for _ in range(8):
+        bend(np.full(2, dq), way_s / 8.0, STILL, LENGTHS_RAD, by_steps)
+    bend(np.full(2, dq), way_s, STILL, LENGTHS_RAD, at_once)
+    np.testing.assert_allclose(by_steps, at_once, rtol=1e-12)
+    both = columns([DAHL_SHORT, DAHL_LONG], dq=np.full(2, dq), bent=at_once)
+    left = -2.0 * np.sign(dq) * np.exp([-4.0, -1.0])
+    np.testing.assert_allclose(both, np.hstack([left[0] * np.eye(2), left[1] * np.eye(2)]), rtol=1e-12)
+    bend(np.full(2, dq), 40.0 * way_s, STILL, LENGTHS_RAD, at_once)
+    np.testing.assert_allclose(columns([DAHL_SHORT, DAHL_LONG], dq=np.full(2, dq), bent=at_once), 0.0, atol=1e-15)
+
+
+def test_nothing_bends_while_a_joint_stands_still_and_the_column_is_what_is_bent():
+    bent = BENT.copy()
+    for dq in (0.9 * STILL, -0.9 * STILL, 0.0):
+        for _ in range(100):
+            bend(np.array([dq, -dq]), PERIOD_S, STILL, LENGTHS_RAD, bent)
+    np.testing.assert_array_equal(bent, BENT)
+    both = columns([DAHL_SHORT, DAHL_LONG], dq=np.array([0.0, 0.9 * STILL]), bent=bent)
+    np.testing.assert_array_equal(both, np.hstack([np.diag(BENT[0]), np.diag(BENT[1])]))
+    bend(np.array([1.1 * STILL, 0.0]), PERIOD_S, STILL, LENGTHS_RAD, bent)
+    assert np.all(bent[:, 0] > BENT[:, 0])
+    np.testing.assert_array_equal(bent[:, 1], BENT[:, 1])
