@@ -1,0 +1,190 @@
+"""The floor of the thresholds: the factor against its formula and against noise, and which residuals count."""
+
+import numpy as np
+import pytest
+import scipy.signal
+from excited_arm import SETTINGS
+from test_certified_kernel import COUNT, RECOVER, Kernel
+
+from adacd_hil.scheme import certified_kernel, sensitivity, tail
+from adacd_hil.scheme.observation import Observation
+
+CONSTANTS = certified_kernel.constants_of(SETTINGS)
+K = CONSTANTS[0]
+PERIOD_S = SETTINGS.bus.period_s
+CUTOFFS = np.array(SETTINGS.certified.cutoffs_rad_s)
+NU_HZ = np.concatenate([CUTOFFS, CUTOFFS[1:]]) / np.pi
+BLOCK = round(tail.BLOCK_S / PERIOD_S)
+HOUR_S = 3600.0
+MODEL_NM = 0.5
+
+
+def factor(nu_Hz, seen_s):
+    return np.minimum(np.sqrt(np.maximum(np.log(nu_Hz * HOUR_S) / np.log(nu_Hz * max(seen_s, 1.0)), 1.0)), 3.0)
+
+
+class Tailed:
+    """The memory of an arm that moves; its thresholds without a floor are MODEL_NM."""
+
+    def __init__(self):
+        self.memory = certified_kernel.new_memory(SETTINGS)
+        self.m = self.memory[0]
+        self.m["h_model"][:] = MODEL_NM
+
+    def see(self, y, samples):
+        self.m["y"][:] = y
+        for _ in range(samples):
+            tail.follow(K, self.m)
+
+    def skip(self, blocks, y=0.0):
+        """See as much as these blocks at once, each by its last sample."""
+        for _ in range(blocks):
+            self.m["block_used"] = BLOCK - 1.0
+            self.see(y, 1)
+
+
+@pytest.mark.parametrize("seen_s", [0.1, 1.0, 10.0, 600.0, HOUR_S, 2.0 * HOUR_S])
+def test_the_floor_is_the_largest_residual_times_the_formula_s_factor(seen_s):
+    tailed = Tailed()
+    largest = np.random.default_rng(1).uniform(-0.3, 0.3, (5, 2))
+    tailed.m["tail_s"] = seen_s - tail.BLOCK_S
+    tailed.see(largest, BLOCK)
+    tailed.see(0.5 * largest, BLOCK)
+    expected = factor(NU_HZ, seen_s)[:, None] * np.abs(largest)
+    np.testing.assert_allclose(tailed.m["tail_Nm"], expected, rtol=1e-10)
+
+
+def test_the_factor_falls_from_its_bound_to_one_after_an_hour():
+    factors = [tail._factor(4.0 / np.pi, seen_s) for seen_s in (0.0, 1.0, 60.0, 600.0, HOUR_S, 1e6)]
+    assert factors[:2] == [tail.LARGEST] * 2
+    assert np.all(np.diff(factors[1:5]) < 0.0)
+    assert factors[4:] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("seen_s", [10.0, 60.0])
+@pytest.mark.parametrize("cutoff", CUTOFFS)
+def test_the_largest_filtered_noise_of_an_hour_is_below_what_a_short_time_lets_expect_by_a_quarter_at_most(
+    cutoff, seen_s
+):
+    """On average over all that could have been the short time."""
+    white = np.random.default_rng(2).standard_normal(round(HOUR_S / PERIOD_S))
+    fall = np.exp(-cutoff * PERIOD_S)
+    noise = np.abs(scipy.signal.lfilter([1.0 - fall], [1.0, -fall], white))
+    seen = noise.reshape(-1, round(seen_s / PERIOD_S)).max(1).mean()
+    assert noise.max() < tail._factor(cutoff / np.pi, seen_s) * seen < 1.25 * noise.max()
+
+
+def test_a_residual_counts_when_its_block_and_the_one_after_it_are_over():
+    tailed = Tailed()
+    tailed.see(0.2, 1)
+    tailed.see(-0.1, 2 * BLOCK - 2)
+    assert not tailed.m["tail_Nm"].any()
+    tailed.see(-0.1, 1)
+    np.testing.assert_allclose(tailed.m["peak"], 0.2)
+
+
+def test_a_joint_that_has_just_rested_shows_no_tail():
+    """A smoothed channel remembers rest longer than its bare filter."""
+    tailed = Tailed()
+    tailed.m["still_smooth"][1, 0] = tailed.m["still"][2, 1] = 1.1 * tail.MOVING
+    tailed.m["still_smooth"][2, 1] = tailed.m["still"][1, 0] = 0.9 * tail.MOVING
+    tailed.see(0.2, 2 * BLOCK)
+    moving = np.full((5, 2), 0.2)
+    moving[1, 0] = moving[4, 1] = 0.0
+    np.testing.assert_allclose(tailed.m["peak"], moving)
+
+
+def test_a_push_raises_the_threshold_by_the_factor_at_most_however_often_it_comes():
+    tailed = Tailed()
+    for push_Nm in (0.45, 0.9, 2.0, 50.0):
+        tailed.skip(100, push_Nm)
+        np.testing.assert_allclose(tailed.m["peak"], min(push_Nm, MODEL_NM))
+        assert np.all(tailed.m["tail_Nm"] <= factor(NU_HZ, 1.0)[:, None] * MODEL_NM)
+
+
+def test_no_threshold_is_below_the_floor_and_a_floor_below_the_threshold_changes_nothing():
+    m = Tailed().m
+    m["M"][:] = [[0.4, 0.1], [0.1, 0.05]]
+    m["hold"][:], m["still"][:], m["still_smooth"][:] = 0.3, 0.2, 0.1
+    h, floored = np.zeros((5, 2)), np.zeros((5, 2))
+    sensitivity.fill_thresholds(K, m, h)
+    model = m["h_model"].copy()
+    m["tail_Nm"][:] = model * [0.9, 1.5]
+    sensitivity.fill_thresholds(K, m, floored)
+    np.testing.assert_allclose(m["h_model"], model, rtol=1e-12)
+    np.testing.assert_allclose(floored - h, model * [0.0, 0.5], rtol=1e-10, atol=1e-15)
+
+
+def test_near_a_contact_its_block_and_the_one_before_do_not_count():
+    tailed = Tailed()
+    tailed.see(0.1, BLOCK)
+    tailed.see(0.3, BLOCK)
+    tailed.see(0.4, BLOCK // 2)
+    tail.discard(tailed.m)
+    tailed.see(0.05, 3 * BLOCK)
+    np.testing.assert_allclose(tailed.m["peak"], 0.1, rtol=1e-3)
+    tailed.see(0.2, 2 * BLOCK)
+    np.testing.assert_allclose(tailed.m["peak"], 0.2)
+
+
+def test_the_largest_is_forgotten_over_ten_minutes_of_motion():
+    tailed = Tailed()
+    tailed.skip(1, 0.4)
+    tailed.skip(1)
+    first = tailed.m["tail_Nm"].copy()
+    tailed.skip(round(tail.FORGOTTEN_S / tail.BLOCK_S))
+    np.testing.assert_allclose(tailed.m["peak"], 0.4 / np.e, rtol=1e-3)
+    np.testing.assert_allclose(tailed.m["tail_Nm"], first / np.e, rtol=1e-3)
+
+
+def test_only_time_in_which_something_was_seen_counts():
+    tailed = Tailed()
+    tailed.skip(1, 0.4)
+    tailed.skip(50)
+    assert float(tailed.m["tail_s"]) == pytest.approx(tail.BLOCK_S)
+    tailed.skip(50, 0.1)
+    assert float(tailed.m["tail_s"]) == pytest.approx(50 * tail.BLOCK_S)
+
+
+def test_a_test_of_another_model_begins_without_a_floor():
+    tailed = Tailed()
+    tailed.see(0.2, 2 * BLOCK + 1)
+    assert tailed.m["tail_Nm"].all()
+    certified_kernel.begin_test(CONSTANTS, tailed.memory)
+    for name in ("peak", "peak_now", "peak_last", "tail_Nm", "block_used", "tail_s"):
+        assert not tailed.m[name].any()
+
+
+@pytest.mark.parametrize(("mode", "is_followed"), [("LEARN", False), ("TEST", True), ("REFINE", True)])
+def test_residuals_are_followed_while_a_frozen_model_is_in_use(mode, is_followed):
+    kernel = steady(mode)
+    assert bool(kernel.m["tail_Nm"].any()) is is_followed
+
+
+def steady(mode, samples=1000):
+    """Let an arm of nothing, with a model of nothing, move on with 5 mNm on it."""
+    kernel = Kernel(theta=np.zeros(COUNT), P=np.zeros((COUNT, COUNT)))
+    go_on(kernel, mode, samples, 0.005)
+    return kernel
+
+
+def go_on(kernel, mode, samples, push_Nm):
+    mode = certified_kernel.WATCH | getattr(certified_kernel, mode)
+    found = [kernel.step([0.0, 0.0], [0.5, -0.5], [-push_Nm, -push_Nm], mode) for _ in range(samples)]
+    return np.array(found) & Observation.CONTACT != 0
+
+
+def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
+    kernel = steady("REFINE")
+    before = kernel.m["peak"].copy()
+    for push_Nm in np.linspace(0.005, 0.5, 80):
+        is_touched = go_on(kernel, "REFINE", 1, push_Nm)[0]
+        if is_touched:
+            break
+    assert is_touched
+    assert np.abs(kernel.m["y"]).max() > 4.0 * before.max()
+    go_on(kernel, "REFINE", 600, 0.005)
+    assert kernel.m["recovering_cycles"] < RECOVER
+    go_on(kernel, "REFINE", RECOVER + 3 * BLOCK, 0.005)
+    assert kernel.m["recovering_cycles"] == 0.0
+    np.testing.assert_allclose(kernel.m["peak"], before, rtol=0.02)
