@@ -326,12 +326,16 @@ def test_after_a_touch_it_begins_anew_from_nothing_and_is_armed(touched):
 
 
 def test_after_a_touch_it_learns_with_thresholds_twice_as_high(touched):
-    """Of the joint that was touched; beside a scheme that begins there and has seen no touch."""
+    """Of the joint that was touched; beside a scheme that begins there with bent bristles, and has seen no touch."""
     measured, played = touched
     begins = int(np.flatnonzero(played.observation.astype(int) & Observation.CONTACT)[0]) + RECOVER + 1
-    calm = play(Record(*(values[begins : begins + 100] for values in measured)))
-    ratio = played.h[begins : begins + 100] / calm.h
-    np.testing.assert_allclose(ratio[50:], np.broadcast_to([2.0, 1.0], (50, 5, 2)), rtol=0.01)
+    calm, learn = Kernel(), certified_kernel.WATCH | certified_kernel.LEARN
+    calm.m["bent"][:] = np.sign(measured.dq[begins])
+    for k in range(begins, begins + 100):
+        calm.step(*(values[k] for values in measured), learn)
+        if k >= begins + 50:
+            expected = np.broadcast_to([2.0, 1.0], (5, 2))
+            np.testing.assert_allclose(played.h[k] / calm.m["h"], expected, rtol=0.01)
 
 
 def test_an_arm_that_stands_still_gets_no_certificate_and_the_reason_names_it():
