@@ -73,6 +73,9 @@ _REFUTED = int(Observation.REFUTED)
 _UNSEEN = int(Observation.UNSEEN)
 _WITHHELD = int(Observation.WITHHELD)
 
+SETTLED = 3.0
+"""Time constants of the learnt filter for which an arm that moves teaches nothing after a gap: by how much the velocity
+lags then is in S until the filter has forgotten it, and would be learnt."""
 _EIGENVALUE_EVERY = 64
 """Samples between two looks at the eigenvalues: they take 8 µs, the rest of a step about 3 µs."""
 WIDE = 1
@@ -149,6 +152,7 @@ def constants_of(settings: Settings) -> Structured:
         "residual_Nm": certified.residual_Nm,
         "learn_every": certified.learn_every,
         "recover_cycles": round(certified.recover_s / period_s),
+        "settle_cycles": round(SETTLED / (cutoff[_LEARNT] * period_s)),
         "fit_cycles": [round(fit_s / period_s) for fit_s in certified.fit_s],
         "test_cycles": [round(test_s / period_s) for test_s in certified.test_s],
         "beta_Nm": certified.beta_Nm,
@@ -259,6 +263,8 @@ def new_memory(settings: Settings) -> Structured:
         "rest_square": joint,
         "roughness": joint,
         "has_sample": (),
+        "torque_changes": joint,
+        "torque_change_Nm": joint,
         "torque_step_Nm": joint,
         "torque_pull_Nm": joint,
         # anchors of the offsets
@@ -341,6 +347,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     belief.discard(m)
     earlier.begin(m)
     fit_samples.begin(m)
+    tail.begin(m)
     m["unit"][:] = 1.0
     m["samples"] = 0.0
     m["recovering_cycles"] = 0.0
@@ -476,6 +483,8 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     if m["has_sample"] != 0.0:
         sensitivity.follow_torque_step(k, m, out["tau_J"])
     m["has_sample"] = 1.0
+    if not is_seen and np.max(np.abs(out["dq"])) > belief.SLOW_RAD_S:
+        m["recovering_cycles"] = max(m["recovering_cycles"], k["settle_cycles"])
     m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
     _take_sample(k, m, out["q"], out["dq"], out["tau_J"], is_seen, out["tau_ext_wide_hat"])
     m["has_gap"] = 0.0

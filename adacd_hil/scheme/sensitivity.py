@@ -35,6 +35,8 @@ SECOND_DIFFERENCE = 0.36
 """Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""
 JUMP = 5.0
 """Deviations of the noise as which a jump counts at most."""
+CHANGES, LARGEST_STEP_NM = 50.0, 0.2
+"""Changes of a torque sensor's value from which on the smallest is its step, and the largest step that is believed."""
 ROUGHNESS_S = 0.3
 """Memory of the velocity's roughness."""
 STRAIN = 2.0
@@ -100,14 +102,20 @@ def follow_standstill(
 def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
     """Take one sample into the sensors' step L (n,), the smallest change ever seen, and how far it pulls their mean.
 
-    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most.
+    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. Until
+    enough changes were seen L is 0: the first ones may be a push.
     """
     for i in range(tau_J.shape[0]):
         change = abs(tau_J[i] - m["last"][2, i])
-        if change > 0.0 and (m["torque_step_Nm"][i] == 0.0 or change < m["torque_step_Nm"][i]):
-            m["torque_step_Nm"][i] = change
+        if change == 0.0:
+            continue
+        m["torque_changes"][i] += 1.0
+        m["torque_change_Nm"][i] = change if m["torque_changes"][i] == 1.0 else min(change, m["torque_change_Nm"][i])
+        step_Nm = min(m["torque_change_Nm"][i], LARGEST_STEP_NM)
+        if m["torque_changes"][i] >= CHANGES and step_Nm != m["torque_step_Nm"][i]:
+            m["torque_step_Nm"][i] = step_Nm
             variance = k["torque_noise_Nm"] ** 2 * m["roughness"][i]
-            m["torque_pull_Nm"][i] = change / np.pi * np.exp(-2.0 * np.pi**2 * variance / change**2)
+            m["torque_pull_Nm"][i] = step_Nm / np.pi * np.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
 
 
 @compiled

@@ -6,9 +6,9 @@ Gaussian's, nu of them a second that are independent, and the largest of T secon
 
     m(T) = sqrt(ln(nu / RATE) / ln(nu T)) times that,    nu = cut-off / pi,    T >= 1 s, m <= LARGEST
 
-The largest counts when its block is over and the one after it: what is held back from a contact is no residual. More
-than the threshold without this floor it never is, so who pushes a little below the threshold again and again raises it
-by m at most. It is forgotten over FORGOTTEN_S of motion.
+The largest counts when its block is over and the one after it: what is held back from a contact is no residual. It
+counts as no more than the threshold without this floor at that moment, so who pushes a little below the threshold again
+and again raises it to m times the largest of those, and no further. It is forgotten over FORGOTTEN_S of motion.
 
 Shapes: peak, peak_now, peak_last, tail_Nm (2 C - 1, n). Units: Nm.
 """

@@ -68,7 +68,7 @@ def life():
     total = REST + count
     random = np.random.default_rng(2)
     periods = np.ones(total, dtype=np.int64)
-    periods[random.integers(REST, total, 6)] = 7
+    periods[random.integers(REST, total, 6)] = 12
     is_complete = np.ones(total, dtype=bool)
     is_complete[random.integers(REST, total, 12)] = False
     is_complete[:2] = False

@@ -29,7 +29,7 @@ def samples(count=400, seed=1):
 
 def teach(m, W_f, tau_f, held=0.0):
     held = np.broadcast_to(held, tau_f.shape).copy()
-    return [belief.learn(K, m, *sample) for sample in zip(W_f, tau_f, held, strict=True)]
+    return [belief.learn(K, m, *sample, np.zeros(2)) for sample in zip(W_f, tau_f, held, strict=True)]
 
 
 def test_a_belief_begins_with_the_prior():
@@ -93,8 +93,8 @@ def test_a_sample_is_not_learnt_before_it_has_waited():
     wait = WAITING * EVERY
     for k in range(at + wait + 1):
         assert np.array_equal(untouched_belief["belief"], belief_hat["belief"])
-        belief.learn(K, untouched_belief, W_f[k], tau_f[k], np.zeros(2))
-        belief.learn(K, belief_hat, W_f[k], touched[k], np.zeros(2))
+        belief.learn(K, untouched_belief, W_f[k], tau_f[k], np.zeros(2), np.zeros(2))
+        belief.learn(K, belief_hat, W_f[k], touched[k], np.zeros(2), np.zeros(2))
     assert np.max(np.abs(untouched_belief["belief"] - belief_hat["belief"])) > 1e-3
 
 

@@ -13,7 +13,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
-from adacd_hil.scheme import certificate, certified_kernel
+from adacd_hil.scheme import certificate, certified_kernel, lost_samples
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 
 COUNT = len(NAMES)
@@ -126,7 +126,7 @@ def test_what_was_lost_is_a_gap_for_the_sample_after_it(smooth):
     before = kernel.m["r"].copy()
     kernel.step(q[299] + 9.0, dq[299], tau_J[299] + 9.0, is_complete=0)
     np.testing.assert_array_equal(kernel.m["r"], before)
-    kernel.step(q[305], dq[305], tau_J[305], periods=6)
+    kernel.step(q[309], dq[309], tau_J[309], periods=lost_samples.MOST_FILLED + 2)
     np.testing.assert_allclose(kernel.m["r"], before, atol=1e-12)
 
 

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, PERIOD_S, SETTINGS
+from excited_arm import PERIOD_S, SETTINGS
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added
@@ -64,16 +64,16 @@ def test_a_payload_that_is_put_down_is_named_too():
 
 
 @pytest.mark.parametrize(
-    ("hand", "named"),
+    ("hand", "named", "most"),
     [
-        (added(F_c1=0.3), r"0\.\d\d ± 0\.\d\d Nm more Coulomb friction of joint 1"),
-        (added(F_v2=0.2), r"0\.(19|20|21) ± 0\.\d\d Nm s/rad more viscous friction of joint 2"),
+        (added(F_c1=0.3), r"0\.(29|30|31) ± 0\.\d\d Nm more Coulomb friction of joint 1", 6),
+        (added(F_v2=0.2), r"0\.(19|20|21) ± 0\.\d\d Nm s/rad more viscous friction of joint 2", 3),
     ],
 )
-def test_friction_that_is_not_the_certified_one_is_named_and_learnt_at_a_word(hand, named):
+def test_friction_that_is_not_the_certified_one_is_named_and_learnt_at_a_word(hand, named, most):
     loop = MonitoredLoop()
     loop.theta = loop.theta + hand
-    assert loop.run_until_taken_back() == 3
+    assert loop.run_until_taken_back() <= most
     assert re.search(rf"3 contacts look like {named} than was certified", loop.said("revoked")[0])
     loop.request = Request.ACKNOWLEDGE
     loop.recover()
@@ -129,15 +129,17 @@ def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
     return rw, np.full(others, ww), size * size * ww / share
 
 
-def verdict_of(contacts, gap_s=1.0, lasts_s=0.5):
-    values = {"cause_rw": np.zeros(5), "cause_ww": np.zeros(5), "contact_rr": 0.0, "theta": np.zeros(len(NAMES))}
-    memory = [values]
+def verdict_of(contacts, gap_s=1.0, lasts_s=0.5, peak=3.0):
+    memory = certified_kernel.new_memory(SETTINGS)
+    values = memory[0]
+    values["theta"] = 0.0
     judge, cycle, verdict = Doubt(SETTINGS, certified_kernel.constants_of(SETTINGS), memory), 0, None
     for rw, ww, rr in contacts:
         judge.go_on(cycle)
         cycle += round(gap_s / PERIOD_S)
         judge.begin(cycle, is_touched=True)
         values["cause_rw"], values["cause_ww"], values["contact_rr"] = rw, ww, rr
+        values["contact_peak"] = peak
         cycle += round(lasts_s / PERIOD_S)
         verdict = judge.end(cycle)
     return verdict
@@ -170,6 +172,38 @@ def test_another_error_than_a_payload_must_strike_three_times_at_once():
     assert verdict_of([contact, contact]) is None
     assert "Coulomb friction of joint 1" in verdict_of([contact] * 3).text
     assert verdict_of([contact] * 3, gap_s=doubt.AT_ONCE_S + 0.1) is None
+
+
+UNEXPLAINED = sums(0.3, cause=COULOMB1, share=0.3)
+
+
+def test_contacts_that_nothing_explains_take_the_certificate_back_when_the_arm_cannot_go_on():
+    assert verdict_of([UNEXPLAINED] * (doubt.MANY - 1), gap_s=0.25) is None
+    assert verdict_of([UNEXPLAINED] * doubt.MANY, gap_s=doubt.HELD_S + 0.01) is None
+    verdict = verdict_of([UNEXPLAINED] * doubt.MANY, gap_s=0.25)
+    assert not verdict.is_payload
+    assert verdict.text == (
+        "8 contacts came within 0.3 s of going on each, and no one error explains them: a light touch, or the arm has "
+        "changed"
+    )
+
+
+def test_weak_contacts_take_the_certificate_back_where_they_are_many():
+    """Three in 6.9 minutes are 1000 times likelier at 30 an hour than at one."""
+    weak = 0.99 * doubt.WEAK
+    assert verdict_of([UNEXPLAINED] * 2, gap_s=5.0, peak=weak) is None
+    assert verdict_of([UNEXPLAINED] * 3, gap_s=215.0, peak=weak) is None
+    assert verdict_of([UNEXPLAINED] * 3, gap_s=5.0, peak=1.01 * doubt.WEAK) is None
+    assert verdict_of([UNEXPLAINED] * 3, gap_s=0.99 * doubt.AT_REST_S, peak=weak) is None
+    text = verdict_of([UNEXPLAINED] * 3, gap_s=195.0, peak=weak).text
+    assert text.startswith("3 contacts came to less than 1.5 times their threshold, and no one error explains them")
+
+
+def test_a_contact_as_the_arm_goes_on_lets_it_move_further_the_next_time_four_times_at_most():
+    loop = MonitoredLoop()
+    loop.theta = loop.theta + added(F_c1=0.3)
+    loop.run_until_taken_back()
+    assert loop.pipeline._memory[0]["strain"].tolist() == [doubt.MOST_STRAIN, 1.0]
 
 
 @pytest.mark.parametrize("size", [-0.3, 2.1])

@@ -217,15 +217,58 @@ def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
     np.testing.assert_allclose(m["velocity_roughness"], [most * (1.0 - share), 1.0], rtol=1e-10)
 
 
-def test_a_contact_doubles_the_strain_of_the_joints_that_are_over_and_three_times_at_most():
+def test_a_contact_doubles_the_strain_of_the_joints_that_are_over_up_to_the_largest():
     m = certified_kernel.new_memory(SETTINGS)[0]
     m["h"][:] = 1.0
     m["y"][3, 1] = -1.1
     strains = []
-    for _ in range(4):
-        sensitivity.strain(m)
+    for largest in (8.0, 8.0, 8.0, 8.0, 4.0):
+        sensitivity.strain(m, largest)
         strains.append(m["strain"].tolist())
-    assert strains == [[1.0, 2.0], [1.0, 4.0], [1.0, 8.0], [1.0, 8.0]]
+    assert strains == [[1.0, 2.0], [1.0, 4.0], [1.0, 8.0], [1.0, 8.0], [1.0, 8.0]]
+
+
+def stepped(step_Nm, std_Nm=0.02):
+    """Return the memory after a second of a sensor with this step, and how far its mean is off at the worst place."""
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    noise = std_Nm * np.random.default_rng(3).standard_normal(200_000)
+    for tau in np.round((noise[:10_000] + 0.5 * step_Nm) / step_Nm) * step_Nm:
+        sensitivity.follow_torque_step(K, m, np.array([tau, 0.0]))
+        m["last"][2] = tau, 0.0
+    places = np.linspace(0.0, step_Nm, 21)
+    return m, max(abs(np.mean(np.round((noise + at) / step_Nm) * step_Nm) - at) for at in places)
+
+
+@pytest.mark.parametrize("step_Nm", [0.0015, 0.04, 0.1, 0.2])
+def test_a_sensor_s_step_is_found_and_its_pull_is_what_rounding_does_to_a_mean(step_Nm):
+    m, off_Nm = stepped(step_Nm)
+    np.testing.assert_allclose(m["torque_step_Nm"], [step_Nm, 0.0], rtol=1e-9)
+    assert m["torque_pull_Nm"][0] == pytest.approx(off_Nm, rel=0.1, abs=2e-4)
+    assert m["torque_pull_Nm"][1] == 0.0
+
+
+def test_what_changes_first_or_by_much_is_no_step():
+    """A push that ends a long rest is one; so is a sensor that has more noise than steps."""
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    changes = int(sensitivity.CHANGES)
+    for k in range(changes + 10):
+        assert (m["torque_step_Nm"][0] > 0.0) == (k >= changes)
+        sensitivity.follow_torque_step(K, m, np.array([5.0 * (k % 2 == 0), 0.0]))
+        m["last"][2] = 5.0 * (k % 2 == 0), 0.0
+    assert m["torque_step_Nm"][0] == sensitivity.LARGEST_STEP_NM
+
+
+def test_a_sensor_s_step_raises_the_thresholds_by_its_noise_and_its_pull():
+    m, _ = stepped(0.1)
+    fine = certified_kernel.new_memory(SETTINGS)[0]
+    h, h_fine = np.zeros((5, 2)), np.zeros((5, 2))
+    for memory, filled in ((m, h), (fine, h_fine)):
+        memory["P"][:] = 0.0
+        memory["theta"][:] = 0.0
+        sensitivity.fill_thresholds(K, memory, filled)
+    noise = K["torque_gain"] * 0.1**2 / 12.0
+    np.testing.assert_allclose(h[:, 0], np.sqrt(h_fine[:, 0] ** 2 + noise) + m["torque_pull_Nm"][0], rtol=1e-9)
+    np.testing.assert_array_equal(h[:, 1], h_fine[:, 1])
 
 
 def relaxed(share, count, strain=8.0):

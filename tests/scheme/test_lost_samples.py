@@ -1,0 +1,124 @@
+"""Samples that are lost: put on a line, they widen the thresholds; many are said."""
+
+import numpy as np
+import pytest
+from excited_arm import PERIOD_S, SETTINGS, ExcitedLoop, record
+from planar_arm import THETA
+
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme import certified_kernel, lost_samples
+from adacd_hil.scheme.observation import Observation
+
+K = certified_kernel.constants_of(SETTINGS)[0]
+MODE = certified_kernel.WATCH | certified_kernel.REFINE
+
+
+def followed(steps, dq=(0.3, 0.3), is_seen=True, lost_Nm2=0.0):
+    """Return G (3, 2) after a sample that came so many periods after the last, which had 0.3 rad/s."""
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    m["last"][1] = 0.3
+    m["hold"][:] = 0.1
+    m["M"][:] = np.eye(2)
+    m["lost"][:] = lost_Nm2
+    lost_samples.follow(K, m, np.array(dq), steps, steps * PERIOD_S, is_seen)
+    return m["lost"].copy()
+
+
+def test_a_sample_after_a_sample_leaves_nothing_open_and_what_was_open_is_forgotten():
+    assert not followed(1).any()
+    expected = np.exp(-2.0 * K["cutoff"] * PERIOD_S)[:, None] * np.ones(2)
+    np.testing.assert_allclose(followed(1, lost_Nm2=1.0), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("steps", [2, 5, 9])
+def test_a_line_leaves_open_the_noise_of_its_ends_the_torque_s_bend_and_friction_where_the_joint_turned(steps):
+    turn = K["cutoff"] * steps * PERIOD_S
+    noise = (K["noise_sigmas"] * K["torque_noise_Nm"] * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
+    bend = lost_samples.CURVATURE_NM_S2 * (steps * PERIOD_S) ** 2 / 12.0
+    expected = np.array([noise + (turn * bend) ** 2, noise + (turn * (bend + 0.1)) ** 2]).T
+    np.testing.assert_allclose(followed(steps, dq=(0.3, -0.3)), expected, rtol=1e-12)
+
+
+def test_a_gap_that_is_cut_out_leaves_the_velocity_s_noise():
+    expected = (2.0 * K["cutoff"] * K["velocity_noise_rad_s"]) ** 2
+    np.testing.assert_allclose(followed(20, is_seen=False), np.tile(expected[:, None], (1, 2)), rtol=1e-12)
+
+
+class LossyArm:
+    """The arm as certified, on the excitation, of whose samples some are lost."""
+
+    def __init__(self, lost, seconds=6.0):
+        measured = record(THETA["P"], seconds, seed=5)
+        self.m = certified_kernel.new_memory(SETTINGS)
+        self.block = certified_kernel.new_block(SETTINGS)
+        constants = certified_kernel.constants_of(SETTINGS)
+        certified_kernel.begin_adaptation(constants, self.m, False)
+        self.found, self.h, since, mode = [], [], 1, certified_kernel.WATCH | certified_kernel.LEARN
+        for k, (q, dq, tau_J) in enumerate(zip(*measured, strict=True)):
+            self.block["q"], self.block["dq"], self.block["tau_J"] = q, dq, tau_J
+            self.block["period_s"] = since * PERIOD_S
+            is_lost = lost(k) and mode == MODE
+            found = certified_kernel.step(constants, self.m, self.block, 0 if is_lost else 1, since, mode)
+            since = since + 1 if is_lost else 1
+            if found & int(Observation.FITTED):
+                certified_kernel.begin_test(constants, self.m)
+                mode = certified_kernel.WATCH | certified_kernel.TEST
+            elif found & int(Observation.CERTIFIED):
+                certified_kernel.begin_refinement(self.m)
+                mode = MODE
+            elif mode == MODE:
+                self.found.append(found)
+                self.h.append(self.m[0]["h"].copy())
+
+
+@pytest.mark.parametrize("burst", [1, 4, 8])
+def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
+    whole, lossy = LossyArm(lambda _k: False), LossyArm(lambda k: k % 40 < burst)
+    assert not np.bitwise_or.reduce(lossy.found) & int(Observation.CONTACT)
+    assert len(lossy.found) == len(whole.found)
+    assert np.max(np.array(lossy.h) / np.array(whole.h)) > 1.0
+    assert np.sum([found & int(Observation.UNSEEN) != 0 for found in lossy.found]) == pytest.approx(
+        burst / 40 * len(lossy.found), rel=0.05
+    )
+
+
+def counted(unseen):
+    m = certified_kernel.new_memory(SETTINGS)[0]
+    for is_unseen in unseen:
+        lost_samples.count(m, is_unseen)
+    return m
+
+
+def test_what_was_lost_is_said_from_two_in_a_row_or_a_tenth_on():
+    assert not lost_samples.take_warning(counted([True] + [False] * 9))
+    assert lost_samples.take_warning(counted([True] + [False] * 8)).startswith("11% of the cycles had no new sample")
+    m = counted([True, True] + [False] * 98)
+    assert lost_samples.take_warning(m) == (
+        "2% of the cycles had no new sample, 2 in a row: a contact is found so many cycles later"
+    )
+    assert not lost_samples.take_warning(m)
+
+
+class LosingLoop(ExcitedLoop):
+    every = 0
+
+    def measure(self):
+        arm = super().measure()
+        is_lost = self.every and self.cycle % self.every < 2
+        since = self.cycle % self.every + 1 if self.every and self.cycle % self.every == 2 else 1
+        return arm._replace(is_complete=not is_lost, steps=0 if is_lost else since)
+
+
+def test_a_run_that_loses_samples_says_so_once():
+    loop = LosingLoop()
+    loop.run_until(SchemeState.MONITOR)
+    loop.pipeline.take_events()
+    loop.every = 20
+    outputs = loop.run(3100)
+    assert {output.state for output in outputs} == {SchemeState.MONITOR}
+    assert [event.name for event in loop.pipeline.take_events()].count("degraded") == 1
+    loop.every = 0
+    loop.run(2000)
+    loop.every = 20
+    loop.run(1100)
+    assert [event.name for event in loop.pipeline.take_events()].count("degraded") == 1
