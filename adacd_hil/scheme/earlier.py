@@ -46,7 +46,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme import anchor, fit_samples, later_samples
-from adacd_hil.scheme.sensitivity import LARGEST_UNIT, UNIT_PEAK
+from adacd_hil.scheme.sensitivity import LARGEST_UNIT
 
 STEADY = 200.0
 """Squared distance over u at which a fit has changed. 200 untouched arms, wide ones included: 113 at most."""
@@ -76,6 +76,8 @@ INERTIA_SHARE = 0.03
 """Less than these, and less than this share of an inertia, is nothing."""
 NOT_ASKED_KGM2 = 1000.0
 """Of a2: a mass shows in a1 and a3, and what else touches the arm bends a2."""
+HARD = 2.0
+"""Mean square of the learnt residuals in their hard moments over that of all: much of them is noise of the velocity."""
 SMALLEST_UNIT = 0.1
 """Least unit of the variances; the rest of it as `sensitivity` has it."""
 _INERTIAS = ("a1", "a2", "a3")
@@ -167,6 +169,7 @@ def keep_before_contact(m: Any) -> None:
     """Keep what the fit had come to until a while before the contact that interrupts it, if nothing is kept yet."""
     if m["has_kept"] == 0.0:
         _keep_steps(m, int(m["steps_used"]) - BACK)
+        _keep(m, m["belief"], m["P_belief"], unit_of(m["fit_square"], m["fit_rows"]), 0.0)
 
 
 @compiled
@@ -205,8 +208,8 @@ def _keep(m: Any, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
 
 @compiled
 def unit_of(square: float, rows: float) -> float:
-    """Return u of residuals whose squares, over their variances, have this sum."""
-    return min(max(UNIT_PEAK * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
+    """Return u of residuals whose squares, over their variances, have this sum, in their hard moments."""
+    return min(max(HARD * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
 
 
 @compiled
