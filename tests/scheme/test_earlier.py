@@ -177,7 +177,7 @@ class Compared:
         self.k, self.m = certified_kernel.constants_of(settings)[0], certified_kernel.new_memory(settings)[0]
         self.m["P_belief"] = std**2 * np.eye(len(NAMES))
         self.m["belief"] = 0.1
-        self.m["fit_square"], self.m["fit_rows"] = 1.0, 4.0
+        self.m["fit_square"], self.m["fit_rows"] = 1.0, earlier.HARD  # u = 1
         earlier._keep(self.m, self.m["belief"], self.m["P_belief"], 1.0, 0.0)
         self.m["bound_Nm"] = np.inf if settings is UNKNOWN else 0.04
 
@@ -355,15 +355,18 @@ def test_a_difference_that_is_small_or_not_known_forgets_nothing():
     assert kept.compared() == [0, 1, 2, 3]
 
 
-def test_the_steps_kept_are_from_before_the_contact():
+def test_what_is_kept_is_from_before_the_contact():
     loop = HeldLoop(FREE)
     loop.learn(1.1)
     m = loop.pipeline._memory[0]
     steps, of_steps = int(m["steps_used"]), m["steps_theta"].copy()
+    kept = steps - earlier.BACK + 1
     loop.lean(0, 3.0, 0.05)
     assert m["has_kept"] == 1.0
-    assert m["kept_count"] == steps - earlier.BACK + 1 > 2
-    assert (m["kept"][: steps - earlier.BACK + 1] == of_steps[: steps - earlier.BACK + 1]).all()
+    assert m["kept_count"] == kept + 1 > 3
+    assert (m["kept"][:kept] == of_steps[:kept]).all()
+    friction = [abs(m["kept"][n][NAMES.index("F_c1")] - THETA["P"][5]) for n in range(kept + 1)]
+    assert friction[-1] < 0.02  # what it had come to at the contact, with nothing of the lean
 
 
 def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
