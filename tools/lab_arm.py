@@ -39,6 +39,7 @@ class LabArm:
     torque_offset_Nm: Pair = (0.0, 0.0)
     sensors: SensorSettings = field(default_factory=SensorSettings)
     drives: DriveSettings = field(default_factory=DriveSettings)
+    own_mechanics: MechanicsSettings | None = None
 
     @property
     def name(self) -> str:
@@ -53,7 +54,9 @@ class LabArm:
 
     @property
     def mechanics(self) -> MechanicsSettings:
-        """What the rigid plant leaves out, for variants that need it."""
+        """What the rigid plant leaves out: its own, or that of a variant that needs some."""
+        if self.own_mechanics is not None:
+            return self.own_mechanics
         if self.friction == "stribeck":
             static_Nm = (STATIC_SHARE * self.arm.coulomb_Nm[0], STATIC_SHARE * self.arm.coulomb_Nm[1])
             return MechanicsSettings(static_Nm=static_Nm)

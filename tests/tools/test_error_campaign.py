@@ -1,0 +1,66 @@
+"""tools/error_campaign.py: what it plays, and when it says that a step was found."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_sim.mechanics_settings import MechanicsSettings
+from firmware_sim.sensor_settings import SensorSettings
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import error_campaign
+from error_campaign import AGREES, ERRORS, SENSORS, WITHIN, Case, Played, find_steps, mechanics_of, quiet_onsets, row_of
+
+FILTERS, CHANNELS = 3, 5
+RISING = np.tile(np.linspace(0.0, 1.0, WITHIN), (CHANNELS, 1))
+
+
+def found(step_Nm, y=0.0, h=np.inf, onsets=(0,)):
+    """After how many cycles a step on joint 2 is found, of channels that rise in a straight line."""
+    residual, threshold = np.zeros((400, CHANNELS, 2)), np.full((400, CHANNELS, 2), np.inf)
+    residual[:, :, 1], threshold[:, :, 1] = y, h
+    cycles = np.zeros(len(onsets))
+    find_steps.py_func(residual, threshold, RISING, FILTERS, np.array(onsets), 1, step_Nm, cycles)
+    return cycles.tolist()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_step_is_found_with_the_first_sample_over_a_threshold(sign):
+    first = int(np.argmax(RISING[0] > 0.5)) + 1
+    assert found(sign, h=0.5, onsets=(0, 20)) == [first, first]
+    assert found(0.49 * sign, h=0.5) == [np.inf]
+
+
+def test_what_is_there_already_counts_with_its_sign():
+    assert found(1.0, y=0.2, h=0.5)[0] < found(1.0, h=0.5)[0] < found(-1.0, y=0.2, h=0.5)[0]
+
+
+def test_a_bare_channel_needs_the_smoothed_one_of_its_filter():
+    h = np.array([np.inf, np.inf, 0.5 / AGREES, np.inf, 0.3])
+    assert found(1.0, h=h) == [int(np.argmax(RISING[0] > 0.5)) + 1]
+    assert found(1.0, h=np.array([np.inf, np.inf, np.inf, np.inf, 0.3])) == [np.inf]
+
+
+def test_onsets_are_on_a_grid_where_nothing_else_happens_in_time():
+    is_quiet = np.ones(1000, dtype=bool)
+    is_quiet[500] = False
+    assert quiet_onsets(is_quiet, 900).tolist() == [*range(0, 201, 20), *range(520, 700, 20)]
+
+
+def test_every_error_is_one():
+    coulomb_Nm = np.array([0.15, 0.08])
+    for error in ERRORS:
+        is_mechanical = mechanics_of(error, coulomb_Nm) != MechanicsSettings()
+        is_measured = SENSORS.get(error, SensorSettings()) != SensorSettings()
+        assert (is_mechanical or is_measured) == (error not in ("clean", "cable 0.1 Nm sin q")), error
+
+
+def test_a_row_has_a_field_for_each_column():
+    case = Case("P", "clean", 0.0, 1)
+    times = ((9.0, 24.0, np.inf),) * 3
+    played = Played(case, 2.0, 0.5, 0, (0.01, 0.01), (0.02, 0.02), (0.0, 0.0), 0.8, times, (0.01, 0.0, 0.0))
+    for row in (row_of(played), row_of(Played(case, None))):
+        assert len(row) == len(error_campaign.HEAD)
+    assert row_of(played)[-3] == "9, 24, inf (1.0%)"
