@@ -144,7 +144,8 @@ def finding(**changes: Any) -> Finding:
     ("name", "changes", "expected"),
     [
         ("command-both", {}, "ok"),
-        ("command-both", {"rest_after_notice_ms": 101.0}, "NOT AT REST"),
+        ("command-both", {"rest_after_notice_ms": 119.0}, "ok"),
+        ("command-both", {"rest_after_notice_ms": 121.0}, "NOT AT REST"),
         ("command-both", {"rest_after_notice_ms": None}, "NOT AT REST"),
         ("command-both", {"is_named": False}, "NOT NAMED"),
         ("command-both", {"noticed_ms": None}, "UNNOTICED"),
