@@ -7,7 +7,7 @@ import pytest
 
 from adacd_hil.config import ConfigError, Settings, load_settings, merge, parse, to_toml
 from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
-from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme import certified_memory
 
 SEVEN = [0.1] * 7
 AT_REST = {"period_s": 2.0, "cosine": [[0.1], [0.2]], "sine": [[0.0], [0.0]]}
@@ -62,7 +62,7 @@ def test_the_scheme_estimates_offsets_lags_and_the_chosen_friction_terms():
     kinds = ("offset1", "offset2", "lag1", "lag2", "load1", "load2", "width1", "width2")
     assert settings.further_names == kinds
     assert settings.further_count == 8
-    assert certified_kernel.parameter_names(settings) == PARAMETER_NAMES + kinds
+    assert certified_memory.parameter_names(settings) == PARAMETER_NAMES + kinds
 
 
 def test_the_paper_s_scheme_has_no_bank_and_nothing_further():
@@ -95,7 +95,7 @@ def test_settings_read_back_from_a_log_are_the_same():
 
 def test_every_parameter_of_the_scheme_has_a_unit():
     terms = ["stribeck", "load", "asymmetric", "width"]
-    names = certified_kernel.parameter_names(certified(certified={"friction_terms": terms}))
+    names = certified_memory.parameter_names(certified(certified={"friction_terms": terms}))
     assert {name: PARAMETER_UNITS[name] for name in names if name in PARAMETER_UNITS}.keys() == set(names)
 
 

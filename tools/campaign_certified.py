@@ -9,7 +9,7 @@ from lab import PERIOD_S, Motion, Recording, paper_motion
 from adacd_hil.config import Settings
 from adacd_hil.control.excitation import Excitation
 from adacd_hil.records import JOINTS, SchemeState
-from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme import certified_memory, loop
 from adacd_hil.scheme.observation import CONTACT_SHIFT
 
 WIDE_FILTER = 1
@@ -42,14 +42,14 @@ class CertifiedScheme:
         settings = replace(
             self._settings, arm=replace(self._settings.arm, link_length_m=recording.arm.arm.link_length_m)
         )
-        n, count = len(recording.q), len(certified_kernel.parameter_names(settings))
-        memory = certified_kernel.new_memory(settings)
+        n, count = len(recording.q), len(certified_memory.parameter_names(settings))
+        memory = certified_memory.new_memory(settings)
         state, observation, theta = np.zeros(n), np.zeros(n), np.zeros((n, count))
         y, h = (np.zeros((n, *memory[0]["y"].shape)) for _ in range(2))
-        certified_kernel.step_record(
-            certified_kernel.constants_of(settings),
+        loop.step_record(
+            certified_memory.constants_of(settings),
             memory,
-            certified_kernel.new_block(settings),
+            certified_memory.new_block(settings),
             recording.q,
             recording.dq,
             recording.tau_J,

@@ -29,7 +29,8 @@ from adacd_hil.analysis.touches import bank_channels, step_response
 from adacd_hil.cli.table import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
-from adacd_hil.scheme import certified_kernel
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme import certified_memory, loop
 from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.sensitivity import AGREES
 from firmware_sim.mechanics_settings import MechanicsSettings
@@ -173,16 +174,16 @@ def play(case: Case, minutes: float) -> Played:
     settings = load_settings("certified", case.profile)
     settings = replace(settings, arm=replace(settings.arm, link_length_m=arm.arm.link_length_m))
     count = len(motion.q_d)
-    memory = certified_kernel.new_memory(settings)
+    memory = certified_memory.new_memory(settings)
     state, observation = np.zeros(count), np.zeros(count)
-    theta = np.zeros((count, len(certified_kernel.parameter_names(settings))))
+    theta = np.zeros((count, len(certified_memory.parameter_names(settings))))
     y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
-    certified_kernel.step_record(
-        certified_kernel.constants_of(settings), memory, certified_kernel.new_block(settings), measured.q, measured.dq,
+    loop.step_record(
+        certified_memory.constants_of(settings), memory, certified_memory.new_block(settings), measured.q, measured.dq,
         tau_J, loaded_at, state, observation, y, h, theta,
     )  # fmt: skip
     begin = max(loaded_at, 0)
-    is_monitored = (state == certified_kernel.MONITOR) & (np.arange(count) >= begin)
+    is_monitored = (state == SchemeState.MONITOR) & (np.arange(count) >= begin)
     if not is_monitored.any():
         return Played(case, None)
     armed = int(np.argmax(is_monitored))

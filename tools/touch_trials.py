@@ -18,7 +18,7 @@ from lab_motion import paper_motion
 from planar_arm import THETA
 
 from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
-from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme import certified_kernel, certified_memory
 from adacd_hil.scheme.belief import payload_direction
 from adacd_hil.scheme.certificate_watch import BY_WORD
 
@@ -182,8 +182,8 @@ class HandLoop(TouchedLoop):
 def paper_rows() -> Vector:
     """Return rows (n, p) of the slowest filter on the paper's motion, without the lags, which no touch looks like."""
     motion = paper_motion(12.0)
-    constants, memory = certified_kernel.constants_of(FREE), certified_kernel.new_memory(FREE)
-    block, rows = certified_kernel.new_block(FREE), []
+    constants, memory = certified_memory.constants_of(FREE), certified_memory.new_memory(FREE)
+    block, rows = certified_memory.new_block(FREE), []
     for cycle, (q, dq) in enumerate(zip(motion.q_d, motion.dq_d, strict=True)):
         block["q"], block["dq"], block["period_s"] = q, dq, 0.0
         certified_kernel.step(constants, memory, block, 1, 1, 0)

@@ -27,7 +27,7 @@ from scipy.signal import lfilter
 from adacd_hil.compiled import compiled
 from adacd_hil.config import ConfigError, ExcitationSettings, Settings
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.certified_kernel import constants_of
+from adacd_hil.scheme.certified_memory import constants_of
 from adacd_hil.scheme.filters import first_order_hold
 from adacd_hil.scheme.regressor import F_C1, F_C2, regressor
 

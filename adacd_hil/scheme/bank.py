@@ -16,6 +16,14 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme import filters
 
+SLOW = 0
+"""Filter by which a model is tested and reported: the slow one, whose noise is least."""
+LEARNT = 1
+"""Filter that is learnt from: faster than that, so its samples are soon independent, and reversals show."""
+WIDE = 1
+"""Filter whose output, with the filter undone, is the external torque of contact reports: undoing a faster one would
+bring back the noise that it let through."""
+
 
 @compiled
 def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old: Vector, weight_new: Vector) -> None:

@@ -60,12 +60,14 @@ def wander(drift_std: Vector, elapsed_s: float, P: Vector) -> None:
 
 
 @compiled
-def learn(k: Any, m: Any, W_f: Vector, tau_f: Vector, held: Vector, still: Vector) -> bool:
+def learn(k: Any, m: Any, c: int) -> bool:
     """Put this sample into the ring, and correct the belief by the one that has waited long enough, if one has.
 
-    W_f (n, p), tau_f (n,): of the filter that is learnt from. held (n,): torque in it that friction may have held at
-    standstill, Nm; still (n,): share of standstill in it. Return whether the belief has changed.
+    c: the filter that is learnt from. Of what it holds, W_f (n, p) and tau_f (n,) are the sample; held (n,) is the
+    torque in it that friction may have held at standstill, Nm; still (n,) the share of standstill. Return whether the
+    belief has changed.
     """
+    W_f, tau_f, held, still = m["W_f"][c], m["tau_f"][c], m["held"][c], m["still"][c]
     m["since_learnt"] += 1.0
     if m["since_learnt"] < k["learn_every"]:
         return False

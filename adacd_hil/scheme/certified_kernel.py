@@ -12,8 +12,7 @@ learnt after (`earlier`), and what is known from elsewhere judges the offsets (`
 **A certificate** is a test of the frozen model on motion that was not used for the fit (`certificate`). While detection
 is armed the belief goes on learning; its mean takes the place of the frozen one after a test (`refinement`).
 
-Three structured arrays of one element carry everything, as in `adacd_hil.scheme.kernel`; the block is
-`records.certified_layout`.
+Constants, memory and block: `certified_memory`.
 """
 
 from typing import Any
@@ -21,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import FRICTION_TERMS, Settings
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, SchemeState, Vector, certified_layout
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme import (
     anchor,
     bank,
@@ -42,7 +40,7 @@ from adacd_hil.scheme import (
     tail,
     termination,
 )
-from adacd_hil.scheme.kernel import Structured, block_dtype, is_filled, keep_sample, put_between
+from adacd_hil.scheme.kernel import Structured, is_filled, keep_sample, put_between
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 
 # What a cycle does, as bits.
@@ -55,10 +53,6 @@ WEIGH = 32  # weigh what a contact of the certified model looks like
 
 # What contradicts a certificate that is withheld.
 NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST = range(5)
-
-ADAPT = int(SchemeState.ADAPT)
-CERTIFY = int(SchemeState.CERTIFY)
-MONITOR = int(SchemeState.MONITOR)
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
@@ -73,254 +67,8 @@ _REFUTED = int(Observation.REFUTED)
 _UNSEEN = int(Observation.UNSEEN)
 _WITHHELD = int(Observation.WITHHELD)
 
-SETTLED = 3.0
-"""Time constants of the learnt filter for which an arm that moves teaches nothing after a gap: by how much the velocity
-lags then is in S until the filter has forgotten it, and would be learnt."""
 _EIGENVALUE_EVERY = 64
 """Samples between two looks at the eigenvalues: they take 8 µs, the rest of a step about 3 µs."""
-WIDE = 1
-"""Filter of the bank whose output, with the filter undone, is the external torque of contact reports: undoing a faster
-one would bring back the noise that it let through."""
-_SLOW = 0
-"""Filter of the bank by which a model is tested and reported: the slow one, whose noise is least."""
-_LEARNT = 1
-"""Filter of the bank that is learnt from: faster than that, so its samples are soon independent, and reversals show."""
-
-
-def parameter_names(settings: Settings) -> tuple[str, ...]:
-    """Name all parameters of the certified scheme, in order: dynamic ones, offsets, lags, further friction."""
-    return settings.estimator.parameter_names + settings.further_names
-
-
-def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
-    """Give each parameter the value of its kind, in the order of `CertifiedSettings`."""
-    inertia, viscous, coulomb, gravity, offset, lag, further = values
-    prefixes = (("F_v", viscous), ("F_c", coulomb), ("offset", offset), ("lag", lag))
-    exact = {"a1": inertia, "a2": inertia, "a3": inertia, "a4": gravity, "a5": gravity}
-    found = [exact.get(name, next((v for p, v in prefixes if name.startswith(p)), further)) for name in names]
-    return np.array(found)
-
-
-def prior_of(settings: Settings) -> Vector:
-    """Return what is expected of an arm of which nothing is known (p,): nothing, but the velocity's usual lag."""
-    return _by_kind((0.0, 0.0, 0.0, 0.0, 0.0, settings.certified.lag_s, 0.0), parameter_names(settings))
-
-
-def prior_std_of(settings: Settings) -> Vector:
-    """Return how far an arm of which nothing is known may be from that (p,)."""
-    names = parameter_names(settings)
-    shares = [next((share for term, share in friction.SHARES.items() if name.startswith(term)), 1.0) for name in names]
-    std: Vector = _by_kind(settings.certified.prior_std, names) * np.array(shares)
-    return std
-
-
-def constants_of(settings: Settings) -> Structured:
-    """Put the settings into the form that the compiled step reads."""
-    certified, names = settings.certified, parameter_names(settings)
-    period_s = settings.bus.period_s
-    cutoff = np.array(certified.cutoffs_rad_s)
-    decay, weight_old, weight_new = np.zeros_like(cutoff), np.zeros_like(cutoff), np.zeros_like(cutoff)
-    bank.discretise(cutoff, period_s, decay, weight_old, weight_new)
-    base = len(settings.estimator.parameter_names)
-    theta_cad = np.zeros(len(names))
-    theta_cad[: len(settings.arm.cad_theta)] = settings.arm.cad_theta
-    inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
-    correlated = 2.0 / (cutoff[_LEARNT] * period_s * certified.learn_every)
-    values: dict[str, Any] = {
-        "period_s": period_s,
-        "cutoff": cutoff,
-        "decay": decay,
-        "weight_old": weight_old,
-        "weight_new": weight_new,
-        "base": base,
-        "first_coulomb": PARAMETER_NAMES.index("F_c1"),
-        "first_term": base + 2 * JOINTS,
-        "width_rad_s": certified.coulomb_width_rad_s,
-        "stribeck_rad_s": certified.stribeck_rad_s,
-        "terms": [FRICTION_TERMS.index(term) for term in certified.friction_terms],
-        "dahl_rad": certified.dahl_rad,
-        "theta_cad": theta_cad,
-        "prior": prior_of(settings),
-        "prior_std": prior_std_of(settings),
-        "enough_std": _by_kind(certified.enough_std, names),
-        "drift_std": _by_kind(certified.drift_std, names),
-        "model_error": _by_kind(certified.model_error, names),
-        "payload_direction": belief.payload_direction(settings.arm.link_length_m, len(names)),
-        "payload_std_kg": certified.payload_std_kg,
-        "payload_inertia_std": certified.payload_inertia_std,
-        "correlated": max(correlated, 1.0),
-        "residual_Nm": certified.residual_Nm,
-        "learn_every": certified.learn_every,
-        "recover_cycles": round(certified.recover_s / period_s),
-        "settle_cycles": round(SETTLED / (cutoff[_LEARNT] * period_s)),
-        "fit_cycles": [round(fit_s / period_s) for fit_s in certified.fit_s],
-        "test_cycles": [round(test_s / period_s) for test_s in certified.test_s],
-        "beta_Nm": certified.beta_Nm,
-        "refine_cycles": round(certified.refine_s / period_s),
-        "excitation_Nm2s": certified.excitation_Nm2s,
-        "condition": certified.condition,
-        "scale": _by_kind((inertia, viscous, coulomb, gravity, coulomb, 0.005, coulomb), names)[: base + 2 * JOINTS],
-        "travel_rad": np.radians(settings.termination.travel_deg),
-        "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
-        "smoothing": np.exp(-certified.smoothing_rad_s * period_s),
-        **sensitivity.noise_constants(certified, period_s),
-        **anchor.constants_of(settings),
-        **doubt.constants_of(settings, len(names)),
-        **earlier.constants_of(settings, prior_std_of(settings)),
-        **last_certificate.constants_of(settings),
-        **tail.constants_of(settings),
-        "model_sigmas": certified.model_sigmas,
-        "torque_noise_Nm": certified.torque_noise_Nm,
-        "noise_sigmas": certified.noise_sigmas,
-        "still_rad_s": certified.still_rad_s,
-        "standstill_share": certified.standstill_share,
-        "collision_Nm": settings.detector.collision_Nm,
-        "position_limit_rad": settings.arm.position_limit_rad,
-        "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
-        "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
-        "rest_torque_Nm": settings.safety.rest_torque_Nm,
-    }
-    constants = np.zeros(1, np.dtype([(name, np.float64, np.shape(value)) for name, value in values.items()]))
-    for name, value in values.items():
-        constants[name] = value
-    return constants
-
-
-def new_memory(settings: Settings) -> Structured:
-    """Return the memory before the first sample: a gap, and a belief that is the prior."""
-    certified = settings.certified
-    filter_count, channel_count = settings.filter_count, settings.channel_count
-    count = len(parameter_names(settings))
-    learn_s = settings.bus.period_s * certified.learn_every
-    waiting = max(round(certified.hold_back_s / learn_s), 1)
-    joint, parameter = (JOINTS,), (count,)
-    columns, square = (JOINTS, count), (count, count)
-    shapes: dict[str, tuple[int, ...]] = {
-        "has_gap": (),
-        "is_steady": (),
-        # bank
-        "Y_p": columns,
-        "Y_h": columns,
-        "input_old": (filter_count, *columns),
-        "S": (filter_count, *columns),
-        "W_f": (filter_count, *columns),
-        "tau_f": (filter_count, JOINTS),
-        "tau_old": (filter_count, JOINTS),
-        "rates": (3, filter_count),
-        "last": (3, JOINTS),
-        "between": (3, JOINTS),
-        # model in use
-        "theta": parameter,
-        "P": square,
-        "M": (JOINTS, JOINTS),
-        "promotions": (),
-        "certified": parameter,
-        "P_certified": square,
-        # belief
-        "belief": parameter,
-        "P_belief": square,
-        "v": parameter,
-        "K": parameter,
-        "ring_W": (waiting, *columns),
-        "ring_tau": (waiting, JOINTS),
-        "ring_R": (waiting, JOINTS),
-        "ring_still": (waiting, JOINTS),
-        "ring_used": (),
-        "ring_next": (),
-        "since_learnt": (),
-        "recovering_cycles": (),
-        # evidence
-        "is_payload": (),
-        "samples": (),
-        "tested": (),
-        "test_limit_Nm": (),
-        "q_low": joint,
-        "q_high": joint,
-        "dq_low": joint,
-        "dq_high": joint,
-        "information": square,
-        "scratch": square,
-        "excitation": (),
-        "condition": (),
-        # candidate
-        "candidate": parameter,
-        "P_candidate": square,
-        "candidate_cycles": (),
-        "candidate_square": (),
-        "frozen_square": (),
-        "candidate_worst": (),
-        # detection
-        "r": (filter_count, JOINTS),
-        "y": (channel_count, JOINTS),
-        "h": (channel_count, JOINTS),
-        "h_model": (channel_count, JOINTS),
-        "still": (filter_count, JOINTS),
-        "still_smooth": (filter_count, JOINTS),
-        "doubt": (filter_count, JOINTS),
-        "bent": (2, JOINTS),
-        "rest_samples": (),
-        "rest_tau": joint,
-        "rest_square": joint,
-        "roughness": joint,
-        "has_sample": (),
-        "torque_changes": joint,
-        "torque_change_Nm": joint,
-        "torque_step_Nm": joint,
-        "torque_pull_Nm": joint,
-        # anchors of the offsets
-        "rest_count": (),
-        "anchor_age_s": (),
-        "anchor_Nm": (anchor.KINDS, *joint),
-        "anchor_std": (anchor.KINDS, *joint),
-        "bound_Nm": (anchor.KINDS, *joint),
-        "judged_Nm": joint,
-        # what was known earlier
-        **earlier.shapes_of(count),
-        **fit_samples.shapes_of(count),
-        **last_certificate.shapes_of(),
-        **doubt.shapes_of(),
-        **tail.shapes_of(channel_count),
-        **lost_samples.shapes_of(filter_count),
-        "withheld_by": (),
-        "dq_old": joint,
-        "ddq_old": joint,
-        "velocity_roughness": joint,
-        "unit": joint,
-        "strain": joint,
-        "used": joint,
-        "peak_share": joint,
-        "hold": joint,
-        "held": (filter_count, JOINTS),
-        # contact
-        "history": (contact.WIDE_SAMPLES + 1, JOINTS),
-        "wide_sigma": joint,
-        "wide_threshold": joint,
-    }
-    memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
-    memory["has_gap"] = 1.0
-    memory["roughness"] = 1.0
-    memory["velocity_roughness"] = 1.0
-    memory["unit"] = 1.0
-    memory["strain"] = 1.0
-    state = memory[0]
-    prior, prior_std = prior_of(settings), prior_std_of(settings)
-    belief.begin(prior, prior_std, state["belief"], state["P_belief"])
-    belief.begin(prior, prior_std, state["theta"], state["P"])
-    constants = constants_of(settings)[0]
-    anchor.begin(constants, state)
-    last_certificate.begin(constants, state)
-    return memory
-
-
-def new_block(settings: Settings) -> Structured:
-    """Return a block before the first sample: zeros, and thresholds that nothing exceeds."""
-    base = len(settings.estimator.parameter_names)
-    further = len(parameter_names(settings)) - base
-    layout = certified_layout(base, further, settings.channel_count)
-    block = np.zeros(1, block_dtype(layout))
-    for name in ("threshold", "threshold_bank", "paper_threshold"):
-        block[name] = np.inf
-    return block
 
 
 @compiled
@@ -489,11 +237,11 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     _take_sample(k, m, out["q"], out["dq"], out["tau_J"], is_seen, out["tau_ext_wide_hat"])
     m["has_gap"] = 0.0
     keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
-    out["tau_f"][:] = m["tau_f"][_SLOW]
-    detector.predict(m["W_f"][_SLOW], k["theta_cad"], out["tau_f_cad"])
+    out["tau_f"][:] = m["tau_f"][bank.SLOW]
+    detector.predict(m["W_f"][bank.SLOW], k["theta_cad"], out["tau_f_cad"])
     for i in range(out["q"].shape[0]):
-        out["tau_ext_hat"][i] = m["r"][_SLOW, i]
-        out["tau_f_hat"][i] = m["r"][_SLOW, i] + out["tau_f"][i]
+        out["tau_ext_hat"][i] = m["r"][bank.SLOW, i]
+        out["tau_f_hat"][i] = m["r"][bank.SLOW, i] + out["tau_f"][i]
         out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
     return bool(is_seen)
 
@@ -530,7 +278,7 @@ def _take_sample(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector, is_seen: 
         sensitivity.follow_velocity_noise(k, m, dq)
     sensitivity.follow_standstill(dq, k["still_rad_s"], k["decay"], k["smoothing"], m["still"], m["still_smooth"])
     sensitivity.follow_friction(k, m)
-    contact.undo_filter(m["r"][WIDE], k["decay"][WIDE], m["history"], tau_ext_wide_hat)
+    contact.undo_filter(m["r"][bank.WIDE], k["decay"][bank.WIDE], m["history"], tau_ext_wide_hat)
 
 
 @compiled
@@ -553,8 +301,8 @@ def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
     """Compare with the thresholds; return CONTACT, COLLISION and the joints that are over, if any."""
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m["h"])
-        out["threshold"][:] = m["h"][_SLOW]
-        sensitivity.fill_wide(k, m, WIDE)
+        out["threshold"][:] = m["h"][bank.SLOW]
+        sensitivity.fill_wide(k, m, bank.WIDE)
     joints = sensitivity.joints_over(m["y"], m["h"])
     if not joints:
         return 0
@@ -593,10 +341,10 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if mode & REFINE:
         _refine(k, m, is_free)
         return 0
-    if is_free and belief.learn(k, m, m["W_f"][_LEARNT], m["tau_f"][_LEARNT], m["held"][_LEARNT], m["still"][_LEARNT]):
+    if is_free and belief.learn(k, m, bank.LEARNT):
         _use_belief(m)
         earlier.follow(k, m)
-        fit_samples.keep(m, m["W_f"][_SLOW], m["tau_f"][_SLOW])
+        fit_samples.keep(m, m["W_f"][bank.SLOW], m["tau_f"][bank.SLOW])
     if not (is_free and _gather_evidence(k, m, out)):
         return 0
     m["withheld_by"] = _contradicted_by(k, m)
@@ -623,10 +371,10 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     """
     m["tested"] += 1.0
     termination.widen(dq, m["dq_low"], m["dq_high"])
-    sensitivity.follow_unit(k, m, _SLOW, k["unit_test_share"])
+    sensitivity.follow_unit(k, m, bank.SLOW, k["unit_test_share"])
     has_moved = True
     for i in range(dq.shape[0]):
-        if not (abs(m["r"][_SLOW, i]) <= m["test_limit_Nm"]):
+        if not (abs(m["r"][bank.SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
             return _REFUTED
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
@@ -645,9 +393,9 @@ def _refine(k: Any, m: Any, is_free: bool) -> None:
     """Learn on beside the model in use, and let what was learnt take over after its test."""
     if not is_free:
         return
-    sensitivity.follow_unit(k, m, _SLOW, k["unit_share"])
+    sensitivity.follow_unit(k, m, bank.SLOW, k["unit_share"])
     sensitivity.relax(k, m)
-    if belief.learn(k, m, m["W_f"][_LEARNT], m["tau_f"][_LEARNT], m["held"][_LEARNT], m["still"][_LEARNT]):
+    if belief.learn(k, m, bank.LEARNT):
         belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])
     refinement.test_candidate(k, m)
 
@@ -657,7 +405,7 @@ def _gather_evidence(k: Any, m: Any, out: Any) -> bool:
     """Take this sample into the evidence and tell whether it is complete and the model can be an arm's."""
     termination.widen(out["q"], m["q_low"], m["q_high"])
     termination.widen(out["dq"], m["dq_low"], m["dq_high"])
-    termination.add_information(m["W_f"][_SLOW], k["period_s"], m["information"])
+    termination.add_information(m["W_f"][bank.SLOW], k["period_s"], m["information"])
     if m["samples"] % _EIGENVALUE_EVERY == _EIGENVALUE_EVERY - 1:
         smallest, largest = termination.eigenvalue_range(m["information"], k["scale"], m["scratch"])
         m["excitation"] = smallest
@@ -685,62 +433,3 @@ def _fill_model(k: Any, m: Any, out: Any) -> None:
     out["condition"][0] = m["condition"]
     out["promotions"][0] = m["promotions"]
     out["quiet_s"][0] = m["tested"] * k["period_s"]
-
-
-@compiled
-def step_record(
-    constants: Structured,
-    memory: Structured,
-    block: Structured,
-    q: Vector,
-    dq: Vector,
-    tau_J: Vector,
-    payload_at: int,
-    state: Vector,
-    observation: Vector,
-    y: Vector,
-    h: Vector,
-    theta: Vector,
-) -> None:
-    """Play an arm that doesn't react over n samples: ADAPT, CERTIFY, MONITOR; at a payload's sample all again.
-
-    After a contact before the certificate it waits as after one while monitoring, then begins anew.
-
-    q, dq, tau_J (n, 2) at the nominal period; payload_at: sample, -1 for none. Fills state (n,) by `SchemeState`,
-    observation (n,), y and h (n, channels, 2), and the model in use theta (n, p).
-    """
-    now, begins_in = ADAPT, -1
-    is_payload = False
-    begin_adaptation(constants, memory, is_payload)
-    for k in range(q.shape[0]):
-        if k == payload_at:
-            is_payload, begins_in = now == MONITOR, 0
-        if begins_in == 0:
-            begin_adaptation(constants, memory, is_payload)
-            now = ADAPT
-        begins_in -= 1
-        block[0]["q"][:] = q[k]
-        block[0]["dq"][:] = dq[k]
-        block[0]["tau_J"][:] = tau_J[k]
-        block[0]["period_s"][0] = 0.0
-        mode = 0
-        if begins_in < 0:
-            mode = LEARN if now == ADAPT else (TEST if now == CERTIFY else REFINE)
-        found = step(constants, memory, block, 1, 1, WATCH | mode)
-        state[k] = now
-        observation[k] = found
-        y[k] = memory[0]["y"]
-        h[k] = memory[0]["h"]
-        theta[k] = memory[0]["theta"]
-        if found & _CONTACT and now != MONITOR and begins_in < 0:
-            begins_in = int(constants[0]["recover_cycles"])
-        elif found & _FITTED:
-            begin_test(constants, memory)
-            now = CERTIFY
-        elif found & _REFUTED:
-            is_payload, begins_in = False, 0
-        elif found & _WITHHELD:
-            begins_in = 0
-        elif found & _CERTIFIED:
-            begin_refinement(memory)
-            now = MONITOR

@@ -18,7 +18,7 @@ from adacd_hil.records import (
     SchemeState,
     certified_layout,
 )
-from adacd_hil.scheme import certificate, certified_kernel, earlier, lost_samples
+from adacd_hil.scheme import bank, certificate, certified_kernel, certified_memory, earlier, lost_samples
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
@@ -54,11 +54,11 @@ class CertifiedPipeline(RunsBatches):
 
     def __init__(self, settings: Settings) -> None:
         base = len(settings.estimator.parameter_names)
-        self._names = certified_kernel.parameter_names(settings)
+        self._names = certified_memory.parameter_names(settings)
         places = certified_layout(base, len(self._names) - base, settings.channel_count).slices
-        self._constants = certified_kernel.constants_of(settings)
-        self._memory = certified_kernel.new_memory(settings)
-        self._block = certified_kernel.new_block(settings)
+        self._constants = certified_memory.constants_of(settings)
+        self._memory = certified_memory.new_memory(settings)
+        self._block = certified_memory.new_block(settings)
         self._values = self._block.view(np.float64)
         self._q = self._values[places["q"]]
         self._dq = self._values[places["dq"]]
@@ -67,7 +67,7 @@ class CertifiedPipeline(RunsBatches):
         self._promotions = self._values[places["promotions"]]
         self._intervals = Intervals(settings)
         self._theta_hat = places["theta_hat"]
-        self._tau_ext_hat = self._memory[0]["y"][certified_kernel.WIDE]  # what a reaction goes by: fast, and smooth
+        self._tau_ext_hat = self._memory[0]["y"][bank.WIDE]  # what a reaction goes by: fast, and smooth
         self._tau_ext_wide_hat = self._values[places["tau_ext_wide_hat"]]
         self._sigma = self._memory[0]["wide_sigma"]
         self._threshold = self._memory[0]["wide_threshold"]

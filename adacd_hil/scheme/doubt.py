@@ -29,12 +29,10 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
-from adacd_hil.scheme import belief, sensitivity
+from adacd_hil.scheme import bank, belief, sensitivity
 
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""
-FILTER = 1
-"""Of the bank: fast enough to forget within 0.1 s that the arm has rested."""
 RESIDUAL_NM = 0.012
 """Rms that a good model leaves behind it."""
 FEWEST_LOADED, FEWEST = 2, 3
@@ -106,8 +104,8 @@ def weigh(k: Any, m: Any) -> None:
     """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
     _follow_peak(m)
     for i in range(m["tau_f"].shape[1]):
-        if m["still"][FILTER, i] < RESTING and abs(m["dq_old"][i]) > belief.SLOW_RAD_S:
-            _add(k, m, i, m["W_f"][FILTER, i], m["tau_f"][FILTER, i], m["still"][FILTER, i], 1.0)
+        if m["still"][bank.LEARNT, i] < RESTING and abs(m["dq_old"][i]) > belief.SLOW_RAD_S:
+            _add(k, m, i, m["W_f"][bank.LEARNT, i], m["tau_f"][bank.LEARNT, i], m["still"][bank.LEARNT, i], 1.0)
 
 
 @compiled
@@ -161,7 +159,7 @@ class Doubt:
 
     def __init__(self, settings: Settings, constants: Any, memory: Any) -> None:
         self._constants, self._memory = constants[0], memory[0]
-        self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[FILTER] * settings.bus.period_s)
+        self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[bank.LEARNT] * settings.bus.period_s)
         self._period_s = settings.bus.period_s
         self._contacts: deque[_Weighed] = deque(maxlen=MOST)
         self._monitored_s = 0.0

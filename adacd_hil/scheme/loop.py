@@ -3,6 +3,8 @@
 The same calls in the same order as a live cycle, without what comes after them: a cycle that is calm ends there, and
 the first that isn't, or the last that was asked for, is the caller's to conclude.
 
+`step_record` plays a record without a supervisor.
+
 Compiled at their first call, which no live run makes.
 """
 
@@ -12,10 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled, released
-from adacd_hil.records import ArmBatch, Vector
-from adacd_hil.scheme import beside, certified_kernel, kernel, report
+from adacd_hil.records import ArmBatch, SchemeState, Vector
+from adacd_hil.scheme import bank, beside, certified_kernel, kernel, report
 from adacd_hil.scheme.calm import Calm, is_calm
 from adacd_hil.scheme.kernel import Structured
+from adacd_hil.scheme.observation import Observation
+
+_ADAPT = int(SchemeState.ADAPT)
+_CERTIFY = int(SchemeState.CERTIFY)
+_MONITOR = int(SchemeState.MONITOR)
+_CONTACT = int(Observation.CONTACT)
+_FITTED = int(Observation.FITTED)
+_CERTIFIED = int(Observation.CERTIFIED)
+_REFUTED = int(Observation.REFUTED)
+_WITHHELD = int(Observation.WITHHELD)
 
 
 class Samples(NamedTuple):
@@ -129,7 +141,7 @@ def run_certified(
         for j in range(values.size):
             recorded.blocks[k, j] = values[j]
         passed += samples.periods[k]
-        y = m["y"][certified_kernel.WIDE]
+        y = m["y"][bank.WIDE]
         along_Nm = y[0] * touch.way[0] + y[1] * touch.way[1]
         if (
             not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k])
@@ -142,3 +154,64 @@ def run_certified(
         report.put_row(touch.rows, place, out["q"], out["tau_ext_wide_hat"], m["wide_sigma"], m["wide_threshold"])
         written += 1
     return last, paper_mode
+
+
+@compiled
+def step_record(
+    constants: Structured,
+    memory: Structured,
+    block: Structured,
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    payload_at: int,
+    state: Vector,
+    observation: Vector,
+    y: Vector,
+    h: Vector,
+    theta: Vector,
+) -> None:
+    """Play an arm that doesn't react over n samples: ADAPT, CERTIFY, MONITOR; at a payload's sample all again.
+
+    After a contact before the certificate it waits as after one while monitoring, then begins anew.
+
+    q, dq, tau_J (n, 2) at the nominal period; payload_at: sample, -1 for none. Fills state (n,) by `SchemeState`,
+    observation (n,), y and h (n, channels, 2), and the model in use theta (n, p).
+    """
+    now, begins_in = _ADAPT, -1
+    is_payload = False
+    certified_kernel.begin_adaptation(constants, memory, is_payload)
+    for k in range(q.shape[0]):
+        if k == payload_at:
+            is_payload, begins_in = now == _MONITOR, 0
+        if begins_in == 0:
+            certified_kernel.begin_adaptation(constants, memory, is_payload)
+            now = _ADAPT
+        begins_in -= 1
+        block[0]["q"][:] = q[k]
+        block[0]["dq"][:] = dq[k]
+        block[0]["tau_J"][:] = tau_J[k]
+        block[0]["period_s"][0] = 0.0
+        mode = certified_kernel.WATCH
+        if begins_in < 0 and now == _ADAPT:
+            mode |= certified_kernel.LEARN
+        elif begins_in < 0:
+            mode |= certified_kernel.TEST if now == _CERTIFY else certified_kernel.REFINE
+        found = certified_kernel.step(constants, memory, block, 1, 1, mode)
+        state[k] = now
+        observation[k] = found
+        y[k] = memory[0]["y"]
+        h[k] = memory[0]["h"]
+        theta[k] = memory[0]["theta"]
+        if found & _CONTACT and now != _MONITOR and begins_in < 0:
+            begins_in = int(constants[0]["recover_cycles"])
+        elif found & _FITTED:
+            certified_kernel.begin_test(constants, memory)
+            now = _CERTIFY
+        elif found & _REFUTED:
+            is_payload, begins_in = False, 0
+        elif found & _WITHHELD:
+            begins_in = 0
+        elif found & _CERTIFIED:
+            certified_kernel.begin_refinement(memory)
+            now = _MONITOR

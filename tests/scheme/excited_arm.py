@@ -11,13 +11,13 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.excitation import Excitation
 from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme import certified_kernel, certified_memory, loop
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
 PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")
 SETTINGS = replace(SETTINGS, safety=replace(SETTINGS.safety, commission_s=0.01))
-NAMES = certified_kernel.parameter_names(SETTINGS)
+NAMES = certified_memory.parameter_names(SETTINGS)
 OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
 
 
@@ -30,7 +30,7 @@ class Record(NamedTuple):
 
 
 class Played(NamedTuple):
-    """What `certified_kernel.step_record` has made of a record."""
+    """What `loop.step_record` has made of a record."""
 
     state: np.ndarray
     observation: np.ndarray
@@ -80,14 +80,14 @@ def record(theta, seconds, tau_ext=None, added=None, added_at_s=0.0, motion=None
 def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS, at_rest: int = 0) -> Played:
     """Play a record through the compiled step, after samples at rest where it begins."""
     count = len(measured.q)
-    constants, memory = certified_kernel.constants_of(settings), certified_kernel.new_memory(settings)
-    block = certified_kernel.new_block(settings)
+    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
+    block = certified_memory.new_block(settings)
     block["q"] = measured.q[0]
     for _ in range(at_rest):
         certified_kernel.step(constants, memory, block, 1, 1, certified_kernel.WATCH)
     state, observation, theta = np.zeros(count), np.zeros(count), np.zeros((count, len(NAMES)))
     y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
-    certified_kernel.step_record(constants, memory, block, *measured, payload_at, state, observation, y, h, theta)
+    loop.step_record(constants, memory, block, *measured, payload_at, state, observation, y, h, theta)
     return Played(state, observation, y, h, theta, constants, memory, block)
 
 

@@ -10,7 +10,7 @@ from long_cases import long_but
 from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme import anchor, certified_kernel
+from adacd_hil.scheme import anchor, certified_memory
 from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
@@ -300,7 +300,7 @@ class Judged:
     """A kernel's memory with one joint's offset judged by an anchor."""
 
     def __init__(self, settings=FREE, std_Nm=0.01, friction_Nm=0.0):
-        self.k, self.m = certified_kernel.constants_of(settings)[0], certified_kernel.new_memory(settings)[0]
+        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
         self.theta, self.P = np.zeros(len(NAMES)), np.zeros((len(NAMES), len(NAMES)))
         self.P[OFFSETS, OFFSETS] = std_Nm**2
         self.theta[FRICTION] = friction_Nm

@@ -8,9 +8,9 @@ import scipy.optimize
 from excited_arm import NAMES, SETTINGS
 from planar_arm import PAYLOAD_1KG
 
-from adacd_hil.scheme import belief, certified_kernel
+from adacd_hil.scheme import bank, belief, certified_memory
 
-CONSTANTS = certified_kernel.constants_of(SETTINGS)
+CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 COUNT = len(NAMES)
 EVERY = SETTINGS.certified.learn_every
@@ -18,7 +18,7 @@ WAITING = round(SETTINGS.certified.hold_back_s / (EVERY * SETTINGS.bus.period_s)
 
 
 def prior():
-    return certified_kernel.new_memory(SETTINGS)[0]
+    return certified_memory.new_memory(SETTINGS)[0]
 
 
 def samples(count=400, seed=1):
@@ -27,9 +27,14 @@ def samples(count=400, seed=1):
     return W_f, W_f @ random.standard_normal(COUNT) + 0.1 * random.standard_normal((count, 2))
 
 
+def learn(m, W_f, tau_f, held=0.0):
+    m["W_f"][bank.LEARNT], m["tau_f"][bank.LEARNT], m["held"][bank.LEARNT] = W_f, tau_f, held
+    return belief.learn(K, m, bank.LEARNT)
+
+
 def teach(m, W_f, tau_f, held=0.0):
-    held = np.broadcast_to(held, tau_f.shape).copy()
-    return [belief.learn(K, m, *sample, np.zeros(2)) for sample in zip(W_f, tau_f, held, strict=True)]
+    held = np.broadcast_to(held, tau_f.shape)
+    return [learn(m, *sample) for sample in zip(W_f, tau_f, held, strict=True)]
 
 
 def test_a_belief_begins_with_the_prior():
@@ -75,7 +80,7 @@ def test_samples_closer_than_their_noise_changes_count_for_less_but_never_for_mo
     a = SETTINGS.certified.cutoffs_rad_s[1]
     for every, correlated in ((EVERY, 2.0 / (a * EVERY * 1e-3)), (20, 2.0), (60, 1.0)):
         settings = replace(SETTINGS, certified=replace(SETTINGS.certified, learn_every=every))
-        assert float(certified_kernel.constants_of(settings)["correlated"][0]) == pytest.approx(correlated)
+        assert float(certified_memory.constants_of(settings)["correlated"][0]) == pytest.approx(correlated)
 
 
 def test_the_belief_tells_when_it_has_changed():
@@ -93,8 +98,8 @@ def test_a_sample_is_not_learnt_before_it_has_waited():
     wait = WAITING * EVERY
     for k in range(at + wait + 1):
         assert np.array_equal(untouched_belief["belief"], belief_hat["belief"])
-        belief.learn(K, untouched_belief, W_f[k], tau_f[k], np.zeros(2), np.zeros(2))
-        belief.learn(K, belief_hat, W_f[k], touched[k], np.zeros(2), np.zeros(2))
+        learn(untouched_belief, W_f[k], tau_f[k])
+        learn(belief_hat, W_f[k], touched[k])
     assert np.max(np.abs(untouched_belief["belief"] - belief_hat["belief"])) > 1e-3
 
 

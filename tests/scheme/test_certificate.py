@@ -5,9 +5,9 @@ import pytest
 from excited_arm import NAMES, SETTINGS
 
 from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.scheme import certificate, certified_kernel
+from adacd_hil.scheme import certificate, certified_kernel, certified_memory
 
-CONSTANTS = certified_kernel.constants_of(SETTINGS)
+CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 FIT = SETTINGS.certified.fit_s
 TRAVEL, SPEED = float(K["travel_rad"]), float(K["velocity_rad_s"])
@@ -15,7 +15,7 @@ TRAVEL, SPEED = float(K["travel_rad"]), float(K["velocity_rad_s"])
 
 def fitted_arm(**changes):
     """Return the memory of an arm whose evidence is just complete, with some fields changed."""
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     m["samples"] = round(FIT[0] * 1e3)
     m["P_belief"][:] = np.diag(np.array(K["enough_std"]) ** 2 * 0.999)
     m["excitation"], m["condition"] = K["excitation_Nm2s"], K["condition"]
@@ -74,7 +74,7 @@ def test_a_payload_needs_neither_travel_nor_excitation_but_certain_parameters():
 
 
 def test_before_its_first_sample_an_arm_has_not_travelled_at_all():
-    memory = certified_kernel.new_memory(SETTINGS)
+    memory = certified_memory.new_memory(SETTINGS)
     certified_kernel.begin_adaptation(CONSTANTS, memory, False)
     lines = missing(memory[0])
     assert "joint 1 has travelled 0.0 deg of 20: move it further" in lines

@@ -13,7 +13,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
-from adacd_hil.scheme import certificate, certified_kernel, lost_samples
+from adacd_hil.scheme import certificate, certified_kernel, certified_memory, lost_samples
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 
 COUNT = len(NAMES)
@@ -30,8 +30,8 @@ class Kernel:
     """The step with its constants, memory and block, sample by sample."""
 
     def __init__(self, settings=SETTINGS, theta=None, P=None):
-        self.constants = certified_kernel.constants_of(settings)
-        self.memory, self.block = certified_kernel.new_memory(settings), certified_kernel.new_block(settings)
+        self.constants = certified_memory.constants_of(settings)
+        self.memory, self.block = certified_memory.new_memory(settings), certified_memory.new_block(settings)
         certified_kernel.begin_adaptation(self.constants, self.memory, False)
         self.m, self.out = self.memory[0], self.block[0]
         if theta is not None:
@@ -320,7 +320,7 @@ def test_after_a_touch_it_begins_anew_from_nothing_and_is_armed(touched):
     _, played = touched
     over = np.flatnonzero(played.observation.astype(int) & Observation.CONTACT)
     begins = int(over[0]) + RECOVER + 1
-    np.testing.assert_array_equal(played.theta[begins], certified_kernel.prior_of(SETTINGS))
+    np.testing.assert_array_equal(played.theta[begins], certified_memory.prior_of(SETTINGS))
     assert played.state[begins] == SchemeState.ADAPT
     assert played.begin_of(SchemeState.MONITOR) - begins <= 2500
 

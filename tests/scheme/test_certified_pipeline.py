@@ -10,7 +10,7 @@ from excited_arm import PERIOD_S, SETTINGS, ExcitedLoop, arm_state, play, record
 from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.records import ContactLevel, FaultReason, Reaction, Request, SchemeState, certified_layout, scheme_layout
-from adacd_hil.scheme import certified_kernel
+from adacd_hil.scheme import certified_kernel, certified_memory
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.margin import MarginWatch
 from adacd_hil.scheme.observation import CONTACT_SHIFT
@@ -19,7 +19,7 @@ from adacd_hil.scheme.pipeline import Pipeline
 PLACES = certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count).slices
 BEFORE = 12
 """Cycles at rest until the first in which an arm learns."""
-PRIOR = certified_kernel.prior_of(SETTINGS)
+PRIOR = certified_memory.prior_of(SETTINGS)
 
 
 def names(outputs):

@@ -10,7 +10,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme import certified_kernel, doubt
+from adacd_hil.scheme import bank, certified_memory, doubt
 from adacd_hil.scheme.certificate_watch import BY_WORD
 from adacd_hil.scheme.doubt import Doubt
 
@@ -122,7 +122,7 @@ def test_who_touches_the_arm_again_and_again_takes_nothing_back():
 
 def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
     """The sums of a contact that one cause explains to this share, with this sigma of its size."""
-    correlated = 2.0 / (SETTINGS.certified.cutoffs_rad_s[doubt.FILTER] * PERIOD_S)
+    correlated = 2.0 / (SETTINGS.certified.cutoffs_rad_s[bank.LEARNT] * PERIOD_S)
     ww = correlated * (doubt.RESIDUAL_NM / sigma) ** 2
     rw = np.zeros(others)
     rw[cause] = size * ww
@@ -130,10 +130,10 @@ def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
 
 
 def verdict_of(contacts, gap_s=1.0, lasts_s=0.5, peak=3.0):
-    memory = certified_kernel.new_memory(SETTINGS)
+    memory = certified_memory.new_memory(SETTINGS)
     values = memory[0]
     values["theta"] = 0.0
-    judge, cycle, verdict = Doubt(SETTINGS, certified_kernel.constants_of(SETTINGS), memory), 0, None
+    judge, cycle, verdict = Doubt(SETTINGS, certified_memory.constants_of(SETTINGS), memory), 0, None
     for rw, ww, rr in contacts:
         judge.go_on(cycle)
         cycle += round(gap_s / PERIOD_S)

@@ -10,7 +10,7 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme import certified_kernel, earlier, later_samples
+from adacd_hil.scheme import certified_memory, earlier, later_samples
 from adacd_hil.scheme.certificate_watch import BY_WORD
 
 FREE = replace(
@@ -174,7 +174,7 @@ class Compared:
     """A kernel's memory with a fit and something kept, both known to `std` in every parameter."""
 
     def __init__(self, settings=FREE, std=0.01):
-        self.k, self.m = certified_kernel.constants_of(settings)[0], certified_kernel.new_memory(settings)[0]
+        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
         self.m["P_belief"] = std**2 * np.eye(len(NAMES))
         self.m["belief"] = 0.1
         self.m["fit_square"], self.m["fit_rows"] = 1.0, earlier.HARD  # u = 1
@@ -216,7 +216,7 @@ def test_an_offset_counts_both_ways_and_where_something_anchors_it_shows_that_wh
 
 def test_what_the_prior_alone_says_judges_nothing():
     prior = Compared()
-    prior.m["P_kept"][0] = np.diag(certified_kernel.new_memory(FREE)[0]["P_belief"].diagonal())
+    prior.m["P_kept"][0] = np.diag(certified_memory.new_memory(FREE)[0]["P_belief"].diagonal())
     prior.m["kept_unit"][0] = earlier.SMALLEST_UNIT
     assert prior.agrees_with("F_c1", 1.0)
     assert prior.agrees_with("a1", 1.0)
@@ -241,7 +241,7 @@ class Halves:
     """A fit whose steps had each half of its information, or less; all its samples are of parameters 0 and 1 alone."""
 
     def __init__(self, steps_used=2):
-        self.k, self.m = certified_kernel.constants_of(FREE)[0], certified_kernel.new_memory(FREE)[0]
+        self.k, self.m = certified_memory.constants_of(FREE)[0], certified_memory.new_memory(FREE)[0]
         count = len(NAMES)
         random = np.random.default_rng(5)
         root = random.standard_normal((count, count))

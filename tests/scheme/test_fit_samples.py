@@ -7,14 +7,14 @@ from planar_arm import THETA
 from test_earlier import FREE, HeldLoop, states
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme import certified_kernel, fit_samples
+from adacd_hil.scheme import certified_memory, fit_samples
 
 
 class Fit:
     """A kernel's memory with a fit that explains what it has learnt, but for noise of 0.01 Nm."""
 
     def __init__(self, learnt=300):
-        self.m = certified_kernel.new_memory(FREE)[0]
+        self.m = certified_memory.new_memory(FREE)[0]
         fit_samples.begin(self.m)
         random = np.random.default_rng(1)
         self.W = random.standard_normal((learnt, 2, len(NAMES)))

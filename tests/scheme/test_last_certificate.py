@@ -11,7 +11,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added, states
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme import certified_kernel, earlier, last_certificate
+from adacd_hil.scheme import certified_memory, earlier, last_certificate
 from adacd_hil.scheme.certificate_watch import BY_WORD, THIS_RUN_ONLY
 
 DATE = "2026-11-22T10:00:00Z"
@@ -142,7 +142,7 @@ class Asked:
         settings = known(np.full(7, 0.1))
         history = replace(settings.history, friction_std_Nm=(0.0,) * 6, inertia_std_kgm2=(0.0,) * 3, **shares)
         settings = replace(settings, history=history)
-        self.k, self.m = certified_kernel.constants_of(settings)[0], certified_kernel.new_memory(settings)[0]
+        self.k, self.m = certified_memory.constants_of(settings)[0], certified_memory.new_memory(settings)[0]
         self.m["P_belief"] = (std**2 + 1e-12) * np.eye(len(NAMES))
         self.m["fit_square"], self.m["fit_rows"] = 1.0, 4.0
 

@@ -6,16 +6,16 @@ from excited_arm import PERIOD_S, SETTINGS, ExcitedLoop, record
 from planar_arm import THETA
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme import certified_kernel, lost_samples
+from adacd_hil.scheme import certified_kernel, certified_memory, lost_samples
 from adacd_hil.scheme.observation import Observation
 
-K = certified_kernel.constants_of(SETTINGS)[0]
+K = certified_memory.constants_of(SETTINGS)[0]
 MODE = certified_kernel.WATCH | certified_kernel.REFINE
 
 
 def followed(steps, dq=(0.3, 0.3), is_seen=True, lost_Nm2=0.0):
     """Return G (3, 2) after a sample that came so many periods after the last, which had 0.3 rad/s."""
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     m["last"][1] = 0.3
     m["hold"][:] = 0.1
     m["M"][:] = np.eye(2)
@@ -49,9 +49,9 @@ class LossyArm:
 
     def __init__(self, lost, seconds=6.0):
         measured = record(THETA["P"], seconds, seed=5)
-        self.m = certified_kernel.new_memory(SETTINGS)
-        self.block = certified_kernel.new_block(SETTINGS)
-        constants = certified_kernel.constants_of(SETTINGS)
+        self.m = certified_memory.new_memory(SETTINGS)
+        self.block = certified_memory.new_block(SETTINGS)
+        constants = certified_memory.constants_of(SETTINGS)
         certified_kernel.begin_adaptation(constants, self.m, False)
         self.found, self.h, since, mode = [], [], 1, certified_kernel.WATCH | certified_kernel.LEARN
         for k, (q, dq, tau_J) in enumerate(zip(*measured, strict=True)):
@@ -83,7 +83,7 @@ def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
 
 
 def counted(unseen):
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     for is_unseen in unseen:
         lost_samples.count(m, is_unseen)
     return m

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from excited_arm import NAMES, SETTINGS
 
-from adacd_hil.scheme import certified_kernel, refinement
+from adacd_hil.scheme import certified_memory, refinement
 
-CONSTANTS = certified_kernel.constants_of(SETTINGS)
+CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 COUNT = len(NAMES)
 TRUE = np.concatenate([[0.4, 0.07, 0.04, 0.1, 0.05, 0.1, 0.08, 0.02, -0.01, 0.001, 0.001], np.zeros(COUNT - 11)])
@@ -17,7 +17,7 @@ class Refined:
     """A memory in which a test of `candidate` ends after CYCLES samples of the true arm, while `frozen` is in use."""
 
     def __init__(self, candidate, frozen):
-        self.m = certified_kernel.new_memory(SETTINGS)[0]
+        self.m = certified_memory.new_memory(SETTINGS)[0]
         self.m["theta"][:] = frozen
         self.m["belief"][:] = candidate
         self.m["P_belief"][:] = 0.25 * np.eye(COUNT)

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 from excited_arm import NAMES, SETTINGS
 
-from adacd_hil.scheme import certified_kernel, sensitivity
+from adacd_hil.scheme import certified_memory, sensitivity
 
 CERTIFIED = SETTINGS.certified
 T = SETTINGS.bus.period_s
@@ -13,14 +13,14 @@ CUTOFFS = np.array(CERTIFIED.cutoffs_rad_s)
 CHANNELS = [(a, True) for a in CUTOFFS] + [(a, False) for a in CUTOFFS[1:]]
 COULOMB = NAMES.index("F_c1")
 STRIBECK = NAMES.index("stribeck1")
-CONSTANTS = certified_kernel.constants_of(SETTINGS)
+CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 
 
 def known_arm(seed=1):
     """Return the memory of an arm of which something is known, in some motion."""
     random = np.random.default_rng(seed)
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     m["theta"][:] = random.uniform(0.05, 0.5, len(NAMES))
     root = 0.02 * random.standard_normal((len(NAMES), len(NAMES)))
     m["P"][:] = root @ root.T
@@ -177,7 +177,7 @@ FLOOR_RAD_S = sensitivity.SECOND_DIFFERENCE * CERTIFIED.velocity_noise_rad_s
 
 def after_a_swing(noise, count=2000):
     """Return the memory after a fast swing, 4 rad/s and 28 rad/s² at most, seen with white noise (n, 2) of dq."""
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     swing = 4.0 * np.sin(7.0 * T * np.arange(count))
     for dq in swing[:, None] + noise:
         sensitivity.follow_velocity_noise(K, m, dq)
@@ -209,7 +209,7 @@ def test_a_coarse_encoder_raises_the_thresholds_of_all_that_its_joint_s_momentum
 
 def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
     """Its second difference is a rise and a fall."""
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     for dq in (0.0, 0.0, 3.0, 3.0, 3.0):
         sensitivity.follow_velocity_noise(K, m, np.array([dq, 0.0]))
     share = T / sensitivity.ROUGHNESS_S
@@ -218,7 +218,7 @@ def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
 
 
 def test_a_contact_doubles_the_strain_of_the_joints_that_are_over_up_to_the_largest():
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     m["h"][:] = 1.0
     m["y"][3, 1] = -1.1
     strains = []
@@ -230,7 +230,7 @@ def test_a_contact_doubles_the_strain_of_the_joints_that_are_over_up_to_the_larg
 
 def stepped(step_Nm, std_Nm=0.02):
     """Return the memory after a second of a sensor with this step, and how far its mean is off at the worst place."""
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     noise = std_Nm * np.random.default_rng(3).standard_normal(200_000)
     for tau in np.round((noise[:10_000] + 0.5 * step_Nm) / step_Nm) * step_Nm:
         sensitivity.follow_torque_step(K, m, np.array([tau, 0.0]))
@@ -249,7 +249,7 @@ def test_a_sensor_s_step_is_found_and_its_pull_is_what_rounding_does_to_a_mean(s
 
 def test_what_changes_first_or_by_much_is_no_step():
     """A push that ends a long rest is one; so is a sensor that has more noise than steps."""
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     changes = int(sensitivity.CHANGES)
     for k in range(changes + 10):
         assert (m["torque_step_Nm"][0] > 0.0) == (k >= changes)
@@ -260,7 +260,7 @@ def test_what_changes_first_or_by_much_is_no_step():
 
 def test_a_sensor_s_step_raises_the_thresholds_by_its_noise_and_its_pull():
     m, _ = stepped(0.1)
-    fine = certified_kernel.new_memory(SETTINGS)[0]
+    fine = certified_memory.new_memory(SETTINGS)[0]
     h, h_fine = np.zeros((5, 2)), np.zeros((5, 2))
     for memory, filled in ((m, h), (fine, h_fine)):
         memory["P"][:] = 0.0
@@ -273,7 +273,7 @@ def test_a_sensor_s_step_raises_the_thresholds_by_its_noise_and_its_pull():
 
 def relaxed(share, count, strain=8.0):
     """Return the memory after samples that show this share of the threshold."""
-    m = certified_kernel.new_memory(SETTINGS)[0]
+    m = certified_memory.new_memory(SETTINGS)[0]
     m["strain"][:] = strain
     m["h"][:] = 0.5
     m["y"][2] = 0.5 * share

@@ -6,10 +6,10 @@ import scipy.signal
 from excited_arm import SETTINGS
 from test_certified_kernel import COUNT, RECOVER, Kernel
 
-from adacd_hil.scheme import certified_kernel, sensitivity, tail
+from adacd_hil.scheme import certified_kernel, certified_memory, sensitivity, tail
 from adacd_hil.scheme.observation import Observation
 
-CONSTANTS = certified_kernel.constants_of(SETTINGS)
+CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 PERIOD_S = SETTINGS.bus.period_s
 CUTOFFS = np.array(SETTINGS.certified.cutoffs_rad_s)
@@ -27,7 +27,7 @@ class Tailed:
     """The memory of an arm that moves; its thresholds without a floor are MODEL_NM."""
 
     def __init__(self):
-        self.memory = certified_kernel.new_memory(SETTINGS)
+        self.memory = certified_memory.new_memory(SETTINGS)
         self.m = self.memory[0]
         self.m["h_model"][:] = MODEL_NM
 
