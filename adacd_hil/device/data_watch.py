@@ -1,5 +1,7 @@
 """How much of the cyclic data comes in time: shares of cycles, second by second, against the limits of `[data]`.
 
+MOST_IN_A_ROW cycles without a sample for the model are said at once, too: a contact is found so much later.
+
 Counted while the drives are enabled: what a device does before and after is no measure of a run.
 """
 
@@ -10,6 +12,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.records import ArmState, Event
 
 WINDOW_S = 1.0
+MOST_IN_A_ROW = 2
 SHORTEST_SHARE = 0.2
 """Part of a window that is judged, too, when the attempt ends in it."""
 
@@ -48,6 +51,8 @@ class DataWatch:
         self._missing = [0] * len(self._names)  # of the present window
         self._repeats_before = list(arm.repeats)
         self._cycles = self._all_cycles = self._incomplete = self._late = 0
+        self._in_a_row = self._rows = 0  # cycles without a sample; rows of them in the present window
+        self._has_rows = False
         self._events: list[Event] = []
 
     def note(self, state: ArmState) -> None:
@@ -57,6 +62,9 @@ class DataWatch:
         if self._cycles == 0:
             self._repeats_before = list(self._arm.repeats)
         self._cycles += 1
+        self._in_a_row = 0 if state.is_complete else self._in_a_row + 1
+        if self._in_a_row == MOST_IN_A_ROW:
+            self._note_row()
         if self._arm.missing_frames:
             self._incomplete += 1
             self._late += state.is_complete
@@ -65,6 +73,14 @@ class DataWatch:
                 self._missing[place] += ~received >> place & 1
         if self._cycles == self._window_cycles:
             self._end_window()
+
+    def _note_row(self) -> None:
+        """Take in that the model waits for a sample; say so, until a window was without."""
+        self._rows += 1
+        if not self._has_rows:
+            self._has_rows = True
+            text = f"no sample for the model in {MOST_IN_A_ROW} cycles in a row: so much later a contact is found"
+            self._events.append(Event("warning", "data", text))
 
     def _end_window(self) -> None:
         """Judge the cycles since the last window; say what is over its limit now, and what is no longer."""
@@ -79,6 +95,11 @@ class DataWatch:
             level = "warning" if share > limit else "info"
             text = f"{name}: {share:.1%} of the last {self._cycles} cycles, {limit:.1%} allowed"
             self._events.append(Event(level, "data", text))
+        if self._has_rows and not self._rows:
+            self._has_rows = False
+            text = f"a sample for the model at least every {MOST_IN_A_ROW} cycles again, for {self._cycles} cycles"
+            self._events.append(Event("info", "data", text))
+        self._rows = 0
         self._all_cycles += self._cycles
         self._cycles = self._incomplete = 0
         self._missing = [0] * len(self._names)

@@ -8,8 +8,10 @@ and of the lag by which the measured velocity is older than the torque. For a la
 measured motion is tau_J(t - d), so tau_J = W theta + d tau_J' to first order, and the filtered derivative needs no
 differentiation: F s tau_J = a (tau_J - tau_f).
 
-Shapes: C filters, n joints, p columns. cutoff, decay, weight_old, weight_new (C,); Y_p, Y_h (n, p); tau_f (C, n);
-S, W_f, input_old (C, n, p). Units: rad/s, Nm.
+A filter's output is smoothed to make its channel. The faster ones have a second channel that isn't, the bare one.
+
+Shapes: C filters, 2 C - 1 channels, n joints, p columns. cutoff, decay, weight_old, weight_new (C,); Y_p, Y_h (n, p);
+tau_f (C, n); S, W_f, input_old (C, n, p). Units: rad/s, Nm.
 """
 
 from adacd_hil.compiled import compiled
@@ -23,6 +25,12 @@ LEARNT = 1
 WIDE = 1
 """Filter whose output, with the filter undone, is the external torque of contact reports: undoing a faster one would
 bring back the noise that it let through."""
+
+
+@compiled
+def filter_of(channel: int, filters: int) -> int:
+    """Return the filter of a channel: C smoothed ones, then the bare ones of all filters but the slow one."""
+    return channel if channel < filters else channel - filters + 1
 
 
 @compiled

@@ -68,7 +68,7 @@ _UNSEEN = int(Observation.UNSEEN)
 _WITHHELD = int(Observation.WITHHELD)
 
 _EIGENVALUE_EVERY = 64
-"""Samples between two looks at the eigenvalues: they take 8 µs, the rest of a step about 3 µs."""
+"""Samples between two looks at the eigenvalues: they take about as long as a step."""
 
 
 @compiled
@@ -116,7 +116,6 @@ def begin_test(constants: Structured, memory: Structured) -> None:
     belief.keep_non_negative(first_viscous, last_coulomb, m["belief"], m["P_belief"])
     _use_belief(m)
     belief.discard(m)
-    tail.begin(m)
     m["tested"] = 0.0
     m["test_limit_Nm"] = certificate.test_limit_Nm(k, earlier.late_square(m))
     m["dq_low"][:] = np.inf
@@ -168,7 +167,6 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
         observation |= _WITHHELD
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
-        lost_samples.count(m, observation & _UNSEEN != 0)
     else:
         out["threshold"][:] = np.inf
         out["threshold_bank"][:] = np.inf
@@ -221,20 +219,20 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     nominal_s: float = k["period_s"]
     period_s: float = out["period_s"][0]
     is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, lost_samples.MOST_FILLED)
+    each_s = period_s / steps if is_seen else period_s
     if is_seen:
-        _choose_rates(k, m, period_s / steps)
+        _choose_rates(k, m, each_s)
         for between in range(1, steps):
             put_between(m["last"], out["q"], out["dq"], out["tau_J"], between / steps, m["between"])
             m["is_steady"] = 0.0
-            _take_sample(k, m, m["between"][0], m["between"][1], m["between"][2], True, out["tau_ext_wide_hat"])
+            q, dq, tau_J = m["between"][0], m["between"][1], m["between"][2]
+            _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
     lost_samples.follow(k, m, out["dq"], max(steps, 1), period_s, is_seen)
-    if m["has_sample"] != 0.0:
-        sensitivity.follow_torque_step(k, m, out["tau_J"])
-    m["has_sample"] = 1.0
+    sensitivity.follow_torque_step(k, m, out["tau_J"])
     if not is_seen and np.max(np.abs(out["dq"])) > belief.SLOW_RAD_S:
         m["recovering_cycles"] = max(m["recovering_cycles"], k["settle_cycles"])
     m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
-    _take_sample(k, m, out["q"], out["dq"], out["tau_J"], is_seen, out["tau_ext_wide_hat"])
+    _take_sample(k, m, out["q"], out["dq"], out["tau_J"], each_s, is_seen, out["tau_ext_wide_hat"])
     m["has_gap"] = 0.0
     keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
     out["tau_f"][:] = m["tau_f"][bank.SLOW]
@@ -259,9 +257,19 @@ def _choose_rates(k: Any, m: Any, period_s: float) -> None:
 
 
 @compiled
-def _take_sample(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector, is_seen: bool, tau_ext_wide_hat: Vector) -> None:
+def _take_sample(
+    k: Any,
+    m: Any,
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    period_s: float,
+    is_seen: bool,
+    tau_ext_wide_hat: Vector,
+) -> None:
     """Take the bank over one period to a sample, or let it resume from there, and compare with the model in use."""
     cutoff = k["cutoff"]
+    friction.bend(dq, period_s, k["still_rad_s"], k["dahl_rad"], m["bent"])
     _fill_regressor(k, m, q, dq, tau_J)
     if is_seen:
         decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
@@ -291,7 +299,6 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
         m["Y_h"][i, first_coulomb + i] = friction.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
         m["Y_h"][i, base + i] = 1.0
     speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
-    friction.bend(dq, k["period_s"], k["still_rad_s"], k["dahl_rad"], m["bent"])
     friction.fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
     regressor.fill_mass_matrix(q, m["theta"], m["M"])
 
@@ -326,7 +333,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if is_touched and is_free_before and mode & (LEARN | TEST):
         sensitivity.strain(m, sensitivity.LARGEST_STRAIN)
         if mode & LEARN:
-            earlier.keep_before_contact(m)
+            earlier.keep(m)
         else:
             earlier.keep_refuted(m)
     if is_touched and mode & REFINE:

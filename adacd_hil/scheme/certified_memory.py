@@ -27,8 +27,8 @@ from adacd_hil.scheme import (
 from adacd_hil.scheme.kernel import Structured, block_dtype
 
 SETTLED = 3.0
-"""Time constants of the learnt filter for which an arm that moves teaches nothing after a gap: by how much the velocity
-lags then is in S until the filter has forgotten it, and would be learnt."""
+"""Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a
+measured velocity, which lags, and forgets that error only then."""
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
@@ -206,7 +206,6 @@ def new_memory(settings: Settings) -> Structured:
         "rest_tau": joint,
         "rest_square": joint,
         "roughness": joint,
-        "has_sample": (),
         "torque_changes": joint,
         "torque_change_Nm": joint,
         "torque_step_Nm": joint,
@@ -242,6 +241,7 @@ def new_memory(settings: Settings) -> Structured:
     }
     memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
     memory["has_gap"] = 1.0
+    memory["last"] = np.nan
     memory["roughness"] = 1.0
     memory["velocity_roughness"] = 1.0
     memory["unit"] = 1.0

@@ -18,7 +18,7 @@ from adacd_hil.records import (
     SchemeState,
     certified_layout,
 )
-from adacd_hil.scheme import bank, certificate, certified_kernel, certified_memory, earlier, lost_samples
+from adacd_hil.scheme import bank, certificate, certified_kernel, certified_memory, earlier
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
@@ -83,7 +83,7 @@ class CertifiedPipeline(RunsBatches):
         self._margin = MarginWatch(self._peak_share.size)
         self._second = round(1.0 / settings.bus.period_s)
         self._monitored = 0
-        self._has_warned = self._is_degraded = False
+        self._has_warned = False
         self._events: list[Event] = []
         self._watch = CertificateWatch(self._constants, self._memory, settings.history.date_utc)
         self._doubt = Doubt(settings, self._constants, self._memory)
@@ -189,7 +189,7 @@ class CertifiedPipeline(RunsBatches):
             self._events.append(event)
 
     def _watch_margin(self, state: SchemeState) -> None:
-        """Judge once a second of monitoring how far residuals stayed below thresholds, and what was lost."""
+        """Judge once a second of monitoring how far residuals stayed below thresholds."""
         self._monitored += 1 if state is SchemeState.MONITOR else 0
         if self._monitored < self._second:
             return
@@ -200,10 +200,6 @@ class CertifiedPipeline(RunsBatches):
         if warning and not self._has_warned:
             self._events.append(Event("warning", "margin", warning))
         self._has_warned = bool(warning)
-        lost = lost_samples.take_warning(self._memory[0])
-        if lost and not self._is_degraded:
-            self._events.append(Event("warning", "degraded", lost))
-        self._is_degraded = bool(lost)
 
     def _calm(self, cycle: int) -> Calm:
         supervisor, touch = self._supervisor, self._touch

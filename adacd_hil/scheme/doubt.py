@@ -30,6 +30,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme import bank, belief, sensitivity
+from adacd_hil.scheme.kernel import Structured
 
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""
@@ -49,13 +50,16 @@ PLAUSIBLE = 4.0
 AT_ONCE_S = 3.0
 """Another error than a payload strikes again so soon after the arm goes on; a person may wait."""
 AT_REST_S, MOST_STRAIN = 0.2, 4.0
+"""A contact so soon after going on is met at rest, and raises the thresholds of its joints, to this many times."""
 MANY, HELD_S = 8, 0.3
+"""So many contacts in a row, each so soon after going on, are no person's."""
 WEAK = 1.5
-"""Of 1100 pushes of 0.1 to 3 Nm and 30 to 800 ms some in a hundred come to less."""
+"""Times its threshold that the residual of a weak contact comes to at most."""
 RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
+"""Weak contacts of a person, of a model that is wrong, and how much likelier the second must be."""
 _FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
-RESTING = 0.6
-"""Share of standstill in a filter's memory from which on a joint counts as resting."""
+TOLD_NOTHING = 0.6
+"""Share of standstill in a filter's memory from which on a sample of its joint tells nothing of a cause."""
 
 
 def constants_of(settings: Settings, count: int) -> dict[str, Vector]:
@@ -78,6 +82,16 @@ def shapes_of() -> dict[str, tuple[int, ...]]:
 
 
 @compiled
+def react(memory: Structured, is_touched: bool, is_soon: bool) -> None:
+    """Take in that the arm reacts: to a touch so soon after going on that it strains the thresholds, or to none."""
+    m = memory[0]
+    if not is_touched:
+        _clear(m)
+    elif is_soon:
+        sensitivity.strain(m, MOST_STRAIN)
+
+
+@compiled
 def _clear(m: Any) -> None:
     m["cause_rw"][:] = 0.0
     m["cause_ww"][:] = 0.0
@@ -95,7 +109,7 @@ def begin(k: Any, m: Any) -> None:
     _follow_peak(m)
     for s in range(int(m["ring_used"])):
         for i in range(m["ring_tau"].shape[1]):
-            if m["ring_still"][s, i] < RESTING:
+            if m["ring_still"][s, i] < TOLD_NOTHING:
                 _add(k, m, i, m["ring_W"][s, i], m["ring_tau"][s, i], m["ring_still"][s, i], k["learn_every"])
 
 
@@ -104,7 +118,7 @@ def weigh(k: Any, m: Any) -> None:
     """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
     _follow_peak(m)
     for i in range(m["tau_f"].shape[1]):
-        if m["still"][bank.LEARNT, i] < RESTING and abs(m["dq_old"][i]) > belief.SLOW_RAD_S:
+        if m["still"][bank.LEARNT, i] < TOLD_NOTHING and abs(m["dq_old"][i]) > belief.SLOW_RAD_S:
             _add(k, m, i, m["W_f"][bank.LEARNT, i], m["tau_f"][bank.LEARNT, i], m["still"][bank.LEARNT, i], 1.0)
 
 
@@ -157,8 +171,8 @@ class _Weighed(NamedTuple):
 class Doubt:
     """Remembers the contacts of a certificate, and tells whether one cause explains the last ones."""
 
-    def __init__(self, settings: Settings, constants: Any, memory: Any) -> None:
-        self._constants, self._memory = constants[0], memory[0]
+    def __init__(self, settings: Settings, constants: Structured, memory: Structured) -> None:
+        self._constants, self._memory = constants[0], memory
         self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[bank.LEARNT] * settings.bus.period_s)
         self._period_s = settings.bus.period_s
         self._contacts: deque[_Weighed] = deque(maxlen=MOST)
@@ -168,9 +182,7 @@ class Doubt:
 
     def compile(self) -> None:
         """Call what is compiled once, on a copy, so that nothing compiles later."""
-        memory = self._memory.copy()
-        _clear(memory)
-        sensitivity.strain(memory, MOST_STRAIN)
+        react(self._memory.copy(), True, True)
 
     def forget(self) -> None:
         """Begin with a new certificate."""
@@ -186,16 +198,16 @@ class Doubt:
         self._waited_s = cycle * self._period_s - self._monitored_s
         likelier = (OFTEN_PER_H - RARELY_PER_H) / 3600.0 * self._waited_s
         self._log_odds = max(self._log_odds - likelier, 0.0)
-        if is_touched and self._waited_s < AT_REST_S:
-            sensitivity.strain(self._memory, MOST_STRAIN)
-        if not is_touched:
-            _clear(self._memory)
+        react(self._memory, is_touched, self._waited_s < AT_REST_S)
 
     def end(self, cycle: int) -> Verdict | None:
         """Take in that it has ended; return what the last ones look like, if they have one cause."""
         now_s = cycle * self._period_s
-        m = self._memory
-        self._contacts.append(_weighed(m, self._waited_s, now_s))
+        last = _weighed(self._memory[0], self._waited_s, now_s)
+        self._contacts.append(last)
+        if 0.0 < last.peak < WEAK and last.waited_s >= AT_REST_S:
+            self._log_odds += np.log(OFTEN_PER_H / RARELY_PER_H)
+            self._weak += 1
         while self._contacts[0].ended_s < now_s - WITHIN_S:
             self._contacts.popleft()
         return self._payload() or self._other() or self._unexplained()
@@ -226,11 +238,8 @@ class Doubt:
         return None
 
     def _unexplained(self) -> Verdict | None:
-        """Count a weak contact; return what is to be said if no person is likely to touch so."""
+        """Return what is to be said if no person is likely to touch so."""
         last = list(self._contacts)[-MANY:]
-        if 0.0 < last[-1].peak < WEAK and last[-1].waited_s >= AT_REST_S:
-            self._log_odds += np.log(OFTEN_PER_H / RARELY_PER_H)
-            self._weak += 1
         text = ""
         if len(last) == MANY and max(contact.waited_s for contact in last[1:]) < HELD_S:
             text = f"{MANY} contacts came within {HELD_S:g} s of going on each"
@@ -245,7 +254,7 @@ class Doubt:
     def _can_be(self, h: int, size: float) -> bool:
         """Tell whether an arm may have so much more of a friction than the model: none has less than none."""
         cause = self._constants["causes"][h]
-        total = float(cause @ self._memory["theta"]) + size
+        total = float(cause @ self._memory[0]["theta"]) + size
         return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._constants["prior_std"])
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:

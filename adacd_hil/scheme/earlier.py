@@ -24,8 +24,8 @@ inertia, an offset that nothing anchors:
     c (theta - theta_0) <= max(floor, SIGMAS sqrt(c (P_0 + P) c'))
 
 The first ones know little and bound little. The last ones may have been touched, and say anything. So one that is
-apart from an earlier one (`later_samples`) is forgotten: a pair is compared with each sample that the next fit learns,
-from APART_STEPS on.
+apart from an earlier one (`later_samples`) is forgotten: with each of the last samples that the next fit learns, one
+pair is compared.
 
 A hand that doesn't help the arm only adds friction and inertia. So **less is the arm's**, and more is a touch that has
 not been seen to end. Of an offset that nothing anchors neither value is known to be the arm's, so both signs count; of
@@ -55,17 +55,14 @@ LEARNT_SHARE = 2.5
 """How many times the rms of the learnt residuals, of their better part, it may differ beside that."""
 LATER_NM = 0.02
 """Of 220 untouched arms, wide ones included, the worst came to 0.95 of this, half of them to 0.35."""
-APART_STEPS = 6
-"""From when on kept beliefs are compared with each other: there are samples enough, and enough are still to come."""
 SMALLEST_SQUARE = 0.015
 """Least u of a fit that is asked whether it has changed."""
 STEP_S = 0.2
 STEPS = 8
 """The fit's own earlier beliefs: how far apart, and how many."""
 KEPT = STEPS + 1
-"""How many beliefs may be kept: the steps, and a model that its test has refuted."""
-BACK = 1
-"""Steps before a contact of which the last is kept: a touch begins before it is seen."""
+"""How many beliefs may be kept: the steps, and what the fit had come to in the end."""
+PAIRS = KEPT * (KEPT - 1) // 2
 SIGMAS = 3.5
 """Of 160 untouched arms, wide ones included, no step differed from the whole fit by more than 2.1."""
 SPEEDS_RAD_S = (0.2, 0.6, 1.2)
@@ -87,7 +84,10 @@ FRICTIONS, INERTIAS = JOINTS * len(SPEEDS_RAD_S), len(_INERTIAS)
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
-    """Return `compared` (q, p), `compared_floor`, `_share`, `_prior` (q,), and `step_samples`. prior_std (p,)."""
+    """Return `compared` (q, p), `compared_floor`, `_share`, `_prior` (q,), `step_samples` and `apart_samples` (2,).
+
+    prior_std (p,). apart_samples: of an arm's fit, and of a payload's.
+    """
     unit = np.eye(prior_std.size)
     base = len(settings.estimator.parameter_names)
     viscous, coulomb = PARAMETER_NAMES.index("F_v1"), PARAMETER_NAMES.index("F_c1")
@@ -95,7 +95,8 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
     inertia = [unit[PARAMETER_NAMES.index(name)] for name in _INERTIAS]
     offset = [unit[base + i] for i in range(JOINTS)]
     rows = np.array(friction + inertia + offset)
-    learn_s = settings.bus.period_s * settings.certified.learn_every
+    certified = settings.certified
+    learn_s = settings.bus.period_s * certified.learn_every
     return {
         "compared": rows,
         "compared_floor": np.array(
@@ -104,6 +105,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
         "compared_share": np.repeat((0.0, INERTIA_SHARE, 0.0), (len(friction), len(inertia), JOINTS)),
         "compared_prior": rows**2 @ prior_std**2,
         "step_samples": np.array(max(round(STEP_S / learn_s), 1)),
+        "apart_samples": np.array([(fit_s - certified.hold_back_s) / learn_s - PAIRS for fit_s in certified.fit_s]),
     }
 
 
@@ -147,7 +149,7 @@ def begin(m: Any) -> None:
 def follow(k: Any, m: Any) -> None:
     """Take in that the fit has learnt a sample."""
     m["fit_samples"] += 1.0
-    if m["has_kept"] != 0.0 and m["steps_used"] >= APART_STEPS:
+    if m["has_kept"] != 0.0 and m["fit_samples"] > k["apart_samples"][int(m["is_payload"])]:
         _compare_kept(m)
     if m["fit_samples"] % k["step_samples"] != 0.0:
         return
@@ -166,22 +168,21 @@ def forget(m: Any) -> None:
 
 
 @compiled
-def keep_before_contact(m: Any) -> None:
-    """Keep what the fit had come to until a while before the contact that interrupts it, if nothing is kept yet."""
+def keep(m: Any) -> None:
+    """Keep what the fit has come to, and how it came about, if nothing is kept yet: a touch may have begun."""
     if m["has_kept"] == 0.0:
-        _keep_steps(m, int(m["steps_used"]) - BACK)
+        _keep_steps(m, int(m["steps_used"]) - 1)
         _keep(m, m["belief"], m["P_belief"], unit_of(m["fit_square"], m["fit_rows"]), 0.0)
 
 
 @compiled
 def keep_refuted(m: Any) -> None:
-    """Keep the model that its test refutes, and how it came about, if nothing is kept yet: a touch may have begun.
+    """Do so with a model whose test has failed.
 
     Not with a new payload: hands have been on the arm, and friction may depend on the load.
     """
-    if m["has_kept"] == 0.0 and m["is_payload"] == 0.0:
-        _keep_steps(m, int(m["steps_used"]) - 1)
-        _keep(m, m["theta"], m["P"], unit_of(m["fit_square"], m["fit_rows"]), 0.0)
+    if m["is_payload"] == 0.0:
+        keep(m)
 
 
 @compiled
@@ -251,7 +252,7 @@ def is_explained(k: Any, m: Any) -> bool:
     """Tell whether the fit's model explains each of its samples; if not, keep what it had come to before the first."""
     first = fit_samples.first_unexplained(m)
     if first >= 0 and m["has_kept"] == 0.0:
-        _keep_steps(m, int(first // k["step_samples"]) - BACK)
+        _keep_steps(m, int(first // k["step_samples"]) - 1)
     return first < 0
 
 

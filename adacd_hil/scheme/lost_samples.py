@@ -16,20 +16,18 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme import sensitivity
 
 CURVATURE_NM_S2 = 500.0
 """Second derivative of the torque: 2.5 Nm at 2.2 Hz, or 0.5 Nm at 5 Hz."""
 
 MOST_FILLED = 8
 """Missing samples that are put on the line between their neighbours."""
-MOST_IN_A_ROW, LARGEST_SHARE = 2, 0.1
-"""From so many cycles in a row without a sample, or more than that share of a second's, detection is degraded."""
 
 
 def shapes_of(filters: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name."""
-    counts = ("cycles_watched", "cycles_unseen", "unseen_in_a_row", "most_unseen")
-    return {"lost": (filters, JOINTS), **dict.fromkeys(counts, ())}
+    return {"lost": (filters, JOINTS)}
 
 
 @compiled
@@ -47,31 +45,4 @@ def follow(k: Any, m: Any, dq: Vector, steps: int, period_s: float, is_seen: boo
                 left_out = CURVATURE_NM_S2 * period_s**2 / 12.0 + (m["hold"][i] if has_turned else 0.0)
                 lost[c, i] += noise * m["roughness"][i] + (turn * left_out) ** 2
             elif not is_seen:
-                lost[c, i] += (2.0 * k["cutoff"][c] * k["velocity_noise_rad_s"]) ** 2 * _momentum(m, i)
-
-
-@compiled
-def count(m: Any, is_unseen: bool) -> None:
-    """Take in a cycle in which the model has seen a sample, or none."""
-    m["cycles_watched"] += 1.0
-    m["cycles_unseen"] += is_unseen
-    m["unseen_in_a_row"] = m["unseen_in_a_row"] + 1.0 if is_unseen else 0.0
-    m["most_unseen"] = max(m["most_unseen"], m["unseen_in_a_row"])
-
-
-def take_warning(m: Any) -> str:
-    """Say whether detection has been slower for lost samples since the last call; empty if not."""
-    share, most = float(m["cycles_unseen"] / max(m["cycles_watched"], 1.0)), int(m["most_unseen"])
-    for name in ("cycles_watched", "cycles_unseen", "most_unseen"):
-        m[name] = 0.0
-    if most < MOST_IN_A_ROW and share <= LARGEST_SHARE:
-        return ""
-    return f"{share:.0%} of the cycles had no new sample, {most} in a row: a contact is found so many cycles later"
-
-
-@compiled
-def _momentum(m: Any, joint: int) -> float:
-    total = 0.0
-    for j in range(m["M"].shape[1]):
-        total += m["velocity_roughness"][j] * m["M"][joint, j] ** 2
-    return float(total)
+                lost[c, i] += (2.0 * k["cutoff"][c] * k["velocity_noise_rad_s"]) ** 2 * sensitivity.momentum_noise(m, i)

@@ -10,11 +10,8 @@ keep to their anchors (`anchor`).
 from typing import Any
 
 from adacd_hil.compiled import compiled
-from adacd_hil.scheme import anchor
+from adacd_hil.scheme import anchor, bank, sensitivity
 from adacd_hil.scheme.regressor import is_positive_definite
-
-MOVING = 0.05
-"""Share of standstill in the filter's memory below which friction is what the model says it is."""
 
 
 @compiled
@@ -37,7 +34,7 @@ def test_candidate(k: Any, m: Any) -> bool:
             residual = -m["tau_f"][c, i]
             for j in range(m["candidate"].shape[0]):
                 residual += m["W_f"][c, i, j] * m["candidate"][j]
-            if c == 0 and m["still"][c, i] < MOVING:
+            if c == bank.SLOW and m["still"][c, i] < sensitivity.MOVING:
                 m["candidate_square"] += residual * residual
                 m["frozen_square"] += m["r"][c, i] ** 2
             bare = max(m["r"].shape[0] + c - 1, 0) if c > 0 else 0

@@ -29,7 +29,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import CertifiedSettings
 from adacd_hil.records import Vector
-from adacd_hil.scheme import contact, friction
+from adacd_hil.scheme import bank, contact, friction
 
 SECOND_DIFFERENCE = 0.36
 """Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""
@@ -46,8 +46,9 @@ STRAIN_S = 10.0
 """Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
 RELAXED = 0.6
 """Share of its threshold that the residual must stay below for that."""
-RESTING = 0.2
-"""Share of standstill in a filter's memory from which on a joint counts as resting."""
+RESTING, MOVING = 0.2, 0.05
+"""Share of standstill in a filter's memory from which on a joint counts as resting, and below which friction is what
+the model says it is."""
 AGREES = 0.4
 """Share of its threshold that the smoothed channel has at least when the bare one finds a push: 0.5 to 0.75."""
 UNIT_PEAK = 4.0
@@ -106,8 +107,8 @@ def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
     enough changes were seen L is 0: the first ones may be a push.
     """
     for i in range(tau_J.shape[0]):
-        change = abs(tau_J[i] - m["last"][2, i])
-        if change == 0.0:
+        change = abs(tau_J[i] - m["last"][2, i])  # nan of the first sample
+        if not change > 0.0:
             continue
         m["torque_changes"][i] += 1.0
         m["torque_change_Nm"][i] = change if m["torque_changes"][i] == 1.0 else min(change, m["torque_change_Nm"][i])
@@ -190,9 +191,7 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
     """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
     filters = m["r"].shape[0]
     for i in range(h.shape[1]):
-        momentum = 0.0
-        for j in range(m["M"].shape[1]):
-            momentum += m["velocity_roughness"][j] * m["M"][i, j] ** 2
+        momentum = momentum_noise(m, i)
         hold = m["hold"][i]
         for c in range(filters):
             g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
@@ -201,6 +200,15 @@ def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
             if c > 0:
                 bare = filters + c - 1
                 h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * m["still"][c, i]
+
+
+@compiled
+def momentum_noise(m: Any, joint: int) -> float:
+    """Return (M R M')_ii of a joint."""
+    total = 0.0
+    for j in range(m["M"].shape[1]):
+        total += m["velocity_roughness"][j] * m["M"][joint, j] ** 2
+    return float(total)
 
 
 @compiled
@@ -231,8 +239,7 @@ def _static_friction(k: Any, m: Any, joint: int) -> float:
 @compiled
 def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float) -> float:
     """Return a channel's threshold but for standstill, and keep what it is without the floor."""
-    filters = m["lost"].shape[0]
-    lost = m["lost"][channel if channel < filters else channel - filters + 1, joint]
+    lost = m["lost"][bank.filter_of(channel, m["lost"].shape[0]), joint]
     noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
     noise += k["torque_gain"][channel] * m["torque_step_Nm"][joint] ** 2 / 12.0 + lost
     m["h_model"][channel, joint] = m["strain"][joint] * np.sqrt(noise + g * g) + m["torque_pull_Nm"][joint]
@@ -250,9 +257,7 @@ def fill_wide(k: Any, m: Any, c: int) -> None:
     samples = float(contact.WIDE_SAMPLES)
     span_s = samples * k["period_s"]
     for i in range(m["r"].shape[1]):
-        momentum = 0.0
-        for j in range(m["M"].shape[1]):
-            momentum += m["velocity_roughness"][j] * m["M"][i, j] ** 2
+        momentum = momentum_noise(m, i)
         noise = k["torque_noise_Nm"] ** 2 * m["roughness"][i] / samples
         velocity = 2.0 * (k["velocity_std_rad_s"] / span_s) ** 2 * momentum
         doubt = m["doubt"][c, i] / k["model_sigmas"]
@@ -285,7 +290,7 @@ def joints_over(y: Vector, h: Vector) -> int:
         for i in range(y.shape[1]):
             is_over = not (abs(y[c, i]) <= h[c, i])
             if is_over and c >= filters and np.isfinite(y[c, i]):
-                smoothed = c - filters + 1
+                smoothed = bank.filter_of(c, filters)
                 is_over = not (abs(y[smoothed, i]) <= AGREES * h[smoothed, i])
             if is_over:
                 joints |= 1 << i

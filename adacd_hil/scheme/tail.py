@@ -20,6 +20,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme import bank, sensitivity
 
 RATE_HZ = 1.0 / 3600.0
 """Excursions over the floor that are expected: one an hour."""
@@ -27,8 +28,6 @@ LARGEST = 3.0
 FORGOTTEN_S = 600.0
 BLOCK_S = 0.064
 """Longer than a touch is held back before it is seen."""
-MOVING = 0.05
-"""Share of standstill in a filter's memory below which friction is what the model says it is."""
 
 
 def constants_of(settings: Settings) -> dict[str, Vector]:
@@ -68,9 +67,9 @@ def follow(k: Any, m: Any) -> None:
     """Take in one sample without contact."""
     filters = m["r"].shape[0]
     for c in range(m["y"].shape[0]):
-        still = m["still_smooth"][c] if c < filters else m["still"][c - filters + 1]
+        still = m["still_smooth"][c] if c < filters else m["still"][bank.filter_of(c, filters)]
         for i in range(m["y"].shape[1]):
-            if still[i] < MOVING:
+            if still[i] < sensitivity.MOVING:
                 seen = min(abs(m["y"][c, i]), m["h_model"][c, i])
                 m["peak_now"][c, i] = max(m["peak_now"][c, i], seen)
     m["block_used"] += 1.0
@@ -78,7 +77,7 @@ def follow(k: Any, m: Any) -> None:
         return
     block_s = m["block_used"] * k["period_s"]
     m["block_used"] = 0.0
-    if np.any(m["peak_last"] > 0.0):
+    if np.max(m["peak_last"]) > 0.0:
         m["tail_s"] += block_s
     for c in range(m["y"].shape[0]):
         factor = _factor(k["excursions_Hz"][c], m["tail_s"])

@@ -335,6 +335,20 @@ def test_kept_beliefs_that_agree_stay_and_each_pair_is_compared_once():
     assert kept.compared() == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize("is_payload", [False, True])
+def test_no_pair_is_left_to_the_cycle_that_ends_the_shortest_fit(is_payload):
+    k, m = certified_memory.constants_of(FREE)[0], certified_memory.new_memory(FREE)[0]
+    m["has_kept"], m["kept_count"], m["apart_n"], m["is_payload"] = 1.0, earlier.KEPT, 1.0, is_payload
+    certified = FREE.certified
+    learn_s = certified.learn_every * PERIOD_S
+    for _ in range(int((certified.fit_s[is_payload] - certified.hold_back_s) / learn_s) - earlier.PAIRS):
+        earlier.follow(k, m)
+    assert m["apart_n"] == 1.0  # none before there are samples on which they may differ
+    for _ in range(earlier.PAIRS):
+        earlier.follow(k, m)
+    assert m["apart_n"] == earlier.KEPT
+
+
 def test_beliefs_that_a_touch_has_come_into_are_forgotten_and_the_others_go_on_judging():
     kept = Kept()
     kept.m["kept"][2:, 1] += 100.0 * kept.std
@@ -360,7 +374,7 @@ def test_what_is_kept_is_from_before_the_contact():
     loop.learn(1.1)
     m = loop.pipeline._memory[0]
     steps, of_steps = int(m["steps_used"]), m["steps_theta"].copy()
-    kept = steps - earlier.BACK + 1
+    kept = steps
     loop.lean(0, 3.0, 0.05)
     assert m["has_kept"] == 1.0
     assert m["kept_count"] == kept + 1 > 3

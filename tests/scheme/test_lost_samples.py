@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from excited_arm import PERIOD_S, SETTINGS, ExcitedLoop, record
+from excited_arm import PERIOD_S, SETTINGS, record
 from planar_arm import THETA
 
-from adacd_hil.records import SchemeState
 from adacd_hil.scheme import certified_kernel, certified_memory, lost_samples
 from adacd_hil.scheme.observation import Observation
 
@@ -80,45 +79,3 @@ def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
     assert np.sum([found & int(Observation.UNSEEN) != 0 for found in lossy.found]) == pytest.approx(
         burst / 40 * len(lossy.found), rel=0.05
     )
-
-
-def counted(unseen):
-    m = certified_memory.new_memory(SETTINGS)[0]
-    for is_unseen in unseen:
-        lost_samples.count(m, is_unseen)
-    return m
-
-
-def test_what_was_lost_is_said_from_two_in_a_row_or_a_tenth_on():
-    assert not lost_samples.take_warning(counted([True] + [False] * 9))
-    assert lost_samples.take_warning(counted([True] + [False] * 8)).startswith("11% of the cycles had no new sample")
-    m = counted([True, True] + [False] * 98)
-    assert lost_samples.take_warning(m) == (
-        "2% of the cycles had no new sample, 2 in a row: a contact is found so many cycles later"
-    )
-    assert not lost_samples.take_warning(m)
-
-
-class LosingLoop(ExcitedLoop):
-    every = 0
-
-    def measure(self):
-        arm = super().measure()
-        is_lost = self.every and self.cycle % self.every < 2
-        since = self.cycle % self.every + 1 if self.every and self.cycle % self.every == 2 else 1
-        return arm._replace(is_complete=not is_lost, steps=0 if is_lost else since)
-
-
-def test_a_run_that_loses_samples_says_so_once():
-    loop = LosingLoop()
-    loop.run_until(SchemeState.MONITOR)
-    loop.pipeline.take_events()
-    loop.every = 20
-    outputs = loop.run(3100)
-    assert {output.state for output in outputs} == {SchemeState.MONITOR}
-    assert [event.name for event in loop.pipeline.take_events()].count("degraded") == 1
-    loop.every = 0
-    loop.run(2000)
-    loop.every = 20
-    loop.run(1100)
-    assert [event.name for event in loop.pipeline.take_events()].count("degraded") == 1

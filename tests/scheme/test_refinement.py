@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from excited_arm import NAMES, SETTINGS
 
-from adacd_hil.scheme import certified_memory, refinement
+from adacd_hil.scheme import certified_memory, refinement, sensitivity
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
@@ -92,7 +92,7 @@ def test_the_smoothed_channels_of_fast_filters_have_no_say(channel):
 def test_a_joint_that_rests_has_no_say_in_which_model_is_better():
     """At rest friction may hold any torque: here the model in use happens to fit joint 1, and it does not count."""
     refined = Refined(off_by(0.05), off_by(0.2))
-    refined.m["still"][0, 0] = 1.1 * refinement.MOVING
+    refined.m["still"][0, 0] = 1.1 * sensitivity.MOVING
     refined.sample()
     m = refined.m
     squares = [(m["W_f"][0, 1] @ (theta - TRUE)) ** 2 for theta in (off_by(0.05), off_by(0.2))]

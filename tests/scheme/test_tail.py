@@ -86,8 +86,8 @@ def test_a_residual_counts_when_its_block_and_the_one_after_it_are_over():
 def test_a_joint_that_has_just_rested_shows_no_tail():
     """A smoothed channel remembers rest longer than its bare filter."""
     tailed = Tailed()
-    tailed.m["still_smooth"][1, 0] = tailed.m["still"][2, 1] = 1.1 * tail.MOVING
-    tailed.m["still_smooth"][2, 1] = tailed.m["still"][1, 0] = 0.9 * tail.MOVING
+    tailed.m["still_smooth"][1, 0] = tailed.m["still"][2, 1] = 1.1 * sensitivity.MOVING
+    tailed.m["still_smooth"][2, 1] = tailed.m["still"][1, 0] = 0.9 * sensitivity.MOVING
     tailed.see(0.2, 2 * BLOCK)
     moving = np.full((5, 2), 0.2)
     moving[1, 0] = moving[4, 1] = 0.0
@@ -146,11 +146,11 @@ def test_only_time_in_which_something_was_seen_counts():
     assert float(tailed.m["tail_s"]) == pytest.approx(50 * tail.BLOCK_S)
 
 
-def test_a_test_of_another_model_begins_without_a_floor():
+def test_a_fit_of_another_model_begins_without_a_floor():
     tailed = Tailed()
     tailed.see(0.2, 2 * BLOCK + 1)
     assert tailed.m["tail_Nm"].all()
-    certified_kernel.begin_test(CONSTANTS, tailed.memory)
+    certified_kernel.begin_adaptation(CONSTANTS, tailed.memory, False)
     for name in ("peak", "peak_now", "peak_last", "tail_Nm", "block_used", "tail_s"):
         assert not tailed.m[name].any()
 
