@@ -25,12 +25,12 @@ from campaign_certified import CertifiedScheme
 from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record, still
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.touches import bank_channels, step_response
 from adacd_hil.cli.table import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme import certified_memory, loop
+from adacd_hil.scheme.bank import channels_of, step_response
 from adacd_hil.scheme.observation import CONTACT_SHIFT
 from adacd_hil.scheme.sensitivity import AGREES
 from firmware_sim.mechanics_settings import MechanicsSettings
@@ -217,7 +217,7 @@ def quiet_onsets(is_quiet: NDArray[np.bool_], end: int) -> NDArray[np.int64]:
 def _found_ms(settings: Settings, y: Array, h: Array, onsets: NDArray[np.int64], step_Nm: float) -> Array:
     """Return after how long a step of joint 1 is found, ms, both signs; inf where it isn't, and without any onset."""
     responses = np.array(
-        [[step_response((k + 0.5) * PERIOD_S, *channel) for k in range(WITHIN)] for channel in bank_channels(settings)]
+        [[step_response((k + 0.5) * PERIOD_S, *channel) for k in range(WITHIN)] for channel in channels_of(settings)]
     )
     found = np.full((2, max(onsets.size, 1)), np.inf)
     for row, sign in enumerate((1.0, -1.0)):

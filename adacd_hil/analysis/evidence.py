@@ -14,9 +14,9 @@ from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.analysis.run import CertifiedStream, Run
 from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.analysis.smallest_push import SmallestPush
-from adacd_hil.analysis.touches import bank_channels
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.scheme.bank import channels_of
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class MarginGatherer:
     """Gathers the margins of one section, cycles at a time."""
 
     def __init__(self, settings: Settings) -> None:
-        self._channels = bank_channels(settings)
+        self._channels = channels_of(settings)
         self._residual: Vector | None = None  # largest (channels, 2)
         self._share: Vector | None = None  # largest residual / threshold (channels, 2)
         self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]

@@ -30,8 +30,9 @@ from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import ADAPTATIONS
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.sections import Section
-from adacd_hil.analysis.touches import bank_channels, filtered, row_at
+from adacd_hil.analysis.touches import filtered, row_at
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
+from adacd_hil.scheme.bank import channels_of
 
 CLOSE_UPS: Final = 24
 """Contacts shown close up; six rows of four are a page."""
@@ -422,7 +423,7 @@ def _view(run: Run) -> _View:
     if run.certified is None:
         fixed = np.broadcast_to(np.array(run.settings.detector.threshold_Nm), run.tau_ext_hat.shape)
         return _View(run.tau_ext_hat, fixed, run.a_rad_s)
-    cutoff, _ = bank_channels(run.settings)[-1]
+    cutoff, _ = channels_of(run.settings)[-1]
     return _View(run.certified.tau_ext[:, -1], run.certified.threshold[:, -1], cutoff)
 
 

@@ -18,9 +18,9 @@ import numpy as np
 
 from adacd_hil.analysis.confidence_bounds import rate_bound_per_h
 from adacd_hil.analysis.distribution import Distribution
-from adacd_hil.analysis.touches import bank_channels, step_response
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.bank import channels_of, step_response
 from adacd_hil.scheme.sensitivity import AGREES
 
 WITHIN_S: Final = 0.1
@@ -44,7 +44,7 @@ class PushGatherer:
     """Gathers the cycles of MONITOR in which nothing touches the arm."""
 
     def __init__(self, settings: Settings) -> None:
-        channels = bank_channels(settings)
+        channels = channels_of(settings)
         self._response = np.array([step_response(WITHIN_S, cutoff, smoothing) for cutoff, smoothing in channels])
         self._filters = len(settings.certified.cutoffs_rad_s)
         self._period_s = settings.bus.period_s

@@ -9,8 +9,8 @@ import numpy as np
 
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.timing import Cycles
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.bank import channels_of, step_response
 
 
 class Touch(NamedTuple):
@@ -84,14 +84,6 @@ def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_r
     return high_s
 
 
-def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> float:
-    """Give what a low-pass, or two in a row, shows of a step of 1: 1 - (b e^(-a t) - a e^(-b t)) / (b - a)."""
-    if b_rad_s is None:
-        return 1.0 - math.exp(-a_rad_s * after_s)
-    a, b = a_rad_s, b_rad_s if b_rad_s != a_rad_s else b_rad_s * (1.0 + 1e-6)
-    return 1.0 - (b * math.exp(-a * after_s) - a * math.exp(-b * after_s)) / (b - a)
-
-
 @dataclass(frozen=True)
 class Channel:
     """A filter with its threshold, Nm (2,): first order, and with `smoothing_rad_s` a second one behind it."""
@@ -119,12 +111,6 @@ class Channel:
         return filtered(response, cycle, period_s, self.smoothing_rad_s)
 
 
-def bank_channels(settings: Settings) -> tuple[tuple[float, float | None], ...]:
-    """List cut-off and smoothing, rad/s, of the channels of the certified scheme's bank, in their order."""
-    cutoffs, smoothing = settings.certified.cutoffs_rad_s, settings.certified.smoothing_rad_s
-    return (*((cutoff, smoothing) for cutoff in cutoffs), *((cutoff, None) for cutoff in cutoffs[1:]))
-
-
 def threshold_at(run: Run, time_s: float) -> Vector:
     """Give the threshold of `tau_ext_hat` in force at a time, Nm (2,); the configured one where detection is off."""
     row = row_at(run, time_s)
@@ -146,7 +132,7 @@ def channels_at(run: Run, time_s: float) -> tuple[Channel, ...]:
     thresholds = run.certified.threshold[row_at(run, time_s)]
     return tuple(
         Channel(cutoff, smoothing, threshold)
-        for (cutoff, smoothing), threshold in zip(bank_channels(run.settings), thresholds, strict=True)
+        for (cutoff, smoothing), threshold in zip(channels_of(run.settings), thresholds, strict=True)
     )
 
 

@@ -14,7 +14,10 @@ Shapes: C filters, 2 C - 1 channels, n joints, p columns. cutoff, decay, weight_
 tau_f (C, n); S, W_f, input_old (C, n, p). Units: rad/s, Nm.
 """
 
+import math
+
 from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
 from adacd_hil.records import Vector
 from adacd_hil.scheme import filters
 
@@ -31,6 +34,20 @@ bring back the noise that it let through."""
 def filter_of(channel: int, filters: int) -> int:
     """Return the filter of a channel: C smoothed ones, then the bare ones of all filters but the slow one."""
     return channel if channel < filters else channel - filters + 1
+
+
+def channels_of(settings: Settings) -> tuple[tuple[float, float | None], ...]:
+    """List cut-off and smoothing, rad/s, of the channels, in their order; smoothing None of a bare one."""
+    cutoffs, smoothing = settings.certified.cutoffs_rad_s, settings.certified.smoothing_rad_s
+    return (*((cutoff, smoothing) for cutoff in cutoffs), *((cutoff, None) for cutoff in cutoffs[1:]))
+
+
+def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> float:
+    """Return what a low-pass, or two in a row, shows of a step of 1: 1 - (b e^(-a t) - a e^(-b t)) / (b - a)."""
+    if b_rad_s is None:
+        return 1.0 - math.exp(-a_rad_s * after_s)
+    a, b = a_rad_s, b_rad_s if b_rad_s != a_rad_s else b_rad_s * (1.0 + 1e-6)
+    return 1.0 - (b * math.exp(-a * after_s) - a * math.exp(-b * after_s)) / (b - a)
 
 
 @compiled

@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.analysis.run import CertifiedStream, Run
-from adacd_hil.analysis.touches import bank_channels
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
+from adacd_hil.scheme.bank import channels_of
 
 FINEST: Final = {
     "rad": 2e-5,
@@ -101,8 +101,7 @@ def _channels(run: Run) -> Iterator[Panel]:
     if stream is None:
         return
     labels = [
-        f"{cutoff:g} rad/s{'' if smoothing is None else ' smoothed'}"
-        for cutoff, smoothing in bank_channels(run.settings)
+        f"{cutoff:g} rad/s{'' if smoothing is None else ' smoothed'}" for cutoff, smoothing in channels_of(run.settings)
     ]
     for joint in range(JOINTS):
         traces = tuple(
