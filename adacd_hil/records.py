@@ -406,5 +406,5 @@ class Event(NamedTuple):
     message: str
 
 
-CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "certificate", "revoked"))
+CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "certificate", "revoked", "sight"))
 """Names of what the scheme says of its certificates: the user is told as it happens, and a replay must say it again."""

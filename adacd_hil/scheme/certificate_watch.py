@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
-from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate
+from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate, sight
 from adacd_hil.scheme.doubt import Verdict
 from adacd_hil.scheme.kernel import Structured
 from adacd_hil.scheme.last_certificate import Certificate
@@ -92,7 +92,7 @@ class CertificateWatch:
         self._refusal = None
         known_by, self._vouched_against = self._known_by(), ""
         level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
-        text = f"{anchor.describe(self._constants, self._memory)}; {known_by}"
+        text = f"{anchor.describe(self._constants, self._memory)}; {sight.describe(self._memory)}; {known_by}"
         self._is_standing = True
         m = self._memory
         self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))

@@ -37,6 +37,7 @@ from adacd_hil.scheme import (
     refinement,
     regressor,
     sensitivity,
+    sight,
     tail,
     termination,
 )
@@ -117,6 +118,7 @@ def begin_test(constants: Structured, memory: Structured) -> None:
     _use_belief(m)
     belief.discard(m)
     m["tested"] = 0.0
+    sight.begin(m)
     m["test_limit_Nm"] = certificate.test_limit_Nm(k, earlier.late_square(m))
     m["dq_low"][:] = np.inf
     m["dq_high"][:] = -np.inf
@@ -379,6 +381,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     m["tested"] += 1.0
     termination.widen(dq, m["dq_low"], m["dq_high"])
     sensitivity.follow_unit(k, m, bank.SLOW, k["unit_test_share"])
+    sight.follow_test(k, m)
     has_moved = True
     for i in range(dq.shape[0]):
         if not (abs(m["r"][bank.SLOW, i]) <= m["test_limit_Nm"]):
@@ -402,6 +405,7 @@ def _refine(k: Any, m: Any, is_free: bool) -> None:
         return
     sensitivity.follow_unit(k, m, bank.SLOW, k["unit_share"])
     sensitivity.relax(k, m)
+    sight.follow(k, m)
     if belief.learn(k, m, bank.LEARNT):
         belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])
     refinement.test_candidate(k, m)

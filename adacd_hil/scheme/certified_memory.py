@@ -22,6 +22,7 @@ from adacd_hil.scheme import (
     last_certificate,
     lost_samples,
     sensitivity,
+    sight,
     tail,
 )
 from adacd_hil.scheme.kernel import Structured, block_dtype
@@ -113,6 +114,7 @@ def constants_of(settings: Settings) -> Structured:
         **earlier.constants_of(settings, prior_std_of(settings)),
         **last_certificate.constants_of(settings),
         **tail.constants_of(settings),
+        **sight.constants_of(settings),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
         "noise_sigmas": certified.noise_sigmas,
@@ -223,6 +225,7 @@ def new_memory(settings: Settings) -> Structured:
         **last_certificate.shapes_of(),
         **doubt.shapes_of(),
         **tail.shapes_of(channel_count),
+        **sight.shapes_of(),
         **lost_samples.shapes_of(filter_count),
         "withheld_by": (),
         "dq_old": joint,

@@ -18,7 +18,7 @@ from adacd_hil.records import (
     SchemeState,
     certified_layout,
 )
-from adacd_hil.scheme import bank, certificate, certified_kernel, certified_memory, earlier
+from adacd_hil.scheme import bank, certificate, certified_kernel, certified_memory, earlier, sight
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
@@ -83,7 +83,7 @@ class CertifiedPipeline(RunsBatches):
         self._margin = MarginWatch(self._peak_share.size)
         self._second = round(1.0 / settings.bus.period_s)
         self._monitored = 0
-        self._has_warned = False
+        self._has_warned = {"margin": False, "sight": False}
         self._events: list[Event] = []
         self._watch = CertificateWatch(self._constants, self._memory, settings.history.date_utc)
         self._doubt = Doubt(settings, self._constants, self._memory)
@@ -189,17 +189,17 @@ class CertifiedPipeline(RunsBatches):
             self._events.append(event)
 
     def _watch_margin(self, state: SchemeState) -> None:
-        """Judge once a second of monitoring how far residuals stayed below thresholds."""
+        """Judge once a second of monitoring how far residuals stayed below thresholds, and what would be found."""
         self._monitored += 1 if state is SchemeState.MONITOR else 0
         if self._monitored < self._second:
             return
         self._monitored = 0
         self._margin.add(self._peak_share.copy())
         self._peak_share[:] = 0.0
-        warning = self._margin.warning
-        if warning and not self._has_warned:
-            self._events.append(Event("warning", "margin", warning))
-        self._has_warned = bool(warning)
+        for name, warning in (("margin", self._margin.warning), ("sight", sight.take_warning(self._memory[0]))):
+            if warning and not self._has_warned[name]:
+                self._events.append(Event("warning", name, warning))
+            self._has_warned[name] = bool(warning)
 
     def _calm(self, cycle: int) -> Calm:
         supervisor, touch = self._supervisor, self._touch

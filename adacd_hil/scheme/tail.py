@@ -88,6 +88,17 @@ def follow(k: Any, m: Any) -> None:
             m["peak_now"][c, i] = 0.0
 
 
+def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> float:
+    """Return how many excursions over a threshold an hour has if the tail is a Gaussian's: 3600 nu (nu T)^(-1 / s²).
+
+    largest_share: s, of its threshold that the residual has come to in seen_s, T; 1 / s = m(T) comes to RATE.
+    """
+    if not largest_share > 0.0:
+        return 0.0
+    seen = max(excursions_Hz * max(seen_s, 1.0), 1.01)
+    return float(3600.0 * excursions_Hz * seen ** (-1.0 / largest_share**2))
+
+
 @compiled
 def _factor(excursions_Hz: float, seen_s: float) -> float:
     """Return m(T)."""

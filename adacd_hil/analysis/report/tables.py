@@ -75,7 +75,8 @@ def push_table(metrics: Metrics) -> str:
     if bound is not None:
         count = metrics.armed_false_alarms
         alarms = f"{count or 'No'} false alarm{'' if count == 1 else 's'}"
-        note += f" {alarms} in that time: by counting alone, at most {bound:.3g} per hour at 95 %."
+        note += f" {alarms} in that time: by counting alone, at most {bound:.3g} per hour at 95 %; "
+        note += f"{push.tail_rate_per_h:.2g} per hour if residuals have the tail of a Gaussian."
     return make_table(head, rows) + f'<p class="note">{note}</p>'
 
 

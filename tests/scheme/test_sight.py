@@ -1,0 +1,114 @@
+"""What a certificate says that detection can see, and what is said when it sees less."""
+
+import re
+
+import numpy as np
+import pytest
+from excited_arm import SETTINGS, TouchedLoop
+
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme import bank, certified_memory, sensitivity, sight, tail
+
+FILTERS = SETTINGS.filter_count
+
+
+def pushes(y, h):
+    """The definition, by numpy, of samples (k, channels, 2)."""
+    shown = np.array([bank.step_response(0.1, *channel) for channel in bank.channels_of(SETTINGS)])[:, None]
+    found = (h + np.abs(y)) / shown
+    agreed = (sensitivity.AGREES * h + np.abs(y)) / shown
+    bare = np.maximum(found[:, FILTERS:], agreed[:, 1:FILTERS])
+    return np.concatenate((found[:, :FILTERS], bare), axis=1).min(axis=1)
+
+
+@pytest.fixture(scope="module")
+def tested():
+    """A loop that has just been certified, and y, h (k, channels, 2) of the cycles of its test."""
+    loop = TouchedLoop(SETTINGS)
+    loop.run_until(SchemeState.CERTIFY)
+    y, h = [], []
+    m = loop.pipeline._memory[0]
+    while loop.step().state is SchemeState.CERTIFY:
+        y.append(m["y"].copy())
+        h.append(m["h"].copy())
+    y.append(m["y"].copy())
+    h.append(m["h"].copy())
+    return loop, np.array(y), np.array(h)
+
+
+def test_a_certificate_states_the_smallest_push_and_the_thresholds_of_its_test(tested):
+    loop, y, h = tested
+    (text,) = loop.said("certificate")
+    said = [tuple(map(float, pair)) for pair in re.findall(r"([\d.]+) / ([\d.]+)", text)]
+    in_force = h.min(axis=1)
+    assert len(y) == round(SETTINGS.certified.test_s[0] / SETTINGS.bus.period_s)
+    assert said[0] == pytest.approx(pushes(y, h).max(axis=0), abs=5.1e-4)
+    assert said[1] == pytest.approx(np.median(in_force, axis=0), rel=sight.WIDTH + 0.01, abs=1e-3)
+    assert said[2] == pytest.approx(np.percentile(in_force, 99.0, axis=0), rel=sight.WIDTH + 0.01, abs=1e-3)
+    assert said[3] == pytest.approx(in_force.max(axis=0), abs=5.1e-4)
+    assert said[1] < said[2] <= said[3]
+
+
+@pytest.mark.parametrize("value_Nm", [1e-5, 0.0123, 0.4, 100.0])
+def test_a_threshold_that_is_always_the_same_is_said_as_it_is(value_Nm):
+    m = certified_memory.new_memory(SETTINGS)[0]
+    m["wide_threshold"], m["h"] = value_Nm, value_Nm
+    for _ in range(10):
+        sight.follow_test(certified_memory.constants_of(SETTINGS)[0], m)
+    pair = f"{value_Nm:.3f} / {value_Nm:.3f}"
+    assert f"thresholds {pair} Nm in the middle, {pair} in 99 %, {pair} at worst" in sight.describe(m)
+
+
+def test_the_next_test_begins_with_nothing_seen(tested):
+    m = tested[0].pipeline._memory.copy()[0]
+    assert m["seen"].any()
+    assert m["seen_push_Nm"].all()
+    sight.begin(m)
+    for name in ("seen", "seen_push_Nm", "seen_worst_Nm"):
+        assert not m[name].any()
+
+
+def test_a_monitor_that_sees_less_than_was_certified_says_so_once():
+    loop = TouchedLoop(SETTINGS)
+    loop.run_until(SchemeState.MONITOR)
+    m = loop.pipeline._memory[0]
+    loop.run(3000)
+    assert loop.said("sight") == []
+    m["roughness"][1] = 400.0  # noise of the torque sensor, of variance
+    loop.run(3000)
+    (text,) = loop.said("sight")
+    found = re.fullmatch(
+        r"joint 2 sees less than was certified: a push of ([\d.]+) Nm is found within 100 ms, a second's mean; of "
+        r"([\d.]+) Nm at worst in the test",
+        text,
+    )
+    assert float(found[1]) > sight.LESS * float(found[2])
+    assert float(found[2]) == pytest.approx(m["seen_push_Nm"][1], abs=0.005)
+    m["roughness"][1] = 1.0
+    loop.run(2000)
+    m["roughness"][1] = 400.0
+    loop.run(2000)
+    assert len(loop.said("sight")) == 2
+
+
+def test_a_joint_that_rests_is_not_asked_what_it_sees():
+    """There friction holds what it can."""
+    k, m = certified_memory.constants_of(SETTINGS)[0], certified_memory.new_memory(SETTINGS)[0]
+    m["h"], m["seen_push_Nm"] = 1.0, 0.1
+    m["still"][:, 0] = 1.0
+    for _ in range(sight.FEWEST):
+        sight.follow(k, m)
+    assert sight.take_warning(m).startswith("joint 2 sees less")
+    assert sight.take_warning(m) == ""
+    for _ in range(sight.FEWEST - 1):  # too little motion to tell
+        sight.follow(k, m)
+    assert sight.take_warning(m) == ""
+
+
+def test_the_rate_under_a_gaussian_tail_is_that_of_the_floor():
+    """A threshold of m(T) times the largest residual of T seconds is exceeded RATE times a second."""
+    for nu_Hz, seen_s in ((3.2, 50.0), (64.0, 600.0)):
+        share = 1.0 / tail._factor(nu_Hz, seen_s)
+        assert tail.rate_per_h(nu_Hz, seen_s, share) == pytest.approx(3600.0 * tail.RATE_HZ)
+        assert tail.rate_per_h(nu_Hz, seen_s, 0.5 * share) < 1e-6
+    assert tail.rate_per_h(3.2, 50.0, 0.0) == 0.0
