@@ -11,8 +11,8 @@ that look at an arm, and a host that is killed come on top; figures are then of 
 
 Columns: ms from the first forged frame to the first line of the log that says that something is wrong; from there to
 rest; degrees that the joint that went furthest went until then; deg/s at most. A row is bad when nothing was noticed,
-when the line names something else, or when the arm was not at rest, slower than
-0.05 rad/s for 0.1 s, 100 ms after it was noticed.
+when the line names something else, or when the arm was not at rest, slower than 0.05 rad/s for 0.1 s, 120 ms after it
+was noticed.
 
 Exit status: 0 no bad row, 1 a bad one, 2 wrong usage, 5 no vcan can be had.
 """

@@ -28,7 +28,7 @@ from firmware_sim.bench import Bench
 from firmware_sim.scenario import Scenario
 
 ATTACK_S = 4.45
-"""When an attack begins, since the drives were enabled: both joints move, joint 1 at its fastest, 95 deg/s."""
+"""When an attack begins, since the drives were enabled: both joints move, joint 1 at 84 deg/s."""
 AFTER_S = 1.5
 """How long the arm is watched after the host has gone; the attack goes on until its own end."""
 REST_RAD_S = 0.05

@@ -1,7 +1,7 @@
 """Arms with errors that the certified scheme may lack: how soon certified, false alarms, thresholds, pushes missed.
 
     python tools/error_campaign.py --minutes 40 --only clean
-    python tools/error_campaign.py --profiles P --only 'lugre*,load,cable' -j 2
+    python tools/error_campaign.py --profiles P --only 'lugre*,load*,cable*' -j 2
 
 Each arm learns on the excitation and then moves at random, in `lab`'s closed loop; with --kg also once that payload has
 been announced. Steps of torque begin every 20 ms, both signs, as each channel answers them (no bus, no tracking loop);
