@@ -499,7 +499,7 @@ class CertifiedSettings:
         (0.0, 0.0015, 0.0015, 0.0, 0.0005, 0.0, 0.0015),
         low=0.0,
         high=1e3,
-        meaning=f"how far it may wander in a second of motion: {_KINDS}",
+        meaning=f"how far it may wander in a second of monitoring: {_KINDS}",
     )
     model_error: tuple[float, ...] = setting(
         (0.003, 0.01, 0.01, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"

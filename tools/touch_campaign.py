@@ -17,7 +17,7 @@ from functools import partial
 
 import numpy as np
 from property_campaign import parse_seeds
-from touch_trials import AFTER_S, KINDS, Trial, play
+from touch_trials import AFTER_S, KINDS, RULES, Trial, play
 
 from adacd_hil.cli.table import format_table
 
@@ -63,6 +63,17 @@ def untouched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
         ("certified", f"{len(times_s)} of {len(trials)}", "all", len(times_s) == len(trials)),
         ("certified after, median and worst", took, "", True),
         ("largest error", f"{worst:.3f} Nm", f"{WRONG_NM:g} Nm", worst <= WRONG_NM),
+        *_rule_figures(trials),
+    ]
+
+
+def _rule_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
+    """Return of each rule how much of its limit a fit was that led to a test."""
+    shares = np.array([share for trial in trials for share in trial.rule_shares]).reshape(-1, len(RULES))
+    return [
+        (f"share of its limit: {rule}, median and worst", f"{np.median(column):.2f}, {column.max():.2f}", "", True)
+        for rule, column in zip(RULES, shares.T, strict=True)
+        if column.size
     ]
 
 

@@ -18,9 +18,10 @@ from lab_motion import paper_motion
 from planar_arm import THETA
 
 from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
-from adacd_hil.scheme import certified_kernel, certified_memory
+from adacd_hil.scheme import certified_kernel, certified_memory, earlier, fit_samples
 from adacd_hil.scheme.belief import payload_direction
 from adacd_hil.scheme.certificate_watch import BY_WORD
+from adacd_hil.scheme.kernel import Structured
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.2)
@@ -35,6 +36,7 @@ SIZES = {
     "inertia": (0.01, 0.1), "payload": (0.05, 1.0), "ramp": (0.02, 1.0),
 }  # fmt: skip
 """Nm, N, Nm, Nm s/rad, N/m, kg m², kg, Nm/s; log-uniform."""
+RULES = ("one model of the whole fit", "each sample explained", "borne out by what came later", "no more than before")
 LIKE_A_JOINT = ("drag", "viscous", "inertia", "payload")
 """Whose torque is a change of the arm's parameters."""
 KNOWN_S = 0.5
@@ -75,6 +77,7 @@ class Trial:
     """What came of one arm. Times in s; errors_Nm: of each certificate since the touch began, on the paper's motion.
 
     by_word_Nm: of those that carry the user's word, who acknowledges every stop, also one that names what has changed.
+    rule_shares: how much of its limit each of RULES was, in the fits that led to certificates.
     """
 
     seed: int
@@ -89,6 +92,7 @@ class Trial:
     back_after_s: float | None
     is_released: bool
     fault: str
+    rule_shares: tuple[tuple[float, ...], ...]
 
 
 def draw_arm(random: np.random.Generator) -> tuple[str, Vector]:
@@ -178,6 +182,21 @@ class HandLoop(TouchedLoop):
         return output
 
 
+def rule_shares(constants: Structured, memory: Structured) -> tuple[float, ...]:
+    """Return how much of its limit each of RULES is of the fit that has just ended."""
+    memory = memory.copy()
+    k, m = constants[0], memory[0]
+    steps = range(min(int(m["steps_used"]), earlier.STEPS))
+    places = [(s, i) for s in range(int(m["samples_kept"])) for i in range(2)]
+    changed = max((earlier.changed_share(m, s) for s in steps), default=0.0)
+    explained = max((abs(fit_samples.residual(m, *place)) for place in places), default=0.0) / fit_samples.limit_Nm(m)
+    later = max((earlier.later_share(k, m, s) for s in steps), default=0.0)
+    earlier.forget(m)
+    earlier.keep(m)
+    earlier.is_no_more(k, m)
+    return float(changed), float(explained), float(later), float(np.max(m["change"] / m["change_limit"]))
+
+
 @cache
 def paper_rows() -> Vector:
     """Return rows (n, p) of the slowest filter on the paper's motion, without the lags, which no touch looks like."""
@@ -204,6 +223,7 @@ def play(seed: int, is_touched: bool) -> Trial:
     begun, state = loop.cycle, SchemeState.ADAPT
     errors: list[float] = []
     by_word: list[float] = []
+    shares: list[tuple[float, ...]] = []
     is_reported, certified_s, back_after_s, fault = False, None, None, ""
     while (at_s := (loop.cycle - begun) * PERIOD_S) < until_s and back_after_s is None and not fault:
         if hand is not None and begins_s <= at_s < ends_s:
@@ -212,6 +232,8 @@ def play(seed: int, is_touched: bool) -> Trial:
             loop.let_go()
         output, before = loop.step(), state
         state = output.state
+        if state is SchemeState.CERTIFY and before is SchemeState.ADAPT:
+            shares.append(rule_shares(loop.pipeline._constants, loop.pipeline._memory))
         is_reported |= state is SchemeState.REACT and before is not state and at_s >= begins_s
         if state is SchemeState.MONITOR and before is SchemeState.CERTIFY and (hand is None or at_s > begins_s):
             certified_s = at_s if certified_s is None else certified_s
@@ -224,5 +246,5 @@ def play(seed: int, is_touched: bool) -> Trial:
         seed, loop.arm, "none" if hand is None else hand.kind, hand is not None and hand.is_like_a_joint_from_the_start,
         is_reported, bool(loop.said("anchor") or loop.said("touch")), certified_s, tuple(errors), tuple(by_word),
         back_after_s,
-        is_released=bool(np.isfinite(ends_s)), fault=fault,
+        is_released=bool(np.isfinite(ends_s)), fault=fault, rule_shares=tuple(shares),
     )  # fmt: skip

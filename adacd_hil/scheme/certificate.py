@@ -20,7 +20,7 @@ from adacd_hil.scheme import termination
 
 TEST_NM = 0.03
 TEST_SHARE = 6.0
-"""Largest residual in a test, and deviations of the fit's residuals beside it. Clean arms: 0.032 Nm in all."""
+"""Largest residual in a test, and deviations of the residuals of the fit's later half beside it."""
 
 
 @compiled

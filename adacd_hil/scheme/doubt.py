@@ -10,12 +10,12 @@ included,
 From r and w goes what the torque explains that a joint held at rest before, which the filter forgets with its share s
 of standstill: r - s Σ r s / Σ s², w likewise.
 
-Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each within
-HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at OFTEN_PER_H than at
-RARELY_PER_H by 1000 : 1. Three in seven minutes are.
+Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each but
+the first within HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at
+OFTEN_PER_H than at RARELY_PER_H by ODDS. Three in 6.8 min are.
 
 An arm that meets the next contact AT_REST_S after going on would never move far enough to tell what it is: the
-thresholds of the joints that showed it double, MOST_STRAIN times at most, and fall back as in `sensitivity`.
+thresholds of the joints that showed it double, to MOST_STRAIN times at most, and fall back as in `sensitivity`.
 
 Shapes: c (h, p), sums (h,), of the share of standstill (h, n) and (n,).
 """

@@ -11,15 +11,15 @@ u: mean square of its residuals over that of the settings. More, and something h
 likewise if the model doesn't explain each of its samples (`fit_samples`). And what came later must come to the same
 torque by itself, on all samples (`later_samples`, rms as in `fit_samples`):
 
-    |W_f (theta_late - theta)| <= LATER_NM + RMS_SHARE rms
+    |W_f (theta_late - theta)| <= LATER_NM + RMS_SHARE rms + LEARNT_SHARE sqrt(u) residual_Nm
 
 This sees a weak touch of the beginning, when theta_0 is not known well enough to differ. Then all of the fit's beliefs
 are kept.
 
-**Over a touch** the fit's earlier beliefs are *kept*: all those of a while before a contact interrupted it, or of
-before a change; where a test has refuted the model, all of them and the model. When the touch began is not known, so a
-later fit must agree with each, in each quantity c that a hand can look like, a joint's friction at some speed, an
-inertia, an offset that nothing anchors:
+**Over a touch** the fit's earlier beliefs are *kept*: where a contact interrupted it all of them and the one at the
+contact, those of before a change, or where a test has refuted the model all of them and the model. When the touch began
+is not known, so a later fit must agree with each, in each quantity c that a hand can look like, a joint's friction at
+some speed, an inertia, an offset that nothing anchors:
 
     c (theta - theta_0) <= max(floor, SIGMAS sqrt(c (P_0 + P) c'))
 
@@ -230,13 +230,18 @@ def is_steady(m: Any) -> bool:
     """Tell whether one model explains the whole fit; if not, keep what it had come to before it changed."""
     used, steps = int(m["steps_used"]), m["steps_rows"].shape[0]
     for number in range(used - 1, max(used - steps, 0) - 1, -1):
-        s = number % steps
-        distance = later_samples.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
-        if not distance <= STEADY * max(_better_square(m, s), SMALLEST_SQUARE):
+        if not changed_share(m, number % steps) <= 1.0:
             if m["has_kept"] == 0.0:
                 _keep_steps(m, number)
             return False
     return True
+
+
+@compiled
+def changed_share(m: Any, s: int) -> float:
+    """Return how much of its limit the distance of step s from the whole fit is."""
+    distance = later_samples.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
+    return float(distance / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
 
 
 @compiled
@@ -265,16 +270,22 @@ def is_borne_out(k: Any, m: Any) -> bool:
     used, steps = int(m["steps_used"]), m["steps_rows"].shape[0]
     if m["is_payload"] != 0.0:
         return True
-    limit_Nm = LATER_NM + later_samples.RMS_SHARE * fit_samples.better_rms(m)
     for number in range(max(used - steps, 0), used):
-        s = number % steps
-        noise_Nm = LEARNT_SHARE * k["residual_Nm"] * np.sqrt(_better_square(m, s))
-        is_found = later_samples.find(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
-        if not (is_found and fit_samples.largest_torque(m, m["later"]) <= limit_Nm + noise_Nm):
+        if not later_share(k, m, number % steps) <= 1.0:
             if m["has_kept"] == 0.0:
                 _keep_steps(m, used - 1)
             return False
     return True
+
+
+@compiled
+def later_share(k: Any, m: Any, s: int) -> float:
+    """Return how much of its limit the torque is by which what came after step s differs from the fit."""
+    if not later_samples.find(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"]):
+        return np.inf
+    limit_Nm = LATER_NM + later_samples.RMS_SHARE * fit_samples.better_rms(m)
+    limit_Nm += LEARNT_SHARE * k["residual_Nm"] * np.sqrt(_better_square(m, s))
+    return float(fit_samples.largest_torque(m, m["later"]) / limit_Nm)
 
 
 @compiled

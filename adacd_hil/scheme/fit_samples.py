@@ -72,12 +72,18 @@ def first_unexplained(m: Any) -> int:
     kept, first = int(m["samples_kept"]), -1
     if m["is_payload"] != 0.0 or kept < 2:
         return first
-    limit = LIMIT_NM + LIMIT_SHARE * better_rms(m)
+    limit = limit_Nm(m)
     for s in range(kept - 1, -1, -1):
         for i in range(m["samples_tau"].shape[1]):
-            if not abs(_residual(m, s, i)) <= limit:
+            if not abs(residual(m, s, i)) <= limit:
                 first = s
     return first if first < 0 else int(first * m["samples_every"])
+
+
+@compiled
+def limit_Nm(m: Any) -> float:
+    """Return the largest residual that the fit explains."""
+    return float(LIMIT_NM + LIMIT_SHARE * better_rms(m))
 
 
 @compiled
@@ -86,7 +92,7 @@ def better_rms(m: Any) -> float:
     squares, half = np.zeros(2), int(m["samples_kept"]) // 2
     for s in range(2 * half):
         for i in range(m["samples_tau"].shape[1]):
-            squares[s // half] += _residual(m, s, i) ** 2
+            squares[s // half] += residual(m, s, i) ** 2
     return float(np.sqrt(np.min(squares) / max(half * m["samples_tau"].shape[1], 1)))
 
 
@@ -104,7 +110,8 @@ def largest_torque(m: Any, theta: Vector) -> float:
 
 
 @compiled
-def _residual(m: Any, s: int, joint: int) -> float:
+def residual(m: Any, s: int, joint: int) -> float:
+    """Return what the belief leaves of sample s, Nm."""
     w, r = m["samples_W"][s, joint], m["samples_tau"][s, joint]
     for j in range(w.shape[0]):
         r -= w[j] * m["belief"][j]

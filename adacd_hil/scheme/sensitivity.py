@@ -13,7 +13,7 @@
   model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed,
   too: a bound, since |F x| <= F |x|.
 - R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
-- e: 1, or more of a joint that has shown contacts while the arm learnt (`strain`).
+- e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`strain`).
 - G: what lost samples leave open (`lost_samples`). tail: floor by the largest residual seen (`tail`).
 - s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
   where it is in the model, and as much more as these are uncertain.

@@ -8,7 +8,7 @@ Gaussian's, nu of them a second that are independent, and the largest of T secon
 
 The largest counts when its block is over and the one after it: what is held back from a contact is no residual. It
 counts as no more than the threshold without this floor at that moment, so who pushes a little below the threshold again
-and again raises it to m times the largest of those, and no further. It is forgotten over FORGOTTEN_S of motion.
+and again raises it to m times the largest of those, and no further. It is forgotten over FORGOTTEN_S without contact.
 
 Shapes: peak, peak_now, peak_last, tail_Nm (2 C - 1, n). Units: Nm.
 """

@@ -39,7 +39,7 @@ from adacd_hil.terminal import one_line
 RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
 """Of a run's log, what a report reads."""
 FULL_CYCLES: Final = 500_000
-"""Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 0.7 kB each."""
+"""Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 1.2 kB each in the log."""
 _PROGRESS_CYCLES: Final = 1_000_000
 _MOST_DIGITS: Final = 18
 

@@ -23,7 +23,7 @@ from adacd_hil.log.setup import Setup
 
 START_TIMEOUT_S = 30.0
 RING_BYTES = 8 * 1024 * 1024
-"""5 s of a run at 1 kHz: longer than any viewer's request keeps the other process busy."""
+"""3.8 s of a certified run at 1 kHz: longer than any viewer's request keeps the other process busy."""
 
 
 class LiveFeed:
