@@ -17,6 +17,8 @@ PERIOD_S = 1e-3
 REACH_RAD = np.radians([60.0, 110.0])
 """Random motions stay within these of zero; the arms' limits are 75 and 120 degrees."""
 SPEED_RAD_S = np.radians([100.0, 100.0])
+BRAKE_S = 0.4
+"""In which a motion that is broken off comes to rest."""
 ACCELERATION_RAD_S2 = np.radians(500.0)
 """Bound of random moves: not twice what the paper's motion of joint 1 has."""
 _PEAK_ACCELERATION_FACTOR = 10.0 / np.sqrt(3.0)  # of a rest-to-rest quintic, over travel / duration²
@@ -127,13 +129,23 @@ def join(motions: Sequence[Motion], speed_deg_s: float = 40.0) -> Motion:
 
 
 def _lead(before: Motion, end: NDArray[np.float64], speed_rad_s: float) -> Motion:
-    """Lead from the last cycle of a motion to rest at `end` (2,)."""
+    """Lead from the last cycle of a motion to rest, if it moves, and from there to rest at `end` (2,)."""
     q, dq, ddq = before.q_d[-1], before.dq_d[-1], before.ddq_d[-1]
-    is_moving = bool(np.any(dq) or np.any(ddq))
+    if np.any(dq) or np.any(ddq):
+        # straight to the end it would overshoot, far if that takes long
+        stop = _way(q, dq, ddq, q + 0.5 * BRAKE_S * dq, BRAKE_S)
+        return _cut("", [stop, rest := _lead(stop, end, speed_rad_s)], len(stop.q_d) + len(rest.q_d))
     duration_s = PEAK_SPEED_FACTOR * float(np.abs(end - q).max()) / speed_rad_s
-    if duration_s < PERIOD_S and not is_moving:
+    if duration_s < PERIOD_S:
         return _still("", 0, end)
-    count = round(max(duration_s, SHORTEST_APPROACH_S) / PERIOD_S)
+    return _way(q, dq, ddq, end, max(duration_s, SHORTEST_APPROACH_S))
+
+
+def _way(
+    q: NDArray[np.float64], dq: NDArray[np.float64], ddq: NDArray[np.float64], end: NDArray[np.float64], lasts_s: float
+) -> Motion:
+    """Move by a quintic to rest at `end` (2,)."""
+    count = round(lasts_s / PERIOD_S)
     coefficients = to_rest(q, dq, ddq, end, count * PERIOD_S)
     way = _still("", count, end)
     for k in range(count - 1):

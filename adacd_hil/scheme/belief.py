@@ -12,6 +12,10 @@ the filter counts as further deviation, and a joint that mostly rests teaches no
 **Payload.** One of mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this
 direction g by sigma_m² g g', and a little in each inertia for what is no point mass. All else stays known.
 
+**Lags.** Their column is the derivative of a torque that is measured with noise. Where the motion changes the torque
+little the column is mostly noise, and an estimate from it shrinks towards zero, the more the longer it goes on. So lags
+are learnt on the excitation, and *held* after it (`hold_lags`).
+
 **Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
 
 Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_still (h, n).
@@ -53,10 +57,18 @@ def add_payload(direction: Vector, payload_std_kg: float, inertia_std: float, P:
 
 
 @compiled
-def wander(drift_std: Vector, elapsed_s: float, P: Vector) -> None:
-    """Widen P (p, p) in place by a random walk of the parameters, `drift_std` (p,) per √s."""
+def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
+    """Widen P (p, p) in place by a random walk of the parameters, `drift_std` (p,) per √s, as far as it shows.
+
+    By |w| of the row W_f (n, p) that shows a parameter most, 1 at most. One that hardly shows would else be learnt from
+    the error of the others, such as friction that grows with the load from a load that hardly varies, and be far off
+    where it counts.
+    """
     for j in range(drift_std.shape[0]):
-        P[j, j] += drift_std[j] ** 2 * elapsed_s
+        shown = 0.0
+        for i in range(W_f.shape[0]):
+            shown = max(shown, abs(W_f[i, j]))
+        P[j, j] += (drift_std[j] * min(shown, 1.0)) ** 2 * elapsed_s
 
 
 @compiled
@@ -89,10 +101,35 @@ def learn(k: Any, m: Any, c: int) -> bool:
     for i in range(still.shape[0]):
         m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > SLOW_RAD_S else 1.0
     m["ring_tau"][place] = tau_f
+    if m["are_lags_held"] != 0.0:
+        _take_out_lags(k, m, place)
     for i in range(tau_f.shape[0]):
         m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + held[i] ** 2)
     m["ring_next"] = (place + 1) % m["ring_tau"].shape[0]
     return bool(has_waited)
+
+
+@compiled
+def hold_lags(k: Any, m: Any) -> None:
+    """Learn the lags no further; what is left open of them stays open, and moves nothing else."""
+    m["are_lags_held"] = 1.0
+    P = m["P_belief"]
+    first = int(k["base"]) + m["ring_tau"].shape[1]
+    for j in range(first, first + m["ring_tau"].shape[1]):
+        variance = P[j, j]
+        P[j, :] = 0.0
+        P[:, j] = 0.0
+        P[j, j] = variance
+
+
+@compiled
+def _take_out_lags(k: Any, m: Any, place: int) -> None:
+    joints = m["ring_tau"].shape[1]
+    first = int(k["base"]) + joints
+    for i in range(joints):
+        for j in range(first, first + joints):
+            m["ring_tau"][place, i] -= m["ring_W"][place, i, j] * m["belief"][j]
+            m["ring_W"][place, i, j] = 0.0
 
 
 @compiled

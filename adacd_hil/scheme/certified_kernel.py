@@ -94,6 +94,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
         belief.begin(k["prior"], k["prior_std"], m["belief"], m["P_belief"])
     _use_belief(m)
     belief.discard(m)
+    m["are_lags_held"] = 0.0
     earlier.begin(m)
     fit_samples.begin(m)
     tail.begin(m)
@@ -125,12 +126,13 @@ def begin_test(constants: Structured, memory: Structured) -> None:
 
 
 @compiled
-def begin_refinement(memory: Structured) -> None:
+def begin_refinement(constants: Structured, memory: Structured) -> None:
     """Begin to refine the model that has just been certified."""
-    m = memory[0]
+    k, m = constants[0], memory[0]
     m["promotions"] = 0.0
     m["certified"][:] = m["theta"]
     m["P_certified"][:] = m["P"]
+    belief.hold_lags(k, m)
     earlier.forget(m)
     refinement.restart(m)
 
@@ -407,7 +409,7 @@ def _refine(k: Any, m: Any, is_free: bool) -> None:
     sensitivity.relax(k, m)
     sight.follow(k, m)
     if belief.learn(k, m, bank.LEARNT):
-        belief.wander(k["drift_std"], k["period_s"] * k["learn_every"], m["P_belief"])
+        belief.wander(k["drift_std"], m["W_f"][bank.LEARNT], k["period_s"] * k["learn_every"], m["P_belief"])
     refinement.test_candidate(k, m)
 
 

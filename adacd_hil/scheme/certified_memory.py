@@ -174,6 +174,7 @@ def new_memory(settings: Settings) -> Structured:
         "ring_used": (),
         "ring_next": (),
         "since_learnt": (),
+        "are_lags_held": (),
         "recovering_cycles": (),
         # evidence
         "is_payload": (),

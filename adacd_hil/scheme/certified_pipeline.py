@@ -94,7 +94,7 @@ class CertifiedPipeline(RunsBatches):
         certified_kernel.begin_adaptation(self._constants, memory, False)
         certified_kernel.step(self._constants, memory, block, 1, 1, _WATCH | certified_kernel.LEARN)
         certified_kernel.begin_test(self._constants, memory)
-        certified_kernel.begin_refinement(memory)
+        certified_kernel.begin_refinement(self._constants, memory)
         earlier.forget(memory[0])
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
         self._touch.compile()
@@ -255,7 +255,7 @@ class CertifiedPipeline(RunsBatches):
         elif state is SchemeState.CERTIFY:
             certified_kernel.begin_test(self._constants, self._memory)
         elif state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
-            certified_kernel.begin_refinement(self._memory)
+            certified_kernel.begin_refinement(self._constants, self._memory)
             self._margin.restart()
             self._doubt.forget()
             self._has_certificate = True

@@ -213,5 +213,5 @@ def step_record(
         elif found & _WITHHELD:
             begins_in = 0
         elif found & _CERTIFIED:
-            certified_kernel.begin_refinement(memory)
+            certified_kernel.begin_refinement(constants, memory)
             now = _MONITOR

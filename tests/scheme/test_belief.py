@@ -136,8 +136,59 @@ def test_a_payload_that_is_no_point_mass_touches_the_inertia_only():
 
 def test_a_wandering_parameter_becomes_less_certain_with_time():
     P = np.diag([1.0, 2.0]) + 0.5
-    belief.wander(np.array([0.1, 0.0]), 4.0, P)
+    belief.wander(np.array([0.1, 0.0]), np.array([[1.0, 1.0]]), 4.0, P)
     np.testing.assert_allclose(P, [[1.54, 0.5], [0.5, 2.5]])
+
+
+@pytest.mark.parametrize(("shown", "share"), [(0.0, 0.0), (0.3, 0.09), (1.0, 1.0), (5.0, 1.0)])
+def test_it_wanders_as_far_as_the_motion_shows_it_in_some_joint(shown, share):
+    P = np.zeros((1, 1))
+    belief.wander(np.array([0.1]), np.array([[0.1 * shown], [-shown]]), 4.0, P)
+    assert P[0, 0] == pytest.approx(0.04 * share)
+
+
+LAGS = [NAMES.index("lag1"), NAMES.index("lag2")]
+OTHERS = [j for j in range(COUNT) if j not in LAGS]
+
+
+def test_a_lag_that_is_held_moves_no_more_and_the_others_are_learnt_as_if_it_were_known():
+    W_f, tau_f = samples(1200)
+    m = prior()
+    teach(m, W_f[:400], tau_f[:400])
+    belief.hold_lags(K, m)
+    belief.discard(m)
+    held, variance = m["belief"][LAGS].copy(), np.diag(m["P_belief"])[LAGS].copy()
+    theta0, P0 = m["belief"][OTHERS].copy(), m["P_belief"][np.ix_(OTHERS, OTHERS)].copy()
+    teach(m, W_f[400:], tau_f[400:])
+    np.testing.assert_array_equal(m["belief"][LAGS], held)
+    np.testing.assert_array_equal(np.diag(m["P_belief"])[LAGS], variance)
+    learnt = slice(400 + EVERY - 1, len(W_f) - WAITING * EVERY, EVERY)
+    W, tau = W_f[learnt][..., OTHERS], tau_f[learnt] - W_f[learnt][..., LAGS] @ held
+    R = SETTINGS.certified.residual_Nm**2 * K["correlated"]
+    information = np.linalg.inv(P0) + np.einsum("nij,nik->jk", W, W) / R
+    theta = np.linalg.solve(information, np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W, tau) / R)
+    np.testing.assert_allclose(m["belief"][OTHERS], theta, rtol=1e-6)
+
+
+def test_noise_of_the_torque_shrinks_a_lag_that_is_learnt_on_and_on_but_not_one_that_is_held():
+    """Its column is a derivative: where the torque hardly changes it is noise, which the torque itself doesn't show."""
+    random = np.random.default_rng(3)
+    count = 20_000
+    change, noise = random.standard_normal((2, count, 2))
+    W_f = np.zeros((count, 2, COUNT))
+    for i in range(2):
+        W_f[:, i, LAGS[i]] = change[:, i] + 2.0 * noise[:, i]
+    tau_f = 0.001 * change
+    lags = []
+    for is_held in (False, True):
+        m = prior()
+        m["belief"][LAGS], m["P_belief"][LAGS, LAGS] = 0.001, 0.01**2
+        if is_held:
+            belief.hold_lags(K, m)
+        teach(m, W_f, tau_f)
+        lags.append(m["belief"][LAGS].tolist())
+    assert lags[0] == pytest.approx([0.0002] * 2, abs=5e-5)
+    assert lags[1] == [0.001] * 2
 
 
 def random_covariance(random, count=5):

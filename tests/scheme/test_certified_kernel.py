@@ -422,7 +422,7 @@ def test_a_frozen_model_that_fails_its_test_is_refuted():
 
 def test_a_contact_pauses_the_test_of_a_candidate_until_the_arm_has_recovered():
     kernel = Kernel(theta=SMOOTH, P=np.zeros((COUNT, COUNT)))
-    certified_kernel.begin_refinement(kernel.memory)
+    certified_kernel.begin_refinement(kernel.constants, kernel.memory)
     rest, mode = np.zeros(2), certified_kernel.WATCH | certified_kernel.REFINE
     for _ in range(100):
         kernel.step(rest, rest, rest, mode)
@@ -476,7 +476,7 @@ def test_an_arm_that_rests_teaches_no_offset_where_friction_holds():
         std = np.where(np.char.startswith(NAMES, "offset"), 0.0115, 1e-4)
         m["belief"][:] = 0.0
         m["P_belief"][:] = m["P"][:] = np.diag(std**2)
-        certified_kernel.begin_refinement(kernel.memory)
+        certified_kernel.begin_refinement(kernel.constants, kernel.memory)
         m["still"][:] = m["still_smooth"][:] = still
         m["h"][:] = 1.0
         for _ in range(2000):

@@ -63,7 +63,7 @@ class LossyArm:
                 certified_kernel.begin_test(constants, self.m)
                 mode = certified_kernel.WATCH | certified_kernel.TEST
             elif found & int(Observation.CERTIFIED):
-                certified_kernel.begin_refinement(self.m)
+                certified_kernel.begin_refinement(constants, self.m)
                 mode = MODE
             elif mode == MODE:
                 self.found.append(found)

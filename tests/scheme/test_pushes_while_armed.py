@@ -5,9 +5,10 @@ import pytest
 from excited_arm import PERIOD_S, SETTINGS, Record, play, record
 from planar_arm import THETA
 
-from adacd_hil.analysis.smallest_push import WITHIN_S, PushGatherer
+from adacd_hil.analysis.smallest_push import PushGatherer
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.observation import Observation
+from adacd_hil.scheme.sight import WITHIN_S
 
 SECONDS = 9.0
 
