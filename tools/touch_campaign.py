@@ -2,6 +2,7 @@
 
     python tools/touch_campaign.py --seeds 0:200 -j 2
     python tools/touch_campaign.py --untouched --seeds 0:200
+    python tools/touch_campaign.py --mujoco --seeds 0:200
 
 Arms and touches by seed (`touch_trials`). Tables go to stdout, progress to stderr. Exit status: 0 all figures are
 within their bounds, 1 one is not, 2 wrong usage.
@@ -98,12 +99,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Hands on an arm that learns.")
     parser.add_argument("--seeds", type=parse_seeds, default=range(200), help="A:B, B excluded, or one; default 0:200")
     parser.add_argument("--untouched", action="store_true", help="leave the arms alone")
+    parser.add_argument("--mujoco", action="store_true", help="play the arm in MuJoCo, with its friction")
     parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
     parser.add_argument("--json", action="store_true", help="print each trial as JSON")
     options = parser.parse_args()
     trials = []
+    one = partial(play, is_touched=not options.untouched, is_foreign=options.mujoco)
     with ProcessPoolExecutor(options.jobs) as pool:
-        for trial in pool.map(partial(play, is_touched=not options.untouched), options.seeds):
+        for trial in pool.map(one, options.seeds):
             trials.append(trial)
             if len(trials) % 20 == 0:
                 print(f"{len(trials)}/{len(options.seeds)}", file=sys.stderr, flush=True)

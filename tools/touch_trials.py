@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "schem
 
 from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop
 from lab_motion import paper_motion
+from mujoco_arm import MujocoArm
 from planar_arm import THETA
 
 from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
@@ -138,13 +139,15 @@ def draw_hand(random: np.random.Generator) -> Hand:
 
 
 class HandLoop(TouchedLoop):
-    """The arm under a hand; the user acknowledges a stop after STEADY_S."""
+    """The arm under a hand; the user acknowledges a stop after STEADY_S. is_foreign: an arm of MuJoCo's."""
 
-    def __init__(self, seed: int):
+    def __init__(self, seed: int, is_foreign: bool = False):
         random = np.random.default_rng(seed)
         self.arm, free = draw_arm(random)
         super().__init__(FREE, random.uniform(-0.2, 0.2, 2), theta=free, seed=seed)
         self.free, self.random = free, random
+        if is_foreign:
+            self.advance = MujocoArm().advance
         self.stopped_cycles = 0
         self.held_at: tuple[float, float] | None = None
 
@@ -213,9 +216,9 @@ def paper_rows() -> Vector:
     return found
 
 
-def play(seed: int, is_touched: bool) -> Trial:
-    """Play one arm, and unless it stays untouched one hand."""
-    loop = HandLoop(seed)
+def play(seed: int, is_touched: bool, is_foreign: bool = False) -> Trial:
+    """Play one arm, and unless it stays untouched one hand. is_foreign: the arm is MuJoCo's."""
+    loop = HandLoop(seed, is_foreign)
     hand = draw_hand(loop.random) if is_touched else None
     begins_s, ends_s = (0.0, 0.0) if hand is None else (hand.begins_s, hand.begins_s + hand.lasts_s)
     until_s = UNTOUCHED_S if hand is None else LONGEST_S if np.isinf(ends_s) else ends_s + AFTER_S

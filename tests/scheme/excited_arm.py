@@ -161,6 +161,7 @@ class ExcitedLoop:
         self.away, self.offset_Nm = np.zeros(2), np.zeros(2)
         self.cycle = self.motion_cycles = 0
         self.request = Request.NONE
+        self.advance = advance
 
     def measure(self) -> ArmState:
         q, dq = self.q.copy(), self.tracked_dq.copy()
@@ -196,7 +197,7 @@ class ExcitedLoop:
         self.tau = self.tau_next
         self.tau_next = controller.Kp * (self.desired[0] - arm.q) + controller.Kd * (self.desired[1] - arm.dq)
         push = self.tau + self.tau_ext
-        advance(self.q, self.dq, self.tracked_q, self.tracked_dq, push, self.theta, PERIOD_S)
+        self.advance(self.q, self.dq, self.tracked_q, self.tracked_dq, push, self.theta, PERIOD_S)
         self.cycle += 1
         return output
 

@@ -11,9 +11,12 @@ from long_cases import long_but
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import touch_campaign
 import touch_trials
+from excited_arm import PERIOD_S
+from mujoco_arm import MujocoArm, model_of
+from planar_arm import THETA, advance
 from touch_trials import Hand, HandLoop, Trial
 
-GOOD = Trial(1, "P", "lean", False, True, False, 2.25, (0.01,), (), 2.0, True, "")
+GOOD = Trial(1, "P", "lean", False, True, False, 2.25, (0.01,), (), 2.0, True, "", ())
 
 
 def met(figures):
@@ -58,10 +61,35 @@ def test_the_error_of_a_model_is_that_of_its_torque_on_the_papers_motion():
 
 
 @pytest.mark.slow
-def test_an_arm_that_nobody_touches_is_certified_and_is_within_the_bounds():
-    trial = touch_trials.play(1, is_touched=False)
+@pytest.mark.parametrize("is_foreign", [False, True])
+def test_an_arm_that_nobody_touches_is_certified_and_is_within_the_bounds(is_foreign):
+    trial = touch_trials.play(1, is_touched=False, is_foreign=is_foreign)
     assert trial.certified_s == pytest.approx(2.0, abs=0.01)
     assert all(met(touch_campaign.untouched_figures([trial])).values())
+
+
+def test_how_near_untouched_fits_come_to_what_would_refuse_them_is_listed_by_rule():
+    trials = [replace(GOOD, rule_shares=((0.1, 0.2, 0.3, 0.4), (0.3, 0.2, 0.5, 0.4)))]
+    shares = [value for name, value, _, _ in touch_campaign.untouched_figures(trials) if "share of its limit" in name]
+    assert shares == ["0.20, 0.30", "0.20, 0.20", "0.40, 0.50", "0.40, 0.40"]
+
+
+@pytest.mark.parametrize("profile", ["P", "S", "M"])
+def test_an_engine_that_is_not_ours_moves_the_arm_as_the_tests_do(profile):
+    """Friction at standstill apart, where the one creeps and the other rests."""
+    ours, theirs = ([np.zeros(2) for _ in range(4)] for _ in range(2))
+    engine = MujocoArm()
+    for k in range(2000):
+        tau = np.array([1.5 * np.sin(0.006 * k), 0.5 * np.cos(0.007 * k)])
+        advance(*ours, tau, THETA[profile], PERIOD_S)
+        engine.advance(*theirs, tau, THETA[profile], PERIOD_S)
+        assert np.abs(ours[0] - theirs[0]).max() < 0.02
+    assert np.abs(ours[0]).min() > 0.3
+
+
+def test_an_arm_that_no_bodies_have_is_refused():
+    with pytest.raises(ValueError, match=r"no two links have a1 = 0\.192"):
+        model_of(np.array([0.192, 0.1, 0.02, 0.03, 0.015, 0.04, 0.02]), 1e-3)
 
 
 @pytest.mark.slow
