@@ -350,8 +350,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if mode & TEST:
         return _test(k, m, out["dq"])
     if mode & REFINE:
-        _refine(k, m, is_free)
-        return 0
+        return _refine(k, m) if is_free else 0
     if is_free and belief.learn(k, m, bank.LEARNT):
         _use_belief(m)
         earlier.follow(k, m)
@@ -401,16 +400,14 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
 
 
 @compiled
-def _refine(k: Any, m: Any, is_free: bool) -> None:
-    """Learn on beside the model in use, and let what was learnt take over after its test."""
-    if not is_free:
-        return
+def _refine(k: Any, m: Any) -> int:
+    """Learn on beside the model in use, and let what was learnt take over after its test; return what is against it."""
     sensitivity.follow_unit(k, m, bank.SLOW, k["unit_share"])
     sensitivity.relax(k, m)
     sight.follow(k, m)
     if belief.learn(k, m, bank.LEARNT):
         belief.wander(k["drift_std"], m["W_f"][bank.LEARNT], k["period_s"] * k["learn_every"], m["P_belief"])
-    refinement.test_candidate(k, m)
+    return _WITHHELD if refinement.test_candidate(k, m) else 0
 
 
 @compiled

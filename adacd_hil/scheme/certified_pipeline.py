@@ -18,12 +18,12 @@ from adacd_hil.records import (
     SchemeState,
     certified_layout,
 )
-from adacd_hil.scheme import bank, certificate, certified_kernel, certified_memory, earlier, sight
+from adacd_hil.scheme import anchor, bank, certificate, certified_kernel, certified_memory, earlier, sight
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.certificate_watch import CertificateWatch
-from adacd_hil.scheme.doubt import Doubt
+from adacd_hil.scheme.doubt import Doubt, Verdict
 from adacd_hil.scheme.intervals import Intervals
 from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_certified
@@ -83,6 +83,7 @@ class CertifiedPipeline(RunsBatches):
         self._margin = MarginWatch(self._peak_share.size)
         self._second = round(1.0 / settings.bus.period_s)
         self._monitored = 0
+        self._drift = ""
         self._has_warned = {"margin": False, "sight": False}
         self._events: list[Event] = []
         self._watch = CertificateWatch(self._constants, self._memory, settings.history.date_utc)
@@ -140,7 +141,7 @@ class CertifiedPipeline(RunsBatches):
             observation &= ~_WITHHELD if self._watch.is_refusing else ~0
             self._events.append(self._watch.accept())
         state = supervisor.step(arm, request, observation, touch.is_reporting, touch.goes_on)
-        if observation & _WITHHELD:
+        if observation & _WITHHELD and previous is not SchemeState.MONITOR:
             self._say(self._watch.refuse(is_reading=previous is SchemeState.COMMISSION))
         if state is not previous:
             state = self._weigh(state, previous, arm.cycle, observation >> CONTACT_SHIFT != 0)
@@ -236,9 +237,13 @@ class CertifiedPipeline(RunsBatches):
         """Take in how a contact of the certified model goes on; return where the arm goes, STOPPED if it is doubted."""
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             self._doubt.begin(cycle, is_touched)
+            is_drifted = self._supervisor.cause is SchemeEvent.DRIFTED
+            self._drift = "; ".join(anchor.describe_refused(self._memory[0], False)) if is_drifted else ""
         is_over = previous is SchemeState.REACT and state in (SchemeState.MONITOR, SchemeState.STOPPED)
         if is_over and self._supervisor.origin is SchemeState.MONITOR:
             verdict = self._doubt.end(cycle)
+            if self._drift:
+                verdict = Verdict(self._drift, is_payload=False)
             if verdict is not None and not self._touch.goes_on:
                 self._events.append(self._watch.doubt(verdict))
                 return self._supervisor.doubt()

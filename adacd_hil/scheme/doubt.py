@@ -218,9 +218,9 @@ class Doubt:
             rw, ww, rr = (sum(column) for column in zip(*((c.rw[0], c.ww[0], c.rr) for c in last), strict=True))
             kg = self._common(last, 0, SPREAD_LOADED)
             if kg is not None and rw * rw > SHARE_OF_ALL * ww * rr and abs(kg) > SURE * self._sigma(ww):
+                kg, sigma = self._size(last, 0)
                 what = "picked up" if kg > 0.0 else "put down"
-                text = f"{count} contacts look like {abs(kg):.2f} ± {2.0 * self._sigma(ww):.2f} kg {what}"
-                return Verdict(text, is_payload=True)
+                return Verdict(f"{count} contacts look like {abs(kg):.2f} ± {sigma:.2f} kg {what}", is_payload=True)
         return None
 
     def _other(self) -> Verdict | None:
@@ -232,9 +232,8 @@ class Doubt:
             ww = sum(contact.ww[h] for contact in last)
             if size is not None and abs(size) > SURE * self._sigma(ww) and self._can_be(h, size):
                 joint, kind = divmod(h - 1, len(_FRICTIONS))
-                ww = sum(contact.ww[h] for contact in last[1:])  # the first may have begun with the change
-                size, sigma = sum(contact.rw[h] for contact in last[1:]) / ww, 2.0 * self._sigma(ww)
-                return Verdict(f"{len(last)} contacts look like {_words(kind, joint, size, sigma)}", is_payload=False)
+                text = _words(kind, joint, *self._size(last, h))
+                return Verdict(f"{len(last)} contacts look like {text}", is_payload=False)
         return None
 
     def _unexplained(self) -> Verdict | None:
@@ -270,6 +269,11 @@ class Doubt:
             if abs(rw / own - size) > spread * abs(size) + 2.0 * self._sigma(own):
                 return None
         return size
+
+    def _size(self, contacts: list[_Weighed], h: int) -> tuple[float, float]:
+        """Return the size of cause h and twice its deviation; the first contact may have begun with the change."""
+        ww = sum(contact.ww[h] for contact in contacts[1:])
+        return float(sum(contact.rw[h] for contact in contacts[1:]) / ww), 2.0 * self._sigma(ww)
 
     def _sigma(self, ww: float) -> float:
         return float(RESIDUAL_NM * np.sqrt(self._correlated / ww))

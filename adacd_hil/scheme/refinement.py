@@ -3,8 +3,8 @@
 The belief goes on learning where nothing touches the arm. Every so often its mean is frozen as a candidate and runs
 beside the model in use on motion that neither was fitted to. It takes over if it explains that motion better and would
 have raised no alarm. So friction that warms up, and a model that was armed early, are followed, but a touch is not:
-a contact pauses the test, what is left below the thresholds can't move a candidate by more than that, and its offsets
-keep to their anchors (`anchor`).
+a contact pauses the test, and what is left below the thresholds can't move a candidate by more than that. An offset
+that has left its anchor (`anchor`), by somebody who leans lightly or a sensor that moves, takes the certificate back.
 """
 
 from typing import Any
@@ -27,7 +27,7 @@ def restart(m: Any) -> None:
 
 @compiled
 def test_candidate(k: Any, m: Any) -> bool:
-    """Take one sample into the test, and tell whether the candidate has just taken over."""
+    """Take one sample into the test; tell whether a candidate that passes it is excluded by an anchor alone."""
     m["candidate_cycles"] += 1.0
     for c in range(m["W_f"].shape[0]):
         for i in range(m["W_f"].shape[1]):
@@ -42,13 +42,13 @@ def test_candidate(k: Any, m: Any) -> bool:
     if m["candidate_cycles"] < k["refine_cycles"]:
         return False
     is_better = m["candidate_square"] < m["frozen_square"] and m["candidate_worst"] < 1.0
-    is_anchored = is_better and anchor.is_within(k, m, m["candidate"], m["P_candidate"])
-    is_promoted = is_anchored and is_positive_definite(m["candidate"])
-    if is_promoted:
+    is_fit = is_better and is_positive_definite(m["candidate"])
+    is_anchored = is_fit and anchor.is_within(k, m, m["candidate"], m["P_candidate"])
+    if is_anchored:
         m["theta"][:] = m["candidate"]
         m["P"][:] = m["P_candidate"]
         m["certified"][:] = m["theta"]
         m["P_certified"][:] = m["P"]
         m["promotions"] += 1.0
     restart(m)
-    return bool(is_promoted)
+    return bool(is_fit and not is_anchored)

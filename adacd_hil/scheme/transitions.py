@@ -32,6 +32,7 @@ class SchemeEvent(IntEnum):
     REVOKED = 17  # the user takes back what is known of the arm, or acknowledges that it is doubted
     DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
     MOVED = 19  # the arm moves before all its drives are enabled
+    DRIFTED = 20  # what was learnt while detecting has an offset that its anchor excludes
 
 
 class Back(Enum):
@@ -77,13 +78,14 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.CERTIFIED: SchemeState.MONITOR,
             SchemeEvent.REFUTED: SchemeState.ADAPT,
         },
-        # Moves, detection armed. Out: a contact; a host that is late; the announcement of a payload change; back from a
-        # contact, the doubt of the model.
+        # Moves, detection armed. Out: a contact; a host that is late; an offset that has left its anchor; the
+        # announcement of a payload change; back from these, the doubt of the model.
         SchemeState.MONITOR: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
             SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.LATE: SchemeState.REACT,
+            SchemeEvent.DRIFTED: SchemeState.REACT,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
             SchemeEvent.DOUBTED: SchemeState.STOPPED,
         },

@@ -48,7 +48,7 @@ def test_a_payload_that_nobody_announced_is_named_and_learnt_at_a_word(profile, 
     assert loop.run_until_taken_back() <= 5
     (text,) = loop.said("revoked")
     named = re.fullmatch(r"\d contacts look like (\S+) ± (\S+) kg picked up: .*, `changed` learns it", text)
-    assert float(named[1]) == pytest.approx(kg, rel=0.1)
+    assert float(named[1]) == pytest.approx(kg, rel=0.15)
     loop.request = Request.PAYLOAD_CHANGED
     loop.run_until(SchemeState.ADAPT)
     assert len(loop.run_until(SchemeState.MONITOR)) * PERIOD_S < 1.5
@@ -149,7 +149,7 @@ def test_two_contacts_that_agree_in_a_payload_are_one_and_a_single_contact_is_no
     assert verdict_of([sums(0.5)]) is None
     verdict = verdict_of([sums(0.5), sums(0.5)])
     assert verdict.is_payload
-    assert verdict.text == "2 contacts look like 0.50 ± 0.03 kg picked up"
+    assert verdict.text == "2 contacts look like 0.50 ± 0.04 kg picked up"
 
 
 @pytest.mark.parametrize(
@@ -220,3 +220,49 @@ def test_how_long_a_contact_and_its_acknowledgement_took_is_not_asked(lasts_s):
 
 def test_contacts_of_more_than_a_minute_ago_do_not_count():
     assert verdict_of([sums(0.5), sums(0.5)], gap_s=doubt.WITHIN_S) is None
+
+
+@pytest.mark.parametrize("torque_Nm", [0.05, -0.06])
+def test_who_leans_more_and_more_below_a_threshold_is_found_by_the_anchor(torque_Nm):
+    """It is learnt as it comes up, so no channel sees it, until the reading at rest contradicts."""
+    loop = MonitoredLoop()
+    for k in range(60_000):
+        loop.tau_ext[0] = torque_Nm * min(k * PERIOD_S / 30.0, 1.0)
+        loop.step()
+        if loop.said("revoked"):
+            break
+    (text,) = loop.said("revoked")
+    assert loop.step().state is SchemeState.STOPPED
+    assert re.match(r"joint 1 has a fitted torque offset of -?0\.0\d\d Nm, by the reading at rest it is", text)
+    told = "somebody leans on it, or the sensor has moved: the certificate is taken back, `relearn` learns the arm anew"
+    assert text.endswith(told)
+    loop.tau_ext[:] = 0.0
+    loop.request = Request.ACKNOWLEDGE
+    loop.recover()
+    assert abs(loop.offset_error_Nm[0]) < 0.02
+
+
+def test_a_sensor_that_moves_takes_the_certificate_back_and_is_accepted_at_a_word():
+    loop = MonitoredLoop()
+    states = []
+    while SchemeState.STOPPED not in states[-1:]:
+        loop.offset_Nm[1] += 2e-3 * PERIOD_S
+        states.append(loop.step().state)
+        assert len(states) < 60_000
+    assert SchemeState.REACT in states
+    assert "joint 2 has a fitted torque offset of 0.0" in loop.said("revoked")[0]
+    loop.request = Request.RELEARN
+    loop.run(3000)
+    loop.request = Request.ACCEPT
+    loop.recover()
+    assert abs(loop.offset_error_Nm[1]) < 0.02
+
+
+@pytest.mark.long
+def test_an_arm_that_only_warms_up_keeps_its_certificate():
+    loop = MonitoredLoop("M")
+    cold = loop.theta.copy()
+    for k in range(120_000):
+        loop.theta[3:] = cold[3:] * (1.0 - 0.2 * k / 120_000)
+        assert loop.step().state is SchemeState.MONITOR
+    assert loop.said("revoked") == []

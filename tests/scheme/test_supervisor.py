@@ -15,19 +15,19 @@ from adacd_hil.scheme.transitions import TRANSITIONS, SchemeEvent, next_state
 # the state from which REACT was entered.
 EVENTS = (
     "FAULT COLLISION CONTACT LATE COMPLETE COMMISSIONED ENABLED ADAPTED FITTED CERTIFIED REFUTED "
-    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED REVOKED DOUBTED MOVED"
+    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED REVOKED DOUBTED MOVED DRIFTED"
 )
 EXPECTED = """
-INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .        .        .         .
-COMMISSION  FAULT  .      .      .      .           ENABLE  .      .        .        .        .      .        .     .     .        .        .        .         .
-ENABLE      FAULT  REACT  REACT  .      .           .       ADAPT  .        .        .        .      .        .     .     .        .        .        .         COMMISSION
-ADAPT       FAULT  REACT  REACT  .      .           .       .      MONITOR  CERTIFY  .        .      .        .     .     .        .        .        .         .
-CERTIFY     FAULT  REACT  REACT  .      .           .       .      .        .        MONITOR  ADAPT  .        .     .     .        .        .        .         .
-MONITOR     FAULT  REACT  REACT  REACT  .           .       .      .        .        .        .      .        .     .     PAYLOAD  .        .        STOPPED         .
-REACT       FAULT  .      .      .      .           .       .      .        .        .        .      STOPPED  back  .     .        .        .        .         .
-STOPPED     FAULT  .      .      .      .           .       .      .        .        .        .      .        .     back  PAYLOAD  ADAPT    ADAPT    .         .
-PAYLOAD     FAULT  REACT  REACT  .      .           .       .      .        .        .        .      .        .     .     .        ADAPT    .        .         .
-FAULT       .      .      .      .      .           .       .      .        .        .        .      .        .     .     .        .        .        .         .
+INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .        .        .         .         .
+COMMISSION  FAULT  .      .      .      .           ENABLE  .      .        .        .        .      .        .     .     .        .        .        .         .         .
+ENABLE      FAULT  REACT  REACT  .      .           .       ADAPT  .        .        .        .      .        .     .     .        .        .        .         COMMISSION         .
+ADAPT       FAULT  REACT  REACT  .      .           .       .      MONITOR  CERTIFY  .        .      .        .     .     .        .        .        .         .         .
+CERTIFY     FAULT  REACT  REACT  .      .           .       .      .        .        MONITOR  ADAPT  .        .     .     .        .        .        .         .         .
+MONITOR     FAULT  REACT  REACT  REACT  .           .       .      .        .        .        .      .        .     .     PAYLOAD  .        .        STOPPED         .         REACT
+REACT       FAULT  .      .      .      .           .       .      .        .        .        .      STOPPED  back  .     .        .        .        .         .         .
+STOPPED     FAULT  .      .      .      .           .       .      .        .        .        .      .        .     back  PAYLOAD  ADAPT    ADAPT    .         .         .
+PAYLOAD     FAULT  REACT  REACT  .      .           .       .      .        .        .        .      .        .     .     .        ADAPT    .        .         .         .
+FAULT       .      .      .      .      .           .       .      .        .        .        .      .        .     .     .        .        .        .         .         .
 """  # noqa: E501
 ORIGINS = ("ENABLE", "ADAPT", "CERTIFY", "MONITOR", "PAYLOAD")
 
@@ -588,6 +588,13 @@ def test_an_acknowledgement_waits_until_the_host_is_on_time():
     assert run.step(LATE, request=Request.ACKNOWLEDGE) is SchemeState.STOPPED
     assert run.step(LATE, cycles=300) is SchemeState.STOPPED
     assert run.step() is SchemeState.MONITOR
+
+
+def test_an_offset_that_has_left_its_anchor_stops_the_arm_for_the_user():
+    run = run_in(SchemeState.MONITOR)
+    assert run.step(observation=Observation.WITHHELD) is SchemeState.REACT
+    assert run.supervisor.cause is SchemeEvent.DRIFTED
+    assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
 
 
 def test_a_late_host_that_was_to_change_the_payload_holds_the_arm_first():

@@ -1,0 +1,206 @@
+"""What contacts have in common, played: payloads that nobody announced, certificates that have become wrong, touches.
+
+    python tools/doubt_campaign.py payload --seeds 0:60 -j 2
+    python tools/doubt_campaign.py wrong --seeds 0:60
+    python tools/doubt_campaign.py touches --seeds 0:60
+
+By seed an arm of `touch_trials` is certified and monitors on the excitation for 1 to 5 s. payload: SIZES_KG are picked
+up by turns. wrong: a joint's friction or its sensor's zero changes. touches: TOUCHES pushes at random times. The user
+acknowledges every stop. Tables go to stdout, progress to stderr. Exit status: 0 all figures are within their bounds, 1
+one is not, 2 wrong usage.
+"""
+
+import argparse
+import os
+import re
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from property_campaign import parse_seeds
+from touch_trials import PERIOD_S, HandLoop
+
+from adacd_hil.cli.table import format_table
+from adacd_hil.records import SchemeState, Vector
+from adacd_hil.scheme.belief import payload_direction
+
+SIZES_KG = (0.05, 0.1, 0.2, 0.5, 1.0)
+ERRORS = ("Coulomb friction", "viscous friction", "torque offset")
+ERROR_SIZES = {"Coulomb friction": (0.1, 1.0), "viscous friction": (0.1, 0.5), "torque offset": (0.1, 2.0)}
+"""Nm, Nm s/rad, Nm; log-uniform."""
+FIRST_OF_ERRORS = {"Coulomb friction": 5, "viscous friction": 3}
+WITHIN_S, WITHIN_CONTACTS = 60.0, 3
+TOUCHES, APART_S = 20, 1.5
+PUSH_NM, PUSH_S = (0.1, 3.0), (0.03, 0.8)
+NAMED = re.compile(r"\d+ contacts look like ([\d.]+) ± [\d.]+ (kg picked up|kg put down|Nm s/rad|Nm)")
+
+
+@dataclass(frozen=True)
+class Played:
+    """What came of one arm. size: kg, Nm, Nm s/rad, of touches 0. named: size that contacts look like, 0 of nothing.
+
+    said: why the certificate was taken back, or that something still pushes; "" if neither. contacts, after_s: until
+    then, since the change.
+    """
+
+    seed: int
+    what: str
+    size: float
+    said: str
+    named: float
+    contacts: int
+    after_s: float
+
+
+class Armed:
+    """An arm that monitors, and what is said of its certificate."""
+
+    def __init__(self, seed: int) -> None:
+        self.loop = HandLoop(seed)
+        for _ in range(20_000):
+            if self.loop.step().state is SchemeState.MONITOR:
+                break
+        else:
+            raise RuntimeError(f"seed {seed}: not certified within 20 s")
+        self.random = self.loop.random
+        self.loop.run(round(self.random.uniform(1.0, 5.0) / PERIOD_S))
+        self.begun, self.contacts = self.loop.cycle, 0
+
+    def between(self, low: float, high: float) -> float:
+        """Draw log-uniformly."""
+        return float(np.exp(self.random.uniform(np.log(low), np.log(high))))
+
+    def play(self, seconds: float) -> str:
+        """Go on until the certificate is doubted; return what is said then, "" if it isn't."""
+        for _ in range(round(seconds / PERIOD_S)):
+            output = self.loop.step()
+            self.contacts += output.state is SchemeState.REACT and output.previous_state is SchemeState.MONITOR
+            if self.loop.said("revoked"):
+                return str(self.loop.said("revoked")[0])
+            if output.state is SchemeState.FAULT:
+                return output.fault.name
+        return ""
+
+    def played(self, seed: int, what: str, size: float, said: str) -> Played:
+        """Sum up."""
+        named = NAMED.match(said)
+        after_s = (self.loop.cycle - self.begun) * PERIOD_S
+        return Played(seed, what, size, said, float(named[1]) if named else 0.0, self.contacts, after_s)
+
+
+def play(seed: int, part: str) -> Played:
+    """Play one arm."""
+    armed = Armed(seed)
+    loop = armed.loop
+    if part == "payload":
+        size = SIZES_KG[seed % len(SIZES_KG)]
+        loop.free = loop.theta = loop.free + size * payload_direction(loop.settings.arm.link_length_m, 7)
+        return armed.played(seed, f"{size:g} kg", size, armed.play(WITHIN_S))
+    if part == "wrong":
+        what, joint = ERRORS[seed % len(ERRORS)], int(armed.random.integers(2))
+        size = armed.between(*ERROR_SIZES[what])
+        if what in FIRST_OF_ERRORS:
+            theta: Vector = loop.theta.copy()
+            theta[FIRST_OF_ERRORS[what] + joint] += size
+            loop.free = loop.theta = theta
+        else:
+            loop.offset_Nm[joint] += size * armed.random.choice([-1.0, 1.0])
+        said = armed.play(WITHIN_S)
+        return armed.played(seed, what, size, said or (loop.said("touch") or [""])[-1])
+    said = "".join(_touches(armed))
+    return armed.played(seed, "touches", 0.0, said)
+
+
+def _touches(armed: Armed) -> Iterator[str]:
+    """Push again and again until the certificate is doubted."""
+    loop, random = armed.loop, armed.random
+    for _ in range(TOUCHES):
+        torque = armed.between(*PUSH_NM) * random.choice([-1.0, 1.0])
+        loop.tau_ext[:] = torque * (np.array([1.0, 0.0]) if random.random() < 0.5 else np.array([1.0, random.random()]))
+        said = armed.play(armed.between(*PUSH_S))
+        loop.tau_ext[:] = 0.0
+        said = said or armed.play(float(random.exponential(APART_S)))
+        if said:
+            yield said
+            return
+
+
+def payload_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
+    """Return name, value, bound of each figure, and whether it is within."""
+    found = []
+    for size in SIZES_KG:
+        mine = [row for row in rows if row.size == size]
+        named = [row for row in mine if "kg picked up" in row.said]
+        near = sum(abs(row.named - size) <= 0.1 * size for row in named)
+        contacts = [row.contacts for row in named] or [0]
+        most, share = (5, 0.95 if size >= 0.2 else 0.9) if size >= 0.1 else (0, 0.0)
+        percentile = float(np.percentile(contacts, 95.0, method="higher"))
+        is_met = len(named) == len(mine) and near >= share * len(mine) and (not most or percentile <= most)
+        found.append(
+            (
+                f"{size:g} kg: named, within 10 %, contacts median / 95 % / worst",
+                f"{len(named)}, {near} of {len(mine)}, {np.median(contacts):g} / {percentile:g} / {max(contacts)}",
+                f"all, {share:.0%}, 5" if most else "all",
+                is_met,
+            )
+        )
+    return found
+
+
+def wrong_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
+    """Return name, value, bound of each figure, and whether it is within."""
+    found = []
+    for what in ERRORS:
+        mine = [row for row in rows if row.what == what]
+        seen = [row for row in mine if row.contacts]
+        told = sum(bool(row.said) for row in seen)
+        revoked = [row for row in mine if "taken back" in row.said]
+        soon = sum(row.contacts <= WITHIN_CONTACTS or row.after_s <= WITHIN_S for row in revoked)
+        quiet = max((row.size for row in mine if not row.contacts), default=0.0)
+        text = f"{len(revoked)}, {told}, {len(seen)} of {len(mine)}; without a contact up to {quiet:.2f}"
+        found.append((f"{what}: taken back, said, met by a contact", text, "each that is met", told == len(seen)))
+        found.append((f"{what}: taken back within 3 contacts or 60 s", f"{soon}", "each", soon == len(revoked)))
+    return found
+
+
+def touches_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
+    """Return name, value, bound of each figure, and whether it is within."""
+    contacts = sum(row.contacts for row in rows)
+    named, lost = sum(row.named > 0.0 for row in rows), sum(bool(row.said) for row in rows)
+    return [
+        ("sequences that were named as an error", f"{named} of {len(rows)}", "1 %", named <= 0.01 * len(rows)),
+        ("sequences that took the certificate back", f"{lost} of {len(rows)}, {contacts} contacts", "", True),
+    ]
+
+
+FIGURES = {"payload": payload_figures, "wrong": wrong_figures, "touches": touches_figures}
+
+
+def main() -> int:
+    """Play the seeds that were asked for."""
+    parser = argparse.ArgumentParser(description="What contacts have in common, played.")
+    parser.add_argument("part", choices=list(FIGURES))
+    parser.add_argument("--seeds", type=parse_seeds, default=range(60), help="A:B, B excluded, or one; default 0:60")
+    parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
+    parser.add_argument("--list", action="store_true", help="print what was said of each arm")
+    options = parser.parse_args()
+    rows = []
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for row in pool.map(partial(play, part=options.part), options.seeds):
+            rows.append(row)
+            if len(rows) % 20 == 0:
+                print(f"{len(rows)}/{len(options.seeds)}", file=sys.stderr, flush=True)
+    if options.list:
+        for row in rows:
+            print(f"{row.seed} {row.what} {row.size:.3g}: {row.contacts} contacts, {row.after_s:.1f} s: {row.said}")
+    figures = FIGURES[options.part](rows)
+    table = [[name, value, bound, "" if is_met else "not met"] for name, value, bound, is_met in figures]
+    print(format_table(("figure", "measured", "bound", ""), table))
+    return 0 if all(row[3] for row in figures) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
