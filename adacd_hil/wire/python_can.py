@@ -83,7 +83,7 @@ class PythonCanBus(Bus):
 
     def recover(self) -> None:
         """Empty the transmit buffer where the interface can, and open it anew. Raises BusError."""
-        # Few interfaces can; all are opened anew, and what that can't do it raises.
+        # Few interfaces can empty a buffer, and a broken one fails: `_open` raises if the interface doesn't work.
         with contextlib.suppress(NotImplementedError, OSError, can.CanError):
             self._bus.flush_tx_buffer()
         self._bus.shutdown()

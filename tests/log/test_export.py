@@ -105,6 +105,7 @@ def test_candump_says_nothing_of_direction_unless_it_is_asked_to(bus, tmp_path):
     assert bare.tobytes() == full.tobytes()
 
 
+# No Python package brings tshark. Where it is missing, the tests above check the lines by a pattern of their own.
 @pytest.mark.skipif(shutil.which("tshark") is None, reason="Wireshark's tshark is not installed")
 def test_wireshark_opens_a_candump_log_with_all_its_frames(bus, tmp_path):
     rewrite(bus, tmp_path / "x.log", "candump")
