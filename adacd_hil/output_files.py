@@ -161,6 +161,17 @@ def replace_file(path: Path, content: bytes | str) -> None:
         beside.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def is_anothers(path: Path, head: bytes) -> bool:
+    """Tell whether a file is there that has something, and doesn't begin as those do that may be replaced.
+
+    Raises OSError.
+    """
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(head)) not in (b"", head)
+
+
 def _check_replaceable(path: Path, is_log: bool) -> None:
     """Raise OSError when what is there can't be replaced or shouldn't be."""
     try:

@@ -10,7 +10,7 @@ import click
 from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.output_files import replace_file
+from adacd_hil.output_files import is_anothers, replace_file
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
     if plot is not None:
         if plot.exists() and plot.samefile(file):
             raise CommandError(f"--plot {plot} is the history itself; give another name", ExitCode.USAGE)
-        if plot.is_file() and plot.stat().st_size and not plot.read_bytes().startswith(_PNG):
+        if is_anothers(plot, _PNG):
             raise CommandError(f"--plot {plot} is there already and no PNG; give another name", ExitCode.USAGE)
         replace_file(plot, _as_png(found))
     print(json.dumps(dataclasses.asdict(found), indent=2) if as_json else _as_text(found))

@@ -142,6 +142,7 @@ def test_the_picture_does_not_replace_the_history(file: Path, first_history: str
 def test_the_picture_replaces_an_earlier_one_and_nothing_else(file: Path, first_history: str) -> None:
     picture, other = file.with_name("arm.png"), file.with_name("other.toml")
     other.write_text(first_history)
+    picture.touch()  # an empty file is nobody's
     for _ in range(2):
         assert CliRunner().invoke(cli, ["history", str(file), "--plot", str(picture)]).exit_code == 0
     result = CliRunner().invoke(cli, ["history", str(file), "--plot", str(other)])

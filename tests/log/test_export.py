@@ -328,9 +328,10 @@ def test_frames_replace_nothing_but_the_same_frames(log, tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_tables_replace_tables_and_nothing_else(log, tmp_path, kind):
+    path = tmp_path / f"cycle.{kind}"
+    path.touch()  # an empty file is nobody's
     for _ in range(2):
         assert command(log, "--format", kind, "--topic", "cycle", "--out", tmp_path).exit_code == 0
-    path = tmp_path / f"cycle.{kind}"
     path.write_text("timestamp,arbitration_id\n")
     done = command(log, "--format", kind, "--topic", "cycle", "--out", tmp_path)
     assert (done.exit_code, path.read_text()) == (1, "timestamp,arbitration_id\n")

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
-from adacd_hil.input_files import open_input
 from adacd_hil.log.decoding import Decoder
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedEvent, Series
-from adacd_hil.output_files import replacing
+from adacd_hil.output_files import is_anothers, replacing
 from adacd_hil.wire.codec import Codec
 
 _LONGEST_STEM = 60
@@ -107,7 +106,8 @@ class Tables:
         path = self._paths.get(topic) or self._path(topic)
         try:
             if topic not in self._tables:
-                self._check_replaceable(path)
+                if is_anothers(path, _HEADS[self._kind]):  # as a recording may be, which is CSV, too
+                    raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
                 beside = self._files.enter_context(replacing(path))
                 table = _Csv(beside) if self._kind == "csv" else _Parquet(beside, self._metadata)
                 self._tables[topic] = self._files.enter_context(closing(table))
@@ -118,15 +118,6 @@ class Tables:
         except OSError as error:
             raise LogError(f"{path} can't be written: {error.strerror or error}") from None
         self.rows[path] += len(columns["t_ns"])
-
-    def _check_replaceable(self, path: Path) -> None:
-        """Raise OSError when another's file is there: tables replace tables, and a recording may be a CSV file."""
-        if not path.is_file() or not path.stat().st_size:
-            return
-        head = _HEADS[self._kind]
-        with open_input(path) as file:
-            if file.read(len(head)) != head:
-                raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
 
     def _path(self, topic: str) -> Path:
         """Name the file of a topic: one of its own, whatever others have called their topics."""
