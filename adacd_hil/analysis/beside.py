@@ -126,7 +126,7 @@ class BesideGatherer:
         unexplained = over if self._finish_cycle is None else over & (piece.cycle < self._finish_cycle)
         unexplained = unexplained.copy()
         if self._span is not None:  # of what the emulator didn't record nobody knows
-            unexplained &= (piece.cycle >= self._span[0]) & (piece.cycle <= self._span[1])
+            unexplained &= self._span.covers(piece.cycle)
         for number, (start_s, end_s) in enumerate(self._windows):
             if start_s > time_s[-1] or end_s < time_s[0]:
                 continue

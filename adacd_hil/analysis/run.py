@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.host_cycles import Span
 from adacd_hil.analysis.timing import CycleColumns, Cycles
 from adacd_hil.config import Settings
 from adacd_hil.log.reader import LoggedEvent
@@ -37,12 +38,12 @@ class Truth:
     force_N: Vector | None = None  # size of the contact force (m,)
     time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
     model_cycle: Cycles | None = None
-    span: tuple[int, int] | None = None
-    """First and last cycle that the emulator recorded, whichever are kept; None: all."""
+    span: Span | None = None
+    """What the emulator recorded, whichever cycles are kept; None: all."""
 
     def covers(self, cycle: int) -> bool:
         """Whether the emulator recorded what was true in a cycle."""
-        return self.span is None or self.span[0] <= cycle <= self.span[1]
+        return self.span is None or bool(self.span.covers(np.array(cycle)))
 
     def model_row(self, cycle: int) -> int | None:
         """Give the row of payload and parameters in a cycle; None without any."""

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.replay.attempts import NMT_ID, RESET_COMMUNICATION, Places, Stretch
 from adacd_hil.analysis.replay.source import FRAME_TOPICS, LogSource, Part
 from adacd_hil.config import Settings
+from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.frame_log import read_frames
@@ -29,7 +30,6 @@ from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.wire.codec import Codec
 
-SYNC_OVERFLOW: Final = 240
 FEEDBACK_SHARE: Final = 0.7
 """Part of the period in which the host awaits its feedback in real time."""
 _REALTIME: Final = (0.9, 1.1)

@@ -1,8 +1,4 @@
-"""The true contacts of a run, read from the emulator's log in constant memory but for the contacts themselves.
-
-The emulator counts its cycles by the counter of SYNC, anew after each reset: in every attempt of a run it begins with
-the first cycle's number less all whole rounds of the counter.
-"""
+"""The true contacts of a run, read from the emulator's log in constant memory but for the contacts themselves."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.host_cycles import whole_rounds
 from adacd_hil.analysis.timing import Cycles
 from adacd_hil.analysis.touches import filtered
-from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.log.stream import LogStream
 from adacd_hil.records import Vector
 
@@ -35,7 +31,7 @@ class TrueContact:
 
     def counted_from(self, first_cycle: int) -> "TrueContact":
         """Return it with the cycles of the host, for which the attempt begins with the given one."""
-        shift = first_cycle - first_cycle % SYNC_OVERFLOW
+        shift = int(whole_rounds(np.array(first_cycle)))
         return replace(self, onset=self.onset + shift, end=self.end + shift, cycle=self.cycle + shift)
 
     def forgotten_after_s(self, period_s: float, a_rad_s: float, threshold: Vector) -> float:

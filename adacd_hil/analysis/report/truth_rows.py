@@ -13,10 +13,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.host_cycles import EmulatorSpan, host_cycles, host_span
 from adacd_hil.analysis.report.thinning import extreme_rows
 from adacd_hil.analysis.run import Truth
 from adacd_hil.analysis.timing import Cycles
-from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import LogStream
 from adacd_hil.records import PARAMETER_NAMES, Vector
@@ -26,7 +26,6 @@ _BEGINNING: Final = (10_000, 1_000)
 _PLENTY: Final = 1_000_000
 _ENDING: Final = 1_000
 _BUCKET: Final = 100
-_NEVER: Final = 1 << 62
 _HELD: Final = 30_000
 """Rows of one contact that wait at most until those in the middle are chosen."""
 
@@ -51,7 +50,7 @@ class TruthRows(NamedTuple):
     metadata: Mapping[str, str]
     problem: str
     is_complete: bool
-    span: tuple[tuple[int, int], tuple[int, int]] | None = None  # attempt and cycle of the first and the last row
+    span: EmulatorSpan | None = None
 
 
 _ROW: Final = np.dtype(
@@ -224,9 +223,7 @@ def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None
 
     begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
 
-    The arm goes on when the host has died; what happens to it then is none of the host's cycles. The emulator counts by
-    the counter of SYNC, anew in each attempt of the run: its cycles lack all whole rounds of the counter that the host
-    had counted before.
+    The arm goes on when the host has died; what happens to it then is none of the host's cycles.
     """
     if not rows.model_cycle.size:
         return None
@@ -242,20 +239,5 @@ def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None
         force_N=None if rows.force_N is None else rows.force_N[of_host],
         time_s=None if time_s is None else time_s[of_host],
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
-        span=_host_span(rows, begins),
+        span=None if rows.span is None else host_span(rows.span, begins),
     )
-
-
-def _host_span(rows: TruthRows, begins: Cycles) -> tuple[int, int] | None:
-    """Give the first and the last cycle that the truth has; one that goes on after this log has no last one."""
-    if rows.span is None:
-        return None
-    attempts, cycles = (np.array(column) for column in zip(*rows.span, strict=True))
-    first, last = host_cycles(cycles, attempts, begins).tolist()
-    return first, last if attempts[1] < len(begins) else _NEVER
-
-
-def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
-    """Turn the emulator's cycles (m,) of attempts (m,) into the host's."""
-    shift = begins - begins % SYNC_OVERFLOW
-    return np.asarray(cycle + shift[np.minimum(attempt, len(shift) - 1)])

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.attempt_begins import AttemptBegins
+from adacd_hil.analysis.host_cycles import AttemptBegins
 from adacd_hil.analysis.motion import APART_S, LoggedMotion, Progress, read_motion, schemes
 from adacd_hil.analysis.replay.replay import contacts_beside
 from adacd_hil.analysis.replay.source import LogSource
