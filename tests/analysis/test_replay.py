@@ -17,6 +17,7 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.stretch import Stretch, begin_of_log
 from adacd_hil.records import FaultReason, SchemeState
+from firmware_sim.truth import TruthLog
 
 pytestmark = pytest.mark.slow
 
@@ -241,3 +242,30 @@ def test_a_log_without_its_settings_is_refused(tmp_path: Path) -> None:
     write(tmp_path / "run.mcap", make_run(3))
     with pytest.raises(LogError, match=r"no attachment config\.toml"):
         replay(tmp_path / "run.mcap")
+
+
+def test_what_comes_before_or_after_the_truth_is_not_judged(log: Path, whole: Replay) -> None:
+    """As in the report: a detection there is neither right nor a false alarm, and a replay says that there are some."""
+    source, truth = LogSource(log), contacts_beside(log)
+    attempt, onset = truth.contacts[0].attempt, truth.contacts[0].onset
+    first, last = truth.span
+    assert first < (attempt, onset) < last
+
+    def judged(*span: tuple[int, int]) -> tuple[int | None, bool, tuple[str, ...]]:
+        untouched = truth._replace(contacts=(), span=span)
+        found = replay_source(LogSource(log), [source.settings], untouched)[0]
+        return found.false_alarms, found.is_whole, found.notes
+
+    said = "the truth doesn't cover 1 detections, which are not judged"
+    assert judged(first, last) == (1, True, ())
+    assert judged(first, (attempt, onset - 1)) == (0, False, (said,))
+    assert judged(last, last) == (0, False, (said,))
+    assert judged(first, (whole.attempts, 0)) == (1, True, ())  # it goes on with the next host
+    assert replay_source(LogSource(log), [source.settings], truth)[0].notes == ()
+
+
+def test_a_truth_without_a_cycle_knows_nothing(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(log.read_bytes())
+    TruthLog(tmp_path / "truth.mcap", blocking=True).close()
+    found = replay(tmp_path / "run.mcap")
+    assert (found.true_contacts, found.false_alarms, found.missed) == (None, None, None)

@@ -409,7 +409,7 @@ def log_settings(log):
 def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
-    contacts = contacts_beside(log)
+    contacts = contacts_beside(log).contacts
     assert [cycle[window.first] for window in read.windows] == [contact.onset for contact in contacts]
     assert [(window.is_armed, window.is_chosen_on) for window in read.windows] == [(True, True)]
     for window, contact in zip(read.windows, contacts, strict=True):
@@ -421,10 +421,24 @@ def test_a_log_gives_its_contacts_and_the_motion_away_from_them(log):
     assert read.digest == hashlib.sha256(log.read_bytes()).hexdigest()
 
 
+def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
+    truth, (whole,) = contacts_beside(log), read_logs([log])
+    ((attempt, _), _) = truth.span
+    cycle = read_log(log, ("/scheme",)).scheme["cycle"].reshape(-1)
+    first, last = np.quantile(cycle[whole.motion.is_free], (0.2, 0.8), method="lower").tolist()
+    short = truth._replace(span=((attempt, first), (attempt, last)))
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: short)
+    (read,) = read_logs([log])
+    is_covered = (first <= cycle) & (cycle <= last)
+    assert read.motion.is_free.tolist() == (whole.motion.is_free & is_covered).tolist()
+    assert 0 < read.motion.is_free.sum() < whole.motion.is_free.sum()
+
+
 def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
-    (first,) = contacts_beside(log)
-    later = [first, dataclasses.replace(first, attempt=1), dataclasses.replace(first, attempt=2)]
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: tuple(later))
+    truth = contacts_beside(log)
+    (first,) = truth.contacts
+    later = (first, dataclasses.replace(first, attempt=1), dataclasses.replace(first, attempt=2))
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: truth._replace(contacts=later))
     monkeypatch.setattr(tune_logs, "_begins", lambda *_: [0, 241])
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
@@ -452,8 +466,8 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 
 
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
-    contacts = contacts_beside(log)
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: contacts * 3)
+    truth = contacts_beside(log)
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: truth._replace(contacts=truth.contacts * 3))
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 

@@ -1,9 +1,9 @@
 """What a replay came to, gathered stretch by stretch in constant memory: states, contacts, adaptations, parameters.
 
 A *detection* is a transition to REACT by a contact. It belongs to the true contact between whose onset and forgetting
-it falls (`touches.forgotten_s`), else it is a false alarm: as in `adacd_hil.analysis.metrics`. As the arm in the log
-moved as it did, a scheme with other settings may still be in REACT when the next contact comes. That contact then
-counts as detected with the first sample over a threshold.
+it falls (`touches.forgotten_s`), else it is a false alarm, unless the emulator didn't record what was true then: as in
+`adacd_hil.analysis.metrics`. As the arm in the log moved as it did, a scheme with other settings may still be in REACT
+when the next contact comes. That contact then counts as detected with the first sample over a threshold.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.replay.truth_contacts import TrueContact
+from adacd_hil.analysis.host_cycles import host_span
+from adacd_hil.analysis.replay.truth_contacts import TrueContact, TrueContacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
@@ -65,17 +66,19 @@ class _Mark(NamedTuple):
 
 
 class OutcomeGatherer:
-    """Takes in the decisions of one replay. `contacts`: the true ones, None where nobody knows them."""
+    """Takes in the decisions of one replay. `truth`: the true contacts, None where nobody knows them."""
 
-    def __init__(self, settings: Settings, contacts: tuple[TrueContact, ...] | None) -> None:
+    def __init__(self, settings: Settings, truth: TrueContacts | None) -> None:
         self.transitions: list[Transition] = []
         self.reports: list[LoggedContact] = []
         self.adaptations: list[Adaptation] = []
         self.theta_hat: tuple[float, ...] = ()
         self.state = SchemeState.INIT
         self._settings = settings
-        self._contacts = None if contacts is None else list(contacts)
+        self._contacts = None if truth is None else list(truth.contacts)
+        self._span = None if truth is None else truth.span
         self._attempt = 0
+        self._begins: list[int] = []  # first cycle of each attempt
         self._theta = layout_of(settings).slices["theta_hat"]
         self._threshold = layout_of(settings).slices["threshold"]
         self._began: tuple[int, int] | None = None  # cycle and time of the adaptation in progress
@@ -151,6 +154,7 @@ class OutcomeGatherer:
         """Begin an attempt, by its number in the run and its first cycle."""
         self._give_up()
         self._attempt = attempt
+        self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
         if self._contacts is not None:
             self._contacts = [
                 contact.counted_from(cycle) if contact.attempt == attempt else contact for contact in self._contacts
@@ -170,6 +174,15 @@ class OutcomeGatherer:
             if each.state is SchemeState.REACT and each.previous not in _BUSY and each.is_contact
         ]
 
+    @property
+    def unjudged(self) -> list[Transition]:
+        """Detections before or after what the emulator recorded: nobody knows whether they were right."""
+        detections = self.detections
+        if self._span is None or not detections:
+            return []
+        is_known = host_span(self._span, np.array(self._begins)).covers(np.array([each.cycle for each in detections]))
+        return [each for each, known in zip(detections, is_known.tolist(), strict=True) if not known]
+
     def judge(self) -> tuple[tuple[ContactOutcome, ...], tuple[int, ...]] | None:
         """Return what became of each true contact, and the times of false alarms, ns; None without the truth."""
         if self._contacts is None:
@@ -178,7 +191,7 @@ class OutcomeGatherer:
         is_certified = self._settings.scheme == "certified"
         a_rad_s = self._settings.certified.cutoffs_rad_s[0] if is_certified else self._settings.filter.a_rad_s
         outcomes = []
-        explained: set[int] = set()
+        explained = {each.cycle for each in self.unjudged}
         detections = self.detections
         for number, mark in self._marks.items():
             contact = self._contacts[number]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.foreign_truth import foreign_truth
+from adacd_hil.analysis.host_cycles import describe_unjudged
 from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.replay.attempts import Stretch
 from adacd_hil.analysis.replay.outcome import Adaptation, ContactOutcome, OutcomeGatherer, Transition
@@ -28,7 +29,7 @@ from adacd_hil.analysis.replay.scheme_comparison import (
     different_arithmetic,
 )
 from adacd_hil.analysis.replay.source import LogSource, Part, Source
-from adacd_hil.analysis.replay.truth_contacts import TrueContact, read_contacts
+from adacd_hil.analysis.replay.truth_contacts import TrueContacts, read_contacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.errors import LogError
@@ -82,7 +83,7 @@ class Replay:
     zero_ns: int
     ending: Transition | None
     notes: tuple[str, ...] = ()
-    """What of the log could not be compared, a line each."""
+    """What of the log could not be compared or judged, a line each."""
 
     @property
     def is_identical(self) -> bool:
@@ -91,7 +92,7 @@ class Replay:
 
     @property
     def is_whole(self) -> bool:
-        """Whether all that the log should have could be compared."""
+        """Whether all that the log should have could be compared and judged."""
         return not self.notes
 
     @property
@@ -108,7 +109,7 @@ class Replay:
 
     @property
     def false_alarms(self) -> int | None:
-        """Detections that no contact explains; None where the truth is not known."""
+        """Detections that the truth covers and no contact explains; None where the truth is not known."""
         return None if self.false_alarms_ns is None else len(self.false_alarms_ns)
 
     def time_s(self, t_ns: int) -> float:
@@ -152,7 +153,7 @@ def replay_many(
     )
 
 
-def contacts_beside(path: Path, progress: Progress = lambda _: None) -> tuple[TrueContact, ...] | None:
+def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueContacts | None:
     """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError.
 
     That of another run is left out, and `progress` is told why.
@@ -172,7 +173,7 @@ class _Player:
     def __init__(
         self,
         settings: Settings,
-        truth: tuple[TrueContact, ...] | None,
+        truth: TrueContacts | None,
         comparison: SchemeComparison | None,
         asking: Asking | None,
     ) -> None:
@@ -277,7 +278,7 @@ def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
 def replay_source(
     source: Source,
     variants: Sequence[Settings],
-    truth: tuple[TrueContact, ...] | None = None,
+    truth: TrueContacts | None = None,
     progress: Progress = lambda _: None,
     tolerance: float | None = None,
     script_of: ScriptOf | None = None,
@@ -402,6 +403,8 @@ def _result(player: _Player, source: Source, tolerance: float, first_ns: int) ->
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source.notes())
     gatherer.end()
     judged = gatherer.judge()
+    if unjudged := describe_unjudged(sum(each.t_ns >= first_ns for each in gatherer.unjudged)):
+        notes.append(unjudged)
     if comparison is not None:
         for cycle, t_ns, logged, asked in player.requests.unexplained:
             comparison.add(Mismatch("/scheme", "request", "", cycle, t_ns, str(logged), str(asked)))

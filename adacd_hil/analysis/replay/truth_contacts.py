@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.host_cycles import whole_rounds
+from adacd_hil.analysis.host_cycles import EmulatorSpan, whole_rounds
 from adacd_hil.analysis.timing import Cycles
 from adacd_hil.analysis.touches import filtered
 from adacd_hil.log.stream import LogStream
@@ -41,9 +41,17 @@ class TrueContact:
         return (1.0 + float(np.log(max(1.0, excess)))) / a_rad_s
 
 
-def read_contacts(path: Path) -> tuple[TrueContact, ...]:
-    """Read the true contacts of a run from its truth.mcap. Raises LogError."""
+class TrueContacts(NamedTuple):
+    """The true contacts of a run, in order, and of which cycles they are known."""
+
+    contacts: tuple[TrueContact, ...]
+    span: EmulatorSpan
+
+
+def read_contacts(path: Path) -> TrueContacts | None:
+    """Read the true contacts of a run from its truth.mcap; None where the emulator never cycled. Raises LogError."""
     contacts: list[TrueContact] = []
+    first: tuple[int, int] | None = None
     held: NDArray[Any] | None = None  # records of the contact that the piece before ended in
     attempt, last = 0, -1
     for piece in LogStream(path, ("/truth",)):
@@ -56,6 +64,7 @@ def read_contacts(path: Path) -> tuple[TrueContact, ...]:
         index = records["contact_index"].reshape(-1)
         edges = np.flatnonzero((np.diff(index, prepend=index[0]) != 0) | is_anew).tolist()
         attempts = attempt + np.cumsum(is_anew)
+        first = first or (int(attempts[0]), int(cycle[0]))
         held = None
         for start, end in pairwise(sorted({0, *edges, len(index)})):
             if index[start] >= 0 and end < len(index):
@@ -64,7 +73,10 @@ def read_contacts(path: Path) -> tuple[TrueContact, ...]:
             elif index[start] >= 0:
                 held = records[start:]
         attempt, last = int(attempts[-1]), int(cycle[-1])
-    return (*contacts, *(() if held is None else (_contact(attempt, held),)))
+    if first is None:
+        return None
+    last_contact = () if held is None else (_contact(attempt, held),)
+    return TrueContacts((*contacts, *last_contact), (first, (attempt, last)))
 
 
 def _contact(attempt: int, records: NDArray[Any]) -> TrueContact:

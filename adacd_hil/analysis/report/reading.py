@@ -16,6 +16,7 @@ import numpy as np
 
 from adacd_hil.analysis.detections import find_detections
 from adacd_hil.analysis.foreign_truth import foreign_truth
+from adacd_hil.analysis.host_cycles import describe_unjudged
 from adacd_hil.analysis.metrics import Gathered
 from adacd_hil.analysis.replay.source import settings_of
 from adacd_hil.analysis.report.cut_points import settling_s, widen
@@ -269,7 +270,7 @@ def _unjudged(run: Run) -> str:
     """Say in one line how many detections the truth can't judge, because it begins later or ends before; "" if none."""
     truth = run.truth
     outside = [d for d in find_detections(run) if truth is not None and not truth.covers(int(run.cycle[d.row]))]
-    return f"the truth doesn't cover {len(outside)} detections, which are not judged" if outside else ""
+    return describe_unjudged(len(outside))
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:

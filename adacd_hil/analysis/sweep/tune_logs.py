@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.host_cycles import AttemptBegins
+from adacd_hil.analysis.host_cycles import AttemptBegins, host_span
 from adacd_hil.analysis.motion import APART_S, LoggedMotion, Progress, read_motion, schemes
 from adacd_hil.analysis.replay.replay import contacts_beside
 from adacd_hil.analysis.replay.source import LogSource
@@ -98,18 +98,19 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: Stret
     parts = _Index()
     motion = read_motion(path, stretch, progress, parts.add)
     index = parts.joined()
-    contacts = contacts_beside(path, progress)
+    truth = contacts_beside(path, progress)
     blocks = -(-len(index.t_ns) // round(BLOCK_S / motion.period_s))
     tenths = np.arange(blocks) * _TENTHS // blocks
     is_chosen_on = np.full(blocks, place % 2 == 0) if count > 1 else tenths % 2 == 0
     windows = None
-    if contacts is not None:
+    if truth is not None:
+        begins = _begins(motion, index)
         windows = tuple(
             _window(number, contact, index, own, None if count == 1 else place)
-            for number, contact in _on_cycles(contacts, _begins(motion, index))
+            for number, contact in _on_cycles(truth.contacts, begins)
             if stretch.is_whole or index.cycle[0] <= contact.onset <= index.cycle[-1]
         )
-        is_free = motion.is_free.copy()
+        is_free = motion.is_free & host_span(truth.span, np.array(begins)).covers(index.cycle)
         apart = round(APART_S / motion.period_s)
         for window in windows:
             is_free[max(window.first - apart, 0) : window.last + apart] = False
