@@ -185,13 +185,14 @@ def test_what_canopen_would_read_over_in_an_eds_is_one_line(text: str, line: str
         read_eds(path, 3)
 
 
-NUMBERS = ("", "0", "-5", "010", "0X41", "$NODEID+0x180", "0x180 + $NODEID", "$NODEID", "0x1 ; say")
+NUMBERS = {"0": 0, "-5": -5, "0X41": 0x41, "$NODEID+0x180": 0x183, "0x180 + $NODEID": 0x183, "0x1 ; say": 1}
+NUMBERS |= dict.fromkeys(("", "010", "$NODEID"))  # canopen makes nothing of these, and doesn't refuse them
 
 
-@pytest.mark.parametrize("value", NUMBERS)
-def test_numbers_as_vendors_write_them_are_read(value: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("value", "default"), NUMBERS.items())
+def test_numbers_as_vendors_write_them_are_no_error(value: str, default: int | None, tmp_path: Path) -> None:
     (tmp_path / "x.eds").write_bytes(b"\xef\xbb\xbf" + with_default(value).encode())
-    assert read_eds(tmp_path / "x.eds", 3)[0x1018][1].name
+    assert read_eds(tmp_path / "x.eds", 3)[0x1018][1].default == default
 
 
 def test_the_budget_names_an_eds_that_it_cant_read(tmp_path: Path) -> None:
