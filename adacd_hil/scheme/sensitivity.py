@@ -6,8 +6,8 @@
   that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
   Its steps add their own noise and pull (`follow_torque_step`).
 - nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
-  counts and is bounded, not Gaussian. The bare filter multiplies it by a; smoothing leaves 0.335 (s / 200) /
-  (1 + a / 600) of that (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
+  counts and is bounded, not Gaussian. The bare filter multiplies it by a, and BARE; smoothing leaves 0.335 (s / 200) /
+  (1 + a / 600) of a (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
 - g² = w (u P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
   parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
   model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed,
@@ -51,6 +51,8 @@ RESTING, MOVING = 0.2, 0.05
 the model says it is."""
 AGREES = 0.4
 """Share of its threshold that the smoothed channel has at least when the bare one finds a push: 0.5 to 0.75."""
+BARE = 1.15
+"""A bare filter leaves nothing else to average it: in 24 h of clean motion it came to 1.02 of a threshold without."""
 UNIT_PEAK = 4.0
 """Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
 SMALLEST_UNIT = 0.05
@@ -71,8 +73,9 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
     """Return, by channel (2 C - 1,), (k_tau sigma_tau)² in Nm² and nu² in rad²/s⁴."""
     a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
     width = np.concatenate([a * s / (a + s), a[1:]])
-    share = np.concatenate([_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), np.ones(a.size - 1)])
-    nu = certified.velocity_noise_rad_s * np.concatenate([a, a[1:]]) * np.minimum(share, 1.0)
+    smoothed = np.minimum(_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), 1.0)
+    share = np.concatenate([smoothed, np.full(a.size - 1, BARE)])
+    nu = certified.velocity_noise_rad_s * np.concatenate([a, a[1:]]) * share
     gain = certified.noise_sigmas**2 * 0.5 * period_s * width
     return {
         "torque_variance": certified.torque_noise_Nm**2 * gain,
@@ -89,12 +92,23 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
 
 @compiled
 def follow_standstill(
-    dq: Vector, still_rad_s: float, decay: Vector, smoothing: float, still: Vector, still_smooth: Vector
+    dq: Vector,
+    before: Vector,
+    still_rad_s: float,
+    decay: Vector,
+    smoothing: float,
+    still: Vector,
+    still_smooth: Vector,
 ) -> None:
-    """Filter with DC gain 1, into `still` (C, n) from 0 to 1, whether each joint may stand still, and smooth it."""
+    """Filter with DC gain 1, into `still` (C, n) from 0 to 1, whether each joint may stand still, and smooth it.
+
+    before (n,): dq one sample ago. One that turns round between two samples has stood still, and its lag lets friction
+    turn a sample or two before the measured velocity does.
+    """
     for c in range(still.shape[0]):
         for i in range(dq.shape[0]):
-            target = 1.0 if abs(dq[i]) < still_rad_s else 0.0
+            has_turned = dq[i] * before[i] < 0.0
+            target = 1.0 if abs(dq[i]) < still_rad_s or has_turned else 0.0
             still[c, i] = target + decay[c] * (still[c, i] - target)
             still_smooth[c, i] = still[c, i] + smoothing * (still_smooth[c, i] - still[c, i])
 

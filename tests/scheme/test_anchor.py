@@ -37,7 +37,7 @@ UNKNOWN = settings_with()
 
 
 @pytest.mark.parametrize(
-    ("settings", "joint", "torque_Nm"), long_but(1, [(FREE, 0, 0.1), (TARED, 1, -0.5), (FREE, 0, 2.0)])
+    ("settings", "joint", "torque_Nm"), long_but(1, [(FREE, 0, 0.1), (TARED, 1, -0.5), (FREE, 0, 1.0)])
 )
 def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(settings, joint, torque_Nm):
     loop = TouchedLoop(settings)
