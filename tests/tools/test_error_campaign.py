@@ -64,3 +64,11 @@ def test_a_row_has_a_field_for_each_column():
     for row in (row_of(played), row_of(Played(case, None))):
         assert len(row) == len(error_campaign.HEAD)
     assert row_of(played)[-3] == "9, 24, inf (1.0%)"
+
+
+@pytest.mark.parametrize("seed", [1, 2, 205])
+def test_the_excitation_is_broken_off_without_leaving_the_arm_s_range(seed):
+    """It is left at 1 rad/s and more; one quintic to where the random moves begin went to 170 degrees."""
+    motion, _ = error_campaign.motion_of(seed, 0.2, False)
+    assert np.all(np.abs(np.degrees(motion.q_d)) < [75.0, 120.0])
+    assert np.abs(np.diff(motion.dq_d, axis=0)).max() < 0.02
