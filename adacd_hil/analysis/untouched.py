@@ -2,7 +2,8 @@
 
 Cycles are taken piece by piece, in order; a run in memory is one piece. A cycle is *free* unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
-5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact. After the request to finish the
+5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact; of what a truth doesn't cover
+nobody knows whether it is free, so it isn't. After the request to finish the
 arm parks and stands, where friction may hold any torque up to F_c: those cycles are not free.
 """
 
@@ -163,6 +164,7 @@ class _Free:
         else:
             around = [(touch.onset_s, touch.end_s + self._settling_s) for touch in touches]
         self._windows = np.array(around).reshape(-1, 2)
+        self._span = None if run.truth is None else run.truth.span
         self._finish_cycle = run.finish_cycle
         self._last_react_s = -np.inf
 
@@ -170,6 +172,8 @@ class _Free:
         """Mark the cycles (n,) of a piece, at such times (n,)."""
         finish = self._finish_cycle
         free = np.ones(time_s.size, dtype=np.bool_) if finish is None else piece.cycle < finish
+        if self._span is not None:
+            free &= self._span.covers(piece.cycle)
         is_here = (self._windows[:, 0] <= time_s[-1]) & (self._windows[:, 1] >= time_s[0])
         for start_s, end_s in self._windows[is_here].tolist():
             free[np.searchsorted(time_s, start_s) : np.searchsorted(time_s, end_s, side="right")] = False

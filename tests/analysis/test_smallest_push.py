@@ -1,11 +1,13 @@
 """How small a push is found in time: by thresholds and residuals that are known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hand_made_run import A, C, M, make_certified_run, make_run, react, touch
 
+from adacd_hil.analysis.host_cycles import Span
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.tables import push_table
 from adacd_hil.scheme.sensitivity import AGREES
@@ -62,6 +64,14 @@ def test_only_armed_cycles_that_nothing_touches_count():
     is_free = np.ones(4000, np.bool_)
     is_free[1500 : 1500 + 100 + 1000] = False  # the touch, and ten time constants of the slowest filter
     assert found.hours * 3600.0 == pytest.approx(is_free.sum() * 1e-3, abs=0.01)
+
+
+def test_cycles_that_the_truth_does_not_cover_are_no_hours_without_a_false_alarm():
+    whole = make_certified_run()
+    part = replace(whole, truth=replace(whole.truth, span=Span(int(whole.cycle[0]), int(whole.cycle[2999]))))
+    armed = whole.state[:3000] == M
+    assert smallest_push(part).hours * 3600.0 == pytest.approx(armed.sum() * 1e-3)
+    assert smallest_push(part).hours < smallest_push(whole).hours
 
 
 def test_what_was_never_armed_says_nothing():
