@@ -271,16 +271,17 @@ class Cycle:
                 if event.name in CERTIFICATE_EVENTS:
                     self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
         if output.state is not self._state:
-            event = self._transition(output)
+            event = self._transition(output, arm)
             recorder.event(t_ns, event)
             self._follow_state(output.state, arm.cycle)
             self._progress(f"{arm.cycle * self._period_s:9.3f} s  {event.message}")
 
-    def _transition(self, output: SchemeOutput) -> Event:
+    def _transition(self, output: SchemeOutput, arm: ArmState) -> Event:
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
-            lateness = self._watch.deadline.describe()
-            return Event("warning", "supervisor", f"{text}: {FaultReason.DEADLINE.name}; {lateness}")
+            late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe()}"
+            why = late if arm.is_late else "a torque offset has left its anchor"
+            return Event("warning", "supervisor", f"{text}: {why}")
         if output.state is SchemeState.COMMISSION and output.previous_state is SchemeState.ENABLE:
             return Event("warning", "supervisor", f"{text}: the arm moves before all its drives are enabled")
         if output.state is not SchemeState.FAULT:

@@ -7,6 +7,7 @@ included,
 
     size = Σ r w / Σ w²,    share = (Σ r w)² / (Σ w² Σ r²),    sigma = RESIDUAL_NM sqrt(correlated / Σ w²)
 
+Of Σ r² over n rows n RESIDUAL_NM² is what a good model leaves too; of a contact that was found soon that is much.
 From r and w goes what the torque explains that a joint held at rest before, which the filter forgets with its share s
 of standstill: r - s Σ r s / Σ s², w likewise.
 
@@ -41,6 +42,8 @@ FEWEST_LOADED, FEWEST = 2, 3
 MOST = 10
 SHARE, SHARE_OF_ALL = 0.75, 0.9
 """Of a contact's squared residual that one error explains; of all their residuals, that a payload does."""
+LEAST_SHARE = 0.5
+"""Of a contact's squared residual that is left when what a good model leaves is taken off."""
 SPREAD_LOADED, SPREAD = 0.15, 0.3
 """By how much of its size the contacts may differ, beside 2 sigma."""
 SURE = 8.0
@@ -51,7 +54,7 @@ AT_ONCE_S = 3.0
 """Another error than a payload strikes again so soon after the arm goes on; a person may wait."""
 AT_REST_S, MOST_STRAIN = 0.2, 4.0
 """A contact so soon after going on is met at rest, and raises the thresholds of its joints, to this many times."""
-MANY, HELD_S = 8, 0.3
+MANY, HELD_S = 10, 0.3
 """So many contacts in a row, each so soon after going on, are no person's."""
 WEAK = 1.5
 """Times its threshold that the residual of a weak contact comes to at most."""
@@ -77,7 +80,7 @@ def shapes_of() -> dict[str, tuple[int, ...]]:
     each = (JOINTS,)
     return {
         "cause_rw": causes, "cause_ww": causes, "cause_ws": (*causes, JOINTS),
-        "contact_rr": (), "contact_peak": (), "contact_rs": each, "contact_ss": each,
+        "contact_rr": (), "contact_rows": (), "contact_peak": (), "contact_rs": each, "contact_ss": each,
     }  # fmt: skip
 
 
@@ -99,6 +102,7 @@ def _clear(m: Any) -> None:
     m["contact_rs"][:] = 0.0
     m["contact_ss"][:] = 0.0
     m["contact_rr"] = 0.0
+    m["contact_rows"] = 0.0
     m["contact_peak"] = 0.0
 
 
@@ -136,6 +140,7 @@ def _add(k: Any, m: Any, i: int, w: Vector, tau: float, still: float, weight: fl
     for j in range(w.shape[0]):
         r += w[j] * m["theta"][j]
     m["contact_rr"] += weight * r * r
+    m["contact_rows"] += weight
     m["contact_rs"][i] += weight * r * still
     m["contact_ss"][i] += weight * still * still
     for h in range(m["cause_rw"].shape[0]):
@@ -286,6 +291,7 @@ def _weighed(m: Any, waited_s: float, now_s: float) -> _Weighed:
     rw = m["cause_rw"] - ws @ (rs / ss)
     ww = np.maximum(m["cause_ww"] - (ws * ws) @ (1.0 / ss), 0.0)
     rr = float(m["contact_rr"] - np.sum(rs * rs / ss))
+    rr = max(rr - RESIDUAL_NM**2 * float(m["contact_rows"]), LEAST_SHARE * rr)
     return _Weighed(rw, ww, rr, float(m["contact_peak"]), waited_s, now_s)
 
 

@@ -183,7 +183,7 @@ def test_contacts_that_nothing_explains_take_the_certificate_back_when_the_arm_c
     verdict = verdict_of([UNEXPLAINED] * doubt.MANY, gap_s=0.25)
     assert not verdict.is_payload
     assert verdict.text == (
-        "8 contacts came within 0.3 s of going on each, and no one error explains them: a light touch, or the arm has "
+        "10 contacts came within 0.3 s of going on each, and no one error explains them: a light touch, or the arm has "
         "changed"
     )
 
