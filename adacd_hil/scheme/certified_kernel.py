@@ -288,8 +288,7 @@ def _take_sample(
     bank.smooth(k["smoothing"], m["r"], m["y"])
     still_rad_s, decay, smoothing = k["still_rad_s"], k["decay"], k["smoothing"]
     sensitivity.follow_standstill(dq, m["dq_old"], still_rad_s, decay, smoothing, m["still"], m["still_smooth"])
-    if m["is_steady"] != 0.0:
-        sensitivity.follow_velocity_noise(k, m, dq)
+    sensitivity.follow_velocity_noise(k, m, dq, m["is_steady"] != 0.0)
     sensitivity.follow_friction(k, m)
     contact.undo_filter(m["r"][bank.WIDE], k["decay"][bank.WIDE], m["history"], tau_ext_wide_hat)
 

@@ -134,16 +134,17 @@ def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
 
 
 @compiled
-def follow_velocity_noise(k: Any, m: Any, dq: Vector) -> None:
-    """Take one sample without a gap into the roughness (n,) of the velocity: its noise over the settings', squared.
+def follow_velocity_noise(k: Any, m: Any, dq: Vector, is_steady: bool) -> None:
+    """Take one sample into the roughness (n,) of the velocity: its noise over the settings', squared.
 
     Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
-    encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most.
+    encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most. After a gap, or on
+    the line over one (is_steady: neither), a sample only becomes the last.
     """
     floor = (SECOND_DIFFERENCE * k["velocity_noise_rad_s"]) ** 2
     for i in range(dq.shape[0]):
         ddq = dq[i] - m["dq_old"][i]
-        if floor > 0.0:
+        if is_steady and floor > 0.0:
             square = (ddq - m["ddq_old"][i]) ** 2 / floor
             square = min(square, JUMP**2 * m["velocity_roughness"][i])
             rough = m["velocity_roughness"][i] + k["roughness_share"] * (square - m["velocity_roughness"][i])

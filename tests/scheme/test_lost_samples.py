@@ -52,7 +52,8 @@ class LossyArm:
         self.block = certified_memory.new_block(SETTINGS)
         constants = certified_memory.constants_of(SETTINGS)
         certified_kernel.begin_adaptation(constants, self.m, False)
-        self.found, self.h, since, mode = [], [], 1, certified_kernel.WATCH | certified_kernel.LEARN
+        self.found, self.h, self.dq, self.still, self.roughness = [], [], [], [], []
+        since, mode = 1, certified_kernel.WATCH | certified_kernel.LEARN
         for k, (q, dq, tau_J) in enumerate(zip(*measured, strict=True)):
             self.block["q"], self.block["dq"], self.block["tau_J"] = q, dq, tau_J
             self.block["period_s"] = since * PERIOD_S
@@ -68,6 +69,9 @@ class LossyArm:
             elif mode == MODE:
                 self.found.append(found)
                 self.h.append(self.m[0]["h"].copy())
+                self.dq.append(dq)
+                self.still.append(self.m[0]["still"].copy())
+                self.roughness.append(self.m[0]["velocity_roughness"].copy())
 
 
 @pytest.mark.parametrize("burst", [1, 4, 8])
@@ -79,3 +83,15 @@ def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
     assert np.sum([found & int(Observation.UNSEEN) != 0 for found in lossy.found]) == pytest.approx(
         burst / 40 * len(lossy.found), rel=0.05
     )
+
+
+def test_an_arm_whose_every_second_sample_is_lost_is_not_taken_for_one_that_stands_still():
+    """No sample follows on the one before it then; each is compared with the last there was all the same."""
+    whole, lossy = LossyArm(lambda _k: False), LossyArm(lambda k: k % 2 == 1)
+    assert not np.bitwise_or.reduce(lossy.found) & int(Observation.CONTACT)
+    np.testing.assert_allclose(np.array(lossy.still)[:, :2], np.array(whole.still)[:, :2], atol=0.25)
+    moving = np.abs(np.array(whole.dq)) > 0.3
+    assert moving.any(axis=0).all()
+    assert np.array(lossy.still)[:, 2][moving].max() < 0.05
+    assert np.median(np.array(lossy.h)[:, 0] / np.array(whole.h)[:, 0]) < 1.5
+    assert np.max(lossy.roughness) < 4.0

@@ -188,7 +188,7 @@ def after_a_swing(noise, count=2000):
     m = certified_memory.new_memory(SETTINGS)[0]
     swing = 4.0 * np.sin(7.0 * T * np.arange(count))
     for dq in swing[:, None] + noise:
-        sensitivity.follow_velocity_noise(K, m, dq)
+        sensitivity.follow_velocity_noise(K, m, dq, True)
     return m
 
 
@@ -219,7 +219,7 @@ def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
     """Its second difference is a rise and a fall."""
     m = certified_memory.new_memory(SETTINGS)[0]
     for dq in (0.0, 0.0, 3.0, 3.0, 3.0):
-        sensitivity.follow_velocity_noise(K, m, np.array([dq, 0.0]))
+        sensitivity.follow_velocity_noise(K, m, np.array([dq, 0.0]), True)
     share = T / sensitivity.ROUGHNESS_S
     most = (1.0 + share * (sensitivity.JUMP**2 - 1.0)) ** 2
     np.testing.assert_allclose(m["velocity_roughness"], [most * (1.0 - share), 1.0], rtol=1e-10)
