@@ -17,7 +17,8 @@ from planar_arm import ENCODER_LSB_RAD, TRACKING_RAD_S
 from adacd_hil.records import Vector
 
 TICKS = 4
-LENGTHS_M = (0.35, 0.30)
+LENGTH_M = 0.35
+"""From joint 1 to joint 2; which bodies have the inertia then, follows."""
 
 
 def model_of(theta: Vector, tick_s: float) -> mujoco.MjModel:
@@ -28,10 +29,9 @@ def model_of(theta: Vector, tick_s: float) -> mujoco.MjModel:
     a1, a2, a3, *friction = (float(value) for value in theta)
     if not 0.0 < a2 * a2 < a3 * (a1 - a3):
         raise ValueError(f"no two links have a1 = {a1:g}, a2 = {a2:g}, a3 = {a3:g} kg m²")
-    length = LENGTHS_M[0]
-    center_m = length * np.sqrt(a3 / (a1 - a3))
-    mass = a2 / (length * center_m)
-    second, first = a3 - mass * center_m**2, a1 - a3 - mass * length**2
+    center_m = LENGTH_M * np.sqrt(a3 / (a1 - a3))
+    mass = a2 / (LENGTH_M * center_m)
+    second, first = a3 - mass * center_m**2, a1 - a3 - mass * LENGTH_M**2
     text = f"""
     <mujoco>
       <compiler angle="radian" inertiafromgeom="false" balanceinertia="false" boundinertia="1e-12"/>
@@ -41,7 +41,7 @@ def model_of(theta: Vector, tick_s: float) -> mujoco.MjModel:
       <worldbody><body>
         <joint name="j0" damping="{friction[0]}" frictionloss="{friction[2]}"/>
         <inertial pos="0 0 0" mass="1" diaginertia="{first} {first} {first}"/>
-        <body pos="{length} 0 0">
+        <body pos="{LENGTH_M} 0 0">
           <joint name="j1" damping="{friction[1]}" frictionloss="{friction[3]}"/>
           <inertial pos="{center_m} 0 0" mass="{mass}" diaginertia="{second} {second} {second}"/>
         </body>

@@ -23,7 +23,7 @@ from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
 from adacd_hil.scheme.certificate_watch import CertificateWatch
-from adacd_hil.scheme.doubt import Doubt, Verdict
+from adacd_hil.scheme.doubt import Doubt
 from adacd_hil.scheme.intervals import Intervals
 from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.scheme.loop import Numbers, Recorded, Samples, run_certified
@@ -83,8 +83,7 @@ class CertifiedPipeline(RunsBatches):
         self._margin = MarginWatch(self._peak_share.size)
         self._second = round(1.0 / settings.bus.period_s)
         self._monitored = 0
-        self._drift = ""
-        self._has_warned = {"margin": False, "sight": False}
+        self._warned: set[str] = set()
         self._events: list[Event] = []
         self._watch = CertificateWatch(self._constants, self._memory, settings.history.date_utc)
         self._doubt = Doubt(settings, self._constants, self._memory)
@@ -198,9 +197,9 @@ class CertifiedPipeline(RunsBatches):
         self._margin.add(self._peak_share.copy())
         self._peak_share[:] = 0.0
         for name, warning in (("margin", self._margin.warning), ("sight", sight.take_warning(self._memory[0]))):
-            if warning and not self._has_warned[name]:
+            if warning and name not in self._warned:
                 self._events.append(Event("warning", name, warning))
-            self._has_warned[name] = bool(warning)
+            self._warned = self._warned | {name} if warning else self._warned - {name}
 
     def _calm(self, cycle: int) -> Calm:
         supervisor, touch = self._supervisor, self._touch
@@ -236,14 +235,12 @@ class CertifiedPipeline(RunsBatches):
     def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
         """Take in how a contact of the certified model goes on; return where the arm goes, STOPPED if it is doubted."""
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
-            self._doubt.begin(cycle, is_touched)
             is_drifted = self._supervisor.cause is SchemeEvent.DRIFTED
-            self._drift = "; ".join(anchor.describe_refused(self._memory[0], False)) if is_drifted else ""
+            drift = "; ".join(anchor.describe_refused(self._memory[0], is_reading=False)) if is_drifted else ""
+            self._doubt.begin(cycle, is_touched, drift)
         is_over = previous is SchemeState.REACT and state in (SchemeState.MONITOR, SchemeState.STOPPED)
         if is_over and self._supervisor.origin is SchemeState.MONITOR:
             verdict = self._doubt.end(cycle)
-            if self._drift:
-                verdict = Verdict(self._drift, is_payload=False)
             if verdict is not None and not self._touch.goes_on:
                 self._events.append(self._watch.doubt(verdict))
                 return self._supervisor.doubt()
@@ -262,6 +259,7 @@ class CertifiedPipeline(RunsBatches):
         elif state is SchemeState.MONITOR and previous is SchemeState.CERTIFY:
             certified_kernel.begin_refinement(self._constants, self._memory)
             self._margin.restart()
+            self._warned.clear()
             self._doubt.forget()
             self._has_certificate = True
             self._feed_forward()

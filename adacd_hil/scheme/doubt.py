@@ -7,9 +7,9 @@ included,
 
     size = Σ r w / Σ w²,    share = (Σ r w)² / (Σ w² Σ r²),    sigma = RESIDUAL_NM sqrt(correlated / Σ w²)
 
-Of Σ r² over n rows n RESIDUAL_NM² is what a good model leaves too; of a contact that was found soon that is much.
-From r and w goes what the torque explains that a joint held at rest before, which the filter forgets with its share s
-of standstill: r - s Σ r s / Σ s², w likewise.
+A joint that rested before held some torque, which the filter forgets as fast as its share s of standstill. What such
+a torque explains goes from r and w: r - s Σ r s / Σ s², w likewise. What a good model leaves in n samples, n
+RESIDUAL_NM², goes from Σ r²; of a contact that was found soon that is much.
 
 Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each but
 the first within HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at
@@ -39,11 +39,10 @@ RESIDUAL_NM = 0.012
 """Rms that a good model leaves behind it."""
 FEWEST_LOADED, FEWEST = 2, 3
 """Contacts that agree in a payload, or in another error."""
-MOST = 10
 SHARE, SHARE_OF_ALL = 0.75, 0.9
 """Of a contact's squared residual that one error explains; of all their residuals, that a payload does."""
 LEAST_SHARE = 0.5
-"""Of a contact's squared residual that is left when what a good model leaves is taken off."""
+"""Of a contact's Σ r² that stays, however much of it a good model may have left."""
 SPREAD_LOADED, SPREAD = 0.15, 0.3
 """By how much of its size the contacts may differ, beside 2 sigma."""
 SURE = 8.0
@@ -55,11 +54,11 @@ AT_ONCE_S = 3.0
 AT_REST_S, MOST_STRAIN = 0.2, 4.0
 """A contact so soon after going on is met at rest, and raises the thresholds of its joints, to this many times."""
 MANY, HELD_S = 10, 0.3
-"""So many contacts in a row, each so soon after going on, are no person's."""
+"""So many contacts in a row, each so soon after going on, are no person's. No more are remembered."""
 WEAK = 1.5
-"""Times its threshold that the residual of a weak contact comes to at most."""
+"""The residual of a weak contact comes to less than so many times its threshold."""
 RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
-"""Weak contacts of a person, of a model that is wrong, and how much likelier the second must be."""
+"""Weak contacts an hour of a person, and of a model that is wrong; how many times likelier the latter must be."""
 _FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
 TOLD_NOTHING = 0.6
 """Share of standstill in a filter's memory from which on a sample of its joint tells nothing of a cause."""
@@ -86,7 +85,10 @@ def shapes_of() -> dict[str, tuple[int, ...]]:
 
 @compiled
 def react(memory: Structured, is_touched: bool, is_soon: bool) -> None:
-    """Take in that the arm reacts: to a touch so soon after going on that it strains the thresholds, or to none."""
+    """Take in that the arm reacts.
+
+    is_touched: to a touch; else there is nothing to weigh. is_soon: right after going on, so the thresholds double.
+    """
     m = memory[0]
     if not is_touched:
         _clear(m)
@@ -180,10 +182,11 @@ class Doubt:
         self._constants, self._memory = constants[0], memory
         self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[bank.LEARNT] * settings.bus.period_s)
         self._period_s = settings.bus.period_s
-        self._contacts: deque[_Weighed] = deque(maxlen=MOST)
+        self._contacts: deque[_Weighed] = deque(maxlen=MANY)
         self._monitored_s = 0.0
         self._waited_s = 0.0
         self._log_odds, self._weak = 0.0, 0
+        self._drift = ""
 
     def compile(self) -> None:
         """Call what is compiled once, on a copy, so that nothing compiles later."""
@@ -198,15 +201,22 @@ class Doubt:
         """Take in that the arm monitors from this cycle on."""
         self._monitored_s = cycle * self._period_s
 
-    def begin(self, cycle: int, is_touched: bool) -> None:
-        """Take in that the arm reacts, to a touch or, as where the host is late, to none."""
+    def begin(self, cycle: int, is_touched: bool, drift: str = "") -> None:
+        """Take in that the arm reacts: to a touch or, as where the host is late, to none.
+
+        drift: which offset has left its anchor, if it reacts to that.
+        """
+        self._drift = drift
         self._waited_s = cycle * self._period_s - self._monitored_s
         likelier = (OFTEN_PER_H - RARELY_PER_H) / 3600.0 * self._waited_s
         self._log_odds = max(self._log_odds - likelier, 0.0)
+        self._weak = self._weak if self._log_odds > 0.0 else 0
         react(self._memory, is_touched, self._waited_s < AT_REST_S)
 
     def end(self, cycle: int) -> Verdict | None:
         """Take in that it has ended; return what the last ones look like, if they have one cause."""
+        if self._drift:
+            return Verdict(self._drift, is_payload=False)
         now_s = cycle * self._period_s
         last = _weighed(self._memory[0], self._waited_s, now_s)
         self._contacts.append(last)
@@ -285,7 +295,7 @@ class Doubt:
 
 
 def _weighed(m: Any, waited_s: float, now_s: float) -> _Weighed:
-    """Return a contact's sums, less what the torque that each joint has held at rest explains of them."""
+    """Return a contact's sums, less what each joint's torque at rest explains, and what a good model leaves."""
     ss = np.maximum(m["contact_ss"], 1e-12)
     rs, ws = m["contact_rs"], m["cause_ws"]
     rw = m["cause_rw"] - ws @ (rs / ss)

@@ -7,8 +7,9 @@ A channel whose response to a step of 1 is g after WITHIN_S is then over its thr
 with y what it shows without the push. A bare channel counts only if the smoothed one of its filter is over AGREES h as
 well (`sensitivity`). Of all channels the least counts. The threshold *in force* is the least h.
 
-A certificate states both over its test. While the arm monitors, a second in which a joint moves and the mean of the
-smallest push is more than LESS times the worst of that test is said.
+Both are an estimate: they assume that thresholds and residuals stay as they are meanwhile. A certificate states them
+over its test. While the arm monitors, a second in which a joint moves and the mean of the smallest push is more than
+LESS times the worst of that test is said.
 
 Shapes: C filters, n joints; y, h (2 C - 1, n); shown (2 C - 1,): g; seen (bins, n): cycles by threshold in force;
 seen_worst_Nm, seen_push_Nm, sum_push_Nm, sum_cycles (n,). Units: Nm.
@@ -27,6 +28,7 @@ from adacd_hil.scheme.sensitivity import AGREES, MOVING
 WITHIN_S = 0.1
 """The slowest filter is at 0.63 of a step by then, without its smoothing."""
 LESS = 2.0
+"""How many times the smallest push of the certificate it may be without a word."""
 LOWEST_NM, WIDTH, BINS = 1e-3, 0.02, 512
 """Thresholds are counted in bins that are 2 % wide, from 1 mNm to 28 Nm."""
 FEWEST = 100
@@ -67,6 +69,8 @@ def begin(m: Any) -> None:
     m["seen"][:] = 0.0
     m["seen_worst_Nm"][:] = 0.0
     m["seen_push_Nm"][:] = 0.0
+    m["sum_push_Nm"][:] = 0.0
+    m["sum_cycles"][:] = 0.0
 
 
 @compiled
@@ -95,8 +99,8 @@ def describe(m: Any) -> str:
     worst_Nm = m["seen_worst_Nm"]
     median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
     return (
-        f"a push of {_by_joint(m['seen_push_Nm'])} Nm is found within {1e3 * WITHIN_S:g} ms at the worst moment of the "
-        f"test, thresholds {_by_joint(median)} Nm in the middle, {_by_joint(most)} in 99 %, "
+        f"a push of {_by_joint(m['seen_push_Nm'])} Nm would be found within {1e3 * WITHIN_S:g} ms at the worst moment "
+        f"of the test, thresholds {_by_joint(median)} Nm in the middle, {_by_joint(most)} in 99 %, "
         f"{_by_joint(worst_Nm)} at worst"
     )
 
@@ -109,11 +113,11 @@ def take_warning(m: Any) -> str:
             push_Nm = m["sum_push_Nm"][i] / m["sum_cycles"][i]
             if push_Nm > LESS * m["seen_push_Nm"][i]:
                 lines.append(
-                    f"joint {i + 1} sees less than was certified: a push of {push_Nm:.2f} Nm is found within "
-                    f"{1e3 * WITHIN_S:g} ms, a second's mean; of {m['seen_push_Nm'][i]:.2f} Nm at worst in the test"
+                    f"joint {i + 1} sees less than was certified: within {1e3 * WITHIN_S:g} ms it finds pushes from "
+                    f"{push_Nm:.2f} Nm on, a second's mean; in the test from {m['seen_push_Nm'][i]:.2f} Nm on at worst"
                 )
-    m["sum_push_Nm"][:] = 0.0
-    m["sum_cycles"][:] = 0.0
+    for name in ("sum_push_Nm", "sum_cycles"):
+        m[name] = 0.0
     return "; ".join(lines)
 
 

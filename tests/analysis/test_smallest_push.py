@@ -90,6 +90,18 @@ def test_the_rate_of_false_alarms_is_bounded_by_counting():
     assert "1 false alarm in that time" in push_table(alarmed)
 
 
+def test_the_rate_under_a_gaussian_tail_follows_from_how_near_residuals_came():
+    """3600 nu (nu T)^(-1 / s²) of each channel and joint; here of the slowest and one joint, nu = 10 / pi."""
+    run = only_the_slowest(make_certified_run(), 0.1)
+    run.certified.tau_ext[:] = 0.0
+    assert smallest_push(run).tail_rate_per_h == 0.0
+    run.certified.tau_ext[2000, 0, 1] = -0.08
+    found, nu_Hz = smallest_push(run), 10.0 / math.pi
+    expected = 3600.0 * nu_Hz * (nu_Hz * found.hours * 3600.0) ** (-1.0 / 0.8**2)
+    assert found.tail_rate_per_h == pytest.approx(expected)
+    assert f"; {expected:.2g} per hour if residuals have the tail of a Gaussian" in push_table(evaluate(run))
+
+
 def test_an_alarm_while_the_arm_learns_is_none_of_those():
     metrics = evaluate(react(make_certified_run((A, 1000), (C, 500), (M, 4000)), 500, 20))
     assert metrics.false_alarms == 1

@@ -53,6 +53,17 @@ def test_a_lean_from_before_the_first_motion_gets_no_certificate_and_is_named(se
 
 
 @pytest.mark.long
+def test_a_heavy_lean_from_before_the_first_motion_is_a_collision_that_waits_for_the_user():
+    loop = TouchedLoop(FREE)
+    loop.run_until(SchemeState.ENABLE)
+    leant = loop.lean(0, 2.0, 3.5)
+    assert [output.state for output in leant[-1000:]] == [SchemeState.STOPPED] * 1000
+    assert not any(output.is_model_valid for output in leant)
+    loop.recover()
+    assert np.abs(loop.offset_error_Nm).max() < LARGEST_ERROR_NM
+
+
+@pytest.mark.long
 @pytest.mark.parametrize(("begins_s", "torque_Nm"), [(0.7, 1.0), (1.75, 0.2)])
 def test_a_lean_that_begins_while_the_arm_learns_gets_no_certificate_either(begins_s, torque_Nm):
     loop = TouchedLoop(FREE)

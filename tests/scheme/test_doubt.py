@@ -48,7 +48,7 @@ def test_a_payload_that_nobody_announced_is_named_and_learnt_at_a_word(profile, 
     assert loop.run_until_taken_back() <= 5
     (text,) = loop.said("revoked")
     named = re.fullmatch(r"\d contacts look like (\S+) ± (\S+) kg picked up: .*, `changed` learns it", text)
-    assert float(named[1]) == pytest.approx(kg, rel=0.15)
+    assert float(named[1]) == pytest.approx(kg, rel=0.1)
     loop.request = Request.PAYLOAD_CHANGED
     loop.run_until(SchemeState.ADAPT)
     assert len(loop.run_until(SchemeState.MONITOR)) * PERIOD_S < 1.5

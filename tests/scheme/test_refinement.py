@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from excited_arm import NAMES, SETTINGS
 
-from adacd_hil.scheme import certified_memory, refinement, sensitivity
+from adacd_hil.scheme import anchor, certified_memory, refinement, sensitivity
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
@@ -109,6 +109,26 @@ def test_a_joint_that_rests_has_no_say_in_which_model_is_better():
     m["still"][:] = 1.0
     refined.sample()
     np.testing.assert_allclose([m["candidate_square"], m["frozen_square"]], squares, rtol=1e-10)
+
+
+@pytest.mark.parametrize(("off_Nm", "is_excluded"), [(0.0, False), (0.1, True)])
+def test_a_better_candidate_that_an_anchor_excludes_is_said_once_and_does_not_take_over(off_Nm, is_excluded):
+    refined = Refined(off_by(0.05), off_by(0.2))
+    refined.m["P_belief"][:] = 1e-6 * np.eye(COUNT)
+    refinement.restart(refined.m)
+    refined.m["candidate_cycles"] = K["refine_cycles"] - CYCLES
+    refined.m["anchor_Nm"][anchor.TARE] = TRUE[[7, 8]] + [off_Nm, 0.0]
+    refined.m["anchor_std"][anchor.TARE] = 0.001
+    assert refined.run() == [False] * (CYCLES - 1) + [is_excluded]
+    assert refined.has_taken_over is not is_excluded
+    assert not refined.sample()  # the next test has begun
+
+
+def test_a_worse_candidate_that_an_anchor_excludes_is_not_said():
+    refined = Refined(off_by(0.2), off_by(0.05))
+    refined.m["anchor_Nm"][anchor.TARE] = 5.0
+    refined.m["anchor_std"][anchor.TARE] = 0.001
+    assert not any(refined.run())
 
 
 def test_after_a_test_the_next_begins_with_the_belief_as_it_is_then():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from excited_arm import SETTINGS, TouchedLoop
 
-from adacd_hil.records import SchemeState
+from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme import bank, certified_memory, sensitivity, sight, tail
 
 FILTERS = SETTINGS.filter_count
@@ -61,10 +61,11 @@ def test_a_threshold_that_is_always_the_same_is_said_as_it_is(value_Nm):
 
 def test_the_next_test_begins_with_nothing_seen(tested):
     m = tested[0].pipeline._memory.copy()[0]
-    assert m["seen"].any()
-    assert m["seen_push_Nm"].all()
+    sight.follow(certified_memory.constants_of(SETTINGS)[0], m)
+    for name in ("seen", "seen_push_Nm", "sum_cycles"):
+        assert m[name].any()
     sight.begin(m)
-    for name in ("seen", "seen_push_Nm", "seen_worst_Nm"):
+    for name in ("seen", "seen_push_Nm", "seen_worst_Nm", "sum_push_Nm", "sum_cycles"):
         assert not m[name].any()
 
 
@@ -78,8 +79,8 @@ def test_a_monitor_that_sees_less_than_was_certified_says_so_once():
     loop.run(3000)
     (text,) = loop.said("sight")
     found = re.fullmatch(
-        r"joint 2 sees less than was certified: a push of ([\d.]+) Nm is found within 100 ms, a second's mean; of "
-        r"([\d.]+) Nm at worst in the test",
+        r"joint 2 sees less than was certified: within 100 ms it finds pushes from ([\d.]+) Nm on, a second's mean; "
+        r"in the test from ([\d.]+) Nm on at worst",
         text,
     )
     assert float(found[1]) > sight.LESS * float(found[2])
@@ -112,3 +113,20 @@ def test_the_rate_under_a_gaussian_tail_is_that_of_the_floor():
         assert tail.rate_per_h(nu_Hz, seen_s, share) == pytest.approx(3600.0 * tail.RATE_HZ)
         assert tail.rate_per_h(nu_Hz, seen_s, 0.5 * share) < 1e-6
     assert tail.rate_per_h(3.2, 50.0, 0.0) == 0.0
+
+
+def test_a_new_certificate_that_sees_less_again_is_told_again():
+    loop = TouchedLoop(SETTINGS)
+    loop.run_until(SchemeState.MONITOR)
+    m = loop.pipeline._memory[0]
+    m["roughness"][1] = 400.0
+    loop.run(1500)
+    loop.request = Request.PAYLOAD
+    loop.run_until(SchemeState.PAYLOAD)
+    m["roughness"][1] = 1.0
+    loop.request = Request.PAYLOAD_CHANGED
+    loop.run_until(SchemeState.MONITOR)
+    assert len(loop.said("sight")) == 1
+    m["roughness"][1] = 400.0
+    loop.run(1500)
+    assert len(loop.said("sight")) == 2
