@@ -25,6 +25,8 @@ class _Node:
     state: int | None = None
     heard_ns: int | None = None
     has_run: bool = False
+    left_to: int | None = None
+    """The last state other than OPERATIONAL since it was judged last, be it OPERATIONAL again by now."""
     complaint: str = ""
 
 
@@ -48,6 +50,7 @@ class HeartbeatWatch:
         self._since_ns = None
         for node in self._nodes.values():
             node.has_run = False
+            node.left_to = None
             node.complaint = ""
 
     def stop(self) -> None:
@@ -61,7 +64,10 @@ class HeartbeatWatch:
             return
         node.state = frame.data[0] & 0x7F
         node.heard_ns = frame.t_ns
-        node.has_run |= node.state == OPERATIONAL
+        if node.state == OPERATIONAL:
+            node.has_run = True
+        elif node.has_run:
+            node.left_to = node.state
 
     def watch(self, t_ns: int) -> list[str]:
         """Name what is wrong now, one line per node; empty when nothing is or nothing is expected."""
@@ -80,24 +86,28 @@ class HeartbeatWatch:
         """Say by identifier when each node was last heard, or began to be watched; None unless all are OPERATIONAL."""
         since_ns = self._since_ns
         nodes = self._nodes.items()
-        if since_ns is None or any(node.state != OPERATIONAL or node.complaint for _, node in nodes):
+        if since_ns is None or any(
+            node.state != OPERATIONAL or node.left_to is not None or node.complaint for _, node in nodes
+        ):
             return None
         return {can_id: max(node.heard_ns or since_ns, since_ns) for can_id, node in nodes}
 
     def _judge(self, node: _Node, t_ns: int, since_ns: int) -> str:
         heard_ns = since_ns if node.heard_ns is None else max(node.heard_ns, since_ns)
         silent_ns = t_ns - heard_ns
+        state = node.state if node.left_to is None else node.left_to
+        node.left_to = None
         if silent_ns > self.patience_ns:
             complaint = "silent"
             text = f"no heartbeat for {silent_ns // 1_000_000} ms, {self.patience_ns // 1_000_000} ms allowed"
         elif (
-            node.state is not None
-            and node.state != OPERATIONAL
+            state is not None
+            and state != OPERATIONAL
             # A heartbeat from before the start command took effect may still be on its way.
             and (node.has_run or t_ns - since_ns > self.patience_ns)
         ):
-            complaint = f"state {node.state}"
-            text = f"is {_STATES.get(node.state, f'in NMT state {node.state}')}, OPERATIONAL expected"
+            complaint = f"state {state}"
+            text = f"is {_STATES.get(state, f'in NMT state {state}')}, OPERATIONAL expected"
         else:
             if node.complaint:
                 self._report(Event("info", node.name, "heartbeat: OPERATIONAL again"))
