@@ -1,4 +1,4 @@
-"""How both programs start from the console: they import their commands so that Ctrl-C ends them no less quietly then.
+"""How a program starts from the console: it imports its commands so that Ctrl-C ends it no less quietly then.
 
 The imports take a few tenths of a second. An exception would come up anywhere in others' modules, which turn it into
 errors of their own. There is nothing to put away so early, and the process ends at once.
@@ -12,35 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-HOST_INTERRUPTED = 130
-"""`adacd_hil.cli.exit_codes.ExitCode.INTERRUPTED`, which takes numpy to import."""
-EMULATOR_INTERRUPTED = 0
-"""`firmware_sim.main.ExitCode.OK`: the emulator is ended by Ctrl-C."""
-
-
-def start_host() -> NoReturn:
-    """Enter `adacd-hil` here: import, run the command line and exit with a documented status."""
-
-    def load() -> Callable[[], NoReturn]:
-        from adacd_hil.cli.main import main
-
-        return main
-
-    _start(load, HOST_INTERRUPTED, "adacd-hil: interrupted")
-
-
-def start_emulator() -> NoReturn:
-    """Enter `firmware-sim` here: import, run the command line and exit with a documented status."""
-
-    def load() -> Callable[[], NoReturn]:
-        from firmware_sim.main import main
-
-        return main
-
-    _start(load, EMULATOR_INTERRUPTED)
-
-
-def _start(load: Callable[[], Callable[[], NoReturn]], interrupted: int, line: str = "") -> NoReturn:
+def start_program(load: Callable[[], Callable[[], NoReturn]], interrupted: int, line: str = "") -> NoReturn:
     """Run what `load` imports; interrupted: status after Ctrl-C, before the command line takes care of it."""
     try:
         with _ending_at_once(interrupted, line):

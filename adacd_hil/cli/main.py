@@ -376,7 +376,7 @@ cli.add_command(tune)
 
 
 def main() -> NoReturn:
-    """Run the command line and exit with a documented status; `adacd_hil.start` comes here."""
+    """Run the command line and exit with a documented status; `adacd_hil.cli.start_host` comes here."""
     open_terminals()
     try:
         code = cli.main(prog_name="adacd-hil", standalone_mode=False)

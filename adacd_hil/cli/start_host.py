@@ -1,0 +1,20 @@
+"""Where the console script `adacd-hil` enters."""
+
+from collections.abc import Callable
+from typing import NoReturn
+
+from adacd_hil.start import start_program
+
+INTERRUPTED = 130
+"""`adacd_hil.cli.exit_codes.ExitCode.INTERRUPTED`, which takes numpy to import."""
+
+
+def start_host() -> NoReturn:
+    """Import, run the command line and exit with a documented status."""
+
+    def load() -> Callable[[], NoReturn]:
+        from adacd_hil.cli.main import main
+
+        return main
+
+    start_program(load, INTERRUPTED, "adacd-hil: interrupted")
