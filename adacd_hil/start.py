@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
+
 def start_program(load: Callable[[], Callable[[], NoReturn]], interrupted: int, line: str = "") -> NoReturn:
     """Run what `load` imports; interrupted: status after Ctrl-C, before the command line takes care of it."""
     try:

@@ -22,7 +22,7 @@ from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme import certified_kernel, certified_memory, earlier, fit_samples
 from adacd_hil.scheme.belief import payload_direction
 from adacd_hil.scheme.certificate_watch import BY_WORD
-from adacd_hil.scheme.kernel import Structured
+from adacd_hil.structured import Structured
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.2)

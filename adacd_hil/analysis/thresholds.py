@@ -44,6 +44,7 @@ from adacd_hil.log.stretch import WHOLE, Stretch
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme import detectors
 from adacd_hil.scheme.regressor import mass_matrix
+from adacd_hil.structured import Structured
 
 BLOCK_S: Final = 0.1
 _PROGRESS_SAMPLES: Final = 1_000_000
@@ -119,7 +120,7 @@ def run_detectors(
 
 def _peaks(
     logs: Sequence[LoggedMotion],
-    constants: detectors.Structured,
+    constants: Structured,
     lag_s: float,
     settings: detectors.DetectorSettings,
     progress: Progress,

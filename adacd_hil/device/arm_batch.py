@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import compiled, released
 from adacd_hil.device.heartbeat import OPERATIONAL
 from adacd_hil.records import JOINTS
+from adacd_hil.structured import Structured
 from adacd_hil.wire.e2e_batch import MOST_DATA_IDS, counter_of, is_next
-
-Structured = np.ndarray[Any, np.dtype[np.void]]
 
 DEVICES = 2 * JOINTS
 STATUS = DEVICES

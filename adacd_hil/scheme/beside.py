@@ -7,8 +7,8 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS
 from adacd_hil.scheme import kernel
-from adacd_hil.scheme.kernel import Structured
 from adacd_hil.scheme.observation import Observation
+from adacd_hil.structured import Structured
 
 _ADAPTED = int(Observation.ADAPTED)
 

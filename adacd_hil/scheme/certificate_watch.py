@@ -8,8 +8,8 @@ import numpy as np
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
 from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate, sight
 from adacd_hil.scheme.doubt import Verdict
-from adacd_hil.scheme.kernel import Structured
 from adacd_hil.scheme.last_certificate import Certificate
+from adacd_hil.structured import Structured
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""

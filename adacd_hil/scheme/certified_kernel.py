@@ -41,8 +41,9 @@ from adacd_hil.scheme import (
     tail,
     termination,
 )
-from adacd_hil.scheme.kernel import Structured, is_filled, keep_sample, put_between
+from adacd_hil.scheme.kernel import is_filled, keep_sample, put_between
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+from adacd_hil.structured import Structured
 
 # What a cycle does, as bits.
 MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero

@@ -25,7 +25,8 @@ from adacd_hil.scheme import (
     sight,
     tail,
 )
-from adacd_hil.scheme.kernel import Structured, block_dtype
+from adacd_hil.scheme.kernel import block_dtype, limits_of
+from adacd_hil.structured import Structured, packed, zeroed
 
 SETTLED = 3.0
 """Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a
@@ -121,15 +122,9 @@ def constants_of(settings: Settings) -> Structured:
         "still_rad_s": certified.still_rad_s,
         "standstill_share": certified.standstill_share,
         "collision_Nm": settings.detector.collision_Nm,
-        "position_limit_rad": settings.arm.position_limit_rad,
-        "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
-        "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
-        "rest_torque_Nm": settings.safety.rest_torque_Nm,
+        **limits_of(settings),
     }
-    constants = np.zeros(1, np.dtype([(name, np.float64, np.shape(value)) for name, value in values.items()]))
-    for name, value in values.items():
-        constants[name] = value
-    return constants
+    return packed(values)
 
 
 def new_memory(settings: Settings) -> Structured:
@@ -243,7 +238,7 @@ def new_memory(settings: Settings) -> Structured:
         "wide_sigma": joint,
         "wide_threshold": joint,
     }
-    memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
+    memory = zeroed(shapes)
     memory["has_gap"] = 1.0
     memory["last"] = np.nan
     memory["roughness"] = 1.0

@@ -42,8 +42,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import ConfigError, setting
 from adacd_hil.records import Vector
 from adacd_hil.scheme import regressor
-
-Structured = np.ndarray[Any, np.dtype[np.void]]
+from adacd_hil.structured import Structured, packed, zeroed
 
 VELOCITY_LAG_S: Final = 1.25e-3
 """The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of
@@ -157,10 +156,7 @@ def constants_of(settings: DetectorSettings, weights: Vector, period_s: float) -
         "weights": weights,
         "drift_Nm": settings.drift_Nm,
     }
-    constants = np.zeros(1, np.dtype([(name, np.float64, np.shape(value)) for name, value in values.items()]))
-    for name, value in values.items():
-        constants[name] = value
-    return constants
+    return packed(values)
 
 
 def new_memory(constants: Structured) -> Structured:
@@ -177,7 +173,7 @@ def new_memory(constants: Structured) -> Structured:
         "up": (joints,),
         "down": (joints,),
     }
-    return np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
+    return zeroed(shapes)
 
 
 @compiled

@@ -31,7 +31,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme import bank, belief, sensitivity
-from adacd_hil.scheme.kernel import Structured
+from adacd_hil.structured import Structured
 
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""

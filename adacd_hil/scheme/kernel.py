@@ -26,8 +26,7 @@ from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Layout, Vector, scheme_layout
 from adacd_hil.scheme import contact, detector, estimator, filters, regressor, termination
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
-
-Structured = np.ndarray[Any, np.dtype[np.void]]
+from adacd_hil.structured import Structured, packed, zeroed
 
 # What a cycle does, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
 LEARN = 1
@@ -109,15 +108,19 @@ def constants_of(settings: Settings) -> Structured:
         "scale": scale[:count],
         "threshold_Nm": settings.detector.threshold_Nm,
         "standstill_rad_s": settings.detector.standstill_rad_s,
+        **limits_of(settings),
+    }
+    return packed(values)
+
+
+def limits_of(settings: Settings) -> dict[str, Any]:
+    """Return the constants with which measurements alone are judged."""
+    return {
         "position_limit_rad": settings.arm.position_limit_rad,
         "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
         "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
         "rest_torque_Nm": settings.safety.rest_torque_Nm,
     }
-    constants = np.zeros(1, np.dtype([(name, np.float64, np.shape(value)) for name, value in values.items()]))
-    for name, value in values.items():
-        constants[name] = value
-    return constants
 
 
 def new_memory(parameter_count: int) -> Structured:
@@ -154,7 +157,7 @@ def new_memory(parameter_count: int) -> Structured:
         "integral": joint,
         "peak": joint,
     }
-    memory = np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
+    memory = zeroed(shapes)
     memory["has_gap"] = 1.0
     return memory
 

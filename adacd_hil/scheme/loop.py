@@ -17,8 +17,8 @@ from adacd_hil.compiled import compiled, released
 from adacd_hil.records import ArmBatch, SchemeState, Vector
 from adacd_hil.scheme import bank, beside, certified_kernel, kernel, report
 from adacd_hil.scheme.calm import Calm, is_calm
-from adacd_hil.scheme.kernel import Structured
 from adacd_hil.scheme.observation import Observation
+from adacd_hil.structured import Structured
 
 _ADAPT = int(SchemeState.ADAPT)
 _CERTIFY = int(SchemeState.CERTIFY)
