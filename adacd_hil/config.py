@@ -210,6 +210,13 @@ class ArmSettings:
         high=1000.0,
         meaning="most that brake and friction of a motor without power hold; 0: free; absent: not known",
     )
+    position_torque_Nm: float = setting(
+        0.0,
+        unit="Nm",
+        low=0.0,
+        high=10.0,
+        meaning="`certified`: most that depends on where the arm is, of a cable or a tilted base; 0: none",
+    )
     torque_limit_Nm: tuple[float, float] = setting(
         (12.0, 6.0), unit="Nm", low=0.0, high=1000.0, meaning="largest commanded torque"
     )
@@ -448,6 +455,8 @@ REACTIONS = tuple(reaction.name.lower() for reaction in Reaction)
 
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
 """Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.friction`."""
+POSITION_TERMS = ("sin_q", "cos_q", "sin_2q", "cos_2q", "sin_sum", "cos_sum")
+"""Torque that depends on where the arm is, one parameter per joint each, of `arm.position_torque_Nm`."""
 
 _KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
 
@@ -949,7 +958,8 @@ class Settings:
         """Names of what the certified scheme estimates beside the dynamic parameters, in order; none of the paper's."""
         if self.scheme == "paper":
             return ()
-        kinds = ("offset", "lag", *self.certified.friction_terms)
+        by_place = POSITION_TERMS if self.arm.position_torque_Nm > 0.0 else ()
+        kinds = ("offset", "lag", *self.certified.friction_terms, *by_place)
         return tuple(f"{kind}{joint + 1}" for kind in kinds for joint in range(JOINTS))
 
     @property

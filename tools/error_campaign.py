@@ -31,7 +31,7 @@ from adacd_hil.config import Settings, load_settings
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme import certified_memory, loop
 from adacd_hil.scheme.bank import channels_of, step_response
-from adacd_hil.scheme.observation import CONTACT_SHIFT
+from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.sensitivity import AGREES
 from firmware_sim.mechanics_settings import MechanicsSettings
 from firmware_sim.sensor_settings import SensorSettings
@@ -100,13 +100,15 @@ class Case:
 class Played:
     """What came of it. Times in s since learning began, thresholds of the slowest channel in Nm by joint.
 
-    found_ms, found_early_ms: by step, of joint 1, the median, 95 % and worst, inf where it is missed; missed: shares.
+    taken_back: certificates that what was learnt since contradicts. found_ms, found_early_ms: by step, of joint 1, the
+    median, 95 % and worst, inf where it is missed; missed: shares.
     """
 
     case: Case
     armed_s: float | None
     hours: float = 0.0
     alarms: int = 0
+    taken_back: int = 0
     median_Nm: tuple[float, ...] = ()
     most_Nm: tuple[float, ...] = ()
     wide_share: tuple[float, ...] = ()
@@ -154,8 +156,11 @@ def find_steps(
                 break
 
 
-def play(case: Case, minutes: float) -> Played:
-    """Record the arm, play the record through the compiled step, and measure."""
+def play(case: Case, minutes: float, position_torque_Nm: float = 0.0) -> Played:
+    """Record the arm, play the record through the compiled step, and measure.
+
+    position_torque_Nm: what the model is told of cables and tilts.
+    """
     base = profile_arm(case.profile)
     arm = replace(
         base,
@@ -172,7 +177,8 @@ def play(case: Case, minutes: float) -> Played:
     if case.error.startswith("cable"):  # as one whose torque the motor makes up for, on the same way
         tau_J = tau_J + CABLE_NM * np.sin(measured.q)
     settings = load_settings("certified", case.profile)
-    settings = replace(settings, arm=replace(settings.arm, link_length_m=arm.arm.link_length_m))
+    known = replace(settings.arm, link_length_m=arm.arm.link_length_m, position_torque_Nm=position_torque_Nm)
+    settings = replace(settings, arm=known)
     count = len(motion.q_d)
     memory = certified_memory.new_memory(settings)
     state, observation = np.zeros(count), np.zeros(count)
@@ -198,6 +204,7 @@ def play(case: Case, minutes: float) -> Played:
         case,
         armed_s=(armed - begin) * PERIOD_S,
         hours=float(is_monitored.sum()) * PERIOD_S / 3600.0,
+        taken_back=int(np.count_nonzero(is_monitored & (observation.astype(np.int64) & Observation.WITHHELD != 0))),
         alarms=int(over.size and 1 + np.count_nonzero(np.diff(over) > APART)),
         median_Nm=tuple(float(np.median(slow[is_quiet, i])) for i in range(2)),
         most_Nm=tuple(float(np.percentile(slow[is_quiet, i], 99.0)) for i in range(2)),
@@ -230,7 +237,7 @@ def row_of(played: Played) -> list[str]:
     case = played.case
     name = [case.profile, f"{case.kg:g} kg" if case.kg else "", case.error, str(case.seed)]
     if played.armed_s is None:
-        return [*name, "never", *[""] * 8]
+        return [*name, "never", *[""] * 9]
 
     def joints(values: tuple[float, ...], text: str) -> str:
         return " / ".join(format(value, text) for value in values)
@@ -239,6 +246,7 @@ def row_of(played: Played) -> list[str]:
         *name,
         f"{played.armed_s:.2f} s",
         f"{played.alarms} in {60.0 * played.hours:.0f} min",
+        str(played.taken_back or ""),
         joints(played.median_Nm, ".3f"),
         joints(played.most_Nm, ".3f"),
         joints(played.wide_share, ".1%"),
@@ -251,8 +259,8 @@ def row_of(played: Played) -> list[str]:
 
 
 HEAD = (
-    "arm", "payload", "error", "seed", "armed after", "false alarms", "threshold, Nm: median", "99 %", "> 0.15 moving",
-    "largest share", *(f"{step:g} Nm: median, 95 %, worst ms (missed)" for step in STEPS_NM),
+    "arm", "payload", "error", "seed", "armed after", "false alarms", "taken back", "threshold, Nm: median", "99 %",
+    "> 0.15 moving", "largest share", *(f"{step:g} Nm: median, 95 %, worst ms (missed)" for step in STEPS_NM),
 )  # fmt: skip
 
 
@@ -264,6 +272,7 @@ def main() -> int:
     parser.add_argument("--kg", default="0", metavar="MASSES", help="0, or a payload that is announced")
     parser.add_argument("--seeds", default="1", metavar="NUMBERS")
     parser.add_argument("--minutes", type=float, default=3.0, help="of random motion; default 3")
+    parser.add_argument("--position-torque", type=float, default=0.0, metavar="NM", help="arm.position_torque_Nm")
     parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
     parser.add_argument("--json", action="store_true", help="print each arm as JSON")
     options = parser.parse_args()
@@ -274,8 +283,9 @@ def main() -> int:
     lists = options.profiles.split(","), errors, options.kg.split(","), options.seeds.split(",")
     cases = [Case(profile, error, float(kg), int(seed)) for profile, error, kg, seed in product(*lists)]
     rows = []
+    played_by = partial(play, minutes=options.minutes, position_torque_Nm=options.position_torque)
     with ProcessPoolExecutor(options.jobs) as pool:
-        for played in pool.map(partial(play, minutes=options.minutes), cases):
+        for played in pool.map(played_by, cases):
             rows.append(played)
             print(f"{len(rows)}/{len(cases)}", file=sys.stderr, flush=True)
     print(json.dumps([asdict(row) for row in rows]) if options.json else format_table(HEAD, map(row_of, rows)))

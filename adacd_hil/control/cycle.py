@@ -280,7 +280,7 @@ class Cycle:
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
             late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe()}"
-            why = late if arm.is_late else "a torque offset has left its anchor"
+            why = late if arm.is_late else "what was learnt since contradicts the certificate"
             return Event("warning", "supervisor", f"{text}: {why}")
         if output.state is SchemeState.COMMISSION and output.previous_state is SchemeState.ENABLE:
             return Event("warning", "supervisor", f"{text}: the arm moves before all its drives are enabled")

@@ -132,6 +132,22 @@ def is_within(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
     return bool(is_within)
 
 
+@compiled
+def distance(k: Any, m: Any, joint: int, offset_Nm: float, variance: float) -> float:
+    """Return (o - a) / (P_oo + sigma_a² + b² t) of the joint's best known anchor, 1/Nm; 0 where there is none.
+
+    Less P_o times this are the parameters of a model whose offset is the anchor's, as far as it is known.
+    """
+    kind = int(np.argmin(m["anchor_std"][:, joint]))
+    std = m["anchor_std"][kind, joint]
+    if std == np.inf:
+        return 0.0
+    known = std**2 + k["zero_drift_Nm2_s"] * m["anchor_age_s"]
+    if kind == REST:
+        known += k["holding_Nm"][joint] ** 2
+    return float((offset_Nm - m["anchor_Nm"][kind, joint]) / (variance + known))
+
+
 def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
     """Let offsets (n,) that the user takes for the sensors' zero, with their deviations, replace all anchors."""
     m["anchor_std"][:] = np.inf

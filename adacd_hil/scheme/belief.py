@@ -27,7 +27,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme import estimator
+from adacd_hil.scheme import estimator, position_evidence
 
 SLOW_RAD_S = 0.02
 """Speed below which noise decides what friction is expected."""
@@ -92,12 +92,14 @@ def learn(k: Any, m: Any, c: int) -> bool:
             w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
             if np.inf == R:
                 continue
+            position_evidence.add(k, m, place, i)
             epsilon, s = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
             m["fit_square"] += epsilon * epsilon / (s - R + R / k["correlated"])
             m["fit_rows"] += 1.0
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W_f
+    m["ring_X"][place] = m["X_f"]
     for i in range(still.shape[0]):
         m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > SLOW_RAD_S else 1.0
     m["ring_tau"][place] = tau_f

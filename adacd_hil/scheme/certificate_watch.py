@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
-from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate, sight
+from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate, position, position_evidence, sight
 from adacd_hil.scheme.doubt import Verdict
 from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.structured import Structured
@@ -21,6 +21,7 @@ _CHANGED = (
     "what the model doesn't know"
 )
 _BEGINS_ANEW = "no certificate, learning begins anew"
+_POSITION_REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model have it, from the next start on"
 
 
 @unique
@@ -31,6 +32,8 @@ class _Cause(Enum):
     ANCHOR = "anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"
     CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
     MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
+    BY_PLACE = "position", _BEGINS_ANEW, _POSITION_REMEDY
+    TOO_MUCH_BY_PLACE = "position", _BEGINS_ANEW, "who holds the arm shall let go, or that bound is too small"
     MORE_THAN_LAST = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
 
 
@@ -39,6 +42,8 @@ _CAUSES = {
     certified_kernel.CHANGED: _Cause.CHANGED,
     certified_kernel.MORE: _Cause.MORE,
     certified_kernel.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
+    certified_kernel.BY_PLACE: _Cause.BY_PLACE,
+    certified_kernel.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
 }
 
 
@@ -92,7 +97,8 @@ class CertificateWatch:
         self._refusal = None
         known_by, self._vouched_against = self._known_by(), ""
         level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
-        text = f"{anchor.describe(self._constants, self._memory)}; {sight.describe(self._memory)}; {known_by}"
+        by_place = position.describe(self._constants, self._memory)
+        text = f"{anchor.describe(self._constants, self._memory)}; {sight.describe(self._memory)}; {known_by}{by_place}"
         self._is_standing = True
         m = self._memory
         self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
@@ -146,6 +152,11 @@ class CertificateWatch:
         remedy = "if nobody touches it the model is wrong, and `relearn` learns it anew"
         return Event("warning", "touch", f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}")
 
+    def contradiction(self) -> Verdict:
+        """Return what contradicts the certificate while the arm monitors: an offset that drifts, a torque by place."""
+        cause = _CAUSES[int(self._memory["withheld_by"])]
+        return Verdict("; ".join(self._describe(cause)), is_payload=False)
+
     def _describe(self, cause: _Cause) -> list[str]:
         if cause is _Cause.MORE:
             return earlier.describe_more(self._constants, self._memory)
@@ -153,7 +164,12 @@ class CertificateWatch:
             return last_certificate.describe_more(self._memory, self._last_utc)
         if cause is _Cause.CHANGED:
             return [_CHANGED]
-        return anchor.describe_refused(self._memory, cause is _Cause.READING)
+        if cause is _Cause.BY_PLACE:
+            return position_evidence.describe(self._memory)
+        if cause is _Cause.TOO_MUCH_BY_PLACE:
+            return position.describe_refused(self._constants, self._memory)
+        by_place = position_evidence.describe(self._memory) if self._memory["is_by_place"] else []
+        return [*anchor.describe_refused(self._memory, cause is _Cause.READING), *by_place]
 
     def accept(self) -> Event:
         """Believe what was refused last, because the user says so; return what there is to say of that."""
@@ -172,6 +188,9 @@ class CertificateWatch:
                 last_certificate.forget(self._memory)
                 self._vouched_against = self._last
                 what = f"the user says that nobody touches the arm: {self._last} is not compared"
+            case _Cause.BY_PLACE | _Cause.TOO_MUCH_BY_PLACE:
+                self._refusal = refusal
+                what = f"no word makes up for a torque that depends on the place: {refusal.cause.value[2]}"
             case _:
                 earlier.forget(self._memory)
                 self._vouched_against = _THE_RUN

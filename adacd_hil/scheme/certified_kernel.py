@@ -34,6 +34,8 @@ from adacd_hil.scheme import (
     friction,
     last_certificate,
     lost_samples,
+    position,
+    position_evidence,
     refinement,
     regressor,
     sensitivity,
@@ -53,8 +55,8 @@ TEST = 8  # test the frozen model
 REFINE = 16  # correct the belief, and let its mean take over after a test
 WEIGH = 32  # weigh what a contact of the certified model looks like
 
-# What contradicts a certificate that is withheld.
-NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST = range(5)
+# What contradicts a certificate that is withheld, or taken back.
+NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE = range(7)
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
@@ -82,6 +84,8 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
     k, m = constants[0], memory[0]
+    if is_payload:
+        position_evidence.clear(k, m)
     m["has_gap"] = 1.0
     m["W_f"][:] = 0.0
     m["tau_f"][:] = 0.0
@@ -135,6 +139,7 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
     m["P_certified"][:] = m["P"]
     belief.hold_lags(k, m)
     earlier.forget(m)
+    position_evidence.clear(k, m)
     refinement.restart(m)
 
 
@@ -284,6 +289,10 @@ def _take_sample(
         )  # fmt: skip
     else:
         bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
+    rates = m["rates"]
+    position_evidence.follow(
+        m, q, rates[0, bank.LEARNT], rates[1, bank.LEARNT], rates[2, bank.LEARNT], is_seen
+    )  # fmt: skip
     bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
     bank.smooth(k["smoothing"], m["r"], m["y"])
@@ -305,6 +314,9 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
         m["Y_h"][i, base + i] = 1.0
     speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
     friction.fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
+    if k["position_torque_Nm"] != 0.0:
+        position.fill(q, m["X"])
+        position.place(m["X"], int(k["first_position"]), m["Y_h"])
     regressor.fill_mass_matrix(q, m["theta"], m["M"])
 
 
@@ -366,11 +378,15 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
 def _contradicted_by(k: Any, m: Any) -> int:
     """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
     if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
+        m["is_by_place"] = 1.0 if position_evidence.is_found(k, m) else 0.0
         return ANCHOR
+    m["is_by_place"] = 0.0
     if not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(k, m)):
-        return CHANGED
+        return BY_PLACE if position_evidence.is_found(k, m) else CHANGED
     if not earlier.is_no_more(k, m):
-        return MORE
+        return BY_PLACE if position_evidence.is_found(k, m) else MORE
+    if not position.is_bounded(k, m):
+        return TOO_MUCH_BY_PLACE
     return NOTHING if last_certificate.is_no_more(k, m) else MORE_THAN_LAST
 
 
@@ -388,7 +404,10 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     for i in range(dq.shape[0]):
         if not (abs(m["r"][bank.SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
-            return _REFUTED
+            if not position_evidence.is_found(k, m):
+                return _REFUTED
+            m["withheld_by"] = BY_PLACE
+            return _REFUTED | _WITHHELD
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
         has_moved = has_moved and fastest >= k["velocity_rad_s"]
     is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
@@ -397,6 +416,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     if anchor.is_within(k, m, m["theta"], m["P"]):
         return _CERTIFIED
     m["withheld_by"] = ANCHOR
+    m["is_by_place"] = 1.0 if position_evidence.is_found(k, m) else 0.0
     return _REFUTED | _WITHHELD
 
 
@@ -406,9 +426,17 @@ def _refine(k: Any, m: Any) -> int:
     sensitivity.follow_unit(k, m, bank.SLOW, k["unit_share"])
     sensitivity.relax(k, m)
     sight.follow(k, m)
+    is_by_place = False
     if belief.learn(k, m, bank.LEARNT):
         belief.wander(k["drift_std"], m["W_f"][bank.LEARNT], k["period_s"] * k["learn_every"], m["P_belief"])
-    return _WITHHELD if refinement.test_candidate(k, m) else 0
+        is_by_place = position_evidence.is_found_in_time(k, m)
+    if refinement.test_candidate(k, m):
+        m["withheld_by"] = ANCHOR
+        m["is_by_place"] = 0.0
+        return _WITHHELD
+    if is_by_place:
+        m["withheld_by"] = BY_PLACE
+    return _WITHHELD if is_by_place else 0
 
 
 @compiled

@@ -21,6 +21,8 @@ from adacd_hil.scheme import (
     friction,
     last_certificate,
     lost_samples,
+    position,
+    position_evidence,
     sensitivity,
     sight,
     tail,
@@ -31,6 +33,10 @@ from adacd_hil.structured import Structured, packed, zeroed
 SETTLED = 3.0
 """Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a
 measured velocity, which lags, and forgets that error only then."""
+
+
+_OFFSET = 4
+"""Place of the offsets in what is said by kind of parameter."""
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
@@ -57,7 +63,20 @@ def prior_std_of(settings: Settings) -> Vector:
     names = parameter_names(settings)
     shares = [next((share for term, share in friction.SHARES.items() if name.startswith(term)), 1.0) for name in names]
     std: Vector = _by_kind(settings.certified.prior_std, names) * np.array(shares)
+    std[len(names) - _position_count(settings) :] = settings.arm.position_torque_Nm / position.LARGEST_OF_STD
     return std
+
+
+def _position_count(settings: Settings) -> int:
+    """Return how many parameters are of the torque by place; they are the last ones."""
+    return JOINTS * position.TERMS if settings.arm.position_torque_Nm > 0.0 else 0
+
+
+def _enough_std_of(settings: Settings) -> Vector:
+    """Return how well each parameter must be known (p,); an offset no better than the torque by place."""
+    by_kind = list(settings.certified.enough_std)
+    by_kind[_OFFSET] = float(np.hypot(by_kind[_OFFSET], settings.arm.position_torque_Nm))
+    return _by_kind(tuple(by_kind), parameter_names(settings))
 
 
 def constants_of(settings: Settings) -> Structured:
@@ -81,6 +100,8 @@ def constants_of(settings: Settings) -> Structured:
         "base": base,
         "first_coulomb": PARAMETER_NAMES.index("F_c1"),
         "first_term": base + 2 * JOINTS,
+        "first_position": len(names) - _position_count(settings),
+        "position_torque_Nm": settings.arm.position_torque_Nm,
         "width_rad_s": certified.coulomb_width_rad_s,
         "stribeck_rad_s": certified.stribeck_rad_s,
         "terms": [FRICTION_TERMS.index(term) for term in certified.friction_terms],
@@ -88,7 +109,7 @@ def constants_of(settings: Settings) -> Structured:
         "theta_cad": theta_cad,
         "prior": prior_of(settings),
         "prior_std": prior_std_of(settings),
-        "enough_std": _by_kind(certified.enough_std, names),
+        "enough_std": _enough_std_of(settings),
         "drift_std": _by_kind(certified.drift_std, names),
         "model_error": _by_kind(certified.model_error, names),
         "payload_direction": belief.payload_direction(settings.arm.link_length_m, len(names)),
@@ -116,6 +137,7 @@ def constants_of(settings: Settings) -> Structured:
         **last_certificate.constants_of(settings),
         **tail.constants_of(settings),
         **sight.constants_of(settings),
+        **position_evidence.constants_of(settings, prior_std_of(settings)),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
         "noise_sigmas": certified.noise_sigmas,
@@ -222,6 +244,7 @@ def new_memory(settings: Settings) -> Structured:
         **doubt.shapes_of(),
         **tail.shapes_of(channel_count),
         **sight.shapes_of(),
+        **position_evidence.shapes_of(count, waiting),
         **lost_samples.shapes_of(filter_count),
         "withheld_by": (),
         "dq_old": joint,
@@ -251,6 +274,7 @@ def new_memory(settings: Settings) -> Structured:
     belief.begin(prior, prior_std, state["theta"], state["P"])
     constants = constants_of(settings)[0]
     anchor.begin(constants, state)
+    position_evidence.clear(constants, state)
     last_certificate.begin(constants, state)
     return memory
 

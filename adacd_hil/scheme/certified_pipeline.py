@@ -18,7 +18,15 @@ from adacd_hil.records import (
     SchemeState,
     certified_layout,
 )
-from adacd_hil.scheme import anchor, bank, certificate, certified_kernel, certified_memory, earlier, sight
+from adacd_hil.scheme import (
+    bank,
+    certificate,
+    certified_kernel,
+    certified_memory,
+    earlier,
+    position_evidence,
+    sight,
+)
 from adacd_hil.scheme.batch import RunsBatches
 from adacd_hil.scheme.beside import Beside
 from adacd_hil.scheme.calm import Calm
@@ -96,6 +104,7 @@ class CertifiedPipeline(RunsBatches):
         certified_kernel.begin_test(self._constants, memory)
         certified_kernel.begin_refinement(self._constants, memory)
         earlier.forget(memory[0])
+        position_evidence.forget(self._constants, memory)
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
         self._touch.compile()
         self._doubt.compile()
@@ -235,9 +244,8 @@ class CertifiedPipeline(RunsBatches):
     def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
         """Take in how a contact of the certified model goes on; return where the arm goes, STOPPED if it is doubted."""
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
-            is_drifted = self._supervisor.cause is SchemeEvent.DRIFTED
-            drift = "; ".join(anchor.describe_refused(self._memory[0], is_reading=False)) if is_drifted else ""
-            self._doubt.begin(cycle, is_touched, drift)
+            is_contradicted = self._supervisor.cause is SchemeEvent.CONTRADICTED
+            self._doubt.begin(cycle, is_touched, self._watch.contradiction() if is_contradicted else None)
         is_over = previous is SchemeState.REACT and state in (SchemeState.MONITOR, SchemeState.STOPPED)
         if is_over and self._supervisor.origin is SchemeState.MONITOR:
             verdict = self._doubt.end(cycle)
@@ -270,6 +278,7 @@ class CertifiedPipeline(RunsBatches):
         if cause is SchemeEvent.REVOKED:
             self._revoke()
         elif cause in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
+            position_evidence.forget(self._constants, self._memory)
             self._is_payload = self._has_certificate
             self._paper.begin_adaptation()
         elif previous is SchemeState.CERTIFY:
@@ -282,6 +291,7 @@ class CertifiedPipeline(RunsBatches):
         self._theta_ff = np.zeros(self._theta_ff.size)
         self._events.append(self._watch.revoke())
         earlier.forget(self._memory[0])
+        position_evidence.forget(self._constants, self._memory)
         self._paper.begin_adaptation()
 
     def _forget_if_disturbed(self, state: SchemeState) -> None:

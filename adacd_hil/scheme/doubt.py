@@ -186,7 +186,7 @@ class Doubt:
         self._monitored_s = 0.0
         self._waited_s = 0.0
         self._log_odds, self._weak = 0.0, 0
-        self._drift = ""
+        self._contradiction: Verdict | None = None
 
     def compile(self) -> None:
         """Call what is compiled once, on a copy, so that nothing compiles later."""
@@ -201,12 +201,12 @@ class Doubt:
         """Take in that the arm monitors from this cycle on."""
         self._monitored_s = cycle * self._period_s
 
-    def begin(self, cycle: int, is_touched: bool, drift: str = "") -> None:
+    def begin(self, cycle: int, is_touched: bool, contradiction: Verdict | None = None) -> None:
         """Take in that the arm reacts: to a touch or, as where the host is late, to none.
 
-        drift: which offset has left its anchor, if it reacts to that.
+        contradiction: what contradicts the certificate, if it reacts to that.
         """
-        self._drift = drift
+        self._contradiction = contradiction
         self._waited_s = cycle * self._period_s - self._monitored_s
         likelier = (OFTEN_PER_H - RARELY_PER_H) / 3600.0 * self._waited_s
         self._log_odds = max(self._log_odds - likelier, 0.0)
@@ -215,8 +215,8 @@ class Doubt:
 
     def end(self, cycle: int) -> Verdict | None:
         """Take in that it has ended; return what the last ones look like, if they have one cause."""
-        if self._drift:
-            return Verdict(self._drift, is_payload=False)
+        if self._contradiction is not None:
+            return self._contradiction
         now_s = cycle * self._period_s
         last = _weighed(self._memory[0], self._waited_s, now_s)
         self._contacts.append(last)

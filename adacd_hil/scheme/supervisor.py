@@ -97,7 +97,7 @@ _RAISED_BY = MappingProxyType(
         SchemeEvent.FITTED: _FITTED,
         SchemeEvent.CERTIFIED: _CERTIFIED,
         SchemeEvent.REFUTED: _REFUTED,
-        SchemeEvent.DRIFTED: _WITHHELD,
+        SchemeEvent.CONTRADICTED: _WITHHELD,
     }
 )
 """Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
@@ -372,7 +372,7 @@ class Supervisor:
         is_still = self._still_cycles >= self._rest_cycles
         match self._state:
             case SchemeState.MONITOR if arm.is_late or observation & _WITHHELD:
-                event = SchemeEvent.LATE if arm.is_late else SchemeEvent.DRIFTED
+                event = SchemeEvent.LATE if arm.is_late else SchemeEvent.CONTRADICTED
             case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
                 event = SchemeEvent.PAYLOAD_ANNOUNCED
             case SchemeState.STOPPED if self._is_told_of_payload:

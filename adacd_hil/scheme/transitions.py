@@ -32,7 +32,7 @@ class SchemeEvent(IntEnum):
     REVOKED = 17  # the user takes back what is known of the arm, or acknowledges that it is doubted
     DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
     MOVED = 19  # the arm moves before all its drives are enabled
-    DRIFTED = 20  # what was learnt while detecting has an offset that its anchor excludes
+    CONTRADICTED = 20  # what was learnt since contradicts the certificate: by an anchor, or by place
 
 
 class Back(Enum):
@@ -78,14 +78,14 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]
             SchemeEvent.CERTIFIED: SchemeState.MONITOR,
             SchemeEvent.REFUTED: SchemeState.ADAPT,
         },
-        # Moves, detection armed. Out: a contact; a host that is late; an offset that has left its anchor; the
+        # Moves, detection armed. Out: a contact; a host that is late; what was learnt since contradicts it; the
         # announcement of a payload change; back from these, the doubt of the model.
         SchemeState.MONITOR: {
             SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COLLISION: SchemeState.REACT,
             SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.LATE: SchemeState.REACT,
-            SchemeEvent.DRIFTED: SchemeState.REACT,
+            SchemeEvent.CONTRADICTED: SchemeState.REACT,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
             SchemeEvent.DOUBTED: SchemeState.STOPPED,
         },

@@ -16,7 +16,7 @@ def test_an_arm_whose_offset_leaves_its_anchor_stops_and_says_which(tmp_path: Pa
     summary, _ = run_embedded(resolve("certified", str(file), None, None), "lockstep", tmp_path, told.append)
     events = [entry.event for entry in read_log(summary.log.path).events]
     stopped = [event.message for event in events if event.name == "supervisor" and "MONITOR -> REACT" in event.message]
-    assert stopped == ["MONITOR -> REACT: a torque offset has left its anchor"]
+    assert stopped == ["MONITOR -> REACT: what was learnt since contradicts the certificate"]
     (revoked,) = [event.message for event in events if event.name == "revoked"]
     assert revoked.startswith("joint 1 has a fitted torque offset of 0.0")
     assert "by the reading at rest it is" in revoked

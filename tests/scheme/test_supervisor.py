@@ -15,7 +15,7 @@ from adacd_hil.scheme.transitions import TRANSITIONS, SchemeEvent, next_state
 # the state from which REACT was entered.
 EVENTS = (
     "FAULT COLLISION CONTACT LATE COMPLETE COMMISSIONED ENABLED ADAPTED FITTED CERTIFIED REFUTED "
-    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED REVOKED DOUBTED MOVED DRIFTED"
+    "AT_REST CLEARED ACKNOWLEDGED PAYLOAD_ANNOUNCED PAYLOAD_CHANGED REVOKED DOUBTED MOVED CONTRADICTED"
 )
 EXPECTED = """
 INIT        FAULT  .      .      .      COMMISSION  .       .      .        .        .        .      .        .     .     .        .        .        .         .         .
@@ -593,7 +593,7 @@ def test_an_acknowledgement_waits_until_the_host_is_on_time():
 def test_an_offset_that_has_left_its_anchor_stops_the_arm_for_the_user():
     run = run_in(SchemeState.MONITOR)
     assert run.step(observation=Observation.WITHHELD) is SchemeState.REACT
-    assert run.supervisor.cause is SchemeEvent.DRIFTED
+    assert run.supervisor.cause is SchemeEvent.CONTRADICTED
     assert run.step(observation=Observation.AT_REST, cycles=REST_CYCLES) is SchemeState.STOPPED
 
 

@@ -1,0 +1,169 @@
+"""A torque that depends on where the arm is: named where the model lacks it, learnt within its bound where it may."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from excited_arm import SETTINGS, TouchedLoop, play, record
+from planar_arm import THETA
+
+from adacd_hil.config import POSITION_TERMS, load_settings
+from adacd_hil.records import Request, SchemeState
+from adacd_hil.scheme import bank, certified_kernel, certified_memory, position, position_evidence
+
+FREE = replace(SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)))
+TOLD = replace(FREE, arm=replace(FREE.arm, position_torque_Nm=0.15))
+CABLE_NM = 0.1
+REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model have it, from the next start on"
+
+
+class CabledLoop(TouchedLoop):
+    """The arm with a cable on each joint that pulls by `cable_Nm` sin q."""
+
+    cable_Nm = CABLE_NM
+
+    def step(self):
+        self.tau_ext[:] = self.cable_Nm * np.sin(self.q)
+        return super().step()
+
+
+def cabled(seconds, cable_Nm=CABLE_NM, lean_Nm=0.0):
+    """Record the arm with the torque that a cable adds to what its sensors see; and joint 1's, of who leans on it."""
+    measured = record(THETA["P"], seconds)
+    return measured._replace(tau_J=measured.tau_J + cable_Nm * np.sin(measured.q) + np.array((lean_Nm, 0.0)))
+
+
+def learnt(settings, measured):
+    """Let an adaptation take in a record, contacts or not; return the kernel's arrays."""
+    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
+    block = certified_memory.new_block(settings)
+    certified_kernel.begin_adaptation(constants, memory, False)
+    for q, dq, tau_J in zip(*measured, strict=True):
+        block["q"], block["dq"], block["tau_J"], block["period_s"] = q, dq, tau_J, 0.0
+        certified_kernel.step(constants, memory, block, 1, 1, certified_kernel.LEARN)
+    return constants, memory
+
+
+def test_columns_are_those_of_a_tilted_base_and_of_cables():
+    X = np.zeros((2, position.TERMS))
+    q = np.array((0.4, -1.1))
+    position.fill(q, X)
+    for i in range(2):
+        expected = np.sin(q[i]), np.cos(q[i]), np.sin(2 * q[i]), np.cos(2 * q[i]), np.sin(q.sum()), np.cos(q.sum())
+        assert X[i] == pytest.approx(expected, abs=1e-15)
+
+
+def test_the_evidence_filters_its_columns_as_the_model_would():
+    _, memory = learnt(TOLD, cabled(0.5))
+    names = certified_memory.parameter_names(TOLD)
+    first = names.index(f"{POSITION_TERMS[0]}1")
+    assert names[first:] == tuple(f"{term}{joint}" for term in POSITION_TERMS for joint in (1, 2))
+    W_f = memory[0]["W_f"][bank.LEARNT]
+    for term in range(position.TERMS):
+        for joint in range(2):
+            in_model = W_f[joint, first + 2 * term + joint]
+            assert memory[0]["X_f"][joint, term] == pytest.approx(in_model, abs=1e-12)
+            assert W_f[1 - joint, first + 2 * term + joint] == 0.0
+
+
+def test_the_evidence_is_that_of_a_dense_gaussian_model():
+    """log N(b; x = 0) of rows whose sums the kernel keeps, by numpy's own determinant and solution."""
+    constants, memory = learnt(FREE, cabled(1.5))
+    k, m = constants[0], memory[0]
+    lower = m["evidence_L"].sum(axis=0)
+    L = lower + np.tril(lower, -1).T
+    S, b = np.diag(k["evidence_std"]), m["evidence_b"]
+    for count in (len(m["belief"]), len(b)):
+        s = S[:count, :count]
+        M = np.eye(count) + s @ L[:count, :count] @ s
+        x = np.zeros(len(b))
+        found = position_evidence._log_evidence(k, m, b, count, x)
+        expected = 0.5 * (s @ b[:count] @ np.linalg.solve(M, s @ b[:count]) - np.linalg.slogdet(M)[1])
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
+        assert x[:count] == pytest.approx(s @ np.linalg.solve(M, s @ b[:count]), rel=1e-6, abs=1e-9)
+        left = m["evidence_yy"] - 2.0 * x @ b + x @ L @ x
+        assert position_evidence._squares_left(m, x) == pytest.approx(left, rel=1e-6)
+
+
+@pytest.mark.parametrize(("cable_Nm", "is_found"), [(0.0, False), (0.005, False), (CABLE_NM, True)])
+def test_only_a_torque_by_place_that_counts_is_evidence(cable_Nm, is_found):
+    constants, memory = learnt(FREE, cabled(4.0, cable_Nm))
+    assert position_evidence.is_found(constants[0], memory[0]) is is_found
+    if is_found:
+        assert memory[0]["position_rms_Nm"] == pytest.approx((0.02, 0.02), abs=0.015)
+        assert re.fullmatch(
+            r"a torque that depends on where the arm is, 0\.0\d\d Nm rms in joint 1 and 0\.0\d\d Nm rms in joint 2, is "
+            r"missing in the model: a cable, a base that is not level, or a hand's spring",
+            *position_evidence.describe(memory[0]),
+        )
+
+
+def test_an_arm_with_a_cable_that_passes_the_test_loses_its_certificate_with_that_reason():
+    loop = CabledLoop(FREE)
+    loop.run_until(SchemeState.MONITOR, 8000)
+    assert any(
+        "a torque that depends on where the arm is, " in line for line in loop.said("touch") + loop.said("anchor")
+    )
+    outputs = loop.run_until(SchemeState.STOPPED, 8000)
+    assert {output.contact for output in outputs} == {None}
+    (revoked,) = loop.said("revoked")
+    assert "a torque that depends on where the arm is, " in revoked
+    assert revoked.endswith("the certificate is taken back, `relearn` learns the arm anew")
+    assert len(loop.pipeline.certificates) == 0
+
+
+def test_an_arm_with_a_cable_is_refused_with_that_reason_and_no_word_makes_up_for_it():
+    loop = CabledLoop(SETTINGS)
+    loop.cable_Nm = 2.0 * CABLE_NM
+    said = []
+    for _ in range(12_000):
+        if loop.step().state is SchemeState.STOPPED:
+            loop.request = Request.ACKNOWLEDGE
+        said = loop.said("position")
+        if said:
+            break
+    assert said
+    assert REMEDY in said[0]
+    assert loop.levels("position") == ["warning"]
+    loop.request = Request.ACCEPT
+    loop.run(1)
+    assert loop.said("position")[-1] == f"no word makes up for a torque that depends on the place: {REMEDY}"
+    assert any("a torque that depends on where the arm is" in line for line in loop.pipeline.describe_withheld())
+
+
+@pytest.mark.slow
+def test_a_model_that_is_told_of_a_cable_is_certified_with_it_and_says_how_much():
+    loop = CabledLoop(TOLD)
+    assert len(loop.run_until(SchemeState.MONITOR, 4000)) < 3000
+    (text,) = loop.said("certificate")
+    found = re.search(r"; torque by place up to (0\.\d+) Nm \(joint 1\), (0\.\d+) Nm \(joint 2\), believed up to", text)
+    assert found is not None
+    assert all(0.02 < float(torque_Nm) < 0.15 for torque_Nm in found.groups())
+    outputs = loop.run(10_000)
+    assert {output.state for output in outputs} == {SchemeState.MONITOR}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lean_Nm", [0.3, 1.0])
+def test_a_model_that_is_told_of_a_cable_takes_no_lean_for_one(lean_Nm):
+    loop = TouchedLoop(TOLD)
+    loop.run_until(SchemeState.ENABLE)
+    leant = loop.lean(0, lean_Nm, 3.5)
+    assert SchemeState.MONITOR not in {output.state for output in leant}
+    said = loop.said("position") + loop.said("anchor")
+    assert re.search(r"joint 1 has a (torque of up to \d\.\d+ Nm that depends on where|fitted torque offset)", said[0])
+
+
+def test_a_clean_arm_has_no_torque_by_place():
+    played = play(record(THETA["P"], 30.0))
+    assert played.begin_of(SchemeState.MONITOR) < 2500
+    assert set(played.state[2500:]) == {SchemeState.MONITOR}
+
+
+def test_the_setting_is_off_by_default_and_bounded():
+    assert load_settings("certified").arm.position_torque_Nm == 0.0
+    assert not any(name.startswith(POSITION_TERMS) for name in certified_memory.parameter_names(SETTINGS))
+    std = certified_memory.prior_std_of(TOLD)
+    assert std[-12:] == pytest.approx(np.full(12, 0.06))
+    assert certified_memory.prior_std_of(SETTINGS) == pytest.approx(std[:-12])
