@@ -158,17 +158,17 @@ class CertificateWatch:
         return Verdict("; ".join(self._describe(cause)), is_payload=False)
 
     def _describe(self, cause: _Cause) -> list[str]:
+        by_place = position_evidence.describe(self._memory) if self._memory["is_by_place"] else []
         if cause is _Cause.MORE:
-            return earlier.describe_more(self._constants, self._memory)
+            return [*earlier.describe_more(self._constants, self._memory), *by_place]
         if cause is _Cause.MORE_THAN_LAST:
             return last_certificate.describe_more(self._memory, self._last_utc)
         if cause is _Cause.CHANGED:
             return [_CHANGED]
         if cause is _Cause.BY_PLACE:
-            return position_evidence.describe(self._memory)
+            return by_place
         if cause is _Cause.TOO_MUCH_BY_PLACE:
             return position.describe_refused(self._constants, self._memory)
-        by_place = position_evidence.describe(self._memory) if self._memory["is_by_place"] else []
         return [*anchor.describe_refused(self._memory, cause is _Cause.READING), *by_place]
 
     def accept(self) -> Event:
@@ -188,9 +188,6 @@ class CertificateWatch:
                 last_certificate.forget(self._memory)
                 self._vouched_against = self._last
                 what = f"the user says that nobody touches the arm: {self._last} is not compared"
-            case _Cause.BY_PLACE | _Cause.TOO_MUCH_BY_PLACE:
-                self._refusal = refusal
-                what = f"no word makes up for a torque that depends on the place: {refusal.cause.value[2]}"
             case _:
                 earlier.forget(self._memory)
                 self._vouched_against = _THE_RUN

@@ -377,17 +377,26 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
 @compiled
 def _contradicted_by(k: Any, m: Any) -> int:
     """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
+    cause = NOTHING
     if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
-        m["is_by_place"] = 1.0 if position_evidence.is_found(k, m) else 0.0
-        return ANCHOR
+        cause = ANCHOR
+    elif not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(k, m)):
+        cause = CHANGED
+    elif not earlier.is_no_more(k, m):
+        cause = MORE
+    if cause != NOTHING:
+        _ask_place(k, m)
+        return BY_PLACE if cause == CHANGED and m["is_by_place"] != 0.0 else cause
     m["is_by_place"] = 0.0
-    if not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(k, m)):
-        return BY_PLACE if position_evidence.is_found(k, m) else CHANGED
-    if not earlier.is_no_more(k, m):
-        return BY_PLACE if position_evidence.is_found(k, m) else MORE
     if not position.is_bounded(k, m):
         return TOO_MUCH_BY_PLACE
     return NOTHING if last_certificate.is_no_more(k, m) else MORE_THAN_LAST
+
+
+@compiled
+def _ask_place(k: Any, m: Any) -> None:
+    """Fill whether a torque that depends on where the arm is has been seen while it learnt."""
+    m["is_by_place"] = 1.0 if position_evidence.is_found(k, m) else 0.0
 
 
 @compiled
@@ -404,7 +413,8 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     for i in range(dq.shape[0]):
         if not (abs(m["r"][bank.SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
-            if not position_evidence.is_found(k, m):
+            _ask_place(k, m)
+            if m["is_by_place"] == 0.0:
                 return _REFUTED
             m["withheld_by"] = BY_PLACE
             return _REFUTED | _WITHHELD
@@ -416,7 +426,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     if anchor.is_within(k, m, m["theta"], m["P"]):
         return _CERTIFIED
     m["withheld_by"] = ANCHOR
-    m["is_by_place"] = 1.0 if position_evidence.is_found(k, m) else 0.0
+    _ask_place(k, m)
     return _REFUTED | _WITHHELD
 
 
@@ -436,6 +446,7 @@ def _refine(k: Any, m: Any) -> int:
         return _WITHHELD
     if is_by_place:
         m["withheld_by"] = BY_PLACE
+        m["is_by_place"] = 1.0
     return _WITHHELD if is_by_place else 0
 
 

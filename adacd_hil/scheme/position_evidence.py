@@ -21,7 +21,7 @@ squares that the basic model leaves in a later one.
 
 Shapes: p parameters, n joints, f = p + n TERMS; evidence_L (n, f, f): by the joint of the row, lower half; evidence_b,
 _x0, _x1 (f,); evidence_M (f, f); evidence_said (n TERMS,): coefficients of the last stretch that came to a torque by
-place, all 0 if none did; position_rms_Nm (n,); is_by_place: 1 where an anchor excludes a fit to which it came as well.
+place, all 0 if none did; position_rms_Nm (n,); is_by_place: 1 where what is refused came to one.
 """
 
 from typing import Any
@@ -77,14 +77,13 @@ def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
 @compiled
 def follow(m: Any, q: Vector, decay: float, weight_old: float, weight_new: float, is_seen: bool) -> None:
     """Take the columns (n, TERMS) over one period through the filter that is learnt from; after a gap they resume."""
-    fill(q, m["X"])
+    X, X_old, X_f = m["X"], m["X_old"], m["X_f"]
+    fill(q, X)
     for i in range(q.shape[0]):
         for term in range(TERMS):
-            x = m["X"][i, term]
             if is_seen:
-                held = weight_old * m["X_old"][i, term] + weight_new * x
-                m["X_f"][i, term] = decay * m["X_f"][i, term] + held
-            m["X_old"][i, term] = x
+                X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
+            X_old[i, term] = X[i, term]
 
 
 @compiled
@@ -124,10 +123,10 @@ def add(k: Any, m: Any, slot: int, joint: int) -> None:
     r = m["ring_tau"][slot, joint]
     for j in range(count):
         r -= v[j] * k["prior"][j]
-    L = m["evidence_L"][joint]
+    L, b = m["evidence_L"][joint], m["evidence_b"]
     for j in range(v.shape[0]):
         if v[j] != 0.0:
-            m["evidence_b"][j] += v[j] * r / R
+            b[j] += v[j] * r / R
             for n in range(j + 1):
                 L[j, n] += v[j] * v[n] / R
     m["evidence_ways"][joint, 1 if v[int(k["first_coulomb"]) + joint] > 0.0 else 0] += 1.0
