@@ -60,7 +60,7 @@ def test_every_error_is_one():
 def test_a_row_has_a_field_for_each_column():
     case = Case("P", "clean", 0.0, 1)
     times = ((9.0, 24.0, np.inf),) * 3
-    played = Played(case, 2.0, 0.5, 0, (0.01, 0.01), (0.02, 0.02), (0.0, 0.0), 0.8, times, (0.01, 0.0, 0.0))
+    played = Played(case, 2.0, 0.5, 0, 1, (0.01, 0.01), (0.02, 0.02), (0.0, 0.0), 0.8, times, (0.01, 0.0, 0.0))
     for row in (row_of(played), row_of(Played(case, None))):
         assert len(row) == len(error_campaign.HEAD)
     assert row_of(played)[-3] == "9, 24, inf (1.0%)"
