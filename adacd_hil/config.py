@@ -21,7 +21,7 @@ import numpy as np
 
 from adacd_hil.input_files import exists, read_input
 from adacd_hil.nearest_name import nearest_name
-from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Reaction, Vector
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, POSITION_TERMS, Reaction, Vector
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeRequest
 from adacd_hil.terminal import one_line
 
@@ -455,8 +455,8 @@ REACTIONS = tuple(reaction.name.lower() for reaction in Reaction)
 
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
 """Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.friction`."""
-POSITION_TERMS = ("sin_q", "cos_q", "sin_2q", "cos_2q", "sin_sum", "cos_sum")
-"""Torque that depends on where the arm is, one parameter per joint each, of `arm.position_torque_Nm`."""
+CROSS_TALK = "cross_talk"
+"""What each torque sensor shows of the other joint's torque, Nm/Nm."""
 
 _KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
 
@@ -484,6 +484,12 @@ class CertifiedSettings:
     )
     dahl_rad: tuple[float, float] = setting(
         (0.001, 0.004), unit="rad", low=1e-6, high=1.0, meaning="bristle lengths of dahl_short and dahl_long"
+    )
+    cross_talk_std: float = setting(
+        0.01,
+        low=0.0,
+        high=0.5,
+        meaning="part of the other joint's torque that a torque sensor shows, a deviation; 0: not identified",
     )
     still_rad_s: float = setting(
         0.002,
@@ -959,7 +965,8 @@ class Settings:
         if self.scheme == "paper":
             return ()
         by_place = POSITION_TERMS if self.arm.position_torque_Nm > 0.0 else ()
-        kinds = ("offset", "lag", *self.certified.friction_terms, *by_place)
+        between = (CROSS_TALK,) if self.certified.cross_talk_std > 0.0 else ()
+        kinds = ("offset", "lag", *self.certified.friction_terms, *between, *by_place)
         return tuple(f"{kind}{joint + 1}" for kind in kinds for joint in range(JOINTS))
 
     @property

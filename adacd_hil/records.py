@@ -26,6 +26,8 @@ PARAMETER_NAMES = ("a1", "a2", "a3", "F_v1", "F_v2", "F_c1", "F_c2")
 """Eq. (19): inertia kg m², viscous friction Nm s/rad, Coulomb friction Nm."""
 GRAVITY_PARAMETER_NAMES = ("a4", "a5")
 """Appended where the joint axes are not vertical; Nm."""
+POSITION_TERMS = ("sin_q", "cos_q", "sin_2q", "cos_2q", "sin_sum", "cos_sum")
+"""Torque that depends on where the arm is, one parameter per joint each, of `arm.position_torque_Nm`."""
 PARAMETER_UNITS = {
     "a1": "kg m²",
     "a2": "kg m²",
@@ -52,6 +54,9 @@ PARAMETER_UNITS = {
     "dahl_short2": "Nm",
     "dahl_long1": "Nm",
     "dahl_long2": "Nm",
+    "cross_talk1": "Nm/Nm",
+    "cross_talk2": "Nm/Nm",
+    **{f"{term}{joint + 1}": "Nm" for term in POSITION_TERMS for joint in range(JOINTS)},
 }
 
 

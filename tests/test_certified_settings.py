@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adacd_hil.config import ConfigError, Settings, load_settings, merge, parse, to_toml
+from adacd_hil.config import FRICTION_TERMS, ConfigError, Settings, load_settings, merge, parse, to_toml
 from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme import certified_memory
 
@@ -59,9 +59,9 @@ def test_an_excitation_whose_harmonics_cancel_at_the_start_is_taken():
 
 def test_the_scheme_estimates_offsets_lags_and_the_chosen_friction_terms():
     settings = certified(certified={"friction_terms": ["load", "width"]})
-    kinds = ("offset1", "offset2", "lag1", "lag2", "load1", "load2", "width1", "width2")
+    kinds = ("offset1", "offset2", "lag1", "lag2", "load1", "load2", "width1", "width2", "cross_talk1", "cross_talk2")
     assert settings.further_names == kinds
-    assert settings.further_count == 8
+    assert settings.further_count == 10
     assert certified_memory.parameter_names(settings) == PARAMETER_NAMES + kinds
 
 
@@ -94,8 +94,8 @@ def test_settings_read_back_from_a_log_are_the_same():
 
 
 def test_every_parameter_of_the_scheme_has_a_unit():
-    terms = ["stribeck", "load", "asymmetric", "width"]
-    names = certified_memory.parameter_names(certified(certified={"friction_terms": terms}))
+    given = {"certified": {"friction_terms": list(FRICTION_TERMS)}, "arm": {"position_torque_Nm": 0.1}}
+    names = certified_memory.parameter_names(certified(**given))
     assert {name: PARAMETER_UNITS[name] for name in names if name in PARAMETER_UNITS}.keys() == set(names)
 
 

@@ -106,6 +106,18 @@ def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: i
 
 
 @compiled
+def fill_cross_talk(tau_f: Vector, first_column: int, W_f: Vector) -> None:
+    """Fill the columns of cross-talk, one per joint from `first_column` on: the other joint's filtered torque.
+
+    Of two joints. What another joint's sensor shows too much or too little is in that torque as well, but to a share of
+    a share.
+    """
+    for c in range(W_f.shape[0]):
+        W_f[c, 0, first_column] = tau_f[c, 1]
+        W_f[c, 1, first_column + 1] = tau_f[c, 0]
+
+
+@compiled
 def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Vector) -> None:
     """Fill the external torque (C, n) that each filter sees, Nm: eq. (13) with our sign, for filters with DC gain 1."""
     for c in range(W_f.shape[0]):

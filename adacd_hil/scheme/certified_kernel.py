@@ -294,6 +294,8 @@ def _take_sample(
         m, q, rates[0, bank.LEARNT], rates[1, bank.LEARNT], rates[2, bank.LEARNT], is_seen
     )  # fmt: skip
     bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
+    if k["has_cross_talk"] != 0.0:
+        bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
     bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
     bank.smooth(k["smoothing"], m["r"], m["y"])
     still_rad_s, decay, smoothing = k["still_rad_s"], k["decay"], k["smoothing"]

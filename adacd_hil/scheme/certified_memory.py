@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.config import FRICTION_TERMS, Settings
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector, certified_layout
+from adacd_hil.config import CROSS_TALK, FRICTION_TERMS, Settings
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector, certified_layout
 from adacd_hil.scheme import (
     anchor,
     bank,
@@ -61,15 +61,28 @@ def prior_of(settings: Settings) -> Vector:
 def prior_std_of(settings: Settings) -> Vector:
     """Return how far an arm of which nothing is known may be from that (p,)."""
     names = parameter_names(settings)
-    shares = [next((share for term, share in friction.SHARES.items() if name.startswith(term)), 1.0) for name in names]
-    std: Vector = _by_kind(settings.certified.prior_std, names) * np.array(shares)
-    std[len(names) - _position_count(settings) :] = settings.arm.position_torque_Nm / position.LARGEST_OF_STD
+    std = _by_kind(settings.certified.prior_std, names)
+    for j, name in enumerate(names):
+        if name.startswith(CROSS_TALK):
+            std[j] = settings.certified.cross_talk_std
+        elif name.startswith(POSITION_TERMS):
+            std[j] = settings.arm.position_torque_Nm / position.LARGEST_OF_STD
+        else:
+            std[j] *= next((share for term, share in friction.SHARES.items() if name.startswith(term)), 1.0)
     return std
 
 
-def _position_count(settings: Settings) -> int:
-    """Return how many parameters are of the torque by place; they are the last ones."""
-    return JOINTS * position.TERMS if settings.arm.position_torque_Nm > 0.0 else 0
+def _drift_std_of(settings: Settings) -> Vector:
+    """Return how far each parameter may wander in a second of monitoring (p,); a sensor's cross-talk doesn't."""
+    names = parameter_names(settings)
+    std = _by_kind(settings.certified.drift_std, names)
+    std[[name.startswith(CROSS_TALK) for name in names]] = 0.0
+    return std
+
+
+def _first_of(term: str, names: tuple[str, ...]) -> int:
+    """Return the place of the first joint's parameter of a term; behind all where there is none."""
+    return names.index(f"{term}1") if f"{term}1" in names else len(names)
 
 
 def _enough_std_of(settings: Settings) -> Vector:
@@ -100,7 +113,9 @@ def constants_of(settings: Settings) -> Structured:
         "base": base,
         "first_coulomb": PARAMETER_NAMES.index("F_c1"),
         "first_term": base + 2 * JOINTS,
-        "first_position": len(names) - _position_count(settings),
+        "has_cross_talk": certified.cross_talk_std > 0.0,
+        "first_cross_talk": _first_of(CROSS_TALK, names),
+        "first_position": _first_of(POSITION_TERMS[0], names),
         "position_torque_Nm": settings.arm.position_torque_Nm,
         "width_rad_s": certified.coulomb_width_rad_s,
         "stribeck_rad_s": certified.stribeck_rad_s,
@@ -110,7 +125,7 @@ def constants_of(settings: Settings) -> Structured:
         "prior": prior_of(settings),
         "prior_std": prior_std_of(settings),
         "enough_std": _enough_std_of(settings),
-        "drift_std": _by_kind(certified.drift_std, names),
+        "drift_std": _drift_std_of(settings),
         "model_error": _by_kind(certified.model_error, names),
         "payload_direction": belief.payload_direction(settings.arm.link_length_m, len(names)),
         "payload_std_kg": certified.payload_std_kg,

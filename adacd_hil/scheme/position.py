@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import POSITION_TERMS
-from adacd_hil.records import Vector
+from adacd_hil.records import POSITION_TERMS, Vector
 from adacd_hil.scheme import anchor
 
 TERMS = len(POSITION_TERMS)

@@ -128,7 +128,7 @@ def test_margins_are_told_while_adapting_too():
 
 def test_every_parameter_has_its_standard_deviation():
     estimates = evaluate(make_certified_run()).evidence.estimates["D"]
-    assert list(estimates)[-2:] == ["dahl_long1", "dahl_long2"]
+    assert list(estimates)[-2:] == ["cross_talk1", "cross_talk2"]
     assert (estimates["lag1"].value, estimates["lag1"].std) == (0.001, 0.01)
 
 

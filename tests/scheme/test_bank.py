@@ -101,6 +101,14 @@ def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
             assert np.count_nonzero(np.delete(columns[:, joint], 3 + joint, axis=1)) == 0
 
 
+def test_the_cross_talk_column_is_the_other_joint_s_filtered_torque():
+    tau_f, W_f = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.zeros((3, 2, COLUMNS))
+    bank.fill_cross_talk(tau_f, 1, W_f)
+    np.testing.assert_array_equal(W_f[:, 0, 1], tau_f[:, 1])
+    np.testing.assert_array_equal(W_f[:, 1, 2], tau_f[:, 0])
+    assert np.count_nonzero(W_f) == 6
+
+
 def test_a_push_toward_positive_q_is_a_positive_external_torque():
     """The arm needs W theta, and the joint gives less: the environment gives the rest."""
     random = np.random.default_rng(2)

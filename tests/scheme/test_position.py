@@ -8,8 +8,8 @@ import pytest
 from excited_arm import SETTINGS, TouchedLoop, play, record
 from planar_arm import THETA
 
-from adacd_hil.config import POSITION_TERMS, load_settings
-from adacd_hil.records import Request, SchemeState
+from adacd_hil.config import load_settings
+from adacd_hil.records import POSITION_TERMS, Request, SchemeState
 from adacd_hil.scheme import bank, certified_kernel, certified_memory, position, position_evidence
 
 FREE = replace(SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)))

@@ -1,0 +1,47 @@
+"""Torque sensors that show some of each other's torque, and too much or too little of their own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from excited_arm import SETTINGS, TouchedLoop, play, record
+from planar_arm import THETA
+
+from adacd_hil.records import SchemeState
+from adacd_hil.scheme import certified_memory
+
+SHARE = 0.02
+SENSORS = np.array([[1.0 + SHARE, SHARE], [SHARE, 1.0 - SHARE]])
+"""What the sensors show of the true torques (2, 2)."""
+UNKNOWING = replace(SETTINGS, certified=replace(SETTINGS.certified, cross_talk_std=0.0))
+CROSS_TALK = [certified_memory.parameter_names(SETTINGS).index(f"cross_talk{joint}") for joint in (1, 2)]
+
+
+@pytest.fixture(scope="module", params=["P", "M"])
+def measured(request):
+    """An arm on the excitation for 20 s, as such sensors see it."""
+    seen = record(THETA[request.param], 20.0)
+    return seen._replace(tau_J=seen.tau_J @ SENSORS.T)
+
+
+def test_an_arm_with_such_sensors_is_certified_as_soon_as_any_other_and_raises_no_alarm(measured):
+    played = play(measured)
+    armed = played.begin_of(SchemeState.MONITOR)
+    assert armed <= 2000
+    assert set(played.state[armed:]) == {SchemeState.MONITOR}
+    assert np.abs(played.theta[-1, CROSS_TALK]).max() < 2.0 * SHARE  # inertia takes some of it, too
+
+
+def test_a_model_that_shall_not_know_of_it_has_no_column_for_it(measured):
+    names = certified_memory.parameter_names(UNKNOWING)
+    assert not any(name.startswith("cross_talk") for name in names)
+    assert len(names) == len(certified_memory.parameter_names(SETTINGS)) - 2
+
+
+def test_a_push_on_one_joint_is_not_taken_for_the_sensors():
+    loop = TouchedLoop(SETTINGS)
+    loop.run_until(SchemeState.MONITOR)
+    before = loop.pipeline._memory[0]["theta"][CROSS_TALK].copy()
+    outputs = loop.lean(1, 0.3, 0.2)
+    assert SchemeState.REACT in {output.state for output in outputs}
+    assert loop.pipeline._memory[0]["theta"][CROSS_TALK] == pytest.approx(before, abs=0.002)
