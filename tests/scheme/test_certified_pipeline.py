@@ -280,7 +280,7 @@ def test_the_block_is_laid_out_as_the_records_say():
     pipeline = CertifiedPipeline(SETTINGS)
     outputs = [pipeline.step(arm_state(k, (0.1, 0.2), (0.03, 0.04), (0.5, 0.6))) for k in range(30)]
     block = outputs[-1].block
-    assert block.shape == (certified_layout(7, 12, 5).size,)
+    assert block.shape == (certified_layout(7, SETTINGS.further_count, 5).size,)
     for name, value in (("q", [0.1, 0.2]), ("dq", [0.03, 0.04]), ("tau_J", [0.5, 0.6])):
         assert block[PLACES[name]].tolist() == value
     bank = block[PLACES["tau_ext_bank"]].reshape(5, 2)
