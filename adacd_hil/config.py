@@ -1008,7 +1008,13 @@ class Settings:
 
 
 def renewed(table: dict[str, Any]) -> dict[str, Any]:
-    """Return the configuration of a log with today's keys in place of those that older versions had."""
+    """Return the configuration of a log with today's keys in place of those that older versions had.
+
+    A log has every key that there was when it was written, so one that is missing was not in the model.
+    """
+    certified = table.get("certified")
+    if isinstance(certified, dict) and "cross_talk_std" not in certified:
+        table = table | {"certified": certified | {"cross_talk_std": 0.0}}
     safety = table.get("safety")
     if not isinstance(safety, dict) or "commission_cycles" not in safety:
         return table

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adacd_hil.config import FRICTION_TERMS, ConfigError, Settings, load_settings, merge, parse, to_toml
+from adacd_hil.config import FRICTION_TERMS, ConfigError, Settings, load_settings, merge, parse, renewed, to_toml
 from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme import certified_memory
 
@@ -91,6 +91,17 @@ def test_settings_read_back_from_a_log_are_the_same():
 
     settings = load_settings("certified", "M")
     assert parse(Settings, tomllib.loads(to_toml(settings))) == settings
+
+
+def test_a_log_from_before_cross_talk_was_identified_has_none_in_its_model():
+    import tomllib
+
+    table = tomllib.loads(to_toml(load_settings("certified", "P")))
+    assert parse(Settings, renewed(table)) == load_settings("certified", "P")
+    del table["certified"]["cross_talk_std"]
+    old = parse(Settings, renewed(table))
+    assert old.certified.cross_talk_std == 0.0
+    assert old.further_names[-1] == "dahl_long2"
 
 
 def test_every_parameter_of_the_scheme_has_a_unit():
