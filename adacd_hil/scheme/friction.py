@@ -16,6 +16,8 @@ Bristles don't bend while a joint may stand still. Two lengths together stand fo
 Shapes: dq, tau_J (n,); bent (2, n): z of the short and of the long ones; Y_h (n, p).
 """
 
+import math
+
 import numpy as np
 
 from adacd_hil.compiled import compiled
@@ -32,7 +34,7 @@ SHARES = {"load": 0.25, "dahl": 0.5}
 def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
     """Return tanh(dq / width); where the width is 0 the sign of dq, and 0 of what may stand still."""
     if width_rad_s > 0.0:
-        return float(np.tanh(dq / width_rad_s))
+        return float(math.tanh(dq / width_rad_s))
     return float(np.sign(dq)) if abs(dq) >= still_rad_s else 0.0
 
 
@@ -43,7 +45,7 @@ def bend(dq: Vector, period_s: float, still_rad_s: float, dahl_rad: Vector, bent
         for i in range(dq.shape[0]):
             if abs(dq[i]) >= still_rad_s:
                 sign = np.sign(dq[i])
-                bent[length, i] = sign + (bent[length, i] - sign) * np.exp(-abs(dq[i]) * period_s / dahl_rad[length])
+                bent[length, i] = sign + (bent[length, i] - sign) * math.exp(-abs(dq[i]) * period_s / dahl_rad[length])
 
 
 @compiled
@@ -66,7 +68,7 @@ def fill_terms(
         for i in range(count):
             sign = smooth_sign(dq[i], still_rad_s, width_rad_s)
             if terms[position] == STRIBECK:
-                value = sign * np.exp(-((dq[i] / stribeck_rad_s) ** 2))
+                value = sign * math.exp(-((dq[i] / stribeck_rad_s) ** 2))
             elif terms[position] == LOAD:
                 value = sign * abs(tau_J[i])
             elif terms[position] == ASYMMETRIC:

@@ -10,6 +10,7 @@ is cut out the velocity's noise stands in S for good, G += (2 a nu)² (M R M')_i
 Shapes: C filters, n joints; lost (C, n), Nm².
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ def follow(k: Any, m: Any, dq: Vector, steps: int, period_s: float, is_seen: boo
     lost, before = m["lost"], m["last"][1]
     for c in range(lost.shape[0]):
         turn = k["cutoff"][c] * period_s
-        decay = np.exp(-2.0 * turn)
+        decay = math.exp(-2.0 * turn)
         noise = (k["noise_sigmas"] * k["torque_noise_Nm"] * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
         for i in range(lost.shape[1]):
             lost[c, i] *= decay

@@ -22,6 +22,7 @@ Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C,
 M (n, n). Units: Nm.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,7 @@ def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
         if m["torque_changes"][i] >= CHANGES and step_Nm != m["torque_step_Nm"][i]:
             m["torque_step_Nm"][i] = step_Nm
             variance = k["torque_noise_Nm"] ** 2 * m["roughness"][i]
-            m["torque_pull_Nm"][i] = step_Nm / np.pi * np.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
+            m["torque_pull_Nm"][i] = step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
 
 
 @compiled

@@ -15,6 +15,7 @@ Shapes: C filters, n joints; y, h (2 C - 1, n); shown (2 C - 1,): g; seen (bins,
 seen_worst_Nm, seen_push_Nm, sum_push_Nm, sum_cycles (n,). Units: Nm.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ def follow_test(k: Any, m: Any) -> None:
     """Take in one sample of a test, without contact."""
     for i in range(m["seen"].shape[1]):
         h = m["wide_threshold"][i]
-        place = int(np.log(max(h / LOWEST_NM, 1.0)) / WIDTH)
+        place = int(math.log(max(h / LOWEST_NM, 1.0)) / WIDTH)
         m["seen"][min(place, BINS - 1), i] += 1.0
         m["seen_worst_Nm"][i] = max(m["seen_worst_Nm"][i], h)
         m["seen_push_Nm"][i] = max(m["seen_push_Nm"][i], smallest_push(m["y"], m["h"], k["shown"], i))
@@ -126,7 +127,7 @@ def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
     place = int(np.searchsorted(seen, share * seen[-1]))
     if place == BINS - 1:
         return float(worst_Nm)
-    return min(LOWEST_NM * float(np.exp(WIDTH * (place + 1))), float(worst_Nm))
+    return min(LOWEST_NM * float(math.exp(WIDTH * (place + 1))), float(worst_Nm))
 
 
 def _by_joint(values_Nm: Any) -> str:

@@ -13,6 +13,7 @@ and again raises it to m times the largest of those, and no further. It is forgo
 Shapes: peak, peak_now, peak_last, tail_Nm (2 C - 1, n). Units: Nm.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -102,5 +103,5 @@ def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> flo
 @compiled
 def _factor(excursions_Hz: float, seen_s: float) -> float:
     """Return m(T)."""
-    share = np.log(excursions_Hz / RATE_HZ) / np.log(max(excursions_Hz * max(seen_s, 1.0), 1.01))
+    share = math.log(excursions_Hz / RATE_HZ) / math.log(max(excursions_Hz * max(seen_s, 1.0), 1.01))
     return float(min(np.sqrt(max(share, 1.0)), LARGEST))
