@@ -133,10 +133,10 @@ def is_within(k: Any, m: Any, theta: Vector, P: Vector) -> bool:
 
 
 @compiled
-def distance(k: Any, m: Any, joint: int, offset_Nm: float, variance: float) -> float:
+def innovation(k: Any, m: Any, joint: int, offset_Nm: float, variance_Nm2: float) -> float:
     """Return (o - a) / (P_oo + sigma_a² + b² t) of the joint's best known anchor, 1/Nm; 0 where there is none.
 
-    Less P_o times this are the parameters of a model whose offset is the anchor's, as far as it is known.
+    theta less P_o times this is the model corrected by the anchor as by a measurement of its offset.
     """
     kind = int(np.argmin(m["anchor_std"][:, joint]))
     std = m["anchor_std"][kind, joint]
@@ -145,7 +145,7 @@ def distance(k: Any, m: Any, joint: int, offset_Nm: float, variance: float) -> f
     known = std**2 + k["zero_drift_Nm2_s"] * m["anchor_age_s"]
     if kind == REST:
         known += k["holding_Nm"][joint] ** 2
-    return float((offset_Nm - m["anchor_Nm"][kind, joint]) / (variance + known))
+    return float((offset_Nm - m["anchor_Nm"][kind, joint]) / (variance_Nm2 + known))
 
 
 def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:

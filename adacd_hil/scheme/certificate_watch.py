@@ -158,18 +158,23 @@ class CertificateWatch:
         return Verdict("; ".join(self._describe(cause)), is_payload=False)
 
     def _describe(self, cause: _Cause) -> list[str]:
-        by_place = position_evidence.describe(self._memory) if self._memory["is_by_place"] else []
-        if cause is _Cause.MORE:
-            return [*earlier.describe_more(self._constants, self._memory), *by_place]
-        if cause is _Cause.MORE_THAN_LAST:
-            return last_certificate.describe_more(self._memory, self._last_utc)
-        if cause is _Cause.CHANGED:
-            return [_CHANGED]
-        if cause is _Cause.BY_PLACE:
-            return by_place
-        if cause is _Cause.TOO_MUCH_BY_PLACE:
-            return position.describe_refused(self._constants, self._memory)
-        return [*anchor.describe_refused(self._memory, cause is _Cause.READING), *by_place]
+        k, m = self._constants, self._memory
+        match cause:
+            case _Cause.READING:
+                lines = anchor.describe_refused(m, is_reading=True)
+            case _Cause.ANCHOR:
+                lines = [*anchor.describe_refused(m, is_reading=False), *position_evidence.describe(m)]
+            case _Cause.CHANGED:
+                lines = [_CHANGED]
+            case _Cause.MORE:
+                lines = [*earlier.describe_more(k, m), *position_evidence.describe(m)]
+            case _Cause.BY_PLACE:
+                lines = position_evidence.describe(m)
+            case _Cause.TOO_MUCH_BY_PLACE:
+                lines = position.describe_refused(k, m)
+            case _Cause.MORE_THAN_LAST:
+                lines = last_certificate.describe_more(m, self._last_utc)
+        return lines
 
     def accept(self) -> Event:
         """Believe what was refused last, because the user says so; return what there is to say of that."""

@@ -76,15 +76,17 @@ _EIGENVALUE_EVERY = 64
 
 
 @compiled
-def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool) -> None:
+def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool, is_first: bool) -> None:
     """Begin to learn: from the prior, or with a payload on top of the arm as it was certified.
+
+    is_first: of the arm as it is now; else an earlier attempt came to nothing, and its samples are evidence still.
 
     What was learnt before is forgotten, so a contact on the way, whenever it is noticed, leaves no trace.
 
     Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
     k, m = constants[0], memory[0]
-    if is_payload:
+    if is_first:
         position_evidence.clear(k, m)
     m["has_gap"] = 1.0
     m["W_f"][:] = 0.0
@@ -289,10 +291,7 @@ def _take_sample(
         )  # fmt: skip
     else:
         bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
-    rates = m["rates"]
-    position_evidence.follow(
-        m, q, rates[0, bank.LEARNT], rates[1, bank.LEARNT], rates[2, bank.LEARNT], is_seen
-    )  # fmt: skip
+    position_evidence.follow(m, q, m["rates"][:, bank.LEARNT], is_seen)
     bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     if k["has_cross_talk"] != 0.0:
         bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
@@ -318,7 +317,7 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
     friction.fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
     if k["position_torque_Nm"] != 0.0:
         position.fill(q, m["X"])
-        position.place(m["X"], int(k["first_position"]), m["Y_h"])
+        position.put_columns(m["X"], int(k["first_position"]), m["Y_h"])
     regressor.fill_mass_matrix(q, m["theta"], m["M"])
 
 
@@ -387,18 +386,10 @@ def _contradicted_by(k: Any, m: Any) -> int:
     elif not earlier.is_no_more(k, m):
         cause = MORE
     if cause != NOTHING:
-        _ask_place(k, m)
-        return BY_PLACE if cause == CHANGED and m["is_by_place"] != 0.0 else cause
-    m["is_by_place"] = 0.0
+        return BY_PLACE if position_evidence.is_found(k, m) and cause == CHANGED else cause
     if not position.is_bounded(k, m):
         return TOO_MUCH_BY_PLACE
     return NOTHING if last_certificate.is_no_more(k, m) else MORE_THAN_LAST
-
-
-@compiled
-def _ask_place(k: Any, m: Any) -> None:
-    """Fill whether a torque that depends on where the arm is has been seen while it learnt."""
-    m["is_by_place"] = 1.0 if position_evidence.is_found(k, m) else 0.0
 
 
 @compiled
@@ -415,11 +406,8 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     for i in range(dq.shape[0]):
         if not (abs(m["r"][bank.SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
-            _ask_place(k, m)
-            if m["is_by_place"] == 0.0:
-                return _REFUTED
-            m["withheld_by"] = BY_PLACE
-            return _REFUTED | _WITHHELD
+            m["withheld_by"] = BY_PLACE if position_evidence.is_found(k, m) else NOTHING
+            return _REFUTED if m["withheld_by"] == NOTHING else _REFUTED | _WITHHELD
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
         has_moved = has_moved and fastest >= k["velocity_rad_s"]
     is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
@@ -428,7 +416,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     if anchor.is_within(k, m, m["theta"], m["P"]):
         return _CERTIFIED
     m["withheld_by"] = ANCHOR
-    _ask_place(k, m)
+    position_evidence.is_found(k, m)
     return _REFUTED | _WITHHELD
 
 
@@ -438,18 +426,14 @@ def _refine(k: Any, m: Any) -> int:
     sensitivity.follow_unit(k, m, bank.SLOW, k["unit_share"])
     sensitivity.relax(k, m)
     sight.follow(k, m)
-    is_by_place = False
+    m["withheld_by"] = NOTHING
     if belief.learn(k, m, bank.LEARNT):
         belief.wander(k["drift_std"], m["W_f"][bank.LEARNT], k["period_s"] * k["learn_every"], m["P_belief"])
-        is_by_place = position_evidence.is_found_in_time(k, m)
+        if position_evidence.is_found_in_time(k, m):
+            m["withheld_by"] = BY_PLACE
     if refinement.test_candidate(k, m):
         m["withheld_by"] = ANCHOR
-        m["is_by_place"] = 0.0
-        return _WITHHELD
-    if is_by_place:
-        m["withheld_by"] = BY_PLACE
-        m["is_by_place"] = 1.0
-    return _WITHHELD if is_by_place else 0
+    return 0 if m["withheld_by"] == NOTHING else _WITHHELD
 
 
 @compiled

@@ -4,6 +4,7 @@ Three structured arrays of one element, as in `adacd_hil.scheme.kernel`; the blo
 parameters, in order: the dynamic ones, torque offsets, lags, further friction.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -33,10 +34,6 @@ from adacd_hil.structured import Structured, packed, zeroed
 SETTLED = 3.0
 """Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a
 measured velocity, which lags, and forgets that error only then."""
-
-
-_OFFSET = 4
-"""Place of the offsets in what is said by kind of parameter."""
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
@@ -87,9 +84,11 @@ def _first_of(term: str, names: tuple[str, ...]) -> int:
 
 def _enough_std_of(settings: Settings) -> Vector:
     """Return how well each parameter must be known (p,); an offset no better than the torque by place."""
-    by_kind = list(settings.certified.enough_std)
-    by_kind[_OFFSET] = float(np.hypot(by_kind[_OFFSET], settings.arm.position_torque_Nm))
-    return _by_kind(tuple(by_kind), parameter_names(settings))
+    std = _by_kind(settings.certified.enough_std, parameter_names(settings))
+    base = len(settings.estimator.parameter_names)
+    offsets = slice(base, base + JOINTS)
+    std[offsets] = np.hypot(std[offsets], settings.arm.position_torque_Nm)
+    return std
 
 
 def constants_of(settings: Settings) -> Structured:
@@ -144,7 +143,7 @@ def constants_of(settings: Settings) -> Structured:
         "scale": _by_kind((inertia, viscous, coulomb, gravity, coulomb, 0.005, coulomb), names)[: base + 2 * JOINTS],
         "travel_rad": np.radians(settings.termination.travel_deg),
         "velocity_rad_s": np.radians(settings.termination.velocity_deg_s),
-        "smoothing": np.exp(-certified.smoothing_rad_s * period_s),
+        "smoothing": math.exp(-certified.smoothing_rad_s * period_s),
         **sensitivity.noise_constants(certified, period_s),
         **anchor.constants_of(settings),
         **doubt.constants_of(settings, len(names)),
@@ -259,6 +258,7 @@ def new_memory(settings: Settings) -> Structured:
         **doubt.shapes_of(),
         **tail.shapes_of(channel_count),
         **sight.shapes_of(),
+        **position.shapes_of(),
         **position_evidence.shapes_of(count, waiting),
         **lost_samples.shapes_of(filter_count),
         "withheld_by": (),

@@ -24,7 +24,6 @@ from adacd_hil.scheme import (
     certified_kernel,
     certified_memory,
     earlier,
-    position_evidence,
     sight,
 )
 from adacd_hil.scheme.batch import RunsBatches
@@ -99,12 +98,11 @@ class CertifiedPipeline(RunsBatches):
     def compile(self) -> None:
         """Run every compiled function of the cycle once, on copies, so that nothing compiles later."""
         memory, block = self._memory.copy(), self._block.copy()
-        certified_kernel.begin_adaptation(self._constants, memory, False)
+        certified_kernel.begin_adaptation(self._constants, memory, False, True)
         certified_kernel.step(self._constants, memory, block, 1, 1, _WATCH | certified_kernel.LEARN)
         certified_kernel.begin_test(self._constants, memory)
         certified_kernel.begin_refinement(self._constants, memory)
         earlier.forget(memory[0])
-        position_evidence.forget(self._constants, memory)
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self._theta_ff)
         self._touch.compile()
         self._doubt.compile()
@@ -156,7 +154,7 @@ class CertifiedPipeline(RunsBatches):
             self._say(self._watch.enter(previous, state))
             self._enter(state, previous)
         elif observation & _WITHHELD and state is SchemeState.ADAPT:
-            certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+            certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload, False)
         if self._promotions[0] != self._refined:
             self._feed_forward()
         block = self._values.copy()
@@ -278,12 +276,12 @@ class CertifiedPipeline(RunsBatches):
         if cause is SchemeEvent.REVOKED:
             self._revoke()
         elif cause in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
-            position_evidence.forget(self._constants, self._memory)
             self._is_payload = self._has_certificate
             self._paper.begin_adaptation()
         elif previous is SchemeState.CERTIFY:
             self._is_payload = False
-        certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+        is_first = cause in (SchemeEvent.REVOKED, SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED)
+        certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload, is_first)
 
     def _revoke(self) -> None:
         """Take back the certificate: nothing is known of the arm, and nothing is fed forward."""
@@ -291,7 +289,6 @@ class CertifiedPipeline(RunsBatches):
         self._theta_ff = np.zeros(self._theta_ff.size)
         self._events.append(self._watch.revoke())
         earlier.forget(self._memory[0])
-        position_evidence.forget(self._constants, self._memory)
         self._paper.begin_adaptation()
 
     def _forget_if_disturbed(self, state: SchemeState) -> None:
@@ -303,7 +300,7 @@ class CertifiedPipeline(RunsBatches):
         is_disturbed = state in (SchemeState.REACT, SchemeState.STOPPED) and self._supervisor.origin in _LEARNING
         is_reported = is_disturbed and not self._touch.is_reporting
         if is_reported and not self._has_forgotten:
-            certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload)
+            certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload, False)
         self._has_forgotten = is_reported
 
     def _feed_forward(self) -> None:

@@ -180,12 +180,12 @@ def step_record(
     """
     now, begins_in = _ADAPT, -1
     is_payload = False
-    certified_kernel.begin_adaptation(constants, memory, is_payload)
+    certified_kernel.begin_adaptation(constants, memory, is_payload, True)
     for k in range(q.shape[0]):
         if k == payload_at:
             is_payload, begins_in = now == _MONITOR, 0
         if begins_in == 0:
-            certified_kernel.begin_adaptation(constants, memory, is_payload)
+            certified_kernel.begin_adaptation(constants, memory, is_payload, k == payload_at)
             now = _ADAPT
         begins_in -= 1
         block[0]["q"][:] = q[k]

@@ -25,4 +25,4 @@ class Observation(IntFlag):
     COLLISION = 512  # a joint is over its upper threshold
     OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
     UNSEEN = 2048  # the filters took no sample in: the residual is not of now
-    WITHHELD = 4096  # an anchor excludes the reading at rest, or the offsets of a model that is otherwise better
+    WITHHELD = 4096  # an anchor, a touch or a torque by place excludes what would be certified, or what is

@@ -10,7 +10,7 @@ anywhere on its own samples. The torque is what stays of it when the joint's off
 what goes with it by the belief's covariance. Where the model has no such columns `position_evidence` tells whether it
 should.
 
-Shapes: q (n,), X (n, TERMS), position_Nm (n,).
+Shapes: q (n,), X (n, TERMS), by_place_Nm (n,): the largest torque by place of the fit.
 """
 
 from typing import Any
@@ -18,12 +18,17 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import POSITION_TERMS, Vector
+from adacd_hil.records import JOINTS, POSITION_TERMS, Vector
 from adacd_hil.scheme import anchor
 
 TERMS = len(POSITION_TERMS)
 LARGEST_OF_STD = 2.5
 """The largest torque, over the standard deviation that each coefficient is expected to have."""
+
+
+def shapes_of() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    return {"by_place_Nm": (JOINTS,)}
 
 
 @compiled
@@ -39,7 +44,7 @@ def fill(q: Vector, X: Vector) -> None:
 
 
 @compiled
-def place(X: Vector, first_column: int, Y_h: Vector) -> None:
+def put_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
     """Put X (n, TERMS) into Y_h (n, p) from `first_column` on, by term and then by joint."""
     joints = X.shape[0]
     for i in range(joints):
@@ -49,28 +54,28 @@ def place(X: Vector, first_column: int, Y_h: Vector) -> None:
 
 @compiled
 def is_bounded(k: Any, m: Any) -> bool:
-    """Tell whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `position_Nm`, its largest."""
+    """Tell whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `by_place_Nm`."""
     if k["position_torque_Nm"] == 0.0:
         return True
     is_bounded = True
-    for i in range(m["position_Nm"].shape[0]):
-        m["position_Nm"][i] = _largest_Nm(k, m, i)
-        is_bounded = is_bounded and m["position_Nm"][i] <= k["position_torque_Nm"]
+    for i in range(m["by_place_Nm"].shape[0]):
+        m["by_place_Nm"][i] = _largest_Nm(k, m, i)
+        is_bounded = is_bounded and m["by_place_Nm"][i] <= k["position_torque_Nm"]
     return bool(is_bounded)
 
 
 @compiled
 def _largest_Nm(k: Any, m: Any, joint: int) -> float:
     """Return the largest torque by place of a joint over the fit's samples, its offset where the anchor says."""
-    joints, first = m["position_Nm"].shape[0], int(k["first_position"])
+    joints, first = m["by_place_Nm"].shape[0], int(k["first_position"])
     offset, largest = int(k["base"]) + joint, 0.0
     P, theta = m["P_belief"], m["belief"]
-    moved = anchor.distance(k, m, joint, theta[offset], P[offset, offset])
+    innovation = anchor.innovation(k, m, joint, theta[offset], P[offset, offset])
     for s in range(int(m["samples_kept"])):
         torque = 0.0
         for term in range(TERMS):
             j = first + term * joints + joint
-            torque += m["samples_W"][s, joint, j] * (theta[j] - P[j, offset] * moved)
+            torque += m["samples_W"][s, joint, j] * (theta[j] - P[j, offset] * innovation)
         largest = max(largest, abs(torque))
     return float(largest)
 
@@ -80,7 +85,7 @@ def describe(k: Any, m: Any) -> str:
     if k["position_torque_Nm"] == 0.0:
         return ""
     return (
-        f"; torque by place up to {_by_joint(m['position_Nm'])}, believed up to {float(k['position_torque_Nm']):g} Nm"
+        f"; torque by place up to {_by_joint(m['by_place_Nm'])}, believed up to {float(k['position_torque_Nm']):g} Nm"
     )
 
 
@@ -89,7 +94,7 @@ def describe_refused(k: Any, m: Any) -> list[str]:
     limit = float(k["position_torque_Nm"])
     return [
         f"joint {i + 1} has a torque of up to {torque:.3f} Nm that depends on where the arm is, bound {limit:g} Nm"
-        for i, torque in enumerate(m["position_Nm"].tolist())
+        for i, torque in enumerate(m["by_place_Nm"].tolist())
         if not torque <= limit
     ]
 

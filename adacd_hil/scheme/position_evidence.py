@@ -20,10 +20,11 @@ There one stretch is not enough, since on one way much depends on the place: wha
 squares that the basic model leaves in a later one.
 
 Shapes: p parameters, n joints, f = p + n TERMS; evidence_L (n, f, f): by the joint of the row, lower half; evidence_b,
-_x0, _x1 (f,); evidence_M (f, f); evidence_said (n TERMS,): coefficients of the last stretch that came to a torque by
-place, all 0 if none did; position_rms_Nm (n,); is_by_place: 1 where what is refused came to one.
+_basic, _full, _row (f,); evidence_M (f, f); evidence_said (n TERMS,): coefficients of the last stretch that came to a
+torque by place, all 0 if none did; missing_rms_Nm (n,): what was found last, 0 where nothing was.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,6 @@ from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme import bank
 from adacd_hil.scheme.position import TERMS, fill
-from adacd_hil.structured import Structured
 
 EXPECTED_NM = 0.06
 """Standard deviation of a coefficient, of an arm that has a cable."""
@@ -66,17 +66,21 @@ def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
     return {
         "X": columns, "X_old": columns, "X_f": columns, "ring_X": (waiting, *columns),
         "evidence_L": (JOINTS, full, full), "evidence_M": (full, full),
-        "evidence_b": (full,), "evidence_x0": (full,), "evidence_x1": (full,), "evidence_v": (full,),
+        "evidence_b": (full,), "evidence_basic": (full,), "evidence_full": (full,), "evidence_row": (full,),
         "evidence_said": (JOINTS * TERMS,),
         "evidence_yy": (), "evidence_weight": (JOINTS,), "evidence_ways": (JOINTS, 2),
         "evidence_samples": (), "evidence_wanted": (),
-        "position_rms_Nm": (JOINTS,), "position_Nm": (JOINTS,), "is_by_place": (),
+        "missing_rms_Nm": (JOINTS,),
     }  # fmt: skip
 
 
 @compiled
-def follow(m: Any, q: Vector, decay: float, weight_old: float, weight_new: float, is_seen: bool) -> None:
-    """Take the columns (n, TERMS) over one period through the filter that is learnt from; after a gap they resume."""
+def follow(m: Any, q: Vector, rates: Vector, is_seen: bool) -> None:
+    """Take the columns (n, TERMS) over one period through the filter that is learnt from; after a gap they resume.
+
+    rates (3,): what one period does to it, see `filters.FirstOrderHold`.
+    """
+    decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f = m["X"], m["X_old"], m["X_f"]
     fill(q, X)
     for i in range(q.shape[0]):
@@ -87,16 +91,11 @@ def follow(m: Any, q: Vector, decay: float, weight_old: float, weight_new: float
 
 
 @compiled
-def forget(constants: Structured, memory: Structured) -> None:
-    """Begin anew, from outside of a step."""
-    clear(constants[0], memory[0])
-
-
-@compiled
 def clear(k: Any, m: Any) -> None:
     """Begin anew: with another arm, as one with another payload, or with a certificate."""
     _clear_sums(m)
     m["evidence_said"][:] = 0.0
+    m["missing_rms_Nm"][:] = 0.0
     m["evidence_wanted"] = k["evidence_first"]
 
 
@@ -115,7 +114,7 @@ def add(k: Any, m: Any, slot: int, joint: int) -> None:
     """Take in the row of a joint from a slot of the ring, which is learnt; one that moves slowly tells nothing."""
     if m["ring_still"][slot, joint] > STILL:
         return
-    v, count = m["evidence_v"], m["belief"].shape[0]
+    v, count = m["evidence_row"], m["belief"].shape[0]
     R = m["ring_R"][slot, joint] + k["correlated"] * _rough_variance(k, m, joint)
     v[:] = 0.0
     v[:count] = m["ring_W"][slot, joint]
@@ -152,56 +151,75 @@ def is_found_in_time(k: Any, m: Any) -> bool:
     m["evidence_samples"] += 1.0
     if m["evidence_samples"] < m["evidence_wanted"]:
         return False
+    is_said, said = is_found(k, m), m["evidence_full"][m["belief"].shape[0] :].copy()
     is_agreed = _is_said_again(k, m)
-    if is_found(k, m):
-        m["evidence_said"][:] = m["evidence_x1"][m["belief"].shape[0] :]
+    if is_said:
+        m["evidence_said"][:] = said
     m["evidence_wanted"] = min(2.0 * m["evidence_wanted"], k["evidence_longest"])
     _clear_sums(m)
     return is_agreed
 
 
 @compiled
+def is_found(k: Any, m: Any) -> bool:
+    """Tell whether the model lacks a torque by place, by all samples there are; fill `missing_rms_Nm` (n,)."""
+    m["missing_rms_Nm"][:] = 0.0
+    if k["position_torque_Nm"] != 0.0:
+        return False
+    b, count, basic, full = m["evidence_b"], m["belief"].shape[0], m["evidence_basic"], m["evidence_full"]
+    basic[:] = 0.0
+    gain = _log_evidence(k, m, b, full.shape[0], full) - _log_evidence(k, m, b, count, basic)
+    if not (gain > GAIN and _squares_left(m, full) < (1.0 - SHARE) * _squares_left(m, basic)):
+        return False
+    largest = 0.0
+    for i in range(m["missing_rms_Nm"].shape[0]):
+        ways = m["evidence_ways"][i]
+        if np.min(ways) >= LEAST_BACK * np.sum(ways):
+            largest = max(largest, _rms_Nm(m, i))
+    if largest > LEAST_NM:
+        _fill_missing(m)
+    return bool(largest > LEAST_NM)
+
+
+@compiled
 def _is_said_again(k: Any, m: Any) -> bool:
-    """Tell whether what an earlier stretch has said explains this one."""
-    x, said, b, count = m["evidence_x0"], m["evidence_said"], m["evidence_v"], m["belief"].shape[0]
+    """Tell whether what an earlier stretch has said explains this one; fill `missing_rms_Nm` (n,)."""
+    m["missing_rms_Nm"][:] = 0.0
+    said, count, basic, full = m["evidence_said"], m["belief"].shape[0], m["evidence_basic"], m["evidence_full"]
     if k["position_torque_Nm"] != 0.0 or not np.any(said != 0.0):
         return False
+    basic[:] = 0.0
+    _log_evidence(k, m, m["evidence_b"], count, basic)
+    b = m["evidence_row"]
     b[:] = m["evidence_b"]
-    x[:] = 0.0
-    _log_evidence(k, m, b, count, x)
-    basic = _squares_left(m, x)
     for i in range(m["evidence_L"].shape[0]):
         for j in range(count):
             for n in range(said.shape[0]):
                 b[j] -= m["evidence_L"][i, count + n, j] * said[n]
-    _log_evidence(k, m, b, count, x)
-    x[count:] = said
-    explained = basic - _squares_left(m, x)
-    return bool(0.5 * explained > GAIN and explained > AGREES * basic)
+    _log_evidence(k, m, b, count, full)
+    full[count:] = said
+    left = _squares_left(m, basic)
+    explained = left - _squares_left(m, full)
+    is_agreed = 0.5 * explained > GAIN and explained > AGREES * left
+    if is_agreed:
+        _fill_missing(m)
+    return bool(is_agreed)
 
 
 @compiled
-def is_found(k: Any, m: Any) -> bool:
-    """Tell whether the model lacks a torque by place; if so fill `position_rms_Nm` (n,)."""
-    if k["position_torque_Nm"] != 0.0:
-        return False
-    count, x0, x1 = m["belief"].shape[0], m["evidence_x0"], m["evidence_x1"]
-    x0[:] = 0.0
-    b = m["evidence_b"]
-    gain = _log_evidence(k, m, b, x1.shape[0], x1) - _log_evidence(k, m, b, count, x0)
-    basic, full = _squares_left(m, x0), _squares_left(m, x1)
-    if not (gain > GAIN and full < (1.0 - SHARE) * basic):
-        return False
-    largest = 0.0
-    for j in range(x0.shape[0]):
-        x0[j] = x1[j] - x0[j]
-    for i in range(m["position_rms_Nm"].shape[0]):
-        square = _quadratic(m["evidence_L"][i], x0) / max(m["evidence_weight"][i], 1e-12)
-        m["position_rms_Nm"][i] = np.sqrt(square)
-        ways = m["evidence_ways"][i]
-        if np.min(ways) >= LEAST_BACK * np.sum(ways):
-            largest = max(largest, m["position_rms_Nm"][i])
-    return bool(largest > LEAST_NM)
+def _fill_missing(m: Any) -> None:
+    for i in range(m["missing_rms_Nm"].shape[0]):
+        m["missing_rms_Nm"][i] = _rms_Nm(m, i)
+
+
+@compiled
+def _rms_Nm(m: Any, joint: int) -> float:
+    """Return by how much the two models differ on a joint's samples."""
+    apart = m["evidence_row"]
+    for j in range(apart.shape[0]):
+        apart[j] = m["evidence_full"][j] - m["evidence_basic"][j]
+    square = _quadratic(m["evidence_L"][joint], apart)
+    return float(np.sqrt(square / max(m["evidence_weight"][joint], 1e-12)))
 
 
 @compiled
@@ -219,7 +237,7 @@ def _log_evidence(k: Any, m: Any, b: Vector, count: int, x: Vector) -> float:
             for i in range(n):
                 total -= M[j, i] * M[n, i]
             M[j, n] = total / M[n, n] if n < j else np.sqrt(max(total, 1e-12))
-        log_det += 2.0 * np.log(M[j, j])
+        log_det += 2.0 * math.log(M[j, j])
         for n in range(j):
             x[j] -= M[j, n] * x[n]
         x[j] /= M[j, j]
@@ -257,8 +275,11 @@ def _quadratic(L: Vector, x: Vector) -> float:
 
 
 def describe(m: Any) -> list[str]:
-    """Say how large the torque is that the model lacks, in one line."""
-    torques = " and ".join(f"{rms:.3f} Nm rms in joint {i + 1}" for i, rms in enumerate(m["position_rms_Nm"].tolist()))
+    """Say how large the torque is that the model lacks, in one line; none where none was found."""
+    missing_Nm = m["missing_rms_Nm"].tolist()
+    if not any(missing_Nm):
+        return []
+    torques = " and ".join(f"{rms:.3f} Nm rms in joint {i + 1}" for i, rms in enumerate(missing_Nm))
     return [
         f"a torque that depends on where the arm is, {torques}, is missing in the model: a cable, a base that is not "
         "level, or a hand's spring"

@@ -10,6 +10,7 @@ from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.config import to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log
+from adacd_hil.records import CERTIFICATE_EVENTS
 from adacd_hil.scheme import anchor
 from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
 
@@ -29,21 +30,31 @@ angle_deg = 90.0
 """
 
 
-@pytest.fixture(scope="module")
-def leant_on(tmp_path_factory) -> Path:
-    """The log of an arm that somebody leans on for the first 2 s."""
-    folder = tmp_path_factory.mktemp("leant_on")
-    (folder / "lean.toml").write_text(LEAN)
-    summary, _ = run_embedded(resolve("certified", str(folder / "lean.toml"), None, None), "lockstep", folder / "out")
+TILT = """
+lasts_s = 12.0
+
+[mechanics]
+tilt_deg = 2.0
+holding_brake_Nm = [5.0, 2.0]
+"""
+
+
+def log_of(folder: Path, scenario: str) -> Path:
+    (folder / "scenario.toml").write_text(scenario)
+    plan = resolve("certified", str(folder / "scenario.toml"), None, None)
+    summary, _ = run_embedded(plan, "lockstep", folder / "out")
     return summary.log.path
 
 
+@pytest.fixture(scope="module")
+def leant_on(tmp_path_factory) -> Path:
+    """The log of an arm that somebody leans on for the first 2 s."""
+    return log_of(tmp_path_factory.mktemp("leant_on"), LEAN)
+
+
 def events_of(path: Path) -> list[str]:
-    return [
-        name
-        for name in (logged.event.name for logged in read_log(path).events)
-        if name in ("anchor", "touch", "certificate")
-    ]
+    names = (logged.event.name for logged in read_log(path).events)
+    return [name for name in names if name in CERTIFICATE_EVENTS]
 
 
 def test_the_log_says_that_a_certificate_was_withheld_and_what_anchors_the_one_that_was_not(leant_on: Path) -> None:
@@ -51,6 +62,12 @@ def test_the_log_says_that_a_certificate_was_withheld_and_what_anchors_the_one_t
     found = replay(leant_on, script_of=ScriptedOperator)
     assert found.mismatches == ()
     assert found.is_identical
+
+
+def test_a_certificate_that_a_torque_by_place_withholds_is_withheld_again(tmp_path: Path) -> None:
+    log = log_of(tmp_path, TILT)
+    assert "position" in events_of(log)
+    assert replay(log, script_of=ScriptedOperator).is_identical
 
 
 def test_another_word_about_a_certificate_is_a_difference(leant_on: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +82,7 @@ def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
     leant_on: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (now,) = {part.said for part in LogSource(leant_on)}
-    assert now == {"margin", "anchor", "touch", "certificate", "revoked", "sight"}
+    assert now == {"margin", *CERTIFICATE_EVENTS}
     config = to_toml(LogSource(leant_on).settings).split("\n")
     before = "\n".join(line for line in config if not line.startswith("drift_Nm_sqrt_s"))
     attachments = {**read_log(leant_on).attachments, "config.toml": before.encode()}

@@ -102,6 +102,13 @@ def test_what_the_motors_hold_is_another_configurations_to_say_only_where_the_lo
     assert keep_facts(PAPER, braked).arm.holding_torque_Nm == (8.0, 4.0)
 
 
+def test_how_much_depends_on_the_place_is_another_configurations_to_say_only_where_the_log_does_not() -> None:
+    cabled = apply_settings(load_settings("certified"), {"arm.position_torque_Nm": "0.2"})
+    own = apply_settings(PAPER, {"arm.position_torque_Nm": "0.1"})
+    assert keep_facts(own, cabled).arm.position_torque_Nm == 0.1
+    assert keep_facts(PAPER, cabled).arm.position_torque_Nm == 0.2
+
+
 def test_changed_settings_are_listed_by_key_with_both_values() -> None:
     other = apply_settings(PAPER, {"filter.a_rad_s": "50", "devices.quick_stop_option": "6"})
     assert changed_keys(PAPER, other) == {

@@ -75,7 +75,7 @@ def test_a_payload_needs_neither_travel_nor_excitation_but_certain_parameters():
 
 def test_before_its_first_sample_an_arm_has_not_travelled_at_all():
     memory = certified_memory.new_memory(SETTINGS)
-    certified_kernel.begin_adaptation(CONSTANTS, memory, False)
+    certified_kernel.begin_adaptation(CONSTANTS, memory, False, True)
     lines = missing(memory[0])
     assert "joint 1 has travelled 0.0 deg of 20: move it further" in lines
     assert "joint 2 has moved at 0.0 to 0.0 deg/s, 10 both ways needed: move it back and forth" in lines

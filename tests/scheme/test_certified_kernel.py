@@ -32,7 +32,7 @@ class Kernel:
     def __init__(self, settings=SETTINGS, theta=None, P=None):
         self.constants = certified_memory.constants_of(settings)
         self.memory, self.block = certified_memory.new_memory(settings), certified_memory.new_block(settings)
-        certified_kernel.begin_adaptation(self.constants, self.memory, False)
+        certified_kernel.begin_adaptation(self.constants, self.memory, False, True)
         self.m, self.out = self.memory[0], self.block[0]
         if theta is not None:
             self.m["theta"][: len(theta)] = theta

@@ -51,7 +51,7 @@ class LossyArm:
         self.m = certified_memory.new_memory(SETTINGS)
         self.block = certified_memory.new_block(SETTINGS)
         constants = certified_memory.constants_of(SETTINGS)
-        certified_kernel.begin_adaptation(constants, self.m, False)
+        certified_kernel.begin_adaptation(constants, self.m, False, True)
         self.found, self.h, self.dq, self.still, self.roughness = [], [], [], [], []
         since, mode = 1, certified_kernel.WATCH | certified_kernel.LEARN
         for k, (q, dq, tau_J) in enumerate(zip(*measured, strict=True)):

@@ -9,7 +9,7 @@ from excited_arm import SETTINGS, TouchedLoop, play, record
 from planar_arm import THETA
 
 from adacd_hil.config import load_settings
-from adacd_hil.records import POSITION_TERMS, Request, SchemeState
+from adacd_hil.records import CERTIFICATE_EVENTS, POSITION_TERMS, Request, SchemeState
 from adacd_hil.scheme import bank, certified_kernel, certified_memory, position, position_evidence
 
 FREE = replace(SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)))
@@ -38,7 +38,7 @@ def learnt(settings, measured):
     """Let an adaptation take in a record, contacts or not; return the kernel's arrays."""
     constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
     block = certified_memory.new_block(settings)
-    certified_kernel.begin_adaptation(constants, memory, False)
+    certified_kernel.begin_adaptation(constants, memory, False, True)
     for q, dq, tau_J in zip(*measured, strict=True):
         block["q"], block["dq"], block["tau_J"], block["period_s"] = q, dq, tau_J, 0.0
         certified_kernel.step(constants, memory, block, 1, 1, certified_kernel.LEARN)
@@ -91,7 +91,7 @@ def test_only_a_torque_by_place_that_counts_is_evidence(cable_Nm, is_found):
     constants, memory = learnt(FREE, cabled(4.0, cable_Nm))
     assert position_evidence.is_found(constants[0], memory[0]) is is_found
     if is_found:
-        assert memory[0]["position_rms_Nm"] == pytest.approx((0.02, 0.02), abs=0.015)
+        assert memory[0]["missing_rms_Nm"] == pytest.approx((0.02, 0.02), abs=0.015)
         assert re.fullmatch(
             r"a torque that depends on where the arm is, 0\.0\d\d Nm rms in joint 1 and 0\.0\d\d Nm rms in joint 2, is "
             r"missing in the model: a cable, a base that is not level, or a hand's spring",
@@ -124,6 +124,7 @@ def test_an_arm_with_a_cable_is_refused_with_that_reason():
     assert said
     assert REMEDY in said[0]
     assert loop.levels("position") == ["warning"]
+    assert "position" in CERTIFICATE_EVENTS
     assert any("a torque that depends on where the arm is" in line for line in loop.pipeline.describe_withheld())
 
 

@@ -150,7 +150,7 @@ def test_a_fit_of_another_model_begins_without_a_floor():
     tailed = Tailed()
     tailed.see(0.2, 2 * BLOCK + 1)
     assert tailed.m["tail_Nm"].all()
-    certified_kernel.begin_adaptation(CONSTANTS, tailed.memory, False)
+    certified_kernel.begin_adaptation(CONSTANTS, tailed.memory, False, True)
     for name in ("peak", "peak_now", "peak_last", "tail_Nm", "block_used", "tail_s"):
         assert not tailed.m[name].any()
 

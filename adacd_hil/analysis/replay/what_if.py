@@ -109,11 +109,14 @@ def keep_facts(own: Settings, other: Settings) -> Settings:
     """Return other settings with what a log says of its arm, bus and devices, and of how time went.
 
     Signs, torque offsets, rated torques, the contract and the sample period made the numbers of the log: no
-    configuration changes them afterwards. What the motors hold without power is the arm's, if the log says it.
+    configuration changes them afterwards. What the motors hold without power, and how much torque depends on the place,
+    are the arm's, if the log says it.
     """
     facts = {name: getattr(own.arm, name) for name in _FACTS}
     if own.arm.holding_torque_Nm is not None:
         facts["holding_torque_Nm"] = own.arm.holding_torque_Nm
+    if own.arm.position_torque_Nm > 0.0:
+        facts["position_torque_Nm"] = own.arm.position_torque_Nm
     realtime = dataclasses.replace(other.realtime, sample_period=own.realtime.sample_period)
     arm = dataclasses.replace(other.arm, **facts)
     return dataclasses.replace(other, arm=arm, bus=own.bus, devices=own.devices, realtime=realtime)
