@@ -36,19 +36,17 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def other_program(source: str) -> Iterator[None]:
-    """Run a program with a raw socket `can` on vcan0 while the block lasts.
-
-    It plays a sender at a rate, and sleeps between its frames: no test waits for it to have slept.
-    """
-    opening = (
+def other_program(sends: str, every_s: float, begin: str = "") -> Iterator[None]:
+    """Run a program with a raw socket `can` on vcan0 while the block lasts: `begin`, then `sends` at a rate."""
+    program = (
         "import socket, struct, time\n"
         "can = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)\n"
         "can.bind(('vcan0',))\n"
         "def send(can_id, data): can.send(struct.pack('=IB3x8s', can_id, len(data), data))\n"
-        "print('begins', flush=True)\n"
+        f"print('begins', flush=True)\n{begin}\n"
+        f"while True:\n {sends}\n time.sleep({every_s})\n"  # the sender's rate; no test waits for it
     )
-    with subprocess.Popen([sys.executable, "-c", opening + source], stdout=subprocess.PIPE) as process:
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == b"begins\n"
@@ -88,7 +86,7 @@ def test_scan_finds_the_arm(arm: Path) -> None:
 
 
 def test_scan_sends_uploads_only_and_lists_strangers(arm: Path) -> None:
-    with other_program("while True: send(0x055, b'abc'); time.sleep(0.01)"), listening() as frames:
+    with other_program("send(0x055, b'abc')", 0.01), listening() as frames:
         scanned = command(arm, "scan", "--json")
     (stranger,) = scanned.json["others"]
     assert (stranger["id"], stranger["message"], stranger["length"]) == (0x055, "unknown", "3")
@@ -156,8 +154,7 @@ def test_doctor_passes_the_arm_and_leaves_it_pre_operational(arm: Path, tmp_path
 
 @pytest.mark.long
 def test_doctor_stops_when_another_master_is_present(arm: Path, tmp_path: Path) -> None:
-    source = "while True: send(0x080, b'\\1'); send(0x77F, b'\\5'); time.sleep(0.01)"
-    with other_program(source), listening() as frames:
+    with other_program("send(0x080, b'\\1'); send(0x77F, b'\\5')", 0.01), listening() as frames:
         done = command(tmp_path, "doctor", "--json")
     found = {check["name"]: check for check in done.json["checks"]}
     assert done.status == 1
@@ -218,12 +215,8 @@ def test_one_node_that_is_out_of_reach_is_named_by_scan_and_doctor(arm: Path, tm
 
 
 def test_monitor_shows_the_bus_and_sends_nothing(arm: Path, tmp_path: Path) -> None:
-    source = (
-        "send(0x000, b'\\1\\0')\n"
-        "k = 0\n"
-        "while True: k = k % 240 + 1; send(0x080, bytes((k,))); send(0x055, b'x'); time.sleep(0.005)"
-    )
-    with other_program(source), listening() as frames:
+    sends = "k = k % 240 + 1; send(0x080, bytes((k,))); send(0x055, b'x')"
+    with other_program(sends, 0.005, "send(0x000, b'\\1\\0'); k = 0"), listening() as frames:
         watched = command(tmp_path, "monitor", "--seconds", "1", "--json")
     messages = {row["message"]: row for row in watched.json["messages"]}
     assert watched.status == 0
@@ -237,8 +230,7 @@ def test_monitor_shows_the_bus_and_sends_nothing(arm: Path, tmp_path: Path) -> N
 @pytest.mark.long
 @pytest.mark.wallclock
 def test_monitor_survives_a_full_bus_and_ends_with_ctrl_c(tmp_path: Path) -> None:
-    flood = "while True:\n for k in range(50): send(k * 37 % 2048, bytes(8))\n time.sleep(0.005)"
-    with other_program(flood):
+    with other_program("for k in range(50): send(k * 37 % 2048, bytes(8))", 0.005):
         process = subprocess.Popen(
             [BIN / "adacd-hil", "monitor", *ON_VCAN], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -252,7 +244,7 @@ def test_monitor_survives_a_full_bus_and_ends_with_ctrl_c(tmp_path: Path) -> Non
 
 
 def test_monitor_with_json_ends_with_one_snapshot_at_ctrl_c(tmp_path: Path) -> None:
-    with other_program("while True: send(0x709, b'\\5'); time.sleep(0.01)"):
+    with other_program("send(0x709, b'\\5')", 0.01):
         process = subprocess.Popen(
             [BIN / "adacd-hil", "monitor", *ON_VCAN, "--seconds", "600", "--node", "9", "--json"],
             stdout=subprocess.PIPE,
