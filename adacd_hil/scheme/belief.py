@@ -27,10 +27,8 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme import estimator, position_evidence
+from adacd_hil.scheme import bank, estimator, friction, position_evidence, sensitivity
 
-SLOW_RAD_S = 0.02
-"""Speed below which noise decides what friction is expected."""
 _SWEEPS = 200
 """Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
 _SETTLED = 1e-9
@@ -72,14 +70,12 @@ def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
 
 
 @compiled
-def learn(k: Any, m: Any, c: int) -> bool:
-    """Put this sample into the ring, and correct the belief by the one that has waited long enough, if one has.
+def learn(k: Any, m: Any) -> bool:
+    """Put this sample, W_learnt (n, p) and tau_learnt (n,), into the ring; return whether the belief has changed.
 
-    c: the filter that is learnt from. Of what it holds, W_f (n, p) and tau_f (n,) are the sample; held (n,) is the
-    torque in it that friction may have held at standstill, Nm; still (n,) the share of standstill. Return whether the
-    belief has changed.
+    It is corrected by the sample that has waited long enough, if one has.
     """
-    W_f, tau_f, held, still = m["W_f"][c], m["tau_f"][c], m["held"][c], m["still"][c]
+    W, tau_J, still = m["W_learnt"], m["tau_learnt"], m["still_smooth"][bank.LEARNT]
     m["since_learnt"] += 1.0
     if m["since_learnt"] < k["learn_every"]:
         return False
@@ -87,7 +83,7 @@ def learn(k: Any, m: Any, c: int) -> bool:
     place = int(m["ring_next"])
     has_waited = m["ring_used"] == m["ring_tau"].shape[0]
     if has_waited:
-        for i in range(tau_f.shape[0]):
+        for i in range(tau_J.shape[0]):
             R = m["ring_R"][place, i]
             w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
             if np.inf == R:
@@ -98,15 +94,15 @@ def learn(k: Any, m: Any, c: int) -> bool:
             m["fit_rows"] += 1.0
     else:
         m["ring_used"] += 1.0
-    m["ring_W"][place] = W_f
-    m["ring_X"][place] = m["X_f"]
+    m["ring_W"][place] = W
+    m["ring_X"][place] = m["X_learnt"]
     for i in range(still.shape[0]):
-        m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > SLOW_RAD_S else 1.0
-    m["ring_tau"][place] = tau_f
+        m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > friction.SLOW_RAD_S else 1.0
+    m["ring_tau"][place] = tau_J
     if m["are_lags_held"] != 0.0:
         _take_out_lags(k, m, place)
-    for i in range(tau_f.shape[0]):
-        m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + held[i] ** 2)
+    for i in range(tau_J.shape[0]):
+        m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + sensitivity.held_Nm(m, i, still[i]) ** 2)
     m["ring_next"] = (place + 1) % m["ring_tau"].shape[0]
     return bool(has_waited)
 

@@ -91,6 +91,10 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     m["has_gap"] = 1.0
     m["W_f"][:] = 0.0
     m["tau_f"][:] = 0.0
+    m["X_f"][:] = 0.0
+    m["W_learnt"][:] = 0.0
+    m["X_learnt"][:] = 0.0
+    m["tau_learnt"][:] = 0.0
     m["history"][:] = 0.0
     m["is_payload"] = 1.0 if is_payload else 0.0
     if is_payload:
@@ -241,7 +245,7 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
             _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
     lost_samples.follow(k, m, out["dq"], max(steps, 1), period_s, is_seen)
     sensitivity.follow_torque_step(k, m, out["tau_J"])
-    if not is_seen and np.max(np.abs(out["dq"])) > belief.SLOW_RAD_S:
+    if not is_seen and np.max(np.abs(out["dq"])) > friction.SLOW_RAD_S:
         m["recovering_cycles"] = max(m["recovering_cycles"], k["settle_cycles"])
     m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
     _take_sample(k, m, out["q"], out["dq"], out["tau_J"], each_s, is_seen, out["tau_ext_wide_hat"])
@@ -291,10 +295,11 @@ def _take_sample(
         )  # fmt: skip
     else:
         bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
-    position_evidence.follow(m, q, m["rates"][:, bank.LEARNT], is_seen)
+    position_evidence.follow(m, q, m["rates"][:, bank.LEARNT], k["smoothing"], is_seen)
     bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     if k["has_cross_talk"] != 0.0:
         bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
+    bank.smooth_learnt(k["smoothing"], m["W_f"], m["tau_f"], m["W_learnt"], m["tau_learnt"])
     bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
     bank.smooth(k["smoothing"], m["r"], m["y"])
     still_rad_s, decay, smoothing = k["still_rad_s"], k["decay"], k["smoothing"]
@@ -356,16 +361,12 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
             earlier.keep_refuted(m)
     if is_touched and mode & REFINE:
         doubt.begin(k, m)
-    if not is_free:
-        belief.discard(m)
-        tail.discard(m)
-    elif mode & (TEST | REFINE):
-        tail.follow(k, m)
+    _follow_noise(k, m, is_free, mode)
     if mode & TEST:
         return _test(k, m, out["dq"])
     if mode & REFINE:
         return _refine(k, m) if is_free else 0
-    if is_free and belief.learn(k, m, bank.LEARNT):
+    if is_free and belief.learn(k, m):
         _use_belief(m)
         earlier.follow(k, m)
         fit_samples.keep(m, m["W_f"][bank.SLOW], m["tau_f"][bank.SLOW])
@@ -373,6 +374,18 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         return 0
     m["withheld_by"] = _contradicted_by(k, m)
     return _FITTED if m["withheld_by"] == NOTHING else _WITHHELD
+
+
+@compiled
+def _follow_noise(k: Any, m: Any, is_free: bool, mode: int) -> None:
+    """Take in the noise of a sample that nothing touches, or throw away what waits to be told from a contact."""
+    if not is_free:
+        belief.discard(m)
+        tail.discard(m)
+        return
+    sensitivity.keep_velocity_noise(k, m)
+    if mode & (TEST | REFINE):
+        tail.follow(k, m)
 
 
 @compiled
@@ -427,8 +440,8 @@ def _refine(k: Any, m: Any) -> int:
     sensitivity.relax(k, m)
     sight.follow(k, m)
     m["withheld_by"] = NOTHING
-    if belief.learn(k, m, bank.LEARNT):
-        belief.wander(k["drift_std"], m["W_f"][bank.LEARNT], k["period_s"] * k["learn_every"], m["P_belief"])
+    if belief.learn(k, m):
+        belief.wander(k["drift_std"], m["W_learnt"], k["period_s"] * k["learn_every"], m["P_belief"])
         if position_evidence.is_found_in_time(k, m):
             m["withheld_by"] = BY_PLACE
     if refinement.test_candidate(k, m):

@@ -182,6 +182,8 @@ def new_memory(settings: Settings) -> Structured:
         "S": (filter_count, *columns),
         "W_f": (filter_count, *columns),
         "tau_f": (filter_count, JOINTS),
+        "W_learnt": columns,
+        "tau_learnt": joint,
         "tau_old": (filter_count, JOINTS),
         "rates": (3, filter_count),
         "last": (3, JOINTS),
@@ -264,6 +266,8 @@ def new_memory(settings: Settings) -> Structured:
         "withheld_by": (),
         "dq_old": joint,
         "ddq_old": joint,
+        "roughness_now": joint,
+        "roughness_kept": joint,
         "velocity_roughness": joint,
         "unit": joint,
         "strain": joint,
@@ -280,6 +284,8 @@ def new_memory(settings: Settings) -> Structured:
     memory["has_gap"] = 1.0
     memory["last"] = np.nan
     memory["roughness"] = 1.0
+    memory["roughness_now"] = 1.0
+    memory["roughness_kept"] = 1.0
     memory["velocity_roughness"] = 1.0
     memory["unit"] = 1.0
     memory["strain"] = 1.0

@@ -30,7 +30,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
-from adacd_hil.scheme import bank, belief, sensitivity
+from adacd_hil.scheme import bank, belief, friction, sensitivity
 from adacd_hil.structured import Structured
 
 WITHIN_S = 60.0
@@ -124,8 +124,8 @@ def weigh(k: Any, m: Any) -> None:
     """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
     _follow_peak(m)
     for i in range(m["tau_f"].shape[1]):
-        if m["still"][bank.LEARNT, i] < TOLD_NOTHING and abs(m["dq_old"][i]) > belief.SLOW_RAD_S:
-            _add(k, m, i, m["W_f"][bank.LEARNT, i], m["tau_f"][bank.LEARNT, i], m["still"][bank.LEARNT, i], 1.0)
+        if m["still_smooth"][bank.LEARNT, i] < TOLD_NOTHING and abs(m["dq_old"][i]) > friction.SLOW_RAD_S:
+            _add(k, m, i, m["W_learnt"][i], m["tau_learnt"][i], m["still_smooth"][bank.LEARNT, i], 1.0)
 
 
 @compiled

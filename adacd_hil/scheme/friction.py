@@ -26,6 +26,8 @@ from adacd_hil.records import Vector
 
 STRIBECK, LOAD, ASYMMETRIC, WIDTH, DAHL_SHORT, DAHL_LONG = range(len(FRICTION_TERMS))
 
+SLOW_RAD_S = 0.02
+"""Speed below which noise decides what friction is expected."""
 SHARES = {"load": 0.25, "dahl": 0.5}
 """Of the prior of further friction, by how a term's name begins; of the others all of it."""
 

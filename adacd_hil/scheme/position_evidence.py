@@ -32,7 +32,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme import bank
+from adacd_hil.scheme import bank, sensitivity
 from adacd_hil.scheme.position import TERMS, fill
 
 EXPECTED_NM = 0.06
@@ -64,7 +64,7 @@ def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
     full = count + JOINTS * TERMS
     columns = (JOINTS, TERMS)
     return {
-        "X": columns, "X_old": columns, "X_f": columns, "ring_X": (waiting, *columns),
+        "X": columns, "X_old": columns, "X_f": columns, "X_learnt": columns, "ring_X": (waiting, *columns),
         "evidence_L": (JOINTS, full, full), "evidence_M": (full, full),
         "evidence_b": (full,), "evidence_basic": (full,), "evidence_full": (full,), "evidence_row": (full,),
         "evidence_said": (JOINTS * TERMS,),
@@ -75,19 +75,20 @@ def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
 
 
 @compiled
-def follow(m: Any, q: Vector, rates: Vector, is_seen: bool) -> None:
-    """Take the columns (n, TERMS) over one period through the filter that is learnt from; after a gap they resume.
+def follow(m: Any, q: Vector, rates: Vector, smoothing: float, is_seen: bool) -> None:
+    """Take the columns (n, TERMS) over one period to what is learnt from; after a gap the filter resumes.
 
-    rates (3,): what one period does to it, see `filters.FirstOrderHold`.
+    rates (3,): what one period does to the filter, see `filters.FirstOrderHold`; smoothing: to the pole behind it.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
-    X, X_old, X_f = m["X"], m["X_old"], m["X_f"]
+    X, X_old, X_f, X_learnt = m["X"], m["X_old"], m["X_f"], m["X_learnt"]
     fill(q, X)
     for i in range(q.shape[0]):
         for term in range(TERMS):
             if is_seen:
                 X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
             X_old[i, term] = X[i, term]
+            X_learnt[i, term] = X_f[i, term] + smoothing * (X_learnt[i, term] - X_f[i, term])
 
 
 @compiled
@@ -135,14 +136,14 @@ def add(k: Any, m: Any, slot: int, joint: int) -> None:
 
 @compiled
 def _rough_variance(k: Any, m: Any, joint: int) -> float:
-    """Return what a velocity that is noisier than the settings say leaves in the filter, Nm²: coarse encoders' steps.
+    """Return what a velocity that is noisier than the settings say leaves in what is learnt, Nm²: an encoder's steps.
 
     At low speed they come slowly, so they count as the model's error does.
     """
     total = 0.0
     for j in range(m["M"].shape[1]):
         total += (m["velocity_roughness"][j] - 1.0) * m["M"][joint, j] ** 2
-    return float((k["cutoff"][bank.LEARNT] * k["velocity_std_rad_s"]) ** 2 * total)
+    return float(sensitivity.VELOCITY_STD_SHARE**2 * k["velocity_variance"][bank.LEARNT] * total)
 
 
 @compiled

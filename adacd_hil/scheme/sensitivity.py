@@ -38,8 +38,8 @@ JUMP = 5.0
 """Deviations of the noise as which a jump counts at most."""
 CHANGES, LARGEST_STEP_NM = 50.0, 0.2
 """Changes of a torque sensor's value from which on the smallest is its step, and the largest step that is believed."""
-ROUGHNESS_S = 0.3
-"""Memory of the velocity's roughness."""
+ROUGHNESS_S, ROUGHNESS_LOST_S = 0.3, 20.0
+"""Memory of the velocity's roughness, and with which it goes back while the joint moves."""
 STRAIN = 2.0
 LARGEST_STRAIN = 8.0
 """A contact while learning doubles the thresholds, three times at most."""
@@ -63,10 +63,10 @@ UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
 UNIT_TEST_S = 0.3
 """The same while a frozen model is tested: begun with a unit of 1 it ends near a quarter of it if all is well."""
+VELOCITY_STD_SHARE = 0.12
+"""Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
 
 _SMOOTHED_SHARE = 0.335 / 200.0
-_VELOCITY_STD_SHARE = 0.12
-"""Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
 _SMOOTHED_FALL_RAD_S = 600.0
 
 
@@ -84,10 +84,11 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
         "velocity_variance": nu**2,
         "velocity_noise_rad_s": np.array(certified.velocity_noise_rad_s),
         "roughness_share": np.array(period_s / ROUGHNESS_S),
+        "roughness_loss": np.array(period_s / ROUGHNESS_LOST_S),
         "strain_share": np.array(period_s / STRAIN_S),
         "unit_share": np.array(period_s / UNIT_S),
         "unit_test_share": np.array(period_s / UNIT_TEST_S),
-        "velocity_std_rad_s": np.array(_VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
+        "velocity_std_rad_s": np.array(VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
     }
 
 
@@ -141,17 +142,33 @@ def follow_velocity_noise(k: Any, m: Any, dq: Vector, is_steady: bool) -> None:
     Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
     encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most. After a gap, or on
     the line over one (is_steady: neither), a sample only becomes the last.
+
+    It is forgotten soon, but for what is kept (`keep_velocity_noise`).
     """
     floor = (SECOND_DIFFERENCE * k["velocity_noise_rad_s"]) ** 2
     for i in range(dq.shape[0]):
         ddq = dq[i] - m["dq_old"][i]
         if is_steady and floor > 0.0:
             square = (ddq - m["ddq_old"][i]) ** 2 / floor
-            square = min(square, JUMP**2 * m["velocity_roughness"][i])
-            rough = m["velocity_roughness"][i] + k["roughness_share"] * (square - m["velocity_roughness"][i])
-            m["velocity_roughness"][i] = max(rough, 1.0)
+            square = min(square, JUMP**2 * m["roughness_now"][i])
+            now = max(m["roughness_now"][i] + k["roughness_share"] * (square - m["roughness_now"][i]), 1.0)
+            m["roughness_now"][i] = now
+            m["velocity_roughness"][i] = max(now, m["roughness_kept"][i])
         m["ddq_old"][i] = ddq
         m["dq_old"][i] = dq[i]
+
+
+@compiled
+def keep_velocity_noise(k: Any, m: Any) -> None:
+    """Keep the largest roughness (n,) of a sample that nothing touched, until motion shows less.
+
+    At rest an encoder that doesn't count shows no noise, and has it again with the first count.
+    """
+    for i in range(m["roughness_kept"].shape[0]):
+        now, kept = m["roughness_now"][i], m["roughness_kept"][i]
+        if abs(m["dq_old"][i]) > friction.SLOW_RAD_S:
+            kept -= k["roughness_loss"] * (kept - now)
+        m["roughness_kept"][i] = max(kept, now)
 
 
 @compiled
@@ -236,8 +253,13 @@ def follow_friction(k: Any, m: Any) -> None:
     for i in range(m["hold"].shape[0]):
         m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i)
         for c in range(m["held"].shape[0]):
-            share = m["still"][c, i]
-            m["held"][c, i] = m["hold"][i] * share if share < RESTING else np.inf
+            m["held"][c, i] = held_Nm(m, i, m["still"][c, i])
+
+
+@compiled
+def held_Nm(m: Any, joint: int, still: float) -> float:
+    """Return how much torque friction may hold in a filter whose memory is by `still` of standstill."""
+    return float(m["hold"][joint] * still) if still < RESTING else np.inf
 
 
 @compiled

@@ -28,8 +28,10 @@ def samples(count=400, seed=1):
 
 
 def learn(m, W_f, tau_f, held=0.0):
-    m["W_f"][bank.LEARNT], m["tau_f"][bank.LEARNT], m["held"][bank.LEARNT] = W_f, tau_f, held
-    return belief.learn(K, m, bank.LEARNT)
+    """Learn a sample in which friction may hold a torque, Nm."""
+    m["W_learnt"], m["tau_learnt"] = W_f, tau_f
+    m["hold"], m["still_smooth"][bank.LEARNT] = 10.0 * np.asarray(held), 0.1
+    return belief.learn(K, m)
 
 
 def teach(m, W_f, tau_f, held=0.0):

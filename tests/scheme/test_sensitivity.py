@@ -215,6 +215,37 @@ def test_a_coarse_encoder_raises_the_thresholds_of_all_that_its_joint_s_momentum
     assert np.all(rise > 1.5)
 
 
+def test_what_an_encoder_has_shown_in_motion_is_kept_at_rest_and_goes_back_in_motion_that_shows_less():
+    noise = np.random.default_rng(3).standard_normal((2000, 2)) * FLOOR_RAD_S
+    m = after_a_swing(noise)
+    for _ in range(2):
+        sensitivity.follow_velocity_noise(K, m, np.zeros(2), True)  # from the motion to rest: two jumps
+    seen = m["roughness_now"].copy()
+    assert np.all(seen > 3.0)
+    sensitivity.keep_velocity_noise(K, m)
+    for _ in range(3000):  # at rest
+        sensitivity.follow_velocity_noise(K, m, np.zeros(2), True)
+        sensitivity.keep_velocity_noise(K, m)
+    assert np.all(m["roughness_now"] == 1.0)
+    np.testing.assert_array_equal(m["velocity_roughness"], seen)
+    moves_s = 10.0
+    for _ in range(round(moves_s / T)):
+        m["dq_old"][0] = 0.5  # and neither noise nor a jump
+        sensitivity.keep_velocity_noise(K, m)
+    sensitivity.follow_velocity_noise(K, m, m["dq_old"].copy(), True)
+    left = 1.0 + (seen - 1.0) * np.exp([-moves_s / sensitivity.ROUGHNESS_LOST_S, 0.0])
+    np.testing.assert_allclose(m["velocity_roughness"], left, rtol=1e-2)
+
+
+def test_a_blow_s_jumps_are_not_kept():
+    m = after_a_swing(np.zeros((2000, 2)))
+    sensitivity.follow_velocity_noise(K, m, np.array([9.0, 9.0]), True)
+    assert np.all(m["velocity_roughness"] > 1.05)
+    for _ in range(600):  # while it is a contact, and after one, nothing is kept
+        sensitivity.follow_velocity_noise(K, m, np.zeros(2), True)
+    assert np.all(m["velocity_roughness"] < 1.04)
+
+
 def test_a_jump_of_the_velocity_counts_as_five_deviations_at_most():
     """Its second difference is a rise and a fall."""
     m = certified_memory.new_memory(SETTINGS)[0]
