@@ -208,7 +208,7 @@ class ArmSettings:
         unit="Nm",
         low=0.0,
         high=1000.0,
-        meaning="most that brake and friction of a motor without power hold; 0: free; absent: not known",
+        meaning="most that brake, friction and cogging of a motor without power hold; 0: free; absent: not known",
     )
     position_torque_Nm: float = setting(
         0.0,

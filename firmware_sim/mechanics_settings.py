@@ -178,8 +178,8 @@ class MechanicsSettings:
 
     @property
     def holding_torque_Nm(self) -> Pair:
-        """What the motors hold without power: their own friction and their brakes."""
-        first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, strict=True)
+        """What the motors hold without power: their own friction, their brakes and their cogging."""
+        first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
         return sum(first), sum(second)
 
     def check(self, arm: Arm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:

@@ -32,6 +32,8 @@ from adacd_hil.records import JOINTS, Vector
 REST, TARE, ACCEPTED, LAST = range(4)
 KINDS = 4
 NAMES = ("the reading at rest", "the tare", "the user's word", "the last certificate")
+_HELD = "the sensor has moved, or the motor holds more at rest than `arm.holding_torque_Nm` says"
+_MOVED = "or the sensor has moved"
 SIGMAS = 4.0
 """Two joints, two-sided: 1.3e-4 of clean arms, each time that it is asked."""
 REST_STD_NM = 0.004
@@ -148,6 +150,15 @@ def innovation(k: Any, m: Any, joint: int, offset_Nm: float, variance_Nm2: float
     return float((offset_Nm - m["anchor_Nm"][kind, joint]) / (variance_Nm2 + known))
 
 
+@compiled
+def is_excluded(m: Any, joint: int, offset_Nm: float) -> bool:
+    """Tell whether an anchor excludes another offset of a joint, by the bounds of the fit that was judged last."""
+    for kind in range(KINDS):
+        if not abs(offset_Nm - m["anchor_Nm"][kind, joint]) <= m["bound_Nm"][kind, joint]:
+            return True
+    return False
+
+
 def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
     """Let offsets (n,) that the user takes for the sensors' zero, with their deviations, replace all anchors."""
     m["anchor_std"][:] = np.inf
@@ -206,6 +217,6 @@ def describe_refused(m: Any, is_reading: bool) -> list[str]:
                 )
                 lines.append(
                     f"joint {i + 1} {what}, by {NAMES[kind]} it is {expected:.3f} ± {limit:.3f} Nm: "
-                    "somebody leans on it, or the sensor has moved"
+                    f"somebody leans on it, {_HELD if kind == REST and not is_reading else _MOVED}"
                 )
     return lines

@@ -53,6 +53,8 @@ def test_an_emulated_arm_says_what_its_motors_hold_unless_the_configuration_does
     assert resolve("certified", "idle", None, None).settings.arm.holding_torque_Nm == (0.0, 0.0)
     geared = resolve("certified", "motor-side-friction", None, None)
     assert geared.settings.arm.holding_torque_Nm == geared.scenario.mechanics.motor_coulomb_Nm != (0.0, 0.0)
+    cogging = resolve("certified", "torque-ripple", None, None)
+    assert cogging.settings.arm.holding_torque_Nm == cogging.scenario.mechanics.ripple_Nm != (0.0, 0.0)
     mine = tmp_path / "my-arm.toml"
     mine.write_text('extends = "certified"\n[arm]\nholding_torque_Nm = [8.0, 4.0]\n')
     assert resolve(str(mine), "idle", None, None).settings.arm.holding_torque_Nm == (8.0, 4.0)
