@@ -60,6 +60,8 @@ SMALLEST_SQUARE = 0.015
 STEP_S = 0.2
 STEPS = 8
 """The fit's own earlier beliefs: how far apart, and how many."""
+YOUNG_STEPS = 1
+"""The first ones are not kept: for so long a hand may have been there all the time, and nothing could tell."""
 KEPT = STEPS + 1
 """How many beliefs may be kept: the steps, and what the fit had come to in the end."""
 PAIRS = KEPT * (KEPT - 1) // 2
@@ -170,7 +172,7 @@ def forget(m: Any) -> None:
 @compiled
 def keep(m: Any) -> None:
     """Keep what the fit has come to, and how it came about, if nothing is kept yet: a touch may have begun."""
-    if m["has_kept"] == 0.0:
+    if m["has_kept"] == 0.0 and m["steps_used"] > YOUNG_STEPS:
         _keep_steps(m, int(m["steps_used"]) - 1)
         _keep(m, m["belief"], m["P_belief"], unit_of(m["fit_square"], m["fit_rows"]), 0.0)
 
@@ -191,7 +193,7 @@ def _keep_steps(m: Any, last: int) -> None:
     steps = m["steps_rows"].shape[0]
     m["kept_count"] = 0.0
     m["apart_s"], m["apart_n"] = 0.0, 1.0
-    for number in range(max(int(m["steps_used"]) - steps, 0), last + 1):
+    for number in range(max(int(m["steps_used"]) - steps, YOUNG_STEPS), last + 1):
         s = number % steps
         age_s = STEP_S * (m["steps_used"] - 1.0 - number)
         _keep(m, m["steps_theta"][s], m["steps_P"][s], unit_of(m["steps_square"][s], m["steps_rows"][s]), age_s)
@@ -330,14 +332,14 @@ def is_no_more(k: Any, m: Any) -> bool:
 
 @compiled
 def _is_leant(k: Any, m: Any, n: int, unit: float) -> bool:
-    """Tell whether an anchored offset of a kept belief is another than the fit's."""
+    """Tell whether an anchored offset of a kept belief is another than the fit's, or any that its anchor excludes."""
     joints = m["bound_Nm"].shape[1]
     first_offset = m["change"].shape[0] - joints
     for i in range(joints):
-        if not anchor.is_open(k, m, i):
-            change, limit = _compare(k, m, n, first_offset + i, unit)
-            if not abs(change) <= limit:
-                return True
+        change, limit = _compare(k, m, n, first_offset + i, unit)
+        is_another = not abs(change) <= limit
+        if is_another and (not anchor.is_open(k, m, i) or anchor.is_excluded(m, i, m["judged_Nm"][i] - change)):
+            return True
     return False
 
 

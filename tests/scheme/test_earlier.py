@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import NAMES, PERIOD_S, SETTINGS, TouchedLoop
+from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop
 from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme import certified_memory, earlier, later_samples
+from adacd_hil.scheme import anchor, certified_memory, earlier, later_samples
 from adacd_hil.scheme.certificate_watch import BY_WORD
 
 FREE = replace(
@@ -227,9 +227,9 @@ def test_what_the_prior_alone_says_judges_nothing():
 def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share, is_steady):
     compared = Compared(std=0.01)
     m = compared.m
-    m["has_kept"], m["kept"], m["steps_used"], m["steps_theta"][0] = 0.0, 0.0, 1.0, 0.1
-    m["steps_P"][0] = 0.02**2 * np.eye(len(NAMES))
-    m["steps_square"][0], m["steps_rows"][0], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
+    m["has_kept"], m["kept"], m["steps_used"], m["steps_theta"][:2] = 0.0, 0.0, 2.0, 0.1
+    m["steps_P"][:2] = 0.02**2 * np.eye(len(NAMES))
+    m["steps_square"][:2], m["steps_rows"][:2], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
     added_variance = (1.0 + later_samples.REGULAR) * 0.02**2 - 0.01**2
     m["belief"][INERTIA] += share * np.sqrt(earlier.STEADY * earlier.SMALLEST_SQUARE * added_variance)
     assert earlier.is_steady(m) is is_steady
@@ -283,7 +283,7 @@ def test_later_samples_that_come_to_another_torque_do_not_bear_the_fit_out(share
     far = np.abs(Halves().differ(0, unit)[:2]).max()
     fit.differ(0, share * earlier.LATER_NM / far * unit)
     assert earlier.is_borne_out(fit.k, fit.m) is is_borne_out
-    assert fit.m["kept_count"] == (0.0 if is_borne_out else min(steps_used, earlier.STEPS))
+    assert fit.m["kept_count"] == (0.0 if is_borne_out else min(steps_used - earlier.YOUNG_STEPS, earlier.STEPS))
     fit.m["is_payload"] = 1.0
     assert earlier.is_borne_out(fit.k, fit.m)
 
@@ -375,13 +375,38 @@ def test_what_is_kept_is_from_before_the_contact():
     loop.learn(1.1)
     m = loop.pipeline._memory[0]
     steps, of_steps = int(m["steps_used"]), m["steps_theta"].copy()
-    kept = steps
+    kept = steps - earlier.YOUNG_STEPS
     loop.lean(0, 3.0, 0.05)
     assert m["has_kept"] == 1.0
     assert m["kept_count"] == kept + 1 > 3
-    assert (m["kept"][:kept] == of_steps[:kept]).all()
+    assert (m["kept"][:kept] == of_steps[earlier.YOUNG_STEPS : steps]).all()
     friction = [abs(m["kept"][n][NAMES.index("F_c1")] - THETA["P"][5]) for n in range(kept + 1)]
     assert friction[-1] < 0.02  # what it had come to at the contact, with nothing of the lean
+
+
+def test_nothing_is_kept_of_a_fit_that_is_as_young_as_a_touch_of_its_beginning():
+    loop = HeldLoop(FREE)
+    loop.learn(0.3)
+    m = loop.pipeline._memory[0]
+    assert m["steps_used"] == 1.0
+    outputs = loop.lean(0, 5.0, 0.05)
+    assert any(output.contact is not None for output in outputs)
+    assert m["has_kept"] == 0.0
+
+
+@pytest.mark.parametrize(("offset_Nm", "is_kept"), [(0.12, True), (0.2, False)])
+def test_a_kept_belief_whose_offset_an_anchor_excludes_was_leant_on_however_wide_the_anchor_is(offset_Nm, is_kept):
+    compared = Compared()
+    m = compared.m
+    m["bound_Nm"][:] = np.inf
+    m["bound_Nm"][anchor.REST] = 0.15  # wider than `beta_Nm`
+    m["anchor_Nm"][anchor.REST] = m["judged_Nm"] = m["belief"][OFFSETS]
+    kept = m["belief"].copy()
+    kept[OFFSETS] += (offset_Nm, 0.0)
+    m["kept_count"], m["has_kept"], m["apart_n"] = 0.0, 0.0, 1.0
+    earlier._keep(m, kept, 0.01**2 * np.eye(len(NAMES)), 1.0, 1.0)
+    earlier.is_no_more(compared.k, m)
+    assert bool(m["has_kept"]) is is_kept
 
 
 def test_of_several_kept_beliefs_the_one_that_knew_the_arm_untouched_judges():
