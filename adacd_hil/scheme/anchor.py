@@ -153,10 +153,7 @@ def innovation(k: Any, m: Any, joint: int, offset_Nm: float, variance_Nm2: float
 @compiled
 def is_excluded(m: Any, joint: int, offset_Nm: float) -> bool:
     """Tell whether an anchor excludes another offset of a joint, by the bounds of the fit that was judged last."""
-    for kind in range(KINDS):
-        if not abs(offset_Nm - m["anchor_Nm"][kind, joint]) <= m["bound_Nm"][kind, joint]:
-            return True
-    return False
+    return not bool(np.all(np.abs(offset_Nm - m["anchor_Nm"][:, joint]) <= m["bound_Nm"][:, joint]))
 
 
 def accept(m: Any, offset_Nm: Vector, std_Nm: Vector) -> None:
