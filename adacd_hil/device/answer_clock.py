@@ -8,7 +8,8 @@ SYNCs have ordinals, counted by those that were sent. Of the SYNCs that are owed
 
 - the one that its alive counter says, where it has one: that counter goes by one a frame;
 - else the oldest, unless a lost frame explains it better: it comes when the device usually answers, or its position
-  fits the motion over that time and not over a shorter one. It can't answer a SYNC sooner than the device ever did.
+  fits the motion over that time and not over a shorter one. It can't answer a SYNC sooner than the device ever did, but
+  for the frames that it used to wait for and that are missing now.
 
 A frame whose counter is behind the last one's is a straggler where an answer is missing there; else somebody sends an
 old frame again.
@@ -32,11 +33,15 @@ CLEAR_RAD = 2e-4
 
 
 class AnswerClock:
-    """The answers of one device. `answered`: the ordinal of the last SYNC that was answered; None before the first."""
+    """The answers of one device.
+
+    answered: the ordinal of the last SYNC that was answered; None before the first. earliest_ns: how soon after a SYNC
+    it has answered, 0 before the first.
+    """
 
     def __init__(self) -> None:
         self.answered: int | None = None
-        self._earliest_ns = self._latest_ns = 0
+        self.earliest_ns = self._latest_ns = 0
         self._usual_count = 0
         self._is_guess = False
         self._unanswered = 0  # bit k: the SYNC k before the last answered one has no answer
@@ -52,12 +57,14 @@ class AnswerClock:
         offset_ns: int,
         step: int | None,
         position_error: Callable[[int], float] | None = None,
+        soonest_ns: int | None = None,
     ) -> int | None:
         """Return the ordinal of the SYNC that a frame answers; None when every SYNC has its answer already.
 
         newest: the last SYNC before the frame came, `offset_ns` later. step: of its alive counter since the last frame;
         None without one, and at the beginning. position_error: by how much the frame's position differs from what its
-        velocity makes of the last one, rad, if so many SYNCs lie between.
+        velocity makes of the last one, rad, if so many SYNCs lie between. soonest_ns: how soon an answer can come;
+        None: as soon as the device ever did.
         """
         answered = self.answered
         if answered is None or answered == newest - 1:
@@ -66,6 +73,9 @@ class AnswerClock:
             return newest if self._is_guess and self._is_newer(offset_ns, position_error) else None
         if step is not None:
             return min(answered + max(step, 1), newest)
+        soonest_ns = self.earliest_ns if soonest_ns is None else soonest_ns
+        if self._usual_count and offset_ns < soonest_ns - TOLERANCE_NS:
+            return answered + 1
         return newest if self._follows_lost_ones(newest - answered, offset_ns, position_error) else answered + 1
 
     def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
@@ -79,8 +89,6 @@ class AnswerClock:
 
     def _follows_lost_ones(self, owed: int, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
         """Tell whether a frame without counter answers the last SYNC, and those before it have lost their answers."""
-        if self._usual_count and offset_ns < self._earliest_ns - TOLERANCE_NS:
-            return False
         advantage_rad = 0.0 if position_error is None else position_error(1) - position_error(owed)
         if abs(advantage_rad) > CLEAR_RAD:
             return advantage_rad > 0.0
@@ -108,8 +116,8 @@ class AnswerClock:
         if ordinal != newest or self._is_guess or self._usual_count >= USUAL_ANSWERS or before is None:
             return
         if not self._usual_count:
-            self._earliest_ns = self._latest_ns = offset_ns
-        self._earliest_ns = min(self._earliest_ns, offset_ns)
+            self.earliest_ns = self._latest_ns = offset_ns
+        self.earliest_ns = min(self.earliest_ns, offset_ns)
         self._latest_ns = max(self._latest_ns, offset_ns)
         self._usual_count += 1
 

@@ -205,10 +205,11 @@ class Arm:
         device, clock, data = self.devices[place], self._clocks[place], frame.data
         offset_ns = frame.t_ns - self._sync_ns[newest % KEPT]
         step = device.end_to_end.step_of(data)
-        error = None
+        error = soonest_ns = None
         if place < JOINTS and clock.answered != newest - 1:  # the motion tells how many periods lie before the frame
             error = partial(self.drives[place].position_error, data)
-        ordinal = None if step == 0 else clock.find(newest, offset_ns, step, error)
+            soonest_ns = self._soonest_ns(place)
+        ordinal = None if step == 0 else clock.find(newest, offset_ns, step, error, soonest_ns)
         if ordinal is None:
             self._refuse(frame, take, place, step, is_second=clock.answered is not None and clock.answered >= newest)
             return
@@ -229,6 +230,11 @@ class Arm:
             clock.pass_by(newest)  # the device has begun anew, so that its counter says nothing of before
         elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
+
+    def _soonest_ns(self, place: int) -> int:
+        """Return how soon a device can answer this SYNC: as the first of those whose frames are not in."""
+        places = (bit for bit in range(len(self._clocks)) if bit == place or not self._seen >> bit & 1)
+        return min(self._clocks[bit].earliest_ns for bit in places)
 
     def _refuse(self, frame: Frame, take: _Take, place: int, step: int | None, is_second: bool) -> None:
         """Judge a frame that answers no SYNC; its values are not used.

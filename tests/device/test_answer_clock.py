@@ -69,6 +69,14 @@ def test_a_position_that_fits_does_not_make_an_answer_come_before_it_can() -> No
     assert settled().find(LAST + 2, USUAL_NS - 200_000, None, lambda assumed: abs(2 - assumed) * 1e-3) == LAST + 1
 
 
+@pytest.mark.parametrize(("sooner_ns", "answers"), [(49_000, LAST + 2), (51_000, LAST + 1)])
+def test_where_the_frame_before_it_is_lost_an_answer_comes_as_soon_as_that_one_would_have(
+    sooner_ns: int, answers: int
+) -> None:
+    before_ns = USUAL_NS - 120_000
+    assert settled().find(LAST + 2, before_ns - sooner_ns, None, soonest_ns=before_ns) == answers
+
+
 def test_a_second_frame_on_a_sync_answers_nothing() -> None:
     clock = settled(is_counted=True)
     assert clock.find(LAST, 2 * USUAL_NS, 1) is None
