@@ -411,5 +411,5 @@ class Event(NamedTuple):
     message: str
 
 
-CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "position", "certificate", "revoked", "sight"))
+CERTIFICATE_EVENTS: Final = frozenset(("anchor", "touch", "position", "elastic", "certificate", "revoked", "sight"))
 """Names of what the scheme says of its certificates: the user is told as it happens, and a replay must say it again."""

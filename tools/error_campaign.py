@@ -33,6 +33,7 @@ from adacd_hil.scheme import certified_memory, loop
 from adacd_hil.scheme.bank import channels_of, step_response
 from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.sensitivity import AGREES
+from firmware_sim.arms import Arm
 from firmware_sim.mechanics_settings import MechanicsSettings
 from firmware_sim.sensor_settings import SensorSettings
 
@@ -46,10 +47,12 @@ APART = 300
 MOVING_RAD_S = 0.02
 STEPS_NM = (0.1, 0.3, 1.0)
 CABLE_NM = 0.1
+ELASTIC_DAMPING, ROTOR_KG_M2 = 0.02, (0.05, 0.01)
 
 
-def mechanics_of(error: str, coulomb_Nm: Array) -> MechanicsSettings:
+def mechanics_of(error: str, arm: Arm) -> MechanicsSettings:
     """Return what the error named does to the arm; the rigid plant where it is another's."""
+    coulomb_Nm, inertia = np.array(arm.coulomb_Nm), arm.theta()[[0, 2]]
 
     def pair(values: Array) -> tuple[float, float]:
         return float(values[0]), float(values[1])
@@ -60,6 +63,14 @@ def mechanics_of(error: str, coulomb_Nm: Array) -> MechanicsSettings:
             static_Nm=pair(1.5 * coulomb_Nm), sigma0_Nm_rad=sigma0, sigma1_Nm_s=pair(1e-3 * np.array(sigma0))
         )
 
+    def elastic(swing_Hz: float) -> MechanicsSettings:
+        rad_s = 2.0 * np.pi * swing_Hz
+        return MechanicsSettings(
+            stiffness_Nm_rad=pair(rad_s**2 * inertia),
+            damping_Nm_s=pair(2.0 * ELASTIC_DAMPING * rad_s * inertia),
+            rotor_inertia_kg_m2=ROTOR_KG_M2,
+        )
+
     made = {
         "lugre 1 mrad": lugre(1e-3),
         "lugre 4 mrad": lugre(4e-3),
@@ -68,6 +79,8 @@ def mechanics_of(error: str, coulomb_Nm: Array) -> MechanicsSettings:
         "tilt 0.5 deg": MechanicsSettings(tilt_deg=0.5, holding_brake_Nm=(5.0, 2.0)),
         "tilt 1 deg": MechanicsSettings(tilt_deg=1.0, holding_brake_Nm=(5.0, 2.0)),
         "ripple 0.05 Nm": MechanicsSettings(ripple_Nm=(0.05, 0.05)),
+        "elastic 8 Hz": elastic(8.0),
+        "elastic 25 Hz": elastic(25.0),
     }
     return made.get(error, MechanicsSettings())
 
@@ -82,7 +95,7 @@ SENSORS = {
 }
 ERRORS = (
     "clean", "lugre 1 mrad", "lugre 4 mrad", "load 6 %", "stribeck x 2", "tilt 0.5 deg", "tilt 1 deg", "ripple 0.05 Nm",
-    *SENSORS, "cable 0.1 Nm sin q",
+    *SENSORS, "cable 0.1 Nm sin q", "elastic 8 Hz", "elastic 25 Hz",
 )  # fmt: skip
 
 
@@ -164,7 +177,7 @@ def play(case: Case, minutes: float, position_torque_Nm: float = 0.0) -> Played:
     base = profile_arm(case.profile)
     arm = replace(
         base,
-        own_mechanics=mechanics_of(case.error, np.array(base.arm.coulomb_Nm)),
+        own_mechanics=mechanics_of(case.error, base.arm),
         sensors=SENSORS.get(case.error, SensorSettings()),
     )
     motion, loaded_at = motion_of(case.seed, minutes, case.kg > 0.0)

@@ -27,7 +27,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme import bank, estimator, friction, position_evidence, sensitivity
+from adacd_hil.scheme import bank, estimator, friction, missing_torque, sensitivity
 
 _SWEEPS = 200
 """Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
@@ -88,14 +88,14 @@ def learn(k: Any, m: Any) -> bool:
             w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
             if np.inf == R:
                 continue
-            position_evidence.add(k, m, place, i)
+            missing_torque.add(k, m, place, i)
             epsilon, s = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
             m["fit_square"] += epsilon * epsilon / (s - R + R / k["correlated"])
             m["fit_rows"] += 1.0
     else:
         m["ring_used"] += 1.0
     m["ring_W"][place] = W
-    m["ring_X"][place] = m["X_learnt"]
+    missing_torque.keep(k, m, place)
     for i in range(still.shape[0]):
         m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > friction.SLOW_RAD_S else 1.0
     m["ring_tau"][place] = tau_J

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
-from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate, position, position_evidence, sight
+from adacd_hil.scheme import anchor, certified_kernel, earlier, last_certificate, missing_torque, position, sight, tail
 from adacd_hil.scheme.doubt import Verdict
 from adacd_hil.scheme.last_certificate import Certificate
 from adacd_hil.structured import Structured
@@ -33,6 +33,7 @@ class _Cause(Enum):
     CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
     MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
     BY_PLACE = "position", _BEGINS_ANEW, _POSITION_REMEDY
+    ELASTIC = "elastic", _BEGINS_ANEW, "the model needs encoders on the links, or stiffer joints"
     TOO_MUCH_BY_PLACE = "position", _BEGINS_ANEW, "who holds the arm shall let go, or that bound is too small"
     MORE_THAN_LAST = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
 
@@ -43,6 +44,7 @@ _CAUSES = {
     certified_kernel.MORE: _Cause.MORE,
     certified_kernel.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
     certified_kernel.BY_PLACE: _Cause.BY_PLACE,
+    certified_kernel.ELASTIC: _Cause.ELASTIC,
     certified_kernel.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
 }
 
@@ -98,9 +100,9 @@ class CertificateWatch:
         known_by, self._vouched_against = self._known_by(), ""
         level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
         by_place = position.describe(self._constants, self._memory)
-        text = f"{anchor.describe(self._constants, self._memory)}; {sight.describe(self._memory)}; {known_by}{by_place}"
+        k, m = self._constants, self._memory
+        text = f"{anchor.describe(k, m)}; {sight.describe(m)}; {tail.describe(k, m)}; {known_by}{by_place}"
         self._is_standing = True
-        m = self._memory
         self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
         return Event(level, "certificate", text)
 
@@ -163,13 +165,13 @@ class CertificateWatch:
             case _Cause.READING:
                 lines = anchor.describe_refused(m, is_reading=True)
             case _Cause.ANCHOR:
-                lines = [*anchor.describe_refused(m, is_reading=False), *position_evidence.describe(m)]
+                lines = [*anchor.describe_refused(m, is_reading=False), *missing_torque.describe(m)]
             case _Cause.CHANGED:
                 lines = [_CHANGED]
             case _Cause.MORE:
-                lines = [*earlier.describe_more(k, m), *position_evidence.describe(m)]
-            case _Cause.BY_PLACE:
-                lines = position_evidence.describe(m)
+                lines = [*earlier.describe_more(k, m), *missing_torque.describe(m)]
+            case _Cause.BY_PLACE | _Cause.ELASTIC:
+                lines = missing_torque.describe(m)
             case _Cause.TOO_MUCH_BY_PLACE:
                 lines = position.describe_refused(k, m)
             case _Cause.MORE_THAN_LAST:

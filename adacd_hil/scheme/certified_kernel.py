@@ -34,8 +34,8 @@ from adacd_hil.scheme import (
     friction,
     last_certificate,
     lost_samples,
+    missing_torque,
     position,
-    position_evidence,
     refinement,
     regressor,
     sensitivity,
@@ -56,7 +56,7 @@ REFINE = 16  # correct the belief, and let its mean take over after a test
 WEIGH = 32  # weigh what a contact of the certified model looks like
 
 # What contradicts a certificate that is withheld, or taken back.
-NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE = range(7)
+NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, ELASTIC = range(8)
 
 _NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
 _OVER_LIMIT = int(Observation.OVER_LIMIT)
@@ -87,7 +87,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     """
     k, m = constants[0], memory[0]
     if is_first:
-        position_evidence.clear(k, m)
+        missing_torque.clear(k, m)
     m["has_gap"] = 1.0
     m["W_f"][:] = 0.0
     m["tau_f"][:] = 0.0
@@ -145,7 +145,7 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
     m["P_certified"][:] = m["P"]
     belief.hold_lags(k, m)
     earlier.forget(m)
-    position_evidence.clear(k, m)
+    missing_torque.clear(k, m)
     refinement.restart(m)
 
 
@@ -295,7 +295,7 @@ def _take_sample(
         )  # fmt: skip
     else:
         bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
-    position_evidence.follow(m, q, m["rates"][:, bank.LEARNT], k["smoothing"], is_seen)
+    missing_torque.follow(m, q, m["rates"][:, bank.LEARNT], k["smoothing"], is_seen)
     bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     if k["has_cross_talk"] != 0.0:
         bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
@@ -399,10 +399,19 @@ def _contradicted_by(k: Any, m: Any) -> int:
     elif not earlier.is_no_more(k, m):
         cause = MORE
     if cause != NOTHING:
-        return BY_PLACE if position_evidence.is_found(k, m) and cause == CHANGED else cause
+        missing = _missing(k, m)
+        return missing if missing != NOTHING and cause == CHANGED else cause
     if not position.is_bounded(k, m):
         return TOO_MUCH_BY_PLACE
     return NOTHING if last_certificate.is_no_more(k, m) else MORE_THAN_LAST
+
+
+@compiled
+def _missing(k: Any, m: Any) -> int:
+    """Return what the model lacks, by what this adaptation has learnt."""
+    if not missing_torque.is_found(k, m):
+        return NOTHING
+    return ELASTIC if m["is_elastic"] != 0.0 else BY_PLACE
 
 
 @compiled
@@ -419,7 +428,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     for i in range(dq.shape[0]):
         if not (abs(m["r"][bank.SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
-            m["withheld_by"] = BY_PLACE if position_evidence.is_found(k, m) else NOTHING
+            m["withheld_by"] = _missing(k, m)
             return _REFUTED if m["withheld_by"] == NOTHING else _REFUTED | _WITHHELD
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
         has_moved = has_moved and fastest >= k["velocity_rad_s"]
@@ -429,7 +438,7 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     if anchor.is_within(k, m, m["theta"], m["P"]):
         return _CERTIFIED
     m["withheld_by"] = ANCHOR
-    position_evidence.is_found(k, m)
+    missing_torque.is_found(k, m)
     return _REFUTED | _WITHHELD
 
 
@@ -442,7 +451,7 @@ def _refine(k: Any, m: Any) -> int:
     m["withheld_by"] = NOTHING
     if belief.learn(k, m):
         belief.wander(k["drift_std"], m["W_learnt"], k["period_s"] * k["learn_every"], m["P_belief"])
-        if position_evidence.is_found_in_time(k, m):
+        if missing_torque.is_found_in_time(k, m):
             m["withheld_by"] = BY_PLACE
     if refinement.test_candidate(k, m):
         m["withheld_by"] = ANCHOR

@@ -22,8 +22,8 @@ from adacd_hil.scheme import (
     friction,
     last_certificate,
     lost_samples,
+    missing_torque,
     position,
-    position_evidence,
     sensitivity,
     sight,
     tail,
@@ -151,7 +151,7 @@ def constants_of(settings: Settings) -> Structured:
         **last_certificate.constants_of(settings),
         **tail.constants_of(settings),
         **sight.constants_of(settings),
-        **position_evidence.constants_of(settings, prior_std_of(settings)),
+        **missing_torque.constants_of(settings, prior_std_of(settings)),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
         "noise_sigmas": certified.noise_sigmas,
@@ -261,7 +261,7 @@ def new_memory(settings: Settings) -> Structured:
         **tail.shapes_of(channel_count),
         **sight.shapes_of(),
         **position.shapes_of(),
-        **position_evidence.shapes_of(count, waiting),
+        **missing_torque.shapes_of(count, waiting),
         **lost_samples.shapes_of(filter_count),
         "withheld_by": (),
         "dq_old": joint,
@@ -295,7 +295,7 @@ def new_memory(settings: Settings) -> Structured:
     belief.begin(prior, prior_std, state["theta"], state["P"])
     constants = constants_of(settings)[0]
     anchor.begin(constants, state)
-    position_evidence.clear(constants, state)
+    missing_torque.clear(constants, state)
     last_certificate.begin(constants, state)
     return memory
 

@@ -7,7 +7,7 @@ They are in the model only where `arm.position_torque_Nm` says that the arm has 
 hand's spring that is held from before the start looks the same, and so does a lean to some extent: over a short way a
 cosine is a constant. So a fit gets no certificate while the torque that it gives to its place is more than that
 anywhere on its own samples. The torque is what stays of it when the joint's offset is put where its anchor says, with
-what goes with it by the belief's covariance. Where the model has no such columns `position_evidence` tells whether it
+what goes with it by the belief's covariance. Where the model has no such columns `missing_torque` tells whether it
 should.
 
 Shapes: q (n,), X (n, TERMS), by_place_Nm (n,): the largest torque by place of the fit.

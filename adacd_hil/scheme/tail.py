@@ -23,8 +23,11 @@ from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme import bank, sensitivity
 
-RATE_HZ = 1.0 / 3600.0
+HOUR_S = 3600.0
+RATE_HZ = 1.0 / HOUR_S
 """Excursions over the floor that are expected: one an hour."""
+RULE_OF_THREE = 3.0
+"""Of none in T seconds: at 95 % at most 3 / T."""
 LARGEST = 3.0
 FORGOTTEN_S = 600.0
 BLOCK_S = 0.064
@@ -97,7 +100,22 @@ def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> flo
     if not largest_share > 0.0:
         return 0.0
     seen = max(excursions_Hz * max(seen_s, 1.0), 1.01)
-    return float(3600.0 * excursions_Hz * seen ** (-1.0 / largest_share**2))
+    return float(HOUR_S * excursions_Hz * seen ** (-1.0 / largest_share**2))
+
+
+def describe(k: Any, m: Any) -> str:
+    """Say what the residuals seen so far let expect of false alarms: by counting alone, and by a Gaussian tail."""
+    seen_s = max(float(m["tail_s"]), float(k["block_cycles"] * k["period_s"]))
+    shares = m["peak"] / np.maximum(np.maximum(m["h_model"], m["tail_Nm"]), 1e-12)
+    rates_per_h = [
+        rate_per_h(float(nu_Hz), seen_s, share)
+        for nu_Hz, joints in zip(k["excursions_Hz"], shares.tolist(), strict=True)
+        for share in joints
+    ]
+    return (
+        f"false alarms per hour: at most {RULE_OF_THREE * HOUR_S / seen_s:.0f} by counting the {seen_s:.2f} s of the "
+        f"test alone, at 95 %, {sum(rates_per_h):.1g} if residuals have the tail of a Gaussian"
+    )
 
 
 @compiled

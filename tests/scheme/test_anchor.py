@@ -10,7 +10,7 @@ from long_cases import long_but
 from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme import anchor, certified_memory, sight
+from adacd_hil.scheme import anchor, certified_memory, sight, tail
 from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
 
@@ -80,9 +80,10 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
     loop.tau_ext[0] = 0.5
     loop.run_until(SchemeState.MONITOR)
     assert abs(loop.offset_error_Nm[0]) > 0.4
+    constants, memory = loop.pipeline._constants[0], loop.pipeline._memory[0]
     assert loop.said("certificate") == [
         f"torque offsets anchored: joint 1 {NOT_AT_ALL}; joint 2 {NOT_AT_ALL}; "
-        f"{sight.describe(loop.pipeline._memory[0])}; {THIS_RUN_ONLY}"
+        f"{sight.describe(memory)}; {tail.describe(constants, memory)}; {THIS_RUN_ONLY}"
     ]
     assert loop.levels("certificate") == ["warning"]
 

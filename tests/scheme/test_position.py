@@ -10,7 +10,7 @@ from planar_arm import THETA
 
 from adacd_hil.config import load_settings
 from adacd_hil.records import CERTIFICATE_EVENTS, POSITION_TERMS, Request, SchemeState
-from adacd_hil.scheme import bank, certified_kernel, certified_memory, position, position_evidence
+from adacd_hil.scheme import bank, certified_kernel, certified_memory, missing_torque, position
 
 FREE = replace(SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)))
 TOLD = replace(FREE, arm=replace(FREE.arm, position_torque_Nm=0.15))
@@ -73,29 +73,31 @@ def test_the_evidence_is_that_of_a_dense_gaussian_model():
     k, m = constants[0], memory[0]
     lower = m["evidence_L"].sum(axis=0)
     L = lower + np.tril(lower, -1).T
-    S, b = np.diag(k["evidence_std"]), m["evidence_b"]
-    for count in (len(m["belief"]), len(b)):
-        s = S[:count, :count]
-        M = np.eye(count) + s @ L[:count, :count] @ s
+    b, count = m["evidence_b"], len(m["belief"])
+    for first, last in ((0, 0), (count, len(b)), (count, len(b) - 2), (len(b) - 2, len(b))):
+        columns = np.r_[0:count, first:last]
+        s = np.diag(k["evidence_std"][columns])
+        M = np.eye(len(columns)) + s @ L[np.ix_(columns, columns)] @ s
         x = np.zeros(len(b))
-        found = position_evidence._log_evidence(k, m, b, count, x)
-        expected = 0.5 * (s @ b[:count] @ np.linalg.solve(M, s @ b[:count]) - np.linalg.slogdet(M)[1])
+        found = missing_torque._log_evidence(m, b, missing_torque._scale_of(k, m, first, last), x)
+        expected = 0.5 * (s @ b[columns] @ np.linalg.solve(M, s @ b[columns]) - np.linalg.slogdet(M)[1])
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
-        assert x[:count] == pytest.approx(s @ np.linalg.solve(M, s @ b[:count]), rel=1e-6, abs=1e-9)
+        assert x[columns] == pytest.approx(s @ np.linalg.solve(M, s @ b[columns]), rel=1e-6, abs=1e-9)
+        assert np.count_nonzero(np.delete(x, columns)) == 0
         left = m["evidence_yy"] - 2.0 * x @ b + x @ L @ x
-        assert position_evidence._squares_left(m, x) == pytest.approx(left, rel=1e-6)
+        assert missing_torque._squares_left(m, x) == pytest.approx(left, rel=1e-6)
 
 
 @pytest.mark.parametrize(("cable_Nm", "is_found"), [(0.0, False), (0.005, False), (CABLE_NM, True)])
 def test_only_a_torque_by_place_that_counts_is_evidence(cable_Nm, is_found):
     constants, memory = learnt(FREE, cabled(4.0, cable_Nm))
-    assert position_evidence.is_found(constants[0], memory[0]) is is_found
+    assert missing_torque.is_found(constants[0], memory[0]) is is_found
     if is_found:
         assert memory[0]["missing_rms_Nm"] == pytest.approx((0.02, 0.02), abs=0.015)
         assert re.fullmatch(
             r"a torque that depends on where the arm is, 0\.0\d\d Nm rms in joint 1 and 0\.0\d\d Nm rms in joint 2, is "
             r"missing in the model: a cable, a base that is not level, or a hand's spring",
-            *position_evidence.describe(memory[0]),
+            *missing_torque.describe(memory[0]),
         )
 
 

@@ -188,3 +188,17 @@ def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
     go_on(kernel, "REFINE", RECOVER + 3 * BLOCK, 0.005)
     assert kernel.m["recovering_cycles"] == 0.0
     np.testing.assert_allclose(kernel.m["peak"], before, rtol=0.02)
+
+
+def test_a_certificate_says_what_counting_and_what_a_gaussian_tail_let_expect_of_false_alarms():
+    memory = certified_memory.new_memory(SETTINGS)[0]
+    memory["tail_s"] = 0.5
+    memory["h_model"][:] = MODEL_NM
+    memory["peak"][:] = 0.0
+    nothing_seen = tail.describe(K, memory)
+    memory["peak"][1] = 0.4 * MODEL_NM, 0.5 * MODEL_NM
+    memory["tail_Nm"][1, 1] = 1.25 * MODEL_NM  # where the floor is the threshold in force, it is what counts
+    expected = 2.0 * tail.rate_per_h(NU_HZ[1], 0.5, 0.4)
+    said = "false alarms per hour: at most 21600 by counting the 0.50 s of the test alone, at 95 %, "
+    assert nothing_seen == said + "0 if residuals have the tail of a Gaussian"
+    assert tail.describe(K, memory) == said + f"{expected:.1g} if residuals have the tail of a Gaussian"

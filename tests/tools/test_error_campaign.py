@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_sim.arms import ARMS
 from firmware_sim.mechanics_settings import MechanicsSettings
 from firmware_sim.sensor_settings import SensorSettings
 
@@ -50,9 +51,8 @@ def test_onsets_are_on_a_grid_where_nothing_else_happens_in_time():
 
 
 def test_every_error_is_one():
-    coulomb_Nm = np.array([0.15, 0.08])
     for error in ERRORS:
-        is_mechanical = mechanics_of(error, coulomb_Nm) != MechanicsSettings()
+        is_mechanical = mechanics_of(error, ARMS["P"]) != MechanicsSettings()
         is_measured = SENSORS.get(error, SensorSettings()) != SensorSettings()
         assert (is_mechanical or is_measured) == (error not in ("clean", "cable 0.1 Nm sin q")), error
 
