@@ -8,10 +8,12 @@ from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.arm_drawing import Push, draw_arm
 from adacd_hil.analysis.report.bounds import CONTACTS
-from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
+from adacd_hil.analysis.report.page import Cell, make_table
 from adacd_hil.analysis.report.words import (
+    NONE,
     contact_rows,
     left_out_text,
+    number_text,
     scaled,
     shown_contacts,
     signs_text,

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 from urllib.parse import quote
 
-from adacd_hil.analysis.report.page import NONE, Cell, document, heading, make_table
+from adacd_hil.analysis.report.page import Cell, document, heading, make_table
 from adacd_hil.analysis.report.report import Report
+from adacd_hil.analysis.report.words import NONE
 
 INDEX_NAME: Final = "index.html"
 

@@ -7,7 +7,6 @@ light one.
 
 import hashlib
 import json
-import math
 import re
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
@@ -17,7 +16,6 @@ from typing import Final
 
 from adacd_hil.analysis.drawing import Drawing
 
-NONE: Final = "–"
 _UNIT: Final = re.compile(r"(?<=\d) (?=(?:s|kg|%)(?!\w))")
 """The space between a number and its unit, where a line must not end."""
 
@@ -65,14 +63,6 @@ def json_block(name: str, value: object) -> str:
     """Write a value that a script reads, whatever texts are in it."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return data_block(name, text.replace("<", "\\u003c"), "application/json")
-
-
-def number_text(value: float | None, digits: int, unit: str = "") -> str:
-    """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
-    if value is None or not math.isfinite(value):
-        return NONE
-    text = f"{value:.{digits}f}".replace("-", "−")
-    return f"{text} {unit}" if unit else text
 
 
 def heading(over: str, title: str, problems: Iterable[str], is_good: bool) -> str:

@@ -11,7 +11,7 @@ from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.contacts_page import contact_cards, contacts_table
 from adacd_hil.analysis.report.definitions import definitions
-from adacd_hil.analysis.report.page import NONE, document, embed, heading, number_text, wrap_section
+from adacd_hil.analysis.report.page import document, embed, heading, wrap_section
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.tables import (
     data_table,
@@ -26,7 +26,7 @@ from adacd_hil.analysis.report.tables import (
 from adacd_hil.analysis.report.timeline import timeline
 from adacd_hil.analysis.report.timing_page import timing_section
 from adacd_hil.analysis.report.traces_page import SCRIPTS, STYLES, traces_section
-from adacd_hil.analysis.report.words import has_paper, stretch_text
+from adacd_hil.analysis.report.words import NONE, has_paper, number_text, stretch_text
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.verdict import LISTED
 

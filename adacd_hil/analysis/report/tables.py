@@ -10,9 +10,17 @@ from adacd_hil.analysis.cyclic_data import percent_text
 from adacd_hil.analysis.evidence import ChannelMargin, Evidence
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import ADAPTATIONS, SECTIONS
-from adacd_hil.analysis.report.page import NONE, Cell, make_table, number_text
+from adacd_hil.analysis.report.page import Cell, make_table
 from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.report.words import pair_text, paper_cells, paper_head, signed_text, stretch_text
+from adacd_hil.analysis.report.words import (
+    NONE,
+    number_text,
+    pair_text,
+    paper_cells,
+    paper_head,
+    signed_text,
+    stretch_text,
+)
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.untouched import Residual
 from adacd_hil.records import PARAMETER_UNITS

@@ -13,7 +13,7 @@ import numpy as np
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import MARKS
-from adacd_hil.analysis.report.page import number_text
+from adacd_hil.analysis.report.words import number_text
 from adacd_hil.analysis.run import Run
 from adacd_hil.records import SchemeState
 

@@ -6,7 +6,8 @@ from typing import Final
 
 from adacd_hil.analysis.drawing import Drawing
 from adacd_hil.analysis.histogram import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
-from adacd_hil.analysis.report.page import NONE, Cell, embed, make_table, number_text, wrap_section
+from adacd_hil.analysis.report.page import Cell, embed, make_table, wrap_section
+from adacd_hil.analysis.report.words import NONE, number_text
 from adacd_hil.analysis.timing import OLDEST_CYCLES, QUANTITIES, Quantity, TimingEvidence
 
 _ABSENT: Final = "not in this log"

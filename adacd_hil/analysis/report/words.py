@@ -6,8 +6,17 @@ from typing import Final
 
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
-from adacd_hil.analysis.report.page import NONE, number_text
 from adacd_hil.analysis.run import StretchOfRun
+
+NONE: Final = "–"
+
+
+def number_text(value: float | None, digits: int, unit: str = "") -> str:
+    """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    text = f"{value:.{digits}f}".replace("-", "−")
+    return f"{text} {unit}" if unit else text
 
 
 def pair_text(values: Sequence[float] | None, digits: int) -> str:
