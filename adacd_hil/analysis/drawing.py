@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -101,6 +101,13 @@ def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
     return mpl.rc_context({**mpl.rcParamsDefault, **_STYLE, **(more or {}), "backend": mpl.rcParams["backend"]})
 
 
+class SvgFragment(NamedTuple):
+    """What is within an `svg` element, as markup, and the element's view box."""
+
+    view_box: str
+    shapes: str
+
+
 @dataclass(frozen=True)
 class Drawing:
     """A figure with its name, its title and one sentence that says what to see."""
@@ -119,7 +126,7 @@ class Drawing:
             canvas.print_png(out, metadata={"Software": None})
         return out.getvalue()
 
-    def svg(self) -> str:
+    def svg(self) -> SvgFragment:
         """Render a fragment for a page, see the module's first lines. Its ids begin with the figure's name."""
         out = io.StringIO()
         with style({"svg.hashsalt": self.name}):
@@ -127,7 +134,7 @@ class Drawing:
             self.figure.patch.set_visible(False)
             canvas.print_svg(out)
             self.figure.patch.set_visible(True)
-        return _fragment(out.getvalue(), self.name, f"{self.title}. {self.caption}")
+        return _fragment(out.getvalue(), self.name)
 
 
 _SUPERSCRIPTS: Final = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -212,7 +219,7 @@ _USE: Final = re.compile(r'(?:xlink:)?href="#([^"]*)"')
 _URL: Final = re.compile(r"url\(#([^)]*)\)")
 
 
-def _fragment(text: str, name: str, description: str) -> str:
+def _fragment(text: str, name: str) -> SvgFragment:
     """Turn matplotlib's file into a fragment: attributes for styles, variables for colours, ids of its own."""
     head = _HEAD.match(text)
     assert head is not None
@@ -224,8 +231,7 @@ def _fragment(text: str, name: str, description: str) -> str:
     body = _URL.sub(lambda m: f"url(#{name}-{m[1]})", body)
     body = _COLOUR.sub(lambda m: _VARIABLES.get(m[0], m[0]), body)
     body = re.sub(r"\n\s*", "\n", body)
-    label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
-    return f'<svg viewBox="{head[1]}" role="img" aria-label="{label}">{body.strip()}'
+    return SvgFragment(head[1], body.strip().removesuffix("</svg>"))
 
 
 def _attributes(match: re.Match[str]) -> str:

@@ -146,8 +146,8 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     Returns what was written, the page first; nothing without a cycle. Raises LogError when it can't be written.
     """
     # Here and not above: plots take a second to import, and memory that the test itself has no use for.
-    from adacd_hil.analysis.report.page import document, heading
-    from adacd_hil.analysis.report.timing_page import timing_section
+    from adacd_hil.analysis.report.page import Heading, render_page
+    from adacd_hil.analysis.report.timing_page import timing_tables
     from adacd_hil.analysis.timing_figures import draw_timing
 
     if not len(report.columns):
@@ -155,8 +155,13 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     evidence = _evidence(report, described["period_us"])
     drawings = draw_timing(report.columns, evidence, int(report.columns.t_ns[0]))
     findings = [line for line in _findings(described) if not line.startswith(("log: ", "pictures: "))]
-    head = heading("adacd-hil commtest", findings[-1], findings[:-1], report.verdict is Verdict.GOOD)
-    page = document("communication test", [head, timing_section(evidence, drawings)])
+    page = render_page(
+        "communication_test_page.html.j2",
+        "communication test",
+        Heading("adacd-hil commtest", findings[-1], findings[:-1], report.verdict is Verdict.GOOD),
+        timing=timing_tables(evidence),
+        timing_figures=drawings,
+    )
     pictures = {HTML_NAME: page.encode()} | {f"{drawing.name}.png": drawing.png() for drawing in drawings}
     try:
         for name, data in pictures.items():

@@ -1,7 +1,6 @@
 """Runs that are too long to be kept: what a report says of them is what it would say of all of their cycles."""
 
 import json
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,7 +16,7 @@ from adacd_hil.analysis.report.json_form import report_json
 from adacd_hil.analysis.report.outline import Facts, TruthClock
 from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.analysis.report.report import write_run_report
-from adacd_hil.analysis.report.timeline import timeline
+from adacd_hil.analysis.report.timeline import timeline_of
 from adacd_hil.analysis.report.truth_rows import TruthRows, read_truth
 from adacd_hil.analysis.report.words import left_out_text, shown_contacts
 from adacd_hil.analysis.verdict import identified_text
@@ -385,8 +384,8 @@ def test_many_adaptations_are_summed_up():
 
 def test_of_many_stays_those_that_are_narrower_than_a_mark_are_drawn_together():
     stays = [(SchemeState.MONITOR, 3), (SchemeState.REACT, 1)] * 800 + [(SchemeState.MONITOR, 4000)]
-    html = timeline(run := make_run(*stays), evaluate(run))
-    marks = re.findall(r"<title>(.*?)</title>", html)
+    timeline = timeline_of(run := make_run(*stays), evaluate(run))
+    marks = [mark.title for mark in timeline.states]
     assert 100 < len(marks) < 650  # 612 fit beside each other
     assert sum(int(mark.split()[0]) for mark in marks if "states" in mark) == 1600
     assert any(mark.startswith("MONITOR, 3.20 to") for mark in marks)

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.trace_encoding import noise_of, pack, step_of
 from adacd_hil.analysis.report.traces import panels_of
-from adacd_hil.analysis.report.traces_page import traces_section
+from adacd_hil.analysis.report.traces_page import traces_of
 from adacd_hil.analysis.run import Motion
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event
@@ -163,7 +164,8 @@ def shown():
     run = react(run, 2005)
     run.state[9300:] = 8
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("warning", "bus", "slow")),))
-    return run, traces_section(run, evaluate(run))
+    traces = traces_of(run, evaluate(run))
+    return run, render("traces.html.j2", run=run, traces=traces, state_key=[], traced_contacts=60)
 
 
 def test_every_series_of_the_plan_is_in_the_page_at_its_full_rate(shown):
@@ -186,4 +188,4 @@ def test_the_plan_shades_what_happened(shown):
 
 def test_a_run_of_one_cycle_has_no_traces():
     run = make_run((3, 1))
-    assert traces_section(run, evaluate(run)) == ""
+    assert traces_of(run, evaluate(run)) is None

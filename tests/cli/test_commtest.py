@@ -71,7 +71,7 @@ def test_the_pictures_are_those_of_the_report_with_the_numbers_of_the_test(tmp_p
     slack = number_text(described["timing"]["times_us"]["slack"]["min"], 1)
     assert re.search(rf"<b>Slack</b>.*?<td>{slack}</td></tr>", page)
     assert re.findall(r'<figure id="([^"]*)"', page) == ["timing-distributions", "timing-line"]
-    assert "<h1>good: 100.00&nbsp;% of the periods" in page
+    assert "<h1>good: 100.00\u00a0% of the periods" in page
 
 
 def test_a_test_without_a_cycle_has_no_pictures(tmp_path: Path) -> None:

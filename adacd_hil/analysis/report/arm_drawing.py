@@ -4,7 +4,7 @@ x to the right, y up, joint 1 at the origin; lengths in mm of the arm.
 """
 
 import math
-from html import escape
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,59 +28,66 @@ class Push(NamedTuple):
     lever_sigma_m: float | None
 
 
-def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> str:
+class Stroke(NamedTuple):
+    """A straight line, and its class."""
+
+    start: _Point
+    end: _Point
+    kind: str
+
+
+@dataclass(frozen=True)
+class ArmDrawing:
+    """What the picture has. view: its left, top, width and height with y down; force: strokes of arrow and spread."""
+
+    description: str
+    view: tuple[float, float, float, float]
+    reach: float
+    links: tuple[Stroke, Stroke]
+    force: list[Stroke]
+    arrowhead: list[_Point]
+
+
+def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> ArmDrawing:
     """Draw the arm at the joint angles q, rad (2,)."""
     angles = (float(q[0]), float(q[0] + q[1]))
     l1, l2 = (1000.0 * length for length in length_m)
     elbow = _along((0.0, 0.0), angles[0], l1)
     tip = _along(elbow, angles[1], l2)
     reach = l1 + l2
-    links = (((0.0, 0.0), elbow), (elbow, tip))
     touched = 0 if push is None else push.link
-    arrow, points = ("", []) if push is None else _arrow(push, links, angles, reach)
-    shapes = [
-        _line(start, end, "link touched" if number == touched else "link")
-        for number, (start, end) in enumerate(links, start=1)
-    ]
-    joints = "".join(f'<circle cx="{x:.0f}" cy="{-y:.0f}" r="{0.035 * reach:.0f}"/>' for x, y in ((0.0, 0.0), elbow))
-    xs, ys = zip((0.0, 0.0), elbow, tip, *points, strict=True)
+    lines = (((0.0, 0.0), elbow), (elbow, tip))
+    kinds = ("link touched" if number == touched else "link" for number in (1, 2))
+    first, second = (Stroke(*line, kind) for line, kind in zip(lines, kinds, strict=True))
+    force, arrowhead = ([], []) if push is None else _arrow(push, (first, second), angles, reach)
+    tails = [stroke.start for stroke in force if stroke.kind.startswith("force")]
+    xs, ys = zip((0.0, 0.0), elbow, tip, *tails, strict=True)
     width, height = 1.5 * reach, 1.1 * reach
     left = 0.5 * (min(xs) + max(xs)) - 0.5 * width
     top = -0.5 * (min(ys) + max(ys)) - 0.5 * height
-    base = 0.08 * reach
-    ground = f'<path d="M{-base:.0f} {-base:.0f}v{2 * base:.0f}" class="base"/>'
-    body = ground + "".join(shapes) + f'<g class="joints">{joints}</g>' + arrow
-    view = f"{left:.0f} {top:.0f} {width:.0f} {height:.0f}"
-    return f'<svg class="arm" viewBox="{view}" role="img" aria-label="{escape(description)}">{body}</svg>'
+    return ArmDrawing(description, (left, top, width, height), reach, (first, second), force, arrowhead)
 
 
 def _along(start: _Point, angle: float, distance: float) -> _Point:
     return (start[0] + distance * math.cos(angle), start[1] + distance * math.sin(angle))
 
 
-def _line(start: _Point, end: _Point, kind: str) -> str:
-    return f'<path d="M{start[0]:.0f} {-start[1]:.0f}L{end[0]:.0f} {-end[1]:.0f}" class="{kind}"/>'
-
-
 def _arrow(
-    push: Push, links: tuple[tuple[_Point, _Point], ...], angles: tuple[float, float], reach: float
-) -> tuple[str, list[_Point]]:
-    """Draw the force with its head on the link, and the spread of its place; give what it reaches."""
-    start, end = links[push.link - 1]
+    push: Push, links: tuple[Stroke, Stroke], angles: tuple[float, float], reach: float
+) -> tuple[list[Stroke], list[_Point]]:
+    """Draw the force and the spread of its place; give the strokes, and the corners of the arrowhead."""
+    start, end, _ = links[push.link - 1]
     angle = angles[push.link - 1]
-    length = math.dist(start, end)
-    lever = 0.5 * length if push.lever_m is None else 1000.0 * push.lever_m
+    lever = 0.5 * math.dist(start, end) if push.lever_m is None else 1000.0 * push.lever_m
     head = _along(start, angle, lever)
-    shapes = ""
+    strokes = []
     if push.lever_sigma_m is not None:
         spread = 1000.0 * push.lever_sigma_m
-        shapes += _line(_along(start, angle, lever - spread), _along(start, angle, lever + spread), "spread")
+        strokes.append(Stroke(_along(start, angle, lever - spread), _along(start, angle, lever + spread), "spread"))
     if push.side == 0:
-        return shapes, []
+        return strokes, []
     outward = angle - push.side * 0.5 * math.pi
     tail = _along(head, outward, (0.14 + 0.22 * float(np.clip(push.share, 0.0, 1.0))) * reach)
     neck = _along(head, outward, 0.085 * reach)
-    wings = [_along(neck, angle, side * 0.04 * reach) for side in (-1.0, 1.0)]
-    corners = " ".join(f"{x:.0f},{-y:.0f}" for x, y in (head, *wings))
-    kind = "force" if push.lever_sigma_m is not None else "force guessed"
-    return f'{shapes}{_line(tail, neck, kind)}<polygon points="{corners}" class="head"/>', [tail]
+    strokes.append(Stroke(tail, neck, "force" if push.lever_sigma_m is not None else "force guessed"))
+    return strokes, [head, *(_along(neck, angle, side * 0.04 * reach) for side in (-1.0, 1.0))]

@@ -1,18 +1,15 @@
 """The contacts of a run on a page: a table, and a card for each with the arm at its moment."""
 
-from collections.abc import Sequence
-from html import escape
-from typing import Final
+from typing import Final, NamedTuple
 
 from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
-from adacd_hil.analysis.report.arm_drawing import Push, draw_arm
+from adacd_hil.analysis.report.arm_drawing import ArmDrawing, Push, draw_arm
 from adacd_hil.analysis.report.bounds import CONTACTS
-from adacd_hil.analysis.report.page import Cell, make_table
+from adacd_hil.analysis.report.page import Cell, Table, make_table
 from adacd_hil.analysis.report.words import (
     NONE,
     contact_rows,
-    left_out_text,
     number_text,
     scaled,
     shown_contacts,
@@ -27,40 +24,44 @@ CARDS: Final = 48
 """Contacts with a card of their own; the table has all."""
 
 
-def contacts_table(metrics: Metrics) -> str:
-    """Write a row per contact, marked where something went wrong."""
+class ContactCard(NamedTuple):
+    """What is known of a contact: what the report says with its uncertainty, the truth, the arm.
+
+    stretch_s: what a script shows of the traces.
+    """
+
+    number: int
+    link: int | None
+    at_s: float
+    stretch_s: tuple[float, float]
+    is_wrong: bool
+    kind: str
+    entries: list[tuple[str, str]]
+    arm: ArmDrawing | None
+
+
+def contacts_table(metrics: Metrics) -> Table | None:
+    """Make a row per contact, marked where something went wrong; None without contacts."""
     if not metrics.contacts:
-        return '<p class="note">None.</p>'
-    rows: list[Sequence[Cell]] = []
+        return None
+    rows: list[list[object]] = []
     contacts = shown_contacts(metrics, CONTACTS)
     head, words = contact_rows(metrics, contacts)
     for contact, row in zip(contacts, words, strict=True):
-        cells: list[Cell] = [escape(word) for word in row]
-        if contact.detected_s is None:
-            cells[6] = (str(cells[6]), "bad")
-        if contact.link is not None and contact.link_detected not in (None, contact.link):
-            cells[3] = (str(cells[3]), "bad")
-        if contact.direction_ok is False:
-            cells[10] = (str(cells[10]), "bad")
-        rows.append(cells)
-    left_out = left_out_text(metrics, CONTACTS)
-    note = f'<p class="note">{left_out}</p>' if left_out else ""
-    if metrics.false_alarms_s:
-        times = ", ".join(number_text(time_s, 3) for time_s in metrics.false_alarms_s[:CONTACTS])
-        more = f" and {len(metrics.false_alarms_s) - CONTACTS} more" if len(metrics.false_alarms_s) > CONTACTS else ""
-        note += f'<p class="note bad">False alarms at {times} s{more}.</p>'
-    return make_table(head, rows, left=()) + note
+        wrong = {
+            3: contact.link is not None and contact.link_detected not in (None, contact.link),
+            6: contact.detected_s is None,
+            10: contact.direction_ok is False,
+        }
+        rows.append([Cell(word, "bad") if wrong.get(column) else word for column, word in enumerate(row)])
+    return make_table(head, rows, left=())
 
 
-def contact_cards(metrics: Metrics, run: Run) -> str:
-    """Write what is known of each contact: what the report says with its uncertainty, the truth, the arm."""
+def contact_cards(metrics: Metrics, run: Run) -> list[ContactCard]:
+    """Make a card for each of the first contacts."""
     contacts = metrics.contacts[:CARDS]
-    if not contacts:
-        return ""
     strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
-    cards = "".join(_card(contact, run, strongest_N) for contact in contacts)
-    more = f'<p class="note">The first {CARDS} of {len(metrics.contacts)}.</p>' if len(metrics.contacts) > CARDS else ""
-    return f'<div class="cards">{cards}</div>{more}'
+    return [_card(contact, run, strongest_N) for contact in contacts]
 
 
 _PLACES: Final = {
@@ -74,21 +75,22 @@ _PLACES: Final = {
 }
 
 
-def _card(contact: Contact, run: Run, strongest_N: float) -> str:
+def _card(contact: Contact, run: Run, strongest_N: float) -> ContactCard:
     entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
     entries += _torques(contact)
     if contact.link is not None:
         force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
         entries.append(("truth", f"link {contact.link}, {force}"))
-    items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries if text != NONE)
-    found = contact.link if contact.link_detected is None else contact.link_detected
-    at_s = contact.at_s
     is_right = contact.detected_s is not None and contact.link in (None, contact.link_detected)
-    tone = "" if is_right or not contact.is_armed else ' class="wrong"'
-    place = f'data-from="{at_s - 0.15:.4f}" data-to="{at_s + 0.6:.4f}"'
-    return (
-        f"<div{tone} {place}>{_arm(contact, run, strongest_N)}<h3>{contact.number}  link {number_text(found, 0)}"
-        f"<small>{number_text(at_s, 2, 's')}</small></h3><p>{escape(_kind(contact))}</p><dl>{items}</dl></div>"
+    return ContactCard(
+        number=contact.number,
+        link=contact.link if contact.link_detected is None else contact.link_detected,
+        at_s=contact.at_s,
+        stretch_s=(contact.at_s - 0.15, contact.at_s + 0.6),
+        is_wrong=contact.is_armed and not is_right,
+        kind=_kind(contact),
+        entries=[(term, text) for term, text in entries if text != NONE],
+        arm=_arm(contact, run, strongest_N),
     )
 
 
@@ -143,10 +145,10 @@ def _torques(contact: Contact) -> list[tuple[str, str]]:
     return entries
 
 
-def _arm(contact: Contact, run: Run, strongest_N: float) -> str:
-    """Draw the arm where it was when the contact was found, or began; nothing without measured positions."""
+def _arm(contact: Contact, run: Run, strongest_N: float) -> ArmDrawing | None:
+    """Draw the arm where it was when the contact was found, or began; None without measured positions."""
     if run.motion is None:
-        return ""
+        return None
     at_s = contact.at_s if contact.detected_s is None else contact.detected_s
     q: Vector = run.motion.q[row_at(run, at_s)]
     push = _push(contact, strongest_N, run.settings.arm.link_length_m[0])

@@ -1,16 +1,17 @@
 """The page over a folder of runs: a row for each with its verdict and a link to its report."""
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Final, NamedTuple
 from urllib.parse import quote
 
-from adacd_hil.analysis.report.page import Cell, document, heading, make_table
+from adacd_hil.analysis.report.page import Heading, render_page
 from adacd_hil.analysis.report.report import Report
 from adacd_hil.analysis.report.words import NONE
 
 INDEX_NAME: Final = "index.html"
+_ORIGIN: Final = ("config", "profile", "interface")
+"""Metadata with a column each."""
 
 
 class Entry(NamedTuple):
@@ -41,34 +42,26 @@ def count_text(entries: Sequence[Entry]) -> str:
     return f"{runs}, {'all good' if bad == 0 else f'{bad} not good'}"
 
 
+class _IndexRow(NamedTuple):
+    """A run in the table: the place of its report, how long it lasted, and what it was made with."""
+
+    entry: Entry
+    place: str
+    lasts: str
+    origin: Sequence[str]
+
+
 def index_page(folder: Path, entries: Sequence[Entry]) -> str:
     """Write the page, which lies in `folder`."""
-    rows: list[Sequence[Cell]] = [(_link(folder, entry), _verdict(entry), *_told(entry)) for entry in entries]
-    head = ("run", "verdict", "lasts, s", "configuration", "profile", "interface")
-    title = f"{count_text(entries)}."
-    parts = [
-        heading("adacd-hil run reports", title, (), all(entry.is_clean for entry in entries)),
-        make_table(head, rows, left=(0, 1, 3, 4, 5)),
-    ]
-    return document(f"{count_text(entries)} – run reports", parts)
+    count = count_text(entries)
+    heading = Heading("adacd-hil run reports", f"{count}.", (), all(entry.is_clean for entry in entries))
+    rows = [_row(folder, entry) for entry in entries]
+    return render_page("index_page.html.j2", f"{count} – run reports", heading, rows=rows)
 
 
-def _link(folder: Path, entry: Entry) -> Cell:
-    name = escape(entry.name)
+def _row(folder: Path, entry: Entry) -> _IndexRow:
     if entry.report is None:
-        return name
-    place = entry.report.html_path.relative_to(folder).as_posix()
-    return f'<a href="{escape(quote(place))}">{name}</a>'
-
-
-def _told(entry: Entry) -> Sequence[Cell]:
-    if entry.report is None:
-        return NONE, NONE, NONE, NONE
-    metadata = entry.report.metadata
-    words = [escape(metadata.get(key) or NONE) for key in ("config", "profile", "interface")]
-    return f"{entry.report.metrics.cycle.duration_s:.1f}", *words
-
-
-def _verdict(entry: Entry) -> Cell:
-    word, tone = ("good", "strong") if entry.is_clean else ("not good", "bad")
-    return f'<b class="{tone}">{word}</b> {escape(entry.verdict)}', "wide"
+        return _IndexRow(entry, "", NONE, [NONE] * len(_ORIGIN))
+    place = quote(entry.report.html_path.relative_to(folder).as_posix())
+    origin = [entry.report.metadata.get(key) or NONE for key in _ORIGIN]
+    return _IndexRow(entry, place, f"{entry.report.metrics.cycle.duration_s:.1f}", origin)

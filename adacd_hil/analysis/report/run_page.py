@@ -1,7 +1,6 @@
 """The page of a report, put together."""
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 
@@ -9,24 +8,25 @@ from adacd_hil.analysis.cyclic_data import percent_text
 from adacd_hil.analysis.drawing import Drawing
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.metrics import Metrics
+from adacd_hil.analysis.report import bounds
 from adacd_hil.analysis.report.contacts_page import contact_cards, contacts_table
-from adacd_hil.analysis.report.definitions import definitions
-from adacd_hil.analysis.report.page import document, embed, heading, wrap_section
+from adacd_hil.analysis.report.long_run import CONTACTS as TRACED_CONTACTS
+from adacd_hil.analysis.report.page import Heading, render_page
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.tables import (
     data_table,
     further_table,
     margins_table,
+    origin_table,
     paper_table,
     parameters_table,
     push_table,
-    run_table,
     sections_table,
 )
-from adacd_hil.analysis.report.timeline import timeline
-from adacd_hil.analysis.report.timing_page import timing_section
-from adacd_hil.analysis.report.traces_page import SCRIPTS, STYLES, traces_section
-from adacd_hil.analysis.report.words import NONE, has_paper, number_text, stretch_text
+from adacd_hil.analysis.report.timeline import state_key, timeline_of
+from adacd_hil.analysis.report.timing_page import timing_tables
+from adacd_hil.analysis.report.traces_page import SCRIPTS, STYLES, traces_of
+from adacd_hil.analysis.report.words import NONE, has_paper, left_out_text, number_text, stretch_text
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.verdict import LISTED
 
@@ -35,27 +35,43 @@ def report_page(
     metrics: Metrics, run: Run, source: Source, drawings: Sequence[Drawing], timing: Sequence[Drawing]
 ) -> str:
     """Write the page. drawings, timing: the figures of the run and of its times."""
-    figures = {drawing.name: embed(drawing) for drawing in drawings}
-    adaptations = "".join(figure for name, figure in figures.items() if name.removeprefix("fig") not in (name, "5"))
-    traces = traces_section(run, metrics)
-    parts = [
-        _header(metrics, run, source),
-        _tiles(metrics),
-        timeline(run, metrics),
-        figures.get("fig5", ""),
-        wrap_section("Paper against measured" if has_paper(metrics) else "Measured", paper_table(metrics)),
-        wrap_section("Sections", sections_table(metrics, run)),
-        wrap_section("Margins", margins_table(metrics.evidence), push_table(metrics)),
-        wrap_section("Contacts", figures.get("contacts", ""), contacts_table(metrics), contact_cards(metrics, run)),
-        wrap_section("Model identification", adaptations, parameters_table(metrics, run), further_table(metrics)),
-        traces,
-        wrap_section("Cyclic data", data_table(metrics)),
-        timing_section(metrics.timing, timing),
-        wrap_section("Run", run_table(metrics, run, source)),
-        definitions(run),
-    ]
-    title = f"{_name(run, source)} – run report"
-    return document(title, parts, STYLES, SCRIPTS) if traces else document(title, parts)
+    figures = {drawing.name: drawing for drawing in drawings}
+    traces = traces_of(run, metrics)
+    since_ns = None if run.log_start_ns is None else run.zero_ns - run.log_start_ns
+    return render_page(
+        "run_page.html.j2",
+        f"{_name(run, source)} – run report",
+        _heading(metrics, run, source),
+        STYLES if traces else (),
+        SCRIPTS if traces else (),
+        run=run,
+        metrics=metrics,
+        bounds=bounds,
+        tiles=_tiles(metrics),
+        timeline=timeline_of(run, metrics),
+        state_key=state_key(run),
+        residuals=figures.get("fig5"),
+        has_paper=has_paper(metrics),
+        paper=paper_table(metrics),
+        sections=sections_table(metrics, run),
+        margins=margins_table(metrics.evidence),
+        push=push_table(metrics.evidence),
+        close_ups=figures.get("contacts"),
+        contacts=contacts_table(metrics),
+        left_out=left_out_text(metrics, bounds.CONTACTS),
+        cards=contact_cards(metrics, run),
+        adaptations=[figures[name] for name in figures if name.removeprefix("fig") not in (name, "5")],
+        parameters=parameters_table(metrics, run),
+        further=further_table(metrics.evidence),
+        traces=traces,
+        traced_contacts=TRACED_CONTACTS,
+        data=data_table(metrics.data),
+        timing=timing_tables(metrics.timing),
+        timing_figures=timing,
+        origin=origin_table(metrics, run, source),
+        settling_s=f"{10.0 / run.a_rad_s:g}",
+        motion_start_s=None if since_ns is None else since_ns * 1e-9,
+    )
 
 
 def _name(run: Run, source: Source) -> str:
@@ -63,7 +79,7 @@ def _name(run: Run, source: Source) -> str:
     return " ".join(filter(None, words)) or source.log_name
 
 
-def _header(metrics: Metrics, run: Run, source: Source) -> str:
+def _heading(metrics: Metrics, run: Run, source: Source) -> Heading:
     meta = [
         ("configuration", "config"), ("profile", "profile"), ("clock", "clock"), ("interface", "interface"),
         ("version", "version"),
@@ -75,11 +91,11 @@ def _header(metrics: Metrics, run: Run, source: Source) -> str:
     if not problems and metrics.dropped:
         problems = [f"{metrics.dropped} packets are not in the log."]
     over = f"adacd-hil run report · {' · '.join(words)}"
-    return heading(over, metrics.verdict, problems, metrics.is_clean)
+    return Heading(over, metrics.verdict, problems, metrics.is_clean)
 
 
-def _tiles(metrics: Metrics) -> str:
-    """Write the handful of numbers to be read first."""
+def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
+    """Give the handful of numbers to be read first: what each is, the number, its unit."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
     times_s = _listed([number_text(value, 2) for value in metrics.adaptation_s.values()])
@@ -101,12 +117,7 @@ def _tiles(metrics: Metrics) -> str:
         ("incomplete cycles", _share_number(metrics.data.incomplete), "%"),
         ("smallest margin", NONE if evidence is None else number_text(evidence.smallest_margin, 2), "×"),
     ]
-    tiles = [tile for tile in tiles if tile[1] != NONE]
-    cells = "".join(
-        f"<div><dt>{escape(label)}</dt><dd>{escape(value)}{f' <small>{unit}</small>' if unit else ''}</dd></div>"
-        for label, value, unit in tiles
-    )
-    return f'<dl class="tiles">{cells}</dl>'
+    return [tile for tile in tiles if tile[1] != NONE]
 
 
 def _share_number(share: float | None) -> str:

@@ -1,11 +1,11 @@
-"""The timeline of a run: states, contacts and notices over time, as a fragment for a page.
+"""The timeline of a run: states, contacts and notices over time, as marks on the lanes of a drawing 1000 wide.
 
-Marks carry the stretch that they stand for (`data-from`, `data-to`, s since motion start), so that a script can show it
-closer; without one they still say what they are.
+A mark carries the stretch that it stands for, s since motion start, so that a script can show it closer; without one it
+still says what it is.
 """
 
 from collections.abc import Iterator
-from html import escape
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -28,8 +28,6 @@ STATE_COLOURS: Final = {
 """Variables of the page; a state that is not here has the ground's colour."""
 
 _LEFT, _RIGHT = 78.0, 996.0
-_STATE_LANE, _CONTACT_LANE, _NOTICE_LANE, _AXIS = 8.0, 44.0, 82.0, 112.0
-_LANE_HEIGHT: Final = 24.0
 _LETTER: Final = 6.4
 """Width of a letter and room beside it."""
 _NARROWEST: Final = 1.5
@@ -55,6 +53,31 @@ class Notice(NamedTuple):
     at_s: float
     is_bad: bool
     text: str
+
+
+class Mark(NamedTuple):
+    """A mark on a lane: the stretch that it stands for, its words, its place, colour or class, and what it shows."""
+
+    from_s: float
+    to_s: float
+    title: str
+    left: float
+    width: float
+    look: str
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """What each lane has. ticks: place and label; is_thinned: what is narrower than a mark is drawn together."""
+
+    left: float
+    width: float
+    states: list[Mark]
+    contacts: list[Mark]
+    notices: list[Mark]
+    ticks: list[tuple[float, str]]
+    is_thinned: bool
 
 
 def stays_of(run: Run) -> list[Stay]:
@@ -84,36 +107,27 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
     return sorted(notices[:_MOST_NOTICES])
 
 
-def state_key(run: Run) -> str:
-    """Name the colours of the states that the run has been in."""
+def state_key(run: Run) -> list[tuple[str, str]]:
+    """Give colour and name of the states that the run has been in."""
     there = {stay.state for stay in stays_of(run)}
-    entries = [f'<i class="key {colour}"></i>{state.name}' for state, colour in STATE_COLOURS.items() if state in there]
-    return f'<span class="keys">{" ".join(entries)}</span>'
+    return [(colour, state.name) for state, colour in STATE_COLOURS.items() if state in there]
 
 
-def timeline(run: Run, metrics: Metrics) -> str:
-    """Write the figure; nothing of a run without cycles."""
+def timeline_of(run: Run, metrics: Metrics) -> Timeline | None:
+    """Lay out the marks; None of a run without cycles."""
     if run.state.size == 0:
-        return ""
-    time_s = run.time_s()
+        return None
+    time_s, stays = run.time_s(), stays_of(run)
     scale = _Scale(float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3))
-    lanes = [
-        _lane("states", _STATE_LANE, "".join(_state_marks(run, scale))),
-        _lane("contacts", _CONTACT_LANE, "".join(_contact_marks(metrics, scale))),
-        _lane("notices", _NOTICE_LANE, "".join(_notice_marks(run, metrics, scale))),
-        "".join(_axis(scale)),
-    ]
-    label = "Timeline of states, contacts and notices"
-    svg = f'<svg viewBox="0 0 1000 140" role="group" aria-label="{label}">\n{"".join(lanes)}</svg>'
-    caption = (
-        "<b>Timeline.</b> States, contacts by number (a bar as long as the touch, hollow if it was not detected), and "
-        'below them warnings, faults and false alarms.<span class="scripted"> Choose any of them to see the traces '
-        "there.</span>"
+    return Timeline(
+        left=_LEFT,
+        width=_RIGHT - _LEFT,
+        states=list(_state_marks(stays, scale)),
+        contacts=list(_contact_marks(metrics, scale)),
+        notices=list(_notice_marks(notices_of(run, metrics), scale)),
+        ticks=list(_ticks(scale)),
+        is_thinned=max(len(stays), len(metrics.contacts)) > MARKS,
     )
-    if max(len(stays_of(run)), len(metrics.contacts)) > MARKS:
-        caption += " What is narrower than a mark is drawn together."
-    caption += f" {state_key(run)}"
-    return f'<figure id="timeline">\n<div class="scroll">{svg}</div>\n<figcaption>{caption}</figcaption>\n</figure>\n'
 
 
 class _Scale(NamedTuple):
@@ -123,16 +137,6 @@ class _Scale(NamedTuple):
     def x(self, time_s: float) -> float:
         share = (time_s - self.start_s) / (self.end_s - self.start_s)
         return _LEFT + min(max(share, 0.0), 1.0) * (_RIGHT - _LEFT)
-
-
-def _lane(name: str, top: float, marks: str) -> str:
-    ground = f'<rect x="{_LEFT}" y="{top}" width="{_RIGHT - _LEFT}" height="{_LANE_HEIGHT}" class="ground"/>'
-    return f'<text x="0" y="{top + 16}" class="lane">{name}</text>{ground}{marks}\n'
-
-
-def _mark(from_s: float, to_s: float, title: str, inner: str) -> str:
-    words = escape(title)
-    return f'<g data-from="{from_s:.4f}" data-to="{to_s:.4f}"><title>{words}</title>{inner}</g>'
 
 
 class _Narrow(NamedTuple):
@@ -164,24 +168,21 @@ def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[Stay | _Narrow]:
         yield _Narrow(group)
 
 
-def _state_marks(run: Run, scale: _Scale) -> Iterator[str]:
-    for drawn in _drawn_stays(stays_of(run), scale):
+def _state_marks(stays: list[Stay], scale: _Scale) -> Iterator[Mark]:
+    for drawn in _drawn_stays(stays, scale):
         stay = drawn.gravest if isinstance(drawn, _Narrow) else drawn
         left, right = scale.x(stay.start_s), scale.x(stay.end_s)
         name, width = stay.state.name, max(right - left, _NARROWEST)
-        colour = STATE_COLOURS.get(stay.state, "paper")
-        box = f'x="{left:.1f}" y="{_STATE_LANE}" width="{width:.1f}" height="{_LANE_HEIGHT}"'
-        inner = f'<rect {box} fill="var(--{colour})"/>'
-        if width > _LETTER * len(name) + 8:
-            inner += f'<text x="{left + width / 2:.1f}" y="{_STATE_LANE + 16}" class="inside">{name}</text>'
+        label = name if width > _LETTER * len(name) + 8 else ""
         margin_s = 0.05 * (stay.end_s - stay.start_s) + 0.005
         if isinstance(drawn, _Narrow):
             name = f"{len(drawn.stays)} states"
         title = f"{name}, {number_text(stay.start_s, 2)} to {number_text(stay.end_s, 2, 's')}"
-        yield _mark(stay.start_s - margin_s, stay.end_s + margin_s, title, inner)
+        colour = STATE_COLOURS.get(stay.state, "paper")
+        yield Mark(stay.start_s - margin_s, stay.end_s + margin_s, title, left, width, colour, label)
 
 
-def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[str]:
+def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[Mark]:
     labelled = drawn = -1e9
     is_crowded = len(metrics.contacts) > MARKS
     for contact in metrics.contacts:
@@ -193,12 +194,14 @@ def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[str]:
         drawn = left
         end_s = contact.end_s if contact.end_s is not None else at_s
         width = max(scale.x(end_s) - left, 2.5)
-        kind = "touch" if contact.detected_s is not None else "touch missed"
-        inner = f'<rect x="{left:.1f}" y="{_CONTACT_LANE + 15}" width="{width:.1f}" height="8" class="{kind}"/>'
-        if left - labelled >= max(_APART, _DIGIT * len(str(contact.number))):
+        look = "touch" if contact.detected_s is not None else "touch missed"
+        label = str(contact.number)
+        if left - labelled >= max(_APART, _DIGIT * len(label)):
             labelled = left
-            inner += f'<text x="{left + width / 2:.1f}" y="{_CONTACT_LANE + 11}" class="number">{contact.number}</text>'
-        yield _mark(at_s - 0.15, max(at_s + 0.6, end_s + 0.15), _contact_title(contact, at_s), inner)
+        else:
+            label = ""
+        title = _contact_title(contact, at_s)
+        yield Mark(at_s - 0.15, max(at_s + 0.6, end_s + 0.15), title, left, width, look, label)
 
 
 def _contact_title(contact: Contact, at_s: float) -> str:
@@ -214,19 +217,13 @@ def _contact_title(contact: Contact, at_s: float) -> str:
     return ", ".join(words)
 
 
-def _notice_marks(run: Run, metrics: Metrics, scale: _Scale) -> Iterator[str]:
-    notices = notices_of(run, metrics)
-    for notice in notices:
-        x, middle = scale.x(notice.at_s), _NOTICE_LANE + _LANE_HEIGHT / 2
-        kind = "bad" if notice.is_bad else "warn"
-        inner = f'<path d="M{x - 5:.1f} {middle + 5}h10l-5 -10z" class="{kind}"/>'
-        title = f"{notice.text}, at {number_text(notice.at_s, 2, 's')}"
-        yield _mark(notice.at_s - 0.25, notice.at_s + 0.25, title, inner)
-    if not notices:
-        yield f'<text x="{_LEFT + 8}" y="{_NOTICE_LANE + 16}" class="none">none</text>'
+def _notice_marks(notices: list[Notice], scale: _Scale) -> Iterator[Mark]:
+    for at_s, is_bad, text in notices:
+        title = f"{text}, at {number_text(at_s, 2, 's')}"
+        yield Mark(at_s - 0.25, at_s + 0.25, title, scale.x(at_s), 0.0, "bad" if is_bad else "warn")
 
 
-def _axis(scale: _Scale) -> Iterator[str]:
+def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
     span_s = scale.end_s - scale.start_s
     step_s = next(
         step
@@ -236,7 +233,4 @@ def _axis(scale: _Scale) -> Iterator[str]:
     )
     digits = max(0, -int(np.floor(np.log10(step_s))))
     for number in range(int(np.ceil(scale.start_s / step_s)), int(scale.end_s / step_s) + 1):
-        x = scale.x(number * step_s)
-        yield f'<path d="M{x:.1f} {_AXIS}v5" class="tick"/>'
-        yield f'<text x="{x:.1f}" y="{_AXIS + 17}" class="time">{number_text(number * step_s, digits)}</text>'
-    yield f'<text x="0" y="{_AXIS + 17}" class="lane">s</text>'
+        yield scale.x(number * step_s), number_text(number * step_s, digits)

@@ -1,12 +1,10 @@
-"""The section *Timing* of a page: tables of the timing evidence, and its figures."""
+"""The timing evidence of a page: its tables."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
-from typing import Final
+from typing import Final, NamedTuple
 
-from adacd_hil.analysis.drawing import Drawing
 from adacd_hil.analysis.histogram import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
-from adacd_hil.analysis.report.page import Cell, embed, make_table, wrap_section
+from adacd_hil.analysis.report.page import Cell, Table, make_table
 from adacd_hil.analysis.report.words import NONE, number_text
 from adacd_hil.analysis.timing import OLDEST_CYCLES, QUANTITIES, Quantity, TimingEvidence
 
@@ -24,70 +22,72 @@ _QUEUES: Final = {
 }
 
 
-def timing_section(evidence: TimingEvidence, drawings: Sequence[Drawing]) -> str:
-    """Write the section: percentiles, figures, then counts, queues and ages. Empty without a cycle."""
+class TimingTables(NamedTuple):
+    """The tables; queues: None where there are none. is_modelled: times are those of a model."""
+
+    is_modelled: bool
+    times: Table
+    counts: Table
+    queues: Table | None
+    ages: Table
+
+
+def timing_tables(evidence: TimingEvidence) -> TimingTables | None:
+    """Make the tables: percentiles, counts, queues and ages. None without a cycle."""
     if not evidence.cycles:
-        return ""
-    modelled = (
-        "Lockstep: these are times of the model of bus and host, not of this machine. "
-        "It has no grid to be late on and no queues."
-    )
-    note = f'<p class="note">{modelled}</p>' if evidence.is_modelled else ""
-    side = "".join((_counts_table(evidence), _queues_table(evidence), _ages_table(evidence)))
-    return wrap_section(
-        "Timing", _times_table(evidence), note, f'<div class="side-by-side">{side}</div>', *map(embed, drawings)
+        return None
+    return TimingTables(
+        is_modelled=evidence.is_modelled,
+        times=_times_table(evidence),
+        counts=_counts_table(evidence),
+        queues=None if evidence.is_modelled else _queues_table(evidence),
+        ages=_ages_table(evidence),
     )
 
 
-def _times_table(evidence: TimingEvidence) -> str:
-    """Write a row per time; slack at the end under a head of its own, because its small values are the bad ones."""
+def _times_table(evidence: TimingEvidence) -> Table:
+    """Make a row per time; slack at the end under a head of its own, because its small values are the bad ones."""
     reserves = [quantity for quantity in QUANTITIES if quantity.is_reserve]
     rows = [_time_row(quantity, evidence, PERCENTILE_NAMES) for quantity in QUANTITIES if not quantity.is_reserve]
     reaction = evidence.reaction
     if reaction is not None:
         words = f"{reaction.count} reaction{'' if reaction.count == 1 else 's'}"
-        label = _label("Reaction", f"detection decision to first reaction frame, {words}")
+        label = ("Reaction", f"detection decision to first reaction frame, {words}")
         rows.append((label, *_values(reaction.percentiles, PERCENTILE_NAMES)))
-    head: list[Cell] = ["", *((name, "head") for name in LOW_PERCENTILE_NAMES)]
+    head = [None, *(Cell(name, "head") for name in LOW_PERCENTILE_NAMES)]
     rows += [head, *(_time_row(quantity, evidence, LOW_PERCENTILE_NAMES) for quantity in reserves)]
     return make_table(("µs", *PERCENTILE_NAMES), rows)
 
 
-def _label(title: str, meaning: str) -> str:
-    return f"<b>{escape(title)}</b> <small>{escape(meaning)}</small>"
-
-
-def _time_row(quantity: Quantity, evidence: TimingEvidence, names: Sequence[str]) -> Sequence[Cell]:
-    label = _label(quantity.title, quantity.meaning)
+def _time_row(quantity: Quantity, evidence: TimingEvidence, names: Sequence[str]) -> Sequence[object]:
+    label = (quantity.title, quantity.meaning)
     statistics = evidence.times[quantity.name]
     if statistics is None:
         reason = NONE if evidence.is_modelled and quantity.name == "lateness" else _ABSENT
         return (label, *[""] * (len(names) - 1), reason)
-    cells: list[Cell] = _values(statistics.percentiles, names)
+    cells: list[object] = [*_values(statistics.percentiles, names)]
     if quantity.is_reserve and statistics.percentiles.get("min", 0.0) < 0.0:
-        cells[-1] = (str(cells[-1]), "bad")
+        cells[-1] = Cell(cells[-1], "bad")
     return (label, *cells)
 
 
-def _values(found: Mapping[str, float], names: Sequence[str]) -> list[Cell]:
+def _values(found: Mapping[str, float], names: Sequence[str]) -> list[str]:
     return [number_text(found.get(name), 1) for name in names]
 
 
-def _counts_table(evidence: TimingEvidence) -> str:
-    rows: list[Sequence[Cell]] = []
+def _counts_table(evidence: TimingEvidence) -> Table:
+    rows: list[Sequence[object]] = []
     for name, words in _COUNTS.items():
         count = evidence.counts[name]
         if count is None:
             rows.append((words, "", _ABSENT))
             continue
-        rows.append((words, (str(count.total), "bad" if count.total else ""), number_text(count.per_100000, 1)))
+        rows.append((words, Cell(count.total, "bad" if count.total else ""), number_text(count.per_100000, 1)))
     return make_table((f"in {evidence.cycles} cycles", "count", "per 100 000"), rows)
 
 
-def _queues_table(evidence: TimingEvidence) -> str:
-    if evidence.is_modelled:
-        return ""
-    rows: list[Sequence[Cell]] = []
+def _queues_table(evidence: TimingEvidence) -> Table:
+    rows: list[Sequence[object]] = []
     for name, words in _QUEUES.items():
         depth = evidence.queues_bytes[name]
         values = ["", _ABSENT] if depth is None else [number_text(depth.get(key), 0) for key in ("p99", "max")]
@@ -95,7 +95,7 @@ def _queues_table(evidence: TimingEvidence) -> str:
     return make_table(("bytes", "p99", "max"), rows)
 
 
-def _ages_table(evidence: TimingEvidence) -> str:
+def _ages_table(evidence: TimingEvidence) -> Table:
     ages = evidence.data_age
     head = ("age of the oldest value used", "cycles", "share")
     if ages is None:

@@ -1,0 +1,164 @@
+"""Templates of pages: they escape every text, and markup is nowhere else."""
+
+import ast
+import dataclasses
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hand_made_run import make_certified_run, react, touch, touched_run
+from jinja2 import UndefinedError
+from parsed_page import Page
+
+from adacd_hil.analysis.drawing import Drawing
+from adacd_hil.analysis.figures import draw
+from adacd_hil.analysis.metrics import evaluate
+from adacd_hil.analysis.report import page
+from adacd_hil.analysis.report.index_page import Entry, index_page
+from adacd_hil.analysis.report.page import Heading, render, render_page
+from adacd_hil.analysis.report.reading import Source
+from adacd_hil.analysis.report.report import Report
+from adacd_hil.analysis.report.run_page import report_page
+from adacd_hil.analysis.report.timing_page import timing_tables
+from adacd_hil.analysis.run import Motion, Run
+from adacd_hil.analysis.timing_figures import draw_timing
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+TEMPLATES = sorted((ROOT / "adacd_hil" / "analysis" / "report" / "templates").iterdir())
+EVIL = """'"><evil>&</script></style></title></svg><script>alert(1)</script>"""
+
+
+def spoilt(value: Any) -> Any:
+    """Append markup to every text in a value; a run's own are not shown, and a figure's name is the program's."""
+    if isinstance(value, str):
+        return value + EVIL
+    if isinstance(value, Drawing):
+        return replace(value, title=value.title + EVIL, caption=value.caption + EVIL)
+    if isinstance(value, tuple):
+        return type(value)(*map(spoilt, value)) if hasattr(value, "_fields") else tuple(map(spoilt, value))
+    if isinstance(value, list):
+        return [spoilt(item) for item in value]
+    if isinstance(value, dict):
+        return {key: spoilt(item) for key, item in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type | Run):
+        fields = (field.name for field in dataclasses.fields(value))
+        return replace(value, **{name: spoilt(getattr(value, name)) for name in fields})
+    return value
+
+
+@pytest.fixture
+def spoiling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every text that a template is given be markup, but the styles and scripts, which are files of the package."""
+
+    def render_spoilt(template: str, **values: Any) -> str:
+        own = ("styles", "scripts")
+        return render(template, **{name: value if name in own else spoilt(value) for name, value in values.items()})
+
+    monkeypatch.setattr(page, "render", render_spoilt)
+
+
+def certified_run() -> Run:
+    run = make_certified_run()
+    touch(run, 3000, 250, (5.0, 1.0), link=2)
+    run = react(run, 3005, link=2, force_N=-9.0, force_sigma=0.5, lever_m=0.2, lever_sigma=0.01)
+    still = np.full((len(run.cycle), 2), 0.25)
+    return replace(run, motion=Motion(still, still, still), log_start_ns=0)
+
+
+def page_of(run: Run) -> str:
+    metrics = evaluate(run)
+    timing = draw_timing(run.timing, metrics.timing, run.zero_ns)[:1]
+    return report_page(metrics, run, Source("run.mcap", "cut"), draw(run, metrics)[:1], timing)
+
+
+def page_of_a_folder(_: Run) -> str:
+    run = touched_run()
+    where = Path("runs/a/report.html")
+    report = Report(evaluate(run), run.metadata, Source("run.mcap", "cut"), where, where, ())
+    return index_page(Path("runs"), [Entry("a", report), Entry("b", None, "no log")])
+
+
+def page_of_a_communication_test(run: Run) -> str:
+    timing = timing_tables(evaluate(run).timing)
+    heading = Heading("commtest", "good", ("event: late",), True)
+    return render_page("communication_test_page.html.j2", "test", heading, timing=timing, timing_figures=[])
+
+
+PAGES = {
+    "paper": (page_of, touched_run),
+    "certified": (page_of, certified_run),
+    "folder": (page_of_a_folder, touched_run),
+    "communication test": (page_of_a_communication_test, touched_run),
+}
+
+
+@pytest.mark.usefixtures("spoiling")
+@pytest.mark.parametrize("name", PAGES)
+def test_whatever_text_a_template_is_given_stays_text(name: str) -> None:
+    write, make = PAGES[name]
+    html = write(make())
+    parsed = Page(html)
+    assert html.count("&lt;evil&gt;") > 15
+    assert "<evil" not in html
+    assert (parsed.tags & {"evil"}, parsed.unbalanced, parsed.open) == (set(), [], [])
+    assert html.count("alert(1)") == html.count("&lt;script&gt;alert(1)") + html.count("\\u003cscript\\u003ealert(1)")
+
+
+def test_a_template_that_asks_for_what_it_is_not_given_is_an_error() -> None:
+    with pytest.raises(UndefinedError, match="'settling_s' is undefined"):
+        render("definitions.html.j2", run=touched_run(), motion_start_s=None)
+
+
+def test_what_is_not_escaped_is_the_packages_own_and_says_why() -> None:
+    unescaped = []
+    for template in TEMPLATES:
+        lines = template.read_text(encoding="utf-8").splitlines()
+        for before, line in zip(["", *lines], lines, strict=False):
+            unescaped += re.findall(r"{{ (\S+)\|\s*safe", line)
+            assert "safe" not in line or "{#" in line or " safe: " in before, f"{template.name}: {line}"
+            assert "autoescape" not in line
+    assert sorted(unescaped) == ["script.text", "style.text", "svg.shapes"]
+
+
+TAGS = (
+    "a b body br button circle code dd div dl dt em figcaption figure g h1 h2 h3 h4 head header html i img input label "
+    "li main meta noscript ol output p path polygon polyline pre rect script section small span strong style sub sup "
+    "svg table tbody td text th thead title tr tspan ul"
+)
+MARKUP = re.compile(rf"(?<!\?P)</?(?:{TAGS.replace(' ', '|')})(?=[\s/>])|</\0|<!DOCTYPE|&(?:nbsp|lt|gt|quot);")
+"""An element of a page, also one whose name is filled in."""
+OTHERS_MARKUP = {Path("adacd_hil/analysis/drawing.py")}
+"""Takes apart what matplotlib wrote."""
+
+
+def markup_in(module: Path) -> list[str]:
+    """List the texts of a module that are markup, docstrings left out."""
+    found = []
+    tree = ast.parse(module.read_text(encoding="utf-8"))
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            found += [node.value] if MARKUP.search(node.value) else []
+        elif isinstance(node, ast.JoinedStr):
+            text = "".join(part.value if isinstance(part, ast.Constant) else "\0" for part in node.values)
+            found += [text] if MARKUP.search(text) else []
+    return found
+
+
+def test_no_module_writes_markup() -> None:
+    modules = [module for package in ("adacd_hil", "firmware_sim") for module in (ROOT / package).rglob("*.py")]
+    found = {module.relative_to(ROOT): markup_in(module) for module in modules}
+    assert {module for module, texts in found.items() if texts} == OTHERS_MARKUP
+
+
+def test_help_is_given_without_the_templates_engine() -> None:
+    lines = ("import sys", "from adacd_hil.cli.main import cli", "cli(['--help'], standalone_mode=False)")
+    command = [sys.executable, "-c", "; ".join((*lines, "sys.exit('jinja2' in sys.modules)"))]
+    assert subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode == 0
