@@ -147,7 +147,7 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     """
     # Here and not above: plots take a second to import, and memory that the test itself has no use for.
     from adacd_hil.analysis.report.page import Heading, render_page
-    from adacd_hil.analysis.report.timing_page import timing_tables
+    from adacd_hil.analysis.report.timing_tables import timing_tables
     from adacd_hil.analysis.timing_figures import draw_timing
 
     if not len(report.columns):

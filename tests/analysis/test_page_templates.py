@@ -24,7 +24,7 @@ from adacd_hil.analysis.report.page import Heading, render, render_page
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.report import Report
 from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.timing_page import timing_tables
+from adacd_hil.analysis.report.timing_tables import timing_tables
 from adacd_hil.analysis.run import Motion, Run
 from adacd_hil.analysis.timing_figures import draw_timing
 
