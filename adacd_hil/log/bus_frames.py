@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.mcap_walk import Topic
 from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, MAX_DATA
+from adacd_hil.log.topic_records import Topic
 from adacd_hil.wire.bus import MAX_CLASSIC_BYTES
 
 

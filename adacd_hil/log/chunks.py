@@ -22,10 +22,10 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.chunk_data import MOST_BYTES, Opening, decompress
 from adacd_hil.log.compiled_records import WORD, pass_over, words_of
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_walk import MAGIC, MOST_RECORD_BYTES, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.opening import MOST_BYTES, Opening, decompress
+from adacd_hil.log.mcap.records import MAGIC, MOST_RECORD_BYTES, RECORD_HEAD_BYTES
 
 try:
     from zlib_ng.zlib_ng import crc32  # six times as fast, which saves a sixth of the time to read a log

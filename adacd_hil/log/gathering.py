@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from adacd_hil.log import compiled_records as compiled
 from adacd_hil.log.bus_frames import FRAME_DTYPE, FRAME_TOPICS, LONG_FRAME_DTYPE, copy_frames, is_of_frames
 from adacd_hil.log.compiled_records import take, words_of
-from adacd_hil.log.mcap_walk import MESSAGE_HEAD, Topic, record_dtype
+from adacd_hil.log.mcap.records import MESSAGE_HEAD
 from adacd_hil.log.ros_types import CAN_FRAME_DTYPE, FD_FRAME_DTYPE, LOG, is_log
+from adacd_hil.log.topic_records import Topic, record_dtype
 
 _FIRST_ROOM = 256
 _SPARE = 16

@@ -19,9 +19,10 @@ from adacd_hil.log import compiled_records as compiled
 from adacd_hil.log.chunks import DAMAGE, Block, Record, read_items, read_others
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.gathering import Gathered, Gathering
+from adacd_hil.log.mcap.records import RECORD_HEAD_BYTES
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.mcap_walk import RECORD_HEAD_BYTES, PayloadLayout, Topic
 from adacd_hil.log.parts import find_parts, part_path
+from adacd_hil.log.topic_records import PayloadLayout, Topic
 
 _COUNTS = {"frames", "messages", "dropped"}
 _CHANNELS = 1 << 16

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from adacd_hil.log.cdr import ENCAPSULATION
 from adacd_hil.log.channels import SCHEME_BLOCK, ChannelId, MessageLike
 from adacd_hil.log.decoding import Decoder
+from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.mcap_file import McapFile
-from adacd_hil.log.mcap_walk import MESSAGE_HEAD, RECORD_HEAD_BYTES, record_dtype
 from adacd_hil.log.packet import (
     EVENT,
     IS_ERROR,
@@ -45,6 +45,7 @@ from adacd_hil.log.ros_types import (
     pack_joint_state,
     pack_log,
 )
+from adacd_hil.log.topic_records import record_dtype
 from adacd_hil.records import JOINTS, Event, scheme_layout
 from adacd_hil.wire.bus import MAX_CLASSIC_BYTES
 

@@ -16,8 +16,8 @@ from adacd_hil.log.bus_frames import FRAME_DTYPE, LONG_FRAME_DTYPE, joined_frame
 from adacd_hil.log.cdr import MessageType
 from adacd_hil.log.channels import DECODED, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.mcap_file import FIELDS_KEY
-from adacd_hil.log.mcap_walk import MESSAGE_HEAD, RECORD_HEAD_BYTES, Payload, Topic
 from adacd_hil.log.ros_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
@@ -30,6 +30,7 @@ from adacd_hil.log.ros_types import (
 )
 from adacd_hil.log.run_folder import log_in
 from adacd_hil.log.summary import LOST_KEY
+from adacd_hil.log.topic_records import Payload, Topic
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactKind,

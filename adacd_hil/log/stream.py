@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.bus_frames import FRAME_DTYPE, is_of_frames
-from adacd_hil.log.mcap_walk import Topic
 from adacd_hil.log.reader import LoggedEvent, Series, events_of, open_log, own_topics, series_of
 from adacd_hil.log.summary import DROPPED_KEY, LOST_KEY
+from adacd_hil.log.topic_records import Topic
 
 
 class Piece(NamedTuple):

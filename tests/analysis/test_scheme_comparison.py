@@ -7,9 +7,9 @@ from adacd_hil.analysis.replay.scheme_comparison import SchemeComparison, differ
 from adacd_hil.config import load_settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.channels import run_channels
-from adacd_hil.log.mcap_walk import record_dtype
 from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.log.topic_records import record_dtype
 from adacd_hil.records import Event, scheme_layout
 from adacd_hil.scheme.batch import SchemeBatch
 

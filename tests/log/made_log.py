@@ -13,8 +13,8 @@ from mcap.records import SummaryOffset as GroupOffset
 
 from adacd_hil.log.cdr import ENCAPSULATION, Member, number_type
 from adacd_hil.log.chunked_file import ChunkedFile, encode
+from adacd_hil.log.mcap.records import MAGIC
 from adacd_hil.log.mcap_file import LIBRARY
-from adacd_hil.log.mcap_walk import MAGIC
 
 HEAD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<BQHIQQ")

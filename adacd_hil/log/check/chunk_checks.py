@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from adacd_hil.log.check.content_checks import ContentCheck
 from adacd_hil.log.check.definition_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings
-from adacd_hil.log.chunk_data import ChunkError, Opening
 from adacd_hil.log.chunked_file import INDEX_ENTRY
-from adacd_hil.log.editing.chunk_contents import Contents, message_contents, read_contents
-from adacd_hil.log.editing.record_scan import HEAD, RawRecord, name_of, parse
+from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
+from adacd_hil.log.mcap.opening import ChunkError, Opening
+from adacd_hil.log.mcap.records import HEAD, RawRecord, name_of, parse
 
 _CHANNEL_NUMBERS = 2**16
 

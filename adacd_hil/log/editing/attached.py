@@ -7,10 +7,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.editing.record_scan import RawRecord, parse, scan
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.mcap_file import RUN_METADATA
-from adacd_hil.log.mcap_walk import MAGIC
 
 
 def attachment(path: Path, name: str) -> bytes | None:

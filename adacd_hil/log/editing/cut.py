@@ -12,10 +12,10 @@ import numpy as np
 from mcap.records import Attachment
 from numpy.typing import NDArray
 
-from adacd_hil.log.editing.chunk_contents import Contents
 from adacd_hil.log.editing.intact import IntactLog
 from adacd_hil.log.editing.log_copy import LogCopy
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.chunk_contents import Contents
 from adacd_hil.log.mcap_file import ENDING_KEY, RUN_METADATA
 from adacd_hil.log.reader import LoggedContact, read_log
 from adacd_hil.log.stretch import Stretch

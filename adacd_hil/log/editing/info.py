@@ -17,15 +17,14 @@ from mcap.records import Attachment, Channel, Metadata, Statistics
 from adacd_hil.input_files import open_input
 from adacd_hil.log.cdr import payload_dtype
 from adacd_hil.log.check.content_checks import payload_size
-from adacd_hil.log.chunk_data import ChunkError, Opening
-from adacd_hil.log.editing.chunk_contents import Contents, read_contents
-from adacd_hil.log.editing.definitions import Definitions
-from adacd_hil.log.editing.file_end import FileEnd, read_end, read_record
-from adacd_hil.log.editing.record_scan import RawRecord, parse
 from adacd_hil.log.editing.salvage import Salvage
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.chunk_contents import Contents, read_contents
+from adacd_hil.log.mcap.definitions import Definitions
+from adacd_hil.log.mcap.file_end import FileEnd, read_end, read_record
+from adacd_hil.log.mcap.opening import ChunkError, Opening
+from adacd_hil.log.mcap.records import MAGIC, MESSAGE_HEAD, RawRecord, parse
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, FIELDS_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.mcap_walk import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.ros_types import LOG, unpack_log
 from adacd_hil.log.summary import DROPPED_KEY, count_frames, number

@@ -9,14 +9,13 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.chunk_data import ChunkError, Opening
-from adacd_hil.log.editing.chunk_contents import Contents, message_contents, read_contents
-from adacd_hil.log.editing.definitions import Definitions
-from adacd_hil.log.editing.file_end import crc_of, read_end
-from adacd_hil.log.editing.record_scan import Gap, RawRecord, attachment_crc_fits, parse, scan
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
+from adacd_hil.log.mcap.definitions import Definitions
+from adacd_hil.log.mcap.file_end import crc_of, read_end
+from adacd_hil.log.mcap.opening import ChunkError, Opening
+from adacd_hil.log.mcap.records import MAGIC, Gap, RawRecord, attachment_crc_fits, parse, scan
 from adacd_hil.log.mcap_file import PART_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.mcap_walk import MAGIC
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.summary import DROPPED_KEY, number
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
 from adacd_hil.log.chunked_file import ChunkedFile
-from adacd_hil.log.editing.chunk_contents import Contents
-from adacd_hil.log.editing.file_end import read_end
 from adacd_hil.log.editing.info import read_info
-from adacd_hil.log.editing.record_scan import read_header
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.chunk_contents import Contents
+from adacd_hil.log.mcap.file_end import read_end
+from adacd_hil.log.mcap.records import read_header
 from adacd_hil.log.mcap_file import LIBRARY, PRODUCT, ROS_PROFILE, SUMMARY_METADATA
 from adacd_hil.log.parts import is_part_name
 from adacd_hil.log.summary import COPY_ENDINGS

@@ -14,10 +14,10 @@ import numpy as np
 from mcap.records import Attachment
 from numpy.typing import NDArray
 
-from adacd_hil.log.editing.chunk_contents import Contents
 from adacd_hil.log.editing.intact import IntactLog
 from adacd_hil.log.editing.log_copy import LogCopy, Messages, Source
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.chunk_contents import Contents
 from adacd_hil.log.mcap_file import ENDING_KEY, RUN_METADATA
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.summary import DROPPED_KEY, MERGED, count_frames

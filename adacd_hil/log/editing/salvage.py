@@ -17,18 +17,18 @@ from mcap.records import Attachment, Chunk, Metadata, Statistics
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.chunk_data import ChunkError, Opening
-from adacd_hil.log.editing.chunk_contents import Contents, message_contents, read_contents
-from adacd_hil.log.editing.definitions import Definitions
-from adacd_hil.log.editing.file_end import crc_of, read_end
-from adacd_hil.log.editing.record_scan import (
+from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
+from adacd_hil.log.mcap.definitions import Definitions
+from adacd_hil.log.mcap.file_end import crc_of, read_end
+from adacd_hil.log.mcap.opening import ChunkError, Opening
+from adacd_hil.log.mcap.records import (
     Gap,
     RawRecord,
     attachment_crc_fits,
     parse,
     scan,
 )
-from adacd_hil.log.errors import LogError
 
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _NOTES = 20

@@ -28,9 +28,9 @@ from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.chunk_data import MOST_BYTES, Opening
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.recorded_frames import MOST_CHANNELS, MOST_NS, RECORDED_FRAME_DTYPE
+from adacd_hil.log.mcap.opening import MOST_BYTES, Opening
 
 _PIECE = 10_000
 """Frames that are gathered."""

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
 from adacd_hil.log.cdr import ENCAPSULATION
-from adacd_hil.log.chunk_data import Opening
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
+from adacd_hil.log.mcap.opening import Opening
+from adacd_hil.log.mcap.records import MAGIC, MESSAGE_HEAD, MOST_RECORD_BYTES, RECORD_HEAD_BYTES
 from adacd_hil.log.mcap_file import RUN_METADATA
-from adacd_hil.log.mcap_walk import MAGIC, MESSAGE_HEAD, MOST_RECORD_BYTES, RECORD_HEAD_BYTES
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import EPOCH_KEY
 from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, MAX_DATA

@@ -1,7 +1,4 @@
-"""Topics of an MCAP file, and what a whole message record of fixed size looks like to numpy.
-
-Layout of records: MCAP specification, section Records.
-"""
+"""Topics of a log, and the numpy layout of their message records where these have a fixed size."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,13 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Channel, Schema
 
-MAGIC = b"\x89MCAP0\r\n"
-MESSAGE_HEAD = 31
-"""Bytes of a message record before its payload: opcode, length, channel, sequence, log time, publish time."""
-RECORD_HEAD_BYTES = 9
-"""Bytes of a record that its length doesn't count: opcode, length."""
-MOST_RECORD_BYTES = 64 << 20
-"""Of a record that is read. A chunk of ours has 0.1 MB, one of others up to 16 MB; an attachment of a run 0.2 MB."""
+from adacd_hil.log.mcap.records import MESSAGE_HEAD
 
 
 class Payload(NamedTuple):

@@ -33,11 +33,17 @@ from mcap.records import (
 )
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.editing.record_shapes import fits, has_shape
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_walk import MAGIC, MOST_RECORD_BYTES
+from adacd_hil.log.mcap.record_shapes import fits, has_shape
 
+MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
+RECORD_HEAD_BYTES = HEAD.size
+"""Bytes of a record that its length doesn't count: opcode, length."""
+MESSAGE_HEAD = 31
+"""Bytes of a message record before its payload: opcode, length, channel, sequence, log time, publish time."""
+MOST_RECORD_BYTES = 64 << 20
+"""Of a record that is read. A chunk of ours has 0.1 MB, one of others up to 16 MB; an attachment of a run 0.2 MB."""
 _WINDOW = 1 << 20
 _READERS: dict[int, Any] = {
     Opcode.HEADER: Header.read,

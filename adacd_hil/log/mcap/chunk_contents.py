@@ -11,8 +11,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from adacd_hil.log.chunked_file import INDEX_ENTRY
-from adacd_hil.log.editing.record_scan import HEAD, RawRecord
-from adacd_hil.log.mcap_walk import MESSAGE_HEAD
+from adacd_hil.log.mcap.records import HEAD, MESSAGE_HEAD, RawRecord
 
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _START = struct.Struct("<BQ")

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from adacd_hil.log.editing.record_scan import RawRecord, parse
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.mcap.records import RawRecord, parse
 
 
 class Definitions:

@@ -7,9 +7,8 @@ from typing import IO, NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Footer
 
-from adacd_hil.log.editing.record_scan import HEAD, RawRecord, parse
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_walk import MAGIC, MOST_RECORD_BYTES
+from adacd_hil.log.mcap.records import HEAD, MAGIC, MOST_RECORD_BYTES, RawRecord, parse
 
 _BLOCK = 1 << 20
 _FOOTER = HEAD.size + 20

@@ -1,0 +1,1 @@
+"""MCAP files below the level of topics: records, chunks, blocks of messages."""
