@@ -53,22 +53,44 @@ def is_of_frames(topic: Topic) -> bool:
     return topic.name in FRAME_TOPICS and FRAME_TOPICS[topic.name].type_name == topic.type_name
 
 
-def copy_frames(frames: NDArray[Any], to: NDArray[Any]) -> None:
-    """Copy frames to others of their type, or of the longer one."""
-    data = frames["data"]
-    for name in FRAME_DTYPE.fields or ():
-        if name != "data":
-            to[name] = frames[name]
-    to["data"][:, : data.shape[1]] = data
-    to["data"][:, data.shape[1] :] = 0
+def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any]:
+    """Make frames of the records of a topic of frames; epoch_ns: what their times are less than those of the file."""
+    kind = FRAME_TOPICS[topic.name]
+    frames = np.empty(len(records), LONG_FRAME_DTYPE if kind.is_long else FRAME_DTYPE)
+    frames["t_ns"] = records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"] - epoch_ns
+    frames["cycle_t_ns"] = records["publish_time"].astype(np.int64) - epoch_ns
+    frames["is_tx"] = kind.is_tx
+    frames["length"] = records["len" if kind.is_long else "dlc"]
+    for name in ("can_id", "is_error", "data"):
+        frames[name] = records[name]
+    return frames
 
 
 def joined_frames(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Join frames in order, as long ones where some are."""
-    dtype = LONG_FRAME_DTYPE if any(piece.dtype == LONG_FRAME_DTYPE for piece in pieces) else FRAME_DTYPE
-    frames = np.empty(sum(map(len, pieces)), dtype)
-    place = 0
-    for piece in pieces:
-        copy_frames(piece, frames[place : place + len(piece)])
-        place += len(piece)
-    return frames
+    is_long = any(piece.dtype == LONG_FRAME_DTYPE for piece in pieces)
+    dtype = LONG_FRAME_DTYPE if is_long else FRAME_DTYPE
+    whole = [_lengthened(piece) if is_long else piece for piece in pieces]
+    items = np.concatenate((np.empty(0, _item(dtype)), *(piece.view(_item(dtype)) for piece in whole)))
+    return items.view(dtype)
+
+
+def reordered_frames(frames: NDArray[Any], order: NDArray[np.int64]) -> NDArray[Any]:
+    """Put frames into another order."""
+    return frames.view(_item(frames.dtype))[order].view(frames.dtype)
+
+
+def _item(dtype: "np.dtype[Any]") -> str:
+    """Name the type of a frame's bytes, which numpy copies as a whole and not field by field."""
+    return f"V{dtype.itemsize}"
+
+
+def _lengthened(frames: NDArray[Any]) -> NDArray[Any]:
+    if frames.dtype == LONG_FRAME_DTYPE:
+        return frames
+    long = np.zeros(len(frames), LONG_FRAME_DTYPE)
+    for name in FRAME_DTYPE.names or ():
+        if name != "data":
+            long[name] = frames[name]
+    long["data"][:, :MAX_CLASSIC_BYTES] = frames["data"]
+    return long

@@ -6,7 +6,7 @@ Cut and damaged files are read as far as they are intact; `is_complete` and `pro
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -16,8 +16,10 @@ from adacd_hil.log.bus_frames import FRAME_DTYPE, LONG_FRAME_DTYPE, joined_frame
 from adacd_hil.log.cdr import MessageType
 from adacd_hil.log.channels import DECODED, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_walk import LogWalk
 from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.mcap_file import FIELDS_KEY
+from adacd_hil.log.piece_builder import RawPiece
 from adacd_hil.log.ros_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
@@ -44,9 +46,6 @@ from adacd_hil.records import (
     Vector,
 )
 
-if TYPE_CHECKING:
-    from adacd_hil.log.joined import JoinedWalk
-
 __all__ = [
     "FRAME_DTYPE",
     "LONG_FRAME_DTYPE",
@@ -64,7 +63,7 @@ _KNOWN = {
     FD_FRAME.name: Payload(FD_FRAME_DTYPE, has_tail=True),
     JOINT_STATE.name: Payload(JOINT_STATE_DTYPE),
 }
-_PIECE_CYCLES = 20_000
+_EVERY_CYCLE = 1 << 62
 _NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
 
 
@@ -188,14 +187,10 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
     """
     path = log_in(path)
     walk, epoch_ns = open_log(path, topics)
-    pieces = list(walk.pieces(_PIECE_CYCLES, epoch_ns, has_frame_records=True))
-    rows = {}
-    for name in walk.topics:
-        found = [piece.records[name] for piece in pieces if name in piece.records]
-        if found:
-            rows[name] = np.concatenate(found)
+    pieces = list(walk.pieces(_EVERY_CYCLE, epoch_ns, has_frame_records=True))
+    piece = pieces[0] if pieces else RawPiece({}, joined_frames([]), {})
     own = own_topics(walk.metadata)
-    every = series_of(rows, walk.topics, own, epoch_ns)
+    every = series_of(piece.records, walk.topics, own, epoch_ns)
     series = {name: values for name, values in every.items() if name.startswith(DECODED) or name in own}
     return RunLog(
         path=path,
@@ -205,8 +200,8 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
         attachments=walk.attachments,
         topics=series,
         decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
-        frames=joined_frames([piece.frames for piece in pieces]),
-        events=[event for piece in pieces for event in events_of(piece.payloads, walk.topics, epoch_ns)],
+        frames=piece.frames,
+        events=events_of(piece.payloads, walk.topics, epoch_ns),
         contacts=contacts_of(series["/contact"]),
         parts=walk.parts,
     )
@@ -219,7 +214,7 @@ def topic_bytes(path: str | Path, topic: str) -> bytes:
     """
     walk, _ = open_log(path, (topic,))
     found = []
-    for piece in walk.pieces(_PIECE_CYCLES, 0, has_frame_records=True):
+    for piece in walk.pieces(_EVERY_CYCLE, 0, has_frame_records=True):
         found += piece.payloads.get(topic, [])
         if topic in piece.records:
             rows = {topic: piece.records[topic]}
@@ -229,11 +224,9 @@ def topic_bytes(path: str | Path, topic: str) -> bytes:
     return b"".join(found)
 
 
-def open_log(path: str | Path, topics: Collection[str] | None) -> tuple["JoinedWalk", int]:
+def open_log(path: str | Path, topics: Collection[str] | None) -> tuple[LogWalk, int]:
     """Begin to read a log; return the walk over it and what was added to t_ns for its times. Raises LogError."""
-    from adacd_hil.log.joined import JoinedWalk  # which loads numba
-
-    walk = JoinedWalk(log_in(path), _payload_layout, topics)
+    walk = LogWalk(log_in(path), _payload_layout, topics)
     return walk, _number(walk.metadata, EPOCH_KEY, 0)
 
 

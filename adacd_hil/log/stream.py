@@ -1,6 +1,6 @@
 """A log from front to back, piece by piece, in constant memory: for what is longer than memory, or has to be fast.
 
-On two processors one reads, checks and decompresses ahead while the other walks over the records; topics that weren't
+On two processors one reads, checks and decompresses ahead while the other gathers the messages; topics that weren't
 asked for cost nothing but their decompression.
 """
 
@@ -96,6 +96,6 @@ class LogStream:
 
     def __iter__(self) -> Iterator[Piece]:
         own = self._own_topics()
-        for gathered in self._walk.pieces(self._cycles_per_piece, self.epoch_ns):
+        for piece in self._walk.pieces(self._cycles_per_piece, self.epoch_ns):
             topics = {name: topic for name, topic in self._walk.topics.items() if not is_of_frames(topic)}
-            yield Piece(series_of(gathered.records, topics, own, self.epoch_ns), gathered.frames, gathered.payloads)
+            yield Piece(series_of(piece.records, topics, own, self.epoch_ns), piece.frames, piece.payloads)

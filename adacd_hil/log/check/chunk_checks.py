@@ -87,8 +87,9 @@ class ChunkCheck:
         contents = read_contents(data)
         for opcode in contents.strangers:
             self._findings.add("chunk-record", f"a chunk holds a {name_of(opcode)}", record.offset)
-        if contents.rest:
-            self._findings.add("chunk-record", f"a chunk ends with {contents.rest} bytes of no record", record.offset)
+        for place in contents.breaks:
+            rest = len(data) - place
+            self._findings.add("chunk-record", f"a chunk ends with {rest} bytes of no record", record.offset)
         self._compare_times(chunk, contents, record.offset)
         self._messages(contents, record.offset)
         self._expect(contents, facts)

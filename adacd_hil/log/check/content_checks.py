@@ -98,7 +98,7 @@ class ContentCheck:
         heads = data[contents.starts[looked_at, np.newaxis] + np.arange(MESSAGE_HEAD, MESSAGE_HEAD + 4)]
         is_wrong[looked_at] = (heads[:, 0] != 0) | (heads[:, 1] > _LAST_ENCAPSULATION)
         for place in np.flatnonzero(np.isin(contents.channels, [*self._fd_frames, *self._logs]) & ~is_wrong).tolist():
-            payload = contents.data[contents.starts[place] + MESSAGE_HEAD : contents.ends[place]]
+            payload = contents.payload(place)
             is_fd = int(contents.channels[place]) in self._fd_frames
             is_wrong[place] = not (_is_fd_frame(payload) if is_fd else is_log(payload))
         for place in np.flatnonzero(is_wrong)[:1].tolist():

@@ -260,4 +260,4 @@ def _fields(channel: Channel) -> tuple[str, ...]:
 
 def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
     for place in np.flatnonzero(contents.channels == channel).tolist():
-        yield contents.data[contents.starts[place] + MESSAGE_HEAD : contents.ends[place]]
+        yield contents.payload(place)

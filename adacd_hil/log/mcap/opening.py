@@ -4,11 +4,11 @@ Ours have 256 KiB before compression and shrink to 40 %; those of others have 1 
 that opens to gigabytes is no log.
 """
 
-import zlib
-
 import lz4.frame
 import zstandard
 from mcap.records import Chunk
+
+from adacd_hil.log.mcap.records import crc32
 
 MOST_BYTES = 32 << 20
 """Of a chunk, before compression."""
@@ -41,49 +41,62 @@ class Opening:
 
     def open(self, chunk: Chunk) -> bytes:
         """Return what a chunk holds, as long as it is. Raises ChunkError when that can't be had."""
-        try:
-            data = decompress(chunk.compression, chunk.data)
-        except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
-            raise ChunkError(f"can't be decompressed: {error or type(error).__name__}") from None
+        data = decompress(chunk.compression, chunk.data)
         self.allow(len(chunk.data), len(data))
         return data
 
     def open_checked(self, chunk: Chunk) -> bytes:
         """Return what a chunk holds. Raises ChunkError when it isn't what was put in, as far as that can be told."""
-        data = self.open(chunk)
-        if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-            raise ChunkError("fails its CRC")
-        if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
-            raise ChunkError(f"holds {len(data)} bytes, not {chunk.uncompressed_size}")
-        return data
+        return _checked(chunk, self.open(chunk), is_size_certain=bool(chunk.uncompressed_crc))
 
 
-def decompress(compression: str, data: bytes) -> bytes:
-    """Decompress the records of a chunk. Raises ChunkError for more than MOST_BYTES, and what the libraries raise."""
+def open_as_claimed(chunk: Chunk) -> bytes:
+    """Return what a chunk holds, whose size has been allowed. Raises ChunkError when that isn't as it says."""
+    data = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
+    return _checked(chunk, data, is_size_certain=False)
+
+
+def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
+    if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
+        raise ChunkError("fails its CRC")
+    if not is_size_certain and len(data) != chunk.uncompressed_size:
+        raise ChunkError(f"holds {len(data)} bytes, not {chunk.uncompressed_size}")
+    return data
+
+
+def decompress(compression: str, data: bytes, most_bytes: int = MOST_BYTES) -> bytes:
+    """Decompress the records of a chunk. Raises ChunkError when that fails, and for more than `most_bytes`."""
     if compression not in _KINDS:
         raise ChunkError(f"unknown compression {compression[:20]!r}")
-    if compression == "":
-        opened = data
-    elif compression == "zstd":
-        opened = _unzstd(data)
-    else:
-        stream = lz4.frame.LZ4FrameDecompressor()
-        opened = stream.decompress(data, MOST_BYTES + 1)
-        if not stream.eof and len(opened) <= MOST_BYTES:
-            raise ChunkError("can't be decompressed: it is cut")
-    if len(opened) > MOST_BYTES:
-        raise ChunkError(f"opens to more than {MOST_BYTES} bytes")
+    try:
+        opened = _decompress(compression, data, most_bytes)
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+        raise ChunkError(f"can't be decompressed: {error or type(error).__name__}") from None
+    if len(opened) > most_bytes:
+        raise ChunkError(f"opens to more than {most_bytes} bytes")
     return opened
 
 
-def _unzstd(data: bytes) -> bytes:
+def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
+    if compression == "":
+        return data
+    if compression == "zstd":
+        return _unzstd(data, most_bytes)
+    stream = lz4.frame.LZ4FrameDecompressor()
+    opened: bytes = stream.decompress(data, most_bytes + 1)
+    if not stream.eof and len(opened) <= most_bytes:
+        raise ChunkError("can't be decompressed: it is cut")
+    return opened
+
+
+def _unzstd(data: bytes, most_bytes: int) -> bytes:
     size = zstandard.frame_content_size(data)
     decompressor = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
-    if size > MOST_BYTES:
-        raise ChunkError(f"claims {size} bytes, more than {MOST_BYTES}")
+    if size > most_bytes:
+        raise ChunkError(f"claims {size} bytes, more than {most_bytes}")
     if size >= 0:
         return decompressor.decompress(data, max_output_size=max(size, 1))
-    pieces, left = [], MOST_BYTES + 1
+    pieces, left = [], most_bytes + 1
     with decompressor.stream_reader(data) as reader:  # a writer that didn't know
         while left > 0 and (piece := reader.read(min(left, _PIECE_BYTES))):
             pieces.append(piece)

@@ -1,4 +1,4 @@
-"""The records of an MCAP file in order, whole, cut or damaged: what is no record is said, and what follows is found.
+"""The records of an MCAP file in order: up to where they go, or, in a damaged file, what follows the damage too.
 
 Constant memory: one record at a time; one of more than MOST_RECORD_BYTES is none. Chunks stay closed.
 """
@@ -7,8 +7,7 @@ import io
 import os
 import re
 import struct
-import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -36,6 +35,12 @@ from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.record_shapes import fits, has_shape
 
+try:
+    from zlib_ng import zlib_ng as fast_zlib  # six times as fast, which saves a sixth of the time to read a log
+except ImportError:
+    import zlib as fast_zlib  # type: ignore[no-redef]
+
+crc32: Callable[..., int] = fast_zlib.crc32
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
 RECORD_HEAD_BYTES = HEAD.size
@@ -45,6 +50,9 @@ MESSAGE_HEAD = 31
 MOST_RECORD_BYTES = 64 << 20
 """Of a record that is read. A chunk of ours has 0.1 MB, one of others up to 16 MB; an attachment of a run 0.2 MB."""
 _WINDOW = 1 << 20
+_RUN_BYTES = 1 << 15
+_INDEX_HEAD = 6
+"""Bytes of a message index before its entries: its channel, how many bytes they have."""
 _READERS: dict[int, Any] = {
     Opcode.HEADER: Header.read,
     Opcode.FOOTER: Footer.read,
@@ -78,11 +86,25 @@ class RawRecord(NamedTuple):
         return self.offset + HEAD.size + len(self.body)
 
 
+class IndexRun(NamedTuple):
+    """Message indexes that follow each other."""
+
+    data: bytes  # their records
+    entries: list[bytes]  # of each
+
+
 class Gap(NamedTuple):
     """Bytes that are no record."""
 
     offset: int
     size: int
+
+
+class Problem(NamedTuple):
+    """Something that is missing of a file, in words. `is_damage`: these follow "the file is"."""
+
+    text: str
+    is_damage: bool = False
 
 
 class Trailer(NamedTuple):
@@ -102,12 +124,67 @@ def parse(opcode: int, body: bytes) -> Any:
     """Read a record with mcap's class for it. Raises LogError when it makes no sense."""
     try:
         return _READERS[opcode](ReadDataStream(io.BytesIO(body)))
-    except (McapError, struct.error, ValueError, OverflowError) as error:
+    except (McapError, struct.error, ValueError, OverflowError, MemoryError) as error:
         raise LogError(f"{name_of(opcode)} can't be read: {error or type(error).__name__}") from None
 
 
+def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
+    """List the records of a file up to its end, or to what can't be one; message indexes, which are many, in runs.
+
+    passed: kinds whose bodies aren't read. Raises LogError, which begins with `name`, when it isn't MCAP.
+    """
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    magic = file.read(len(MAGIC))
+    if not MAGIC.startswith(magic):
+        raise LogError(f"{name} is not an MCAP file")
+    position, is_whole = len(magic), False
+    while len(head := file.read(HEAD.size)) == HEAD.size:
+        opcode, length = HEAD.unpack(head)
+        if length > MOST_RECORD_BYTES:
+            yield Problem(f"the record at byte {position} has {length} bytes, more than {MOST_RECORD_BYTES}")
+            return
+        end = position + HEAD.size + length
+        if not opcode or end > size:
+            break
+        if opcode in passed:
+            file.seek(length, io.SEEK_CUR)
+            yield RawRecord(position, opcode, b"")
+        elif opcode == Opcode.MESSAGE_INDEX:
+            run = _index_run(head + file.read(max(length, _RUN_BYTES)))
+            if not run.data:  # the file has become shorter meanwhile
+                break
+            end = position + len(run.data)
+            file.seek(end)
+            yield run
+        else:
+            body = file.read(length)
+            if len(body) < length:
+                break
+            yield RawRecord(position, opcode, body)
+        position = end
+        if opcode == Opcode.FOOTER:
+            is_whole = file.read(len(MAGIC)) == MAGIC
+            break
+    if not is_whole:
+        yield Problem(f"cut after {size} bytes", is_damage=True)
+
+
+def _index_run(data: bytes) -> IndexRun:
+    """Take the message indexes at the beginning of `data`, of which the first is whole."""
+    position, entries = 0, []
+    while len(data) - position >= HEAD.size:
+        opcode, length = HEAD.unpack_from(data, position)
+        end = position + HEAD.size + length
+        if opcode != Opcode.MESSAGE_INDEX or end > len(data):
+            break
+        entries.append(data[position + HEAD.size + _INDEX_HEAD : end])
+        position = end
+    return IndexRun(data[:position], entries)
+
+
 def scan(file: IO[bytes]) -> Iterator[RawRecord | Gap | Trailer]:
-    """List the records of a file, and the gaps between them."""
+    """List the records of a file, and the gaps between them: what follows damage is found again."""
     return _Scan(file).items()
 
 
@@ -191,4 +268,4 @@ class _Scan:
 def attachment_crc_fits(body: bytes, is_vouched: bool = True) -> bool:
     """Say whether the body of an attachment fits its CRC; 0, for none, does if something else vouches for it."""
     stored = int.from_bytes(body[-4:], "little")
-    return stored == zlib.crc32(body[:-4]) or (stored == 0 and is_vouched)
+    return stored == crc32(body[:-4]) or (stored == 0 and is_vouched)

@@ -3,29 +3,29 @@
 What is intact of a cut or damaged file is kept, what isn't raises nothing.
 """
 
-import io
-import zlib
+import contextlib
+import operator
 from collections.abc import Collection, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from adacd_hil.log import compiled_records as compiled
-from adacd_hil.log.chunks import DAMAGE, Block, Record, read_items, read_others
+from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.gathering import Gathered, Gathering
-from adacd_hil.log.mcap.records import RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.blocks import Block, Item, read_blocks
+from adacd_hil.log.mcap.records import HEAD, RawRecord, attachment_crc_fits, parse, walk
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.parts import find_parts, part_path
+from adacd_hil.log.piece_builder import UNKNOWN, UNWANTED, PieceBuilder, RawPiece
 from adacd_hil.log.topic_records import PayloadLayout, Topic
 
 _COUNTS = {"frames", "messages", "dropped"}
 _CHANNELS = 1 << 16
+_NOT_OF_HEAD = set(Opcode) - {Opcode.ATTACHMENT, Opcode.METADATA}
 
 
 class Definition(NamedTuple):
@@ -42,16 +42,15 @@ class _Extras:
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
 
-    def take(self, record: Record) -> None:
-        """Take in a record, if it is an attachment or metadata. Raises one of DAMAGE."""
-        stream = ReadDataStream(io.BytesIO(record.body))
+    def take(self, record: RawRecord) -> None:
+        """Take in an attachment or metadata. Raises LogError for a damaged one."""
         if record.opcode == Opcode.ATTACHMENT:
-            attachment = Attachment.read(stream)
-            if zlib.crc32(record.body[:-4]) != int.from_bytes(record.body[-4:], "little"):
-                raise ValueError("attachment fails its CRC")
+            attachment: Attachment = parse(record.opcode, record.body)
+            if not attachment_crc_fits(record.body, is_vouched=False):
+                raise LogError("attachment fails its CRC")
             self.attachments[attachment.name] = attachment.data
         elif record.opcode == Opcode.METADATA:
-            metadata = Metadata.read(stream)
+            metadata: Metadata = parse(record.opcode, record.body)
             self.metadata[metadata.name] = metadata.metadata
 
 
@@ -66,36 +65,48 @@ class _Part(NamedTuple):
 def _read_head(path: Path) -> _Extras:
     """Read what comes before the messages. Raises LogError when the file can't be read or isn't MCAP."""
     extras = _Extras()
-    for item in read_others(path):
-        if isinstance(item, Record):
-            try:
-                extras.take(item)
-            except DAMAGE:
-                continue
-            if RUN_METADATA in extras.metadata:
-                break
+    try:
+        with open_input(path) as file:
+            for record in walk(file, str(path), _NOT_OF_HEAD):
+                if isinstance(record, RawRecord):
+                    with contextlib.suppress(LogError):
+                        extras.take(record)
+                if RUN_METADATA in extras.metadata:
+                    break
+    except OSError as error:
+        raise _unreadable(path, error) from None
     return extras
 
 
+def _read_items(path: Path) -> Iterator[Item]:
+    """Read a file from front to end. Raises LogError as `_read_head` does."""
+    try:
+        with open_input(path) as file:
+            yield from read_blocks(file, str(path))
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: OSError) -> LogError:
+    return LogError(f"log {path} can't be read: {error.strerror}")
+
+
 class _Definitions:
-    """The channels that a file defines."""
+    """The channels that a file defines; a later definition replaces an earlier one."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, Schema] = {}
 
-    def take(self, data: bytes) -> Definition | None:
-        """Take in a record; return the channel, if it defines one. Raises one of DAMAGE."""
-        stream = ReadDataStream(io.BytesIO(data[RECORD_HEAD_BYTES:]))
-        if data[0] == Opcode.SCHEMA:
-            schema = Schema.read(stream)
-            self._schemas[schema.id] = schema
-        elif data[0] == Opcode.CHANNEL:
-            channel = Channel.read(stream)
-            return Definition(channel, self._schemas.get(channel.schema_id, Schema(0, b"", "", "")))
-        return None
+    def take(self, record: RawRecord) -> Definition | None:
+        """Take in a definition; return the channel, if it is one. Raises LogError for one that makes no sense."""
+        definition: Schema | Channel = parse(record.opcode, record.body)
+        if isinstance(definition, Schema):
+            self._schemas[definition.id] = definition
+            return None
+        return Definition(definition, self._schemas.get(definition.schema_id, Schema(0, b"", "", "")))
 
 
-class JoinedWalk:
+class LogWalk:
     """What a log holds. `problem` says in one line what is missing, "" for a whole log."""
 
     def __init__(
@@ -161,24 +172,24 @@ class JoinedWalk:
         names = [part_path(self._path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 
-    def pieces(self, cycles: int, epoch_ns: int, has_frame_records: bool = False) -> Iterator[Gathered]:
+    def pieces(self, cycles: int, epoch_ns: int, has_frame_records: bool = False) -> Iterator[RawPiece]:
         """Read the messages of all parts, at most so many cycles at a time; what is known of the log grows meanwhile.
 
         epoch_ns: what the times of frames are less than those of the file; has_frame_records: of frames the records
         are gathered, too.
         """
-        gathering = Gathering(cycles, epoch_ns, has_frame_records)
+        builder = PieceBuilder(cycles, epoch_ns, has_frame_records)
         self._problems, self.summary, self.parts = [], {}, 0
         joined = -1
         for step in self._plan:
             if isinstance(step, str):
                 self._problems.append(step)
                 continue
-            walk = _PartWalk(step.path, gathering, self._layout, self._wanted)
+            walk = _PartWalk(step.path, builder, self._layout, self._wanted)
             for piece in walk.pieces():
-                self.topics = {topic.name: topic for topic in gathering.topics}
+                self.topics = {topic.name: topic for topic in builder.topics}
                 yield piece
-            self.topics = {topic.name: topic for topic in gathering.topics}
+            self.topics = {topic.name: topic for topic in builder.topics}
             if walk.problem:
                 self._problems.append(walk.problem if step.is_alone else f"{step.path.name}: {walk.problem}")
             self._problems += [
@@ -190,8 +201,8 @@ class JoinedWalk:
             self._sum_up(walk.extras.metadata.get(SUMMARY_METADATA, {}))
         if joined == self._last and self.summary.get(ENDING_KEY) == CONTINUED:
             self._problems += self._missing(self._last + 1, self._last + 2)
-        if not gathering.is_empty:
-            yield gathering.end()
+        if not builder.is_empty:
+            yield builder.end()
 
     def _sum_up(self, summary: dict[str, str]) -> None:
         both = self.summary.keys() & summary.keys() & _COUNTS
@@ -204,103 +215,108 @@ class JoinedWalk:
 class _PartWalk:
     """The walk over one file."""
 
-    def __init__(self, path: Path, gathering: Gathering, layout: PayloadLayout, wanted: Collection[str] | None) -> None:
+    def __init__(
+        self, path: Path, builder: PieceBuilder, layout: PayloadLayout, wanted: Collection[str] | None
+    ) -> None:
         self.extras = _Extras()
         self.problem = ""
         self.other_types: set[str] = set()
         """Topics that have another type than in the parts before."""
         self._path = path
-        self._gathering = gathering
+        self._builder = builder
         self._layout = layout
         self._wanted = wanted
         self._definitions = _Definitions()
-        self._channels = np.full(_CHANNELS, compiled.UNKNOWN, np.int64)
+        self._slots = np.full(_CHANNELS, UNKNOWN, np.int32)  # of each channel
         self._has_searched = False
 
     def _note(self, problem: str) -> None:
         self.problem = self.problem or problem
 
-    def pieces(self) -> Iterator[Gathered]:
+    def pieces(self) -> Iterator[RawPiece]:
         """Read the file; yield whenever enough is gathered."""
-        for item in read_items(self._path):
+        for item in _read_items(self._path):
             if isinstance(item, Block):
                 yield from self._take_block(item)
-            elif isinstance(item, Record):
+            elif isinstance(item, RawRecord):
                 try:
                     self.extras.take(item)
-                except DAMAGE:
-                    self._note(f"damaged at byte {item.position}")
+                except LogError:
+                    self._note(f"damaged at byte {item.offset + HEAD.size}")
             else:
                 self._note(item.text)
 
-    def _take_block(self, block: Block) -> Iterator[Gathered]:
-        for start, end in pairwise((0, *block.ends)):
-            for stop in self._gathering.walk(block.data, start, end, self._channels):
-                if stop.reason == compiled.CUT:
-                    yield self._gathering.end()
-                elif stop.reason == compiled.UNDEFINED:
-                    self._search(stop.culprit)
-                elif stop.reason == compiled.BROKEN:
-                    self._note(f"damaged at byte {block.position}")
-                else:
-                    self._define(block.data[stop.position : stop.end].tobytes(), block.position)
+    def _take_block(self, block: Block) -> Iterator[RawPiece]:
+        contents = block.contents
+        marks: list[tuple[int, RawRecord | None]] = [(record.offset, record) for record in contents.definitions]
+        marks += [(place, None) for place in contents.breaks]
+        first = 0
+        for place, definition in sorted(marks, key=operator.itemgetter(0)):
+            last = int(np.searchsorted(contents.starts, place))
+            yield from self._take_messages(block, slice(first, last))
+            first = last
+            try:
+                self._define(definition)
+            except LogError:
+                self._note(f"damaged at byte {block.position}")
+        yield from self._take_messages(block, slice(first, len(contents.starts)))
         if block.problem:
             self._note(block.problem)
-        if self._gathering.take_wrong():
+        if self._builder.wrong or Opcode.MESSAGE in contents.strangers:
+            self._builder.wrong = 0
             self._note("a message is not as long as its schema says")
 
-    def _define(self, data: bytes, position: int) -> None:
-        """Take in a definition, which `data` begin with."""
-        try:
-            definition = self._definitions.take(data)
-        except DAMAGE:
-            self._note(f"damaged at byte {position}")
-            return
+    def _take_messages(self, block: Block, messages: slice) -> Iterator[RawPiece]:
+        channels = block.contents.channels[messages]
+        slots = self._slots[channels]
+        if UNKNOWN in slots:
+            for channel in dict.fromkeys(channels[slots == UNKNOWN].tolist()):
+                self._search(channel)
+            slots = self._slots[channels]
+        yield from self._builder.add(block.contents, messages, slots)
+
+    def _define(self, record: RawRecord | None) -> None:
+        """Take in a definition. Raises LogError for one that makes no sense, and for None, which is no record."""
+        if record is None:
+            raise LogError("no record")
+        definition = self._definitions.take(record)
         if definition is not None:
-            self._channels[definition.channel.id] = self._slot_of(definition)
+            self._slots[definition.channel.id] = self._slot_of(definition)
 
     def _slot_of(self, definition: Definition) -> int:
         """Find the slot of a channel."""
         channel, schema = definition
         if self._wanted is not None and channel.topic not in self._wanted:
-            return compiled.UNWANTED
+            return UNWANTED
         topic = Topic.of(channel.topic, schema.name, self._layout(channel, schema))
-        for slot, known in enumerate(self._gathering.topics):
+        for slot, known in enumerate(self._builder.topics):
             if known.name == topic.name:
                 if known == topic:
                     return slot
                 self.other_types.add(topic.name)
-                return compiled.UNWANTED
-        return self._gathering.add(topic)
+                return UNWANTED
+        return self._builder.add_topic(topic)
 
     def _search(self, channel: int) -> None:
         """Look for the definition of a channel in the whole file: the one that came before its messages is damaged."""
         if not self._has_searched:
             self._has_searched = True
             for definition in _defined_in(self._path):
-                self._channels[definition.channel.id] = self._slot_of(definition)
-        if self._channels[channel] == compiled.UNKNOWN:
-            self._channels[channel] = compiled.UNWANTED
+                self._slots[definition.channel.id] = self._slot_of(definition)
+        if self._slots[channel] == UNKNOWN:
+            self._slots[channel] = UNWANTED
             self._note(f"messages of channel {channel}, which is not defined")
 
 
 def _defined_in(path: Path) -> Iterator[Definition]:
     """Read all definitions of a file."""
     definitions = _Definitions()
-    nothing = Gathering(cycles=np.iinfo(np.int64).max, epoch_ns=0, has_frame_records=False)
-    unwanted = np.full(_CHANNELS, compiled.UNWANTED, np.int64)
-    for item in read_items(path):
-        if not isinstance(item, Block):
-            continue
-        for start, end in pairwise((0, *item.ends)):
-            for stop in nothing.walk(item.data, start, end, unwanted):
-                if stop.reason == compiled.DEFINITION:
-                    try:
-                        definition = definitions.take(item.data[stop.position : stop.end].tobytes())
-                    except DAMAGE:
-                        continue
-                    if definition is not None:
-                        yield definition
+    for item in _read_items(path):
+        for record in item.contents.definitions if isinstance(item, Block) else ():
+            with contextlib.suppress(LogError):
+                definition = definitions.take(record)
+                if definition is not None:
+                    yield definition
 
 
 def _parts_of(path: Path) -> dict[int, Path]:
