@@ -10,27 +10,23 @@ of the MCAP channel, of which a topic may have several:
 """
 
 import contextlib
-import io
-import struct
-import zlib
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
 from adacd_hil.log.cdr import ENCAPSULATION
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
-from adacd_hil.log.mcap.opening import Opening
-from adacd_hil.log.mcap.records import MAGIC, MESSAGE_HEAD, MOST_RECORD_BYTES, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.blocks import Block, read_blocks
+from adacd_hil.log.mcap.chunk_contents import Contents
+from adacd_hil.log.mcap.file_end import summary_of
+from adacd_hil.log.mcap.records import HEAD, MAGIC, MESSAGE_HEAD, Problem, RawRecord, parse
 from adacd_hil.log.mcap_file import RUN_METADATA
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import EPOCH_KEY
@@ -41,11 +37,6 @@ CHANNEL_KEY = "can_channel"
 RATE_SWITCH_KEY = "bit_rate_switch"
 ERROR_STATE_KEY = "error_state_indicator"
 SENT = "to_can_bus"
-_RECORD_HEAD = struct.Struct("<BQ")
-_FOOTER = struct.Struct("<BQQQI")
-_MESSAGE_START = struct.Struct("<BQH")
-_NAME_BYTES = struct.Struct("<I")
-_DAMAGE = (McapError, struct.error, ValueError, EOFError, MemoryError, OverflowError)
 _HEAD_BYTES = MESSAGE_HEAD + len(ENCAPSULATION) + 12
 """Bytes of a record up to its frame_id."""
 _HEAD_DTYPE = np.dtype(
@@ -95,7 +86,6 @@ class McapFrames:
         self._bus = ""
         self._schemas: dict[int, Schema] = {}
         self._sources: dict[int, _Source | None] = {}
-        self._opening = Opening()
         self._files = _parts(source) if isinstance(source, Path) else [source]
         first = self._files[0]
         try:
@@ -124,82 +114,49 @@ class McapFrames:
         self.problem = self.problem or problem
 
     def _read(self, file: IO[bytes], name: str) -> Iterator[NDArray[Any]]:
-        """Walk over the records of a part."""
-        size = file.seek(0, io.SEEK_END)
-        file.seek(0)
-        self._schemas, self._sources, self._opening = {}, {}, Opening()
-        crc = zlib.crc32(file.read(len(MAGIC)))
-        position = len(MAGIC)
-        opcode = 0
-        while opcode != Opcode.FOOTER:
-            head = file.read(_RECORD_HEAD.size)
-            position += len(head)
-            opcode, length = _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else (0, 0)
-            if opcode == 0 or length > size - position:
-                self._note(f"{name} is cut after {size} bytes")
-                return
-            if length > MOST_RECORD_BYTES:
-                self._note(f"{name}: the record at byte {position} has {length} bytes, more than {MOST_RECORD_BYTES}")
-                return
-            body = file.read(length)
-            position += length
-            if opcode == Opcode.DATA_END and int.from_bytes(body[:4], "little") not in (0, crc):
-                self._note(f"{name}: the data section fails its CRC")
-            crc = zlib.crc32(body, zlib.crc32(head, crc))
-            if opcode == Opcode.CHUNK and not self._sources:
-                self._define_from_summary(file, size)
-                file.seek(position)
+        """Read a part."""
+        self._schemas, self._sources = {}, {}
+        summary = summary_of(file)  # for the case that the chunk that defines channels is damaged
+        for item in read_blocks(file, name, block_bytes=1):
+            if isinstance(item, Block) and not self._sources:
+                with contextlib.suppress(LogError):
+                    for record in summary:
+                        self._define(record)
+            if isinstance(item, Problem):
+                self._note(f"{name} is {item.text}" if item.is_damage else f"{name}: {item.text}")
+                continue
             try:
-                frames = self._take(opcode, head + body)
-            except _DAMAGE:
-                self._note(f"{name} is damaged at byte {position - length}")
+                frames = self._take(item)
+            except (LogError, ValueError):
+                position = item.position if isinstance(item, Block) else item.offset + HEAD.size
+                self._note(f"{name} is damaged at byte {position}")
                 continue
             if len(frames):
                 yield frames
-        if file.read(len(MAGIC)) != MAGIC:
-            self._note(f"{name} is cut after {size} bytes")
 
-    def _define_from_summary(self, file: IO[bytes], size: int) -> None:
-        """Take in the definitions that the end of the file repeats, for the case that their chunk is damaged."""
-        place = size - len(MAGIC) - _FOOTER.size
-        file.seek(max(place, 0))
-        footer = file.read(_FOOTER.size)
-        opcode, _, position, _, _ = _FOOTER.unpack(footer) if len(footer) == _FOOTER.size else (0, 0, 0, 0, 0)
-        if opcode != Opcode.FOOTER or not max(0, place - MOST_RECORD_BYTES) < position <= place:
-            return
-        file.seek(position)
-        summary = file.read(place - position)
-        position = 0
-        with contextlib.suppress(*_DAMAGE):
-            while position < len(summary):
-                opcode, length = _RECORD_HEAD.unpack_from(summary, position)
-                position += _RECORD_HEAD.size + length
-                self._define(opcode, summary[position - length : position])
-
-    def _take(self, opcode: int, record: bytes) -> NDArray[Any]:
-        """Take in a record outside chunks, or a chunk; return the frames in it."""
-        stream = ReadDataStream(io.BytesIO(record[_RECORD_HEAD.size :]))
-        if opcode == Opcode.CHUNK:
-            chunk = Chunk.read(stream)
-            return self._frames(self._opening.open_checked(chunk))
-        if opcode in (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA):
-            return self._frames(record)
-        if opcode == Opcode.METADATA:
-            metadata = Metadata.read(stream)
+    def _take(self, item: Block | RawRecord) -> NDArray[Any]:
+        """Take in a chunk or a record outside chunks; return the frames in it. Raises LogError, ValueError."""
+        if isinstance(item, Block):
+            if item.problem or item.contents.breaks:
+                raise LogError("a chunk is damaged")
+            for record in item.contents.definitions:
+                self._define(record)
+            return self._frames(item.contents)
+        if item.opcode == Opcode.METADATA:
+            metadata: Metadata = parse(item.opcode, item.body)
             if metadata.name == RUN_METADATA:
                 self._bus = metadata.metadata.get("channel", "")
                 epoch_ns = metadata.metadata.get(EPOCH_KEY, "")
                 self.epoch_ns = int(epoch_ns) if epoch_ns.isdecimal() else 0
         return _NO_FRAMES
 
-    def _define(self, opcode: int, body: bytes) -> None:
-        """Take in a schema or a channel."""
-        stream = ReadDataStream(io.BytesIO(body))
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(stream)
+    def _define(self, record: RawRecord) -> None:
+        """Take in a schema or a channel. Raises LogError."""
+        if record.opcode == Opcode.SCHEMA:
+            schema: Schema = parse(record.opcode, record.body)
             self._schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(stream)
+        elif record.opcode == Opcode.CHANNEL:
+            channel: Channel = parse(record.opcode, record.body)
             self._sources[channel.id] = self._source(channel)
 
     def _source(self, channel: Channel) -> _Source | None:
@@ -218,29 +175,27 @@ class McapFrames:
             has_error_state=is_fd and channel.metadata.get(ERROR_STATE_KEY, "0") == "1",
         )
 
-    def _frames(self, data: bytes) -> NDArray[Any]:
-        """Read the frames of a chunk in the order of the file."""
-        found: defaultdict[tuple[_Source, int, int], list[int]] = defaultdict(list)
-        position = 0
-        while position < len(data):
-            opcode, length, channel_id = _MESSAGE_START.unpack_from(data, position)
-            end = position + RECORD_HEAD_BYTES + length
-            if opcode == Opcode.MESSAGE:
-                source = self._sources.get(channel_id)
-                if source is not None:
-                    (name_bytes,) = _NAME_BYTES.unpack_from(data, position + _HEAD_BYTES - _NAME_BYTES.size)
-                    found[source, end - position, name_bytes].append(position)
-            else:
-                self._define(opcode, data[position + RECORD_HEAD_BYTES : end])
-            position = end
-        groups = [
-            (_unpack(source, data, np.array(starts), size, name_bytes, self.epoch_ns), starts)
-            for (source, size, name_bytes), starts in found.items()
-        ]
-        if not groups:
+    def _frames(self, contents: Contents) -> NDArray[Any]:
+        """Read the frames of a chunk in the order of the file. Raises ValueError for a frame that is none."""
+        places, found = [], []
+        for number in np.unique(contents.channels).tolist():
+            source = self._sources.get(number)
+            if source is None:
+                continue
+            messages = np.flatnonzero(contents.channels == number)
+            starts = contents.starts[messages]
+            sizes = contents.ends[messages] - starts
+            if (sizes < _HEAD_BYTES).any():
+                raise ValueError("a frame is shorter than its type")
+            name_bytes = contents.rows(starts + _HEAD_BYTES - 4, 4).view("<u4")[:, 0]
+            shapes, which = np.unique(np.stack((sizes, name_bytes), axis=1), axis=0, return_inverse=True)
+            for shape, (size, length) in enumerate(shapes.tolist()):
+                chosen = which == shape
+                places.append(messages[chosen])
+                found.append(_unpack(source, contents.rows(starts[chosen], size), length, self.epoch_ns))
+        if not found:
             return _NO_FRAMES
-        places = np.concatenate([starts for _, starts in groups])
-        frames: NDArray[Any] = np.concatenate([frames for frames, _ in groups])[np.argsort(places)]
+        frames: NDArray[Any] = np.concatenate(found)[np.argsort(np.concatenate(places))]
         return frames
 
 
@@ -256,22 +211,20 @@ def _check_magic(file: IO[bytes], name: str) -> None:
         raise LogError(f"{name} is not an MCAP file")
 
 
-def _unpack(
-    source: _Source, data: bytes, starts: NDArray[np.int64], size: int, name_bytes: int, epoch_ns: int
-) -> NDArray[Any]:
-    """Unpack the messages of `size` bytes that begin at `starts`, whose frame_id has `name_bytes` bytes.
+def _unpack(source: _Source, rows: NDArray[np.uint8], name_bytes: int, epoch_ns: int) -> NDArray[Any]:
+    """Unpack the message records `rows` (n, size), whose frame_id has `name_bytes` bytes.
 
     Raises ValueError where they are shorter than their type.
     """
+    size = rows.shape[1]
     body_start = _HEAD_BYTES + name_bytes
     body_start += -(body_start - MESSAGE_HEAD - len(ENCAPSULATION)) % 4
     body = _FD_DTYPE if source.is_fd else _CLASSIC_DTYPE
     if body_start + body.itemsize > size:
         raise ValueError("a frame is shorter than its type")
-    rows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), size)[starts]
     heads = rows[:, :_HEAD_BYTES].copy().view(_HEAD_DTYPE)[:, 0]
     bodies = rows[:, body_start : body_start + body.itemsize].copy().view(body)[:, 0]
-    frames = np.zeros(len(starts), RECORDED_FRAME_DTYPE)
+    frames = np.zeros(len(rows), RECORDED_FRAME_DTYPE)
     frames["t_ns"] = heads["sec"].astype(np.int64) * 1_000_000_000 + heads["nanosec"] - epoch_ns
     frames["cycle_t_ns"] = heads["publish_time"].astype(np.int64) - epoch_ns
     frames["is_tx"] = source.is_tx

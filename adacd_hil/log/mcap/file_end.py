@@ -25,15 +25,10 @@ class FileEnd(NamedTuple):
 
 def read_end(file: IO[bytes]) -> FileEnd | None:
     """Read the end of a file; None where there is none."""
-    size = os.fstat(file.fileno()).st_size
-    place = size - len(MAGIC) - _FOOTER
-    tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
-    if place < len(MAGIC) + _DATA_END or not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER:
+    found = _find(file)
+    if found is None:
         return None
-    footer: Footer = parse(Opcode.FOOTER, tail[HEAD.size : _FOOTER])
-    end = footer.summary_start or place
-    if not len(MAGIC) + _DATA_END <= end <= place:
-        return None
+    place, end, footer = found
     data_end = _read(file, end - _DATA_END, _DATA_END)
     if data_end[0] != Opcode.DATA_END:
         return None
@@ -46,6 +41,27 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
     ):
         summary = _split(_read(file, end, place - end), end)
     return FileEnd(end - _DATA_END, data_crc, summary)
+
+
+def summary_of(file: IO[bytes]) -> list[RawRecord]:
+    """Read the summary of a file, whether or not it has a CRC that fits; empty where there is none."""
+    found = _find(file)
+    if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
+        return []
+    place, end, _ = found
+    return _split(_read(file, end, place - end), end)
+
+
+def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
+    """Find where the footer is, and where the summary begins; None where there is no end."""
+    size = file.seek(0, os.SEEK_END)
+    place = size - len(MAGIC) - _FOOTER
+    tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
+    if place < len(MAGIC) + _DATA_END or not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER:
+        return None
+    footer: Footer = parse(Opcode.FOOTER, tail[HEAD.size : _FOOTER])
+    end = footer.summary_start or place
+    return (place, end, footer) if len(MAGIC) + _DATA_END <= end <= place else None
 
 
 def _split(data: bytes, offset: int) -> list[RawRecord]:
