@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.drawing import (
     COLOURS,
     PANEL_BINS,
@@ -29,8 +28,9 @@ from adacd_hil.analysis.drawing import (
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import ADAPTATIONS
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.touches import filtered, row_at
 from adacd_hil.analysis.sections import Section
-from adacd_hil.analysis.touches import filtered, row_at
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
 from adacd_hil.scheme.bank import channels_of
 

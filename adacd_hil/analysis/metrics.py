@@ -21,23 +21,23 @@ MONITOR at its onset; it is *missed* if it is armed and has no detection.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
 those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.evidence`; the paper's scheme that ran
-beside it on the same stream: `adacd_hil.analysis.beside`.
+beside it on the same stream: `adacd_hil.analysis.score.paper_beside`.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from adacd_hil.analysis.beside import evaluate_beside
-from adacd_hil.analysis.contacts import Contact, list_contacts
 from adacd_hil.analysis.cyclic_data import CyclicData, gather_data
-from adacd_hil.analysis.detections import assign, find_detections
 from adacd_hil.analysis.endings import find_causes, find_faults
 from adacd_hil.analysis.evidence import Evidence, evaluate_certified, last_row
 from adacd_hil.analysis.paper_comparison import PaperRow, compare_with_paper
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.alarms import assign, find_detections
+from adacd_hil.analysis.score.contacts import Contact, list_contacts
+from adacd_hil.analysis.score.paper_beside import evaluate_beside
+from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.analysis.sections import Section, rows_of, split_sections
 from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_reactions
-from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.analysis.untouched import Residual, Untouched, gather_untouched
 from adacd_hil.analysis.verdict import give_verdict, is_margin_below_1, is_revoked
 from adacd_hil.records import PARAMETER_NAMES, SchemeState

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.beside import Beside
-from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.paper_beside import Beside
 from adacd_hil.analysis.sections import Section
 from adacd_hil.analysis.untouched import Residual
 from adacd_hil.analysis.verdict import LISTED

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.analysis.confidence_bounds import rate_bound_per_h
 from adacd_hil.analysis.distribution import Distribution
+from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.analysis.beside import SETTLING_TIME_CONSTANTS, BesideGatherer, Reached, larger
-from adacd_hil.analysis.detections import Detection, find_detections
 from adacd_hil.analysis.evidence import ChannelMargin, MarginGatherer
 from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.score.alarms import Detection, find_detections
+from adacd_hil.analysis.score.paper_beside import SETTLING_TIME_CONSTANTS, BesideGatherer, Reached, larger
+from adacd_hil.analysis.score.touches import Touch, true_contacts
 from adacd_hil.analysis.sections import Section, rows_of, split_sections
 from adacd_hil.analysis.smallest_push import PushGatherer, SmallestPush
-from adacd_hil.analysis.touches import Touch, true_contacts
 from adacd_hil.records import SchemeState, Vector
 
 

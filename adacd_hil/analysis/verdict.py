@@ -3,11 +3,11 @@
 import itertools
 from typing import Final, TypeGuard
 
-from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.cyclic_data import CyclicData, data_text
 from adacd_hil.analysis.endings import Fault
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.sections import Section
 
 LISTED: Final = 4

@@ -24,8 +24,8 @@ from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.report import Report
 from adacd_hil.analysis.report.run_page import report_page
+from adacd_hil.analysis.score.touches import Channel, two_pole_delay_s
 from adacd_hil.analysis.sections import split_sections
-from adacd_hil.analysis.touches import Channel, two_pole_delay_s
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
 

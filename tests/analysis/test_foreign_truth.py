@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from hand_made_run import record, record_truth, touched_run
 
-from adacd_hil.analysis.foreign_truth import config_digest, foreign_truth
 from adacd_hil.analysis.replay.replay import contacts_beside
-from adacd_hil.analysis.report import truth_rows
 from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.analysis.report.report import write_report
-from adacd_hil.analysis.report.truth_rows import TruthRows
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score import truth_reading
+from adacd_hil.analysis.score.foreign_truth import config_digest, foreign_truth
+from adacd_hil.analysis.score.truth_reading import TruthRows
 from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.config import to_toml
 from adacd_hil.log.recorder import Recorder
@@ -120,7 +120,7 @@ def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() ->
         nothing, nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), None, nothing, nothing, np.zeros(1),
         np.zeros((1, 7)), {}, "", True, ((0, 3), (1, 50)),
     )  # fmt: skip
-    one, both = (truth_rows.host_truth(rows, np.array(begins), 1000, None) for begins in ([0], [0, 480]))
+    one, both = (truth_reading.host_truth(rows, np.array(begins), 1000, None) for begins in ([0], [0, 480]))
     assert one is not None
     assert both is not None
     assert (one.covers(2), one.covers(3), one.covers(900)) == (False, True, True)

@@ -11,14 +11,15 @@ from hand_made_run import make_certified_run, make_run, react, touch
 from test_run_report import record_truth
 
 from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report import long_run, truth_rows
+from adacd_hil.analysis.report import long_run
 from adacd_hil.analysis.report.json_form import report_json
 from adacd_hil.analysis.report.outline import Facts, TruthClock
 from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.analysis.report.report import write_run_report
 from adacd_hil.analysis.report.timeline import timeline_of
-from adacd_hil.analysis.report.truth_rows import TruthRows, read_truth
 from adacd_hil.analysis.report.words import left_out_text, shown_contacts
+from adacd_hil.analysis.score import truth_reading
+from adacd_hil.analysis.score.truth_reading import TruthRows, read_truth
 from adacd_hil.analysis.verdict import identified_text
 from adacd_hil.cli.main import cli
 from adacd_hil.config import to_toml
@@ -173,7 +174,7 @@ def test_a_log_of_just_so_many_cycles_is_kept_whole(certified):
 
 def test_a_long_truth_keeps_what_is_asked_of_its_contacts(monkeypatch, certified):
     for name, value in (("_BEGINNING", (50, 20)), ("_ENDING", 60), ("_HELD", 150), ("_BUCKET", 10)):
-        monkeypatch.setattr(truth_rows, name, value)
+        monkeypatch.setattr(truth_reading, name, value)
     whole, thinned = (read_truth(truth_of(certified), most) for most in (10**6, 100))
     assert len(thinned.cycle) < 450
     for index in (0, 1, 2):
@@ -207,7 +208,7 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
         problem="",
         is_complete=True,
     )
-    truth = truth_rows.host_truth(rows, np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
+    truth = truth_reading.host_truth(rows, np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
     assert truth.cycle.tolist() == [98, 99, 100]
     columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
     assert [len(column) for column in columns] == [3] * 5

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.analysis.confidence_bounds import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.analysis.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.analysis.replay.replay import contacts_beside
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.score.confidence_bounds import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.analysis.sweep import tune_logs
 from adacd_hil.analysis.sweep.tune import Candidate, Outcome, Tuning, _best, _problems
 from adacd_hil.analysis.sweep.tune_config import base_of, suggested_toml

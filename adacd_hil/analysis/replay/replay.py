@@ -16,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.foreign_truth import foreign_truth
 from adacd_hil.analysis.host_cycles import describe_unjudged
 from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.replay.attempts import Stretch
@@ -30,6 +29,7 @@ from adacd_hil.analysis.replay.scheme_comparison import (
 )
 from adacd_hil.analysis.replay.source import LogSource, Part, Source
 from adacd_hil.analysis.replay.truth_contacts import TrueContacts, read_contacts
+from adacd_hil.analysis.score.foreign_truth import foreign_truth
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.errors import LogError

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.host_cycles import EmulatorSpan, whole_rounds
+from adacd_hil.analysis.score.touches import filtered
 from adacd_hil.analysis.timing import Cycles
-from adacd_hil.analysis.touches import filtered
 from adacd_hil.log.stream import LogStream
 from adacd_hil.records import Vector
 

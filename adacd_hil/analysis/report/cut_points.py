@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.analysis.beside import SETTLING_TIME_CONSTANTS
 from adacd_hil.analysis.report.outline import BUSY
 from adacd_hil.analysis.run import Run
-from adacd_hil.analysis.touches import true_contacts
+from adacd_hil.analysis.score.paper_beside import SETTLING_TIME_CONSTANTS
+from adacd_hil.analysis.score.touches import true_contacts
 
 MARGIN_S: Final = 0.2
 """Before what a stretch would cut."""

@@ -19,14 +19,15 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.analysis.cyclic_data import CyclicDataGatherer
-from adacd_hil.analysis.detections import find_detections
 from adacd_hil.analysis.metrics import Gathered, is_realtime
 from adacd_hil.analysis.report.bounds import ADAPTATIONS
 from adacd_hil.analysis.report.scheme_rows import SchemeRows, run_of_piece
-from adacd_hil.analysis.report.thinning import Rows, extreme_rows
 from adacd_hil.analysis.report.traces import panels_of
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.alarms import find_detections
+from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.analysis.sections import split_sections
+from adacd_hil.analysis.thinning import Rows, extreme_rows
 from adacd_hil.analysis.timing import (
     QUANTITIES,
     QUEUES,
@@ -35,7 +36,6 @@ from adacd_hil.analysis.timing import (
     columns_of_series,
     find_reactions,
 )
-from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.analysis.untouched import UntouchedGatherer
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import Piece

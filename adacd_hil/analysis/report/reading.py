@@ -14,8 +14,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.detections import find_detections
-from adacd_hil.analysis.foreign_truth import foreign_truth
 from adacd_hil.analysis.host_cycles import describe_unjudged
 from adacd_hil.analysis.metrics import Gathered
 from adacd_hil.analysis.replay.source import settings_of
@@ -23,10 +21,12 @@ from adacd_hil.analysis.report.cut_points import settling_s, widen
 from adacd_hil.analysis.report.long_run import LongRun
 from adacd_hil.analysis.report.outline import Facts, Outline
 from adacd_hil.analysis.report.scheme_rows import SchemeRows, run_of_piece
-from adacd_hil.analysis.report.truth_rows import TruthRows, host_truth, read_truth
 from adacd_hil.analysis.run import Run, StretchOfRun, Truth
+from adacd_hil.analysis.score.alarms import find_detections
+from adacd_hil.analysis.score.foreign_truth import foreign_truth
+from adacd_hil.analysis.score.touches import true_contacts
+from adacd_hil.analysis.score.truth_reading import TruthRows, host_truth, read_truth
 from adacd_hil.analysis.timing import CycleColumns, columns_of_series
-from adacd_hil.analysis.touches import true_contacts
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap_file import ENDING_KEY
 from adacd_hil.log.reader import Series, check_states

@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from adacd_hil.analysis.contacts import Contact
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.run import StretchOfRun
+from adacd_hil.analysis.score.contacts import Contact
 
 NONE: Final = "–"
 

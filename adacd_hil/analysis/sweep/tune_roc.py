@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.confidence_bounds import rate_bound_per_h, share_bounds
 from adacd_hil.analysis.false_alarms import (
     Calibration,
     TooLittleMotionError,
@@ -21,6 +20,7 @@ from adacd_hil.analysis.false_alarms import (
     counted_hours,
     largest_ratio,
 )
+from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h, share_bounds
 from adacd_hil.analysis.thresholds import BLOCK_S
 from adacd_hil.records import Vector
 

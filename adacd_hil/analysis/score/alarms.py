@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.touches import Touch, forgotten_s, threshold_at
 from adacd_hil.analysis.sections import is_interrupted
-from adacd_hil.analysis.touches import Touch, forgotten_s, threshold_at
 from adacd_hil.records import ContactReport, SchemeState
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from adacd_hil.analysis.run import Mask, PaperStream, Run
+from adacd_hil.analysis.score.touches import Touch, forgotten_s, row_at, true_contacts
 from adacd_hil.analysis.sections import Section, rows_of
-from adacd_hil.analysis.touches import Touch, forgotten_s, row_at, true_contacts
 from adacd_hil.records import Vector
 
 SETTLING_TIME_CONSTANTS = 10.0

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.analysis.detections import Detection
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.alarms import Detection
+from adacd_hil.analysis.score.touches import Touch, channels_at, ideal_response, row_at
 from adacd_hil.analysis.sections import Section, section_at
-from adacd_hil.analysis.touches import Touch, channels_at, ideal_response, row_at
 from adacd_hil.records import JOINTS, ContactReport, Location, SchemeState, Vector
 from adacd_hil.scheme.classification import WINDOW_S
 
@@ -82,7 +82,7 @@ def list_contacts(
 ) -> tuple[Contact, ...]:
     """List the true contacts with the first detection of each; without the truth the detections.
 
-    owners: of each detection, see `detections.assign`.
+    owners: of each detection, see `alarms.assign`.
     """
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
