@@ -29,6 +29,7 @@ from lab import (
 )
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.score.alarms import begins_of
 from adacd_hil.scheme.regressor import inverse_dynamics
 
 PAYLOAD_KG = 1.0
@@ -163,7 +164,7 @@ def is_moving(motion: Motion) -> NDArray[np.bool_]:
 def alarms(outcome: Outcome, begin: int, end: int) -> int:
     """Count the alarms of armed detection between two cycles."""
     cycles = np.flatnonzero((outcome.over[begin:end] != 0) & (outcome.phase[begin:end] == ARMED))
-    return int(cycles.size > 0) + int(np.count_nonzero(np.diff(cycles) > ALARM_GAP_S / PERIOD_S))
+    return int(np.count_nonzero(begins_of(cycles, ALARM_GAP_S / PERIOD_S)))
 
 
 def leave_alone(case: Case, duration_s: float, motion_seed: int) -> Row:

@@ -25,6 +25,7 @@ from campaign_certified import CertifiedScheme
 from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record, still
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.score.alarms import begins_of
 from adacd_hil.cli.table import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
@@ -218,7 +219,7 @@ def play(case: Case, minutes: float, position_torque_Nm: float = 0.0) -> Played:
         armed_s=(armed - begin) * PERIOD_S,
         hours=float(is_monitored.sum()) * PERIOD_S / 3600.0,
         taken_back=int(np.count_nonzero(is_monitored & (observation.astype(np.int64) & Observation.WITHHELD != 0))),
-        alarms=int(over.size and 1 + np.count_nonzero(np.diff(over) > APART)),
+        alarms=int(np.count_nonzero(begins_of(over, APART))),
         median_Nm=tuple(float(np.median(slow[is_quiet, i])) for i in range(2)),
         most_Nm=tuple(float(np.percentile(slow[is_quiet, i], 99.0)) for i in range(2)),
         wide_share=tuple(float(np.mean(slow[is_moving[:, i], i] > 0.15)) for i in range(2)),

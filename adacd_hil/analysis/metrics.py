@@ -14,10 +14,8 @@ model's residual is given, because theta_hat still moves. Without the truth, [de
 stands for the contact. After the request to finish the arm parks and stands, where friction may hold any torque up
 to F_c: those cycles don't count.
 
-**A detection** is a transition to REACT by a contact, in whatever state: the certified scheme detects while it adapts
-and while it parks, too. It belongs to a true contact if it falls between the onset and one time constant after the true
-torque, filtered, is back within the threshold; else it is a false alarm. A true contact is *armed* if the scheme is in
-MONITOR at its onset; it is *missed* if it is armed and has no detection.
+**A detection** is an alarm of `adacd_hil.analysis.score.alarms`. Which contacts were found or missed, and which
+detections are false alarms: `adacd_hil.analysis.score.judge`; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
 those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.evidence`; the paper's scheme that ran
@@ -32,15 +30,16 @@ from adacd_hil.analysis.endings import find_causes, find_faults
 from adacd_hil.analysis.evidence import Evidence, evaluate_certified, last_row
 from adacd_hil.analysis.paper_comparison import PaperRow, compare_with_paper
 from adacd_hil.analysis.run import Run
-from adacd_hil.analysis.score.alarms import assign, find_detections
+from adacd_hil.analysis.score.alarms import find_detections
+from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h
 from adacd_hil.analysis.score.contacts import Contact, list_contacts
 from adacd_hil.analysis.score.paper_beside import evaluate_beside
-from adacd_hil.analysis.score.touches import true_contacts
+from adacd_hil.analysis.score.touches import judge_run, true_contacts
 from adacd_hil.analysis.sections import Section, rows_of, split_sections
 from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_reactions
 from adacd_hil.analysis.untouched import Residual, Untouched, gather_untouched
 from adacd_hil.analysis.verdict import give_verdict, is_margin_below_1, is_revoked
-from adacd_hil.records import PARAMETER_NAMES, SchemeState
+from adacd_hil.records import PARAMETER_NAMES
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class Metrics:
         push = None if self.evidence is None else self.evidence.smallest_push
         if push is None or self.armed_false_alarms is None:
             return None
-        return push.false_alarm_bound_per_h(self.armed_false_alarms)
+        return rate_bound_per_h(self.armed_false_alarms, push.hours)
 
 
 class Gathered(NamedTuple):
@@ -104,9 +103,9 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     gathered = gathered or Gathered(gather_untouched(run, [run]), timing_evidence(run), gather_data(run))
     touches = true_contacts(run)
     detections = find_detections(run)
-    owners = assign(run, touches, detections)
+    score = judge_run(run, touches, detections)
     sections = split_sections(run)
-    contacts = list_contacts(run, sections, touches, detections, owners)
+    contacts = list_contacts(run, sections, touches, detections, score)
     residuals = gathered.untouched.residuals
     evidence = _evidence(run, sections, gathered.untouched)
     adaptation_s = {
@@ -115,14 +114,8 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         if section.kind == "adaptation"
     }
     has_truth = run.truth is not None
-    unexplained = [
-        d
-        for d, owner in zip(detections, owners, strict=True)
-        if owner is None and (run.truth is None or run.truth.covers(int(run.cycle[d.row])))
-    ]
-    false_s = tuple(detection.detected_s for detection in unexplained)
-    armed_false = sum(run.state[detection.row - 1] == SchemeState.MONITOR for detection in unexplained)
-    missed = sum(contact.is_armed and contact.detected_s is None for contact in contacts)
+    false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
+    missed = score.missed
     faults, causes, data = find_faults(run), find_causes(run), gathered.data
     payload_kg = _payloads(run, sections)
     is_identified = bool(adaptation_s) and all(value is not None for value in adaptation_s.values())
@@ -152,7 +145,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         is_clean=is_identified
         and missed == 0
         and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
-        armed_false_alarms=armed_false if has_truth else None,
+        armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
 
 
@@ -161,7 +154,7 @@ def _evidence(run: Run, sections: tuple[Section, ...], untouched: Untouched) -> 
         return None
     beside = None
     if run.beside is not None and untouched.beside is not None:
-        beside = evaluate_beside(run, run.beside, sections, untouched.beside)
+        beside = evaluate_beside(run, untouched.beside)
     return evaluate_certified(
         run, run.certified, sections, untouched.margins, untouched.promotions, beside, untouched.smallest_push
     )

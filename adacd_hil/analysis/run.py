@@ -38,6 +38,7 @@ class Truth:
     force_N: Vector | None = None  # size of the contact force (m,)
     time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
     model_cycle: Cycles | None = None
+    attempt: Cycles | None = None  # of its cycles (m,), from 0; None: all are of one
     span: Span | None = None
     """What the emulator recorded, whichever cycles are kept; None: all."""
 

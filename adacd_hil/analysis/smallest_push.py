@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from adacd_hil.analysis.distribution import Distribution
-from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
@@ -28,10 +27,6 @@ class SmallestPush:
     threshold_Nm: tuple[dict[str, float], ...]
     hours: float
     tail_rate_per_h: float
-
-    def false_alarm_bound_per_h(self, false_alarms: int) -> float:
-        """Give the upper 95 % bound of the rate of false alarms, by counting alone: 3 / T where there was none."""
-        return rate_bound_per_h(false_alarms, self.hours)
 
 
 class PushGatherer:

@@ -99,7 +99,7 @@ def _replay_one(
     stretch: "Stretch",
     progress: Any,
 ) -> _Result:
-    from adacd_hil.analysis.replay.replay import contacts_beside, replay_source
+    from adacd_hil.analysis.replay.replay import replay_source
     from adacd_hil.analysis.replay.what_if import (
         apply_settings,
         keep_facts,
@@ -107,6 +107,7 @@ def _replay_one(
         parse_variations,
         refuse_facts,
     )
+    from adacd_hil.analysis.score.truth_contacts import contacts_beside
     from adacd_hil.config import load_settings
     from adacd_hil.control.operator import ScriptedOperator
 

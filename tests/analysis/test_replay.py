@@ -8,10 +8,12 @@ import pytest
 from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
 
 from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.replay.replay import Replay, contacts_beside, replay, replay_many, replay_source
+from adacd_hil.analysis.replay.replay import Replay, replay, replay_many, replay_source
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.what_if import apply_settings, side_by_side
 from adacd_hil.analysis.report.reading import read_run
+from adacd_hil.analysis.score.judge import Score
+from adacd_hil.analysis.score.truth_contacts import contacts_beside
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
@@ -93,7 +95,7 @@ def stretched(log: Path, stretch: Stretch, change=lambda piece: piece, cycles_pe
 @pytest.mark.parametrize("cycles_per_piece", [20_000, 333])
 def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piece: int) -> None:
     whole = replay_source(LogSource(log), [LogSource(log).settings], contacts_beside(log))[0]
-    contact = whole.true_contacts[0]
+    contact = whole.score.contacts[0]
     stretch = Stretch(at_s(log, contact.onset_ns) - 0.2004, at_s(log, contact.onset_ns) + 0.3)
     found = stretched(log, stretch, cycles_per_piece=cycles_per_piece)
     bounds_ns = stretch.bounds_ns(begin_of_log(log))
@@ -101,7 +103,7 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piec
     assert found.compared == found.cycles == ((t_ns >= bounds_ns[0]) & (t_ns < bounds_ns[1])).sum() == 500
     assert found.is_identical
     assert found.zero_ns == whole.zero_ns
-    assert found.true_contacts == whole.true_contacts
+    assert found.score.contacts == whole.score.contacts
     assert found.states == tuple(each for each in whole.states if bounds_ns[0] <= each.t_ns < bounds_ns[1])
     assert found.ending == found.states[-1]
     assert found.contacts == tuple(each for each in whole.contacts if bounds_ns[0] <= each.t_ns < bounds_ns[1])
@@ -109,10 +111,10 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piec
     assert found.adaptations == ()
     assert 0.0 < found.monitored_s < 0.5
     after = stretched(log, Stretch(stretch.end_s), cycles_per_piece=cycles_per_piece)
-    assert (after.true_contacts, after.detections_ns, after.false_alarms_ns) == ((), (), ())
+    assert (after.score, after.detections_ns) == (Score((), ()), ())
     before = stretched(log, Stretch(end_s=stretch.start_s), cycles_per_piece=cycles_per_piece)
     assert before.cycles + found.cycles + after.cycles == whole.cycles
-    assert (before.attempts, before.true_contacts) == (2, ())
+    assert (before.attempts, before.score.contacts) == (2, ())
     assert [each.took_s for each in before.adaptations] == [each.took_s for each in whole.adaptations]
 
 
@@ -203,11 +205,11 @@ def test_a_cut_log_is_compared_as_far_as_it_goes(log: Path, whole: Replay, tmp_p
 def test_what_a_replay_says_of_contacts_is_what_the_report_says(log: Path, whole: Replay) -> None:
     metrics = evaluate(read_run(log, log.with_name("truth.mcap")).run)
     found = whole
-    assert found.true_contacts is not None
-    assert [each.delay_ms for each in found.true_contacts] == pytest.approx([c.delay_ms for c in metrics.contacts])
-    assert [each.link for each in found.true_contacts] == [contact.link for contact in metrics.contacts]
-    assert found.false_alarms == metrics.false_alarms
-    assert found.missed == metrics.missed
+    assert found.score is not None
+    assert [each.delay_ms for each in found.score.contacts] == [contact.delay_ms for contact in metrics.contacts]
+    assert [each.link for each in found.score.contacts] == [contact.link for contact in metrics.contacts]
+    assert len(found.score.false_alarms) == metrics.false_alarms
+    assert found.score.missed == metrics.missed
     assert found.adaptation_s == pytest.approx(list(metrics.adaptation_s.values()))
 
 
@@ -227,11 +229,11 @@ def test_other_settings_decide_otherwise_about_the_same_motion(log: Path) -> Non
     assert mine.is_identical
     assert other.parameters != mine.parameters  # the frames were decoded once more for it
     assert later.compared == 0
-    delays = [each.true_contacts[0].delay_ms for each in (sooner, mine, later)]
+    delays = [each.score.contacts[0].delay_ms for each in (sooner, mine, later)]
     assert delays == sorted(delays)
     assert len(set(delays)) == 3
-    assert never.true_contacts[0].detected_ns is None
-    assert never.missed == 1
+    assert never.score.contacts[0].detected_ns is None
+    assert never.score.missed == 1
     assert contacts_beside(log) is not None
 
 
@@ -251,10 +253,10 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(log: Path, whole: Re
     first, last = truth.span
     assert first < (attempt, onset) < last
 
-    def judged(*span: tuple[int, int]) -> tuple[int | None, bool, tuple[str, ...]]:
+    def judged(*span: tuple[int, int]) -> tuple[int, bool, tuple[str, ...]]:
         untouched = truth._replace(contacts=(), span=span)
         found = replay_source(LogSource(log), [source.settings], untouched)[0]
-        return found.false_alarms, found.is_whole, found.notes
+        return len(found.score.false_alarms), found.is_whole, found.notes
 
     said = "the truth doesn't cover 1 detections, which are not judged"
     assert judged(first, last) == (1, True, ())
@@ -268,4 +270,4 @@ def test_a_truth_without_a_cycle_knows_nothing(log: Path, tmp_path: Path) -> Non
     (tmp_path / "run.mcap").write_bytes(log.read_bytes())
     TruthLog(tmp_path / "truth.mcap", blocking=True).close()
     found = replay(tmp_path / "run.mcap")
-    assert (found.true_contacts, found.false_alarms, found.missed) == (None, None, None)
+    assert found.score is None

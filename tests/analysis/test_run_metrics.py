@@ -254,6 +254,12 @@ def test_a_contact_one_cycle_after_arming_is_armed():
     assert evaluate(run).contacts[0].is_armed is True
 
 
+def test_a_contact_that_began_before_the_log_is_not_missed():
+    run = make_run((M, 500))
+    touch(run, 0, 50, (5.0, 0.0))
+    assert evaluate(run).missed == 0
+
+
 def test_a_detection_without_contact_is_a_false_alarm():
     assert evaluate(react(make_run(), 2000)).false_alarms == 1
 

@@ -162,7 +162,7 @@ def test_a_row_of_a_log_says_what_its_replay_came_to(log: Path, whole: Replay) -
     own, deaf, wrong = replay_task(task)
     assert [row["key"] for row in (own, deaf, wrong)] == [row.key for row in task.rows]
     assert (own["status"], own["identical"], own["cycles"], own["attempts"]) == ("ok", True, whole.cycles, 2)
-    assert (own["detections"], own["missed"]) == (len(whole.detections_ns), whole.missed)
+    assert (own["detections"], own["missed"]) == (len(whole.detections_ns), whole.score.missed)
     assert own["theta_hat.a1"] == whole.parameters["a1"]
     assert 0.0 < own["monitored_s"] < whole.cycles * 1e-3
     assert (deaf["status"], deaf["identical"], deaf["detections"]) == ("ok", None, 0)

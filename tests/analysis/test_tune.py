@@ -14,10 +14,10 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.analysis.false_alarms import TooLittleMotionError, calibrate_detector
-from adacd_hil.analysis.replay.replay import contacts_beside
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.analysis.score.confidence_bounds import least_rate_per_h, rate_bound_per_h, share_bounds
+from adacd_hil.analysis.score.truth_contacts import contacts_beside
 from adacd_hil.analysis.sweep import tune_logs
 from adacd_hil.analysis.sweep.tune import Candidate, Outcome, Tuning, _best, _problems
 from adacd_hil.analysis.sweep.tune_config import base_of, suggested_toml
@@ -257,7 +257,7 @@ def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds
 
 
 def outcome(**changes):
-    return dataclasses.replace(Outcome((5.0, 6.0), 0, 0, 0, 0.01, (2.0, 4.0)), **changes)
+    return dataclasses.replace(Outcome((5.0, 6.0), 0, 0, 0, 0.01, (2.0, 4.0), 0), **changes)
 
 
 @functools.cache
@@ -279,8 +279,9 @@ def candidate(delay_ms=2.0, name="made", changes=None, problems=(), seconds=600.
         ({"adaptation_s": (5.0,)}, ("1 adaptations don't finish",)),
         ({"missed": 1}, ("1 missed",)),
         ({"missed": None, "false_alarms": None}, ()),
-        ({"false_alarms": 1}, ("1 false alarms",)),
-        ({"false_alarms": 1, "hours": 10.0}, ()),
+        ({"false_alarms": 2, "armed_false_alarms": 1}, ("1 false alarms",)),
+        ({"false_alarms": 1, "armed_false_alarms": 1, "hours": 10.0}, ()),
+        ({"false_alarms": 1}, ()),  # while it adapts: the hours are those of MONITOR
     ],
 )
 def test_a_candidate_is_fit_if_it_adapts_misses_nothing_and_alarms_no_more_than_wanted(changes, problem):
@@ -437,7 +438,7 @@ def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
 def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
     truth = contacts_beside(log)
     (first,) = truth.contacts
-    later = (first, dataclasses.replace(first, attempt=1), dataclasses.replace(first, attempt=2))
+    later = [dataclasses.replace(first, number=n + 1, attempt=n) for n in range(3)]
     monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: truth._replace(contacts=later))
     monkeypatch.setattr(tune_logs, "_begins", lambda *_: [0, 241])
     (read,) = read_logs([log])
@@ -467,7 +468,8 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
     truth = contacts_beside(log)
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: truth._replace(contacts=truth.contacts * 3))
+    three = [dataclasses.replace(truth.contacts[0], number=number) for number in (1, 2, 3)]
+    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: truth._replace(contacts=three))
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 

@@ -1,18 +1,17 @@
 """What a replay came to, gathered stretch by stretch in constant memory: states, contacts, adaptations, parameters.
 
-A *detection* is a transition to REACT by a contact. It belongs to the true contact between whose onset and forgetting
-it falls (`touches.forgotten_s`), else it is a false alarm, unless the emulator didn't record what was true then: as in
-`adacd_hil.analysis.metrics`. As the arm in the log moved as it did, a scheme with other settings may still be in REACT
-when the next contact comes. That contact then counts as detected with the first sample over a threshold.
+Alarms are judged as those of a run (`adacd_hil.analysis.score.judge`). As the arm in the log moved as it did, a scheme
+with other settings may still be in REACT when the next contact comes: the first sample over a threshold then finds it.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from adacd_hil.analysis.host_cycles import host_span
-from adacd_hil.analysis.replay.truth_contacts import TrueContact, TrueContacts
+from adacd_hil.analysis.score.alarms import Alarm, enters_react
+from adacd_hil.analysis.score.judge import Score, TouchWindow, judge
+from adacd_hil.analysis.score.truth_contacts import TrueContact, TrueContacts
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
@@ -20,19 +19,18 @@ from adacd_hil.records import FaultReason, SchemeState, Vector
 from adacd_hil.scheme.batch import SchemeBatch
 from adacd_hil.scheme.selection import layout_of
 
-_BUSY = (SchemeState.REACT, SchemeState.STOPPED)
+_REACTING = (SchemeState.REACT, SchemeState.STOPPED)
 _LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 
 
 class Transition(NamedTuple):
-    """A change of state. `is_contact`: a contact is over a threshold in that cycle."""
+    """A change of state."""
 
     cycle: int
     t_ns: int
     previous: SchemeState
     state: SchemeState
     fault: FaultReason
-    is_contact: bool
 
 
 class Adaptation(NamedTuple):
@@ -43,25 +41,12 @@ class Adaptation(NamedTuple):
     theta_hat: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class ContactOutcome:
-    """What became of a true contact. delay_ms: None if it was not detected; is_armed: in MONITOR at its onset."""
+class _Begun(NamedTuple):
+    """A true contact that has begun: when, and in which state and with which threshold that found the scheme."""
 
-    number: int
-    link: int
+    contact: TrueContact
     onset_ns: int
-    is_armed: bool
-    detected_ns: int | None
-
-    @property
-    def delay_ms(self) -> float | None:
-        """Time from onset to detection."""
-        return None if self.detected_ns is None else (self.detected_ns - self.onset_ns) * 1e-6
-
-
-class _Mark(NamedTuple):
-    t_ns: int
-    is_armed: bool
+    before: SchemeState
     threshold: Vector
 
 
@@ -75,17 +60,18 @@ class OutcomeGatherer:
         self.theta_hat: tuple[float, ...] = ()
         self.state = SchemeState.INIT
         self._settings = settings
-        self._contacts = None if truth is None else list(truth.contacts)
-        self._span = None if truth is None else truth.span
-        self._attempt = 0
+        self._truth = truth
+        self._coming: list[TrueContact] = []  # of this attempt, on the host's cycles
+        self._begun: _Begun | None = None  # a contact whose end is yet to come
+        self._touches: list[TouchWindow] = []
+        self._alarms: list[tuple[int, Alarm]] = []  # with the cycle of each
+        self._last: tuple[int, int] | None = None  # cycle and time of the sample before, in this attempt
         self._begins: list[int] = []  # first cycle of each attempt
         self._theta = layout_of(settings).slices["theta_hat"]
         self._threshold = layout_of(settings).slices["threshold"]
         self._began: tuple[int, int] | None = None  # cycle and time of the adaptation in progress
-        self._crossings: list[tuple[int, int]] = []  # cycles and times at which some joint crosses its threshold
+        self._crossings: list[int] = []  # times at which some joint crosses its threshold
         self._was_over = False
-        self._marks: dict[int, _Mark] = {}
-        self._next = 0  # contact whose onset is yet to come
 
     def take(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Take in a stretch."""
@@ -93,10 +79,14 @@ class OutcomeGatherer:
         if count == 0:
             return
         over = batch.contact_joints != 0
-        self._mark_onsets(ticks, batch)
+        self._follow_contacts(ticks, batch)
         rises = np.flatnonzero(over & ~np.concatenate(([self._was_over], over[:-1])))
         self._was_over = bool(over[-1])
-        self._crossings += zip(ticks.cycle[rises].tolist(), ticks.t_ns[rises].tolist(), strict=True)
+        self._crossings += ticks.t_ns[rises].tolist()
+        over[batch.contact_places] |= np.array([r.cycle for r in batch.contacts]) == ticks.cycle[batch.contact_places]
+        for row in np.flatnonzero(enters_react(batch.previous_state, batch.state) & over).tolist():
+            is_armed = bool(batch.previous_state[row] == SchemeState.MONITOR)
+            self._alarms.append((int(ticks.cycle[row]), Alarm(int(ticks.t_ns[row]), is_armed)))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
             self._enter(
                 Transition(
@@ -105,7 +95,6 @@ class OutcomeGatherer:
                     SchemeState(batch.previous_state[row]),
                     SchemeState(batch.state[row]),
                     FaultReason(batch.fault[row]),
-                    bool(over[row]),
                 ),
                 batch.block[row, self._theta],
             )
@@ -114,23 +103,35 @@ class OutcomeGatherer:
         self.theta_hat = tuple(batch.block[-1, self._theta].tolist())
         self.state = SchemeState(batch.state[-1])
 
-    def _mark_onsets(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        contacts = self._contacts or []
-        while self._next < len(contacts) and contacts[self._next].attempt < self._attempt:
-            self._next += 1  # nobody cycled
-        while self._next < len(contacts) and self._is_by(contacts[self._next], int(ticks.cycle[-1])):
-            row = int(np.searchsorted(ticks.cycle, contacts[self._next].onset))
-            configured = np.array(self._settings.detector.threshold_Nm)
-            threshold = batch.block[row, self._threshold]
-            self._marks[self._next] = _Mark(
-                int(ticks.t_ns[row]),
-                bool(batch.previous_state[row] == SchemeState.MONITOR),
-                np.where(np.isfinite(threshold), threshold, configured),
-            )
-            self._next += 1
+    def _follow_contacts(self, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Note when true contacts begin and end, between the cycles that they lie between, and what was so then."""
+        last = int(ticks.cycle[-1])
+        while True:
+            if self._begun is not None and self._begun.contact.end <= last:
+                self._end_contact(self._time_ns(ticks, self._begun.contact.end))
+            elif self._begun is None and self._coming and self._coming[0].onset <= last:
+                contact = self._coming.pop(0)
+                row = int(np.searchsorted(ticks.cycle, contact.onset))
+                before = SchemeState(batch.previous_state[row])
+                threshold = batch.block[row, self._threshold].copy()
+                self._begun = _Begun(contact, self._time_ns(ticks, contact.onset), before, threshold)
+            else:
+                break
+        self._last = last, int(ticks.t_ns[-1])
 
-    def _is_by(self, contact: TrueContact, cycle: int) -> bool:
-        return contact.attempt == self._attempt and contact.onset <= cycle
+    def _time_ns(self, ticks: Ticks, cycle: int) -> int:
+        cycles, times_ns = ticks.cycle, ticks.t_ns
+        if self._last is not None:
+            cycles, times_ns = np.append(self._last[0], cycles), np.append(self._last[1], times_ns)
+        return int(times_ns[0]) + round(float(np.interp(cycle, cycles, times_ns - times_ns[0])))
+
+    def _end_contact(self, end_ns: int) -> None:
+        if self._begun is None:
+            return
+        (contact, onset_ns, before, threshold), self._begun = self._begun, None
+        forgotten_ns = contact.forgotten_ns(end_ns, self._settings, threshold)
+        is_armed, is_reacting = before is SchemeState.MONITOR, before in _REACTING
+        self._touches.append(TouchWindow(contact.number, contact.link, onset_ns, forgotten_ns, is_armed, is_reacting))
 
     def _enter(self, transition: Transition, theta_hat: Vector) -> None:
         self.transitions.append(transition)
@@ -152,62 +153,29 @@ class OutcomeGatherer:
 
     def begin(self, attempt: int, cycle: int) -> None:
         """Begin an attempt, by its number in the run and its first cycle."""
-        self._give_up()
-        self._attempt = attempt
+        self.end()
         self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
-        if self._contacts is not None:
-            self._contacts = [
-                contact.counted_from(cycle) if contact.attempt == attempt else contact for contact in self._contacts
-            ]
-        self._was_over = False
+        if self._truth is not None:
+            mine = (contact for contact in self._truth.contacts if contact.attempt == attempt)
+            self._coming = [contact.counted_from(cycle) for contact in mine]
+        self._was_over, self._last = False, None
 
     def end(self) -> None:
-        """Take note that the log has ended."""
+        """Take note that an attempt, or the log, has ended."""
         self._give_up()
+        if self._last is not None:
+            self._end_contact(self._last[1])
 
     @property
-    def detections(self) -> list[Transition]:
-        """Transitions to REACT by a contact."""
-        return [
-            each
-            for each in self.transitions
-            if each.state is SchemeState.REACT and each.previous not in _BUSY and each.is_contact
-        ]
+    def detections_ns(self) -> list[int]:
+        """Times of all alarms."""
+        return [alarm.t_ns for _, alarm in self._alarms]
 
-    @property
-    def unjudged(self) -> list[Transition]:
-        """Detections before or after what the emulator recorded: nobody knows whether they were right."""
-        detections = self.detections
-        if self._span is None or not detections:
-            return []
-        is_known = host_span(self._span, np.array(self._begins)).covers(np.array([each.cycle for each in detections]))
-        return [each for each, known in zip(detections, is_known.tolist(), strict=True) if not known]
-
-    def judge(self) -> tuple[tuple[ContactOutcome, ...], tuple[int, ...]] | None:
-        """Return what became of each true contact, and the times of false alarms, ns; None without the truth."""
-        if self._contacts is None:
+    def score(self) -> Score | None:
+        """Judge the alarms; None without the truth."""
+        if self._truth is None:
             return None
-        period_s = self._settings.bus.period_s
-        is_certified = self._settings.scheme == "certified"
-        a_rad_s = self._settings.certified.cutoffs_rad_s[0] if is_certified else self._settings.filter.a_rad_s
-        outcomes = []
-        explained = {each.cycle for each in self.unjudged}
-        detections = self.detections
-        for number, mark in self._marks.items():
-            contact = self._contacts[number]
-            forgotten_s = contact.forgotten_after_s(period_s, a_rad_s, mark.threshold)
-            last = contact.end + forgotten_s / period_s
-            mine = [each for each in detections if contact.onset <= each.cycle <= last]
-            explained |= {each.cycle for each in mine}
-            seen = [t_ns for cycle, t_ns in self._crossings if contact.onset <= cycle <= last]
-            first = [each.t_ns for each in mine] or (seen if self._is_busy(contact.onset) else [])
-            outcomes.append(
-                ContactOutcome(number + 1, contact.link, mark.t_ns, mark.is_armed, min(first, default=None))
-            )
-        false_alarms = tuple(each.t_ns for each in detections if each.cycle not in explained)
-        return tuple(outcomes), false_alarms
-
-    def _is_busy(self, cycle: int) -> bool:
-        """Whether the scheme was reacting to something when a cycle came."""
-        before = [each.state for each in self.transitions if each.cycle < cycle]
-        return bool(before) and before[-1] in _BUSY
+        span = host_span(self._truth.span, np.array(self._begins or [0]))
+        is_known = span.covers(np.array([cycle for cycle, _ in self._alarms], np.int64)).tolist()
+        alarms = [alarm._replace(is_known=known) for (_, alarm), known in zip(self._alarms, is_known, strict=True)]
+        return judge(self._touches, alarms, self._crossings)

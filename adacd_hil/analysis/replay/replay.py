@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.host_cycles import describe_unjudged
 from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.replay.attempts import Stretch
-from adacd_hil.analysis.replay.outcome import Adaptation, ContactOutcome, OutcomeGatherer, Transition
+from adacd_hil.analysis.replay.outcome import Adaptation, OutcomeGatherer, Transition
 from adacd_hil.analysis.replay.scheme_comparison import (
     SHOWN,
     TOLERANCE,
@@ -28,13 +28,12 @@ from adacd_hil.analysis.replay.scheme_comparison import (
     different_arithmetic,
 )
 from adacd_hil.analysis.replay.source import LogSource, Part, Source
-from adacd_hil.analysis.replay.truth_contacts import TrueContacts, read_contacts
-from adacd_hil.analysis.score.foreign_truth import foreign_truth
+from adacd_hil.analysis.score.judge import Score
+from adacd_hil.analysis.score.truth_contacts import TrueContacts, contacts_beside
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedContact
-from adacd_hil.log.run_folder import TRUTH_NAME
 from adacd_hil.log.stretch import EVER_NS, WHOLE
 from adacd_hil.log.stretch import Stretch as LogStretch
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
@@ -59,8 +58,8 @@ class Replay:
 
     cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
     are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
-    `mismatched_fields`. parameters: of the end. true_contacts: that begin in the stretch; with false_alarms_ns None
-    where the truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
+    `mismatched_fields`. parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the
+    truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
     ending: the last change of state, which may be before the stretch. attempts: from the beginning of the log.
     """
 
@@ -73,8 +72,7 @@ class Replay:
     contacts: tuple[LoggedContact, ...]
     adaptations: tuple[Adaptation, ...]
     parameters: dict[str, float]
-    true_contacts: tuple[ContactOutcome, ...] | None
-    false_alarms_ns: tuple[int, ...] | None
+    score: Score | None
     detections_ns: tuple[int, ...]
     mismatches: tuple[Mismatch, ...]
     mismatch_count: int
@@ -99,18 +97,6 @@ class Replay:
     def adaptation_s(self) -> tuple[float | None, ...]:
         """How long each adaptation took; None if it came to nothing."""
         return tuple(adaptation.took_s for adaptation in self.adaptations)
-
-    @property
-    def missed(self) -> int | None:
-        """Armed contacts that were not detected; None where the truth is not known."""
-        if self.true_contacts is None:
-            return None
-        return sum(contact.is_armed and contact.detected_ns is None for contact in self.true_contacts)
-
-    @property
-    def false_alarms(self) -> int | None:
-        """Detections that the truth covers and no contact explains; None where the truth is not known."""
-        return None if self.false_alarms_ns is None else len(self.false_alarms_ns)
 
     def time_s(self, t_ns: int) -> float:
         """Give a time since motion start."""
@@ -151,20 +137,6 @@ def replay_many(
     return replay_source(
         LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
     )
-
-
-def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueContacts | None:
-    """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError.
-
-    That of another run is left out, and `progress` is told why.
-    """
-    truth = path.with_name(TRUTH_NAME)
-    if not truth.exists():
-        return None
-    if problem := foreign_truth(path, truth):
-        progress(f"{problem}; it is left out")
-        return None
-    return read_contacts(truth)
 
 
 class _Player:
@@ -402,8 +374,9 @@ def _result(player: _Player, source: Source, tolerance: float, first_ns: int) ->
     """Sum up what a player came to from a time on."""
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source.notes())
     gatherer.end()
-    judged = gatherer.judge()
-    if unjudged := describe_unjudged(sum(each.t_ns >= first_ns for each in gatherer.unjudged)):
+    score = gatherer.score()
+    score = None if score is None else score.since(first_ns)
+    if unjudged := describe_unjudged(0 if score is None else len(score.unjudged)):
         notes.append(unjudged)
     if comparison is not None:
         for cycle, t_ns, logged, asked in player.requests.unexplained:
@@ -420,9 +393,8 @@ def _result(player: _Player, source: Source, tolerance: float, first_ns: int) ->
         contacts=tuple(each for each in gatherer.reports if each.t_ns >= first_ns),
         adaptations=tuple(each for each in gatherer.adaptations if each.t_ns >= first_ns),
         parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
-        true_contacts=None if judged is None else tuple(each for each in judged[0] if each.onset_ns >= first_ns),
-        false_alarms_ns=None if judged is None else tuple(t_ns for t_ns in judged[1] if t_ns >= first_ns),
-        detections_ns=tuple(each.t_ns for each in gatherer.detections if each.t_ns >= first_ns),
+        score=score,
+        detections_ns=tuple(t_ns for t_ns in gatherer.detections_ns if t_ns >= first_ns),
         mismatches=() if comparison is None else comparison.first(),
         mismatch_count=0 if comparison is None else comparison.count,
         mismatched_fields={} if comparison is None else dict(comparison.fields),

@@ -178,11 +178,11 @@ def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, str]:
 def side_by_side(replays: Sequence[Replay]) -> list[Row]:
     """Return a row per quantity: its name, then its value in each replay."""
     rows = [("contacts detected", *map(_detected, replays))]
-    if any(each.true_contacts is None for each in replays):
+    if any(each.score is None for each in replays):
         rows.append(("detections at", *(_times(each, each.detections_ns) for each in replays)))
     rows += _contact_rows(replays)
     rows += [
-        ("missed", *("–" if each.missed is None else str(each.missed) for each in replays)),
+        ("missed", *("–" if each.score is None else str(each.score.missed) for each in replays)),
         ("false alarms", *map(_false_alarms, replays)),
         ("median delay, ms", *map(_median_delay, replays)),
     ]
@@ -196,7 +196,9 @@ def side_by_side(replays: Sequence[Replay]) -> list[Row]:
 
 
 def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
-    contacts = [{contact.number: contact for contact in each.true_contacts or ()} for each in replays]
+    contacts = [
+        {contact.number: contact for contact in (each.score.contacts if each.score else ())} for each in replays
+    ]
     rows = []
     for number in sorted(set().union(*contacts)):
         known = [each.get(number) for each in contacts]
@@ -214,10 +216,9 @@ def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
 
 
 def _detected(found: Replay) -> str:
-    if found.true_contacts is None:
+    if found.score is None:
         return str(len(found.detections_ns))
-    seen = sum(contact.detected_ns is not None for contact in found.true_contacts)
-    return f"{seen} of {len(found.true_contacts)}"
+    return f"{len(found.score.delays_ms)} of {len(found.score.contacts)}"
 
 
 def _times(found: Replay, times_ns: Sequence[int]) -> str:
@@ -225,14 +226,15 @@ def _times(found: Replay, times_ns: Sequence[int]) -> str:
 
 
 def _false_alarms(found: Replay) -> str:
-    if found.false_alarms_ns is None:
+    if found.score is None:
         return "–"
-    count = len(found.false_alarms_ns)
-    return f"{count}, at {_times(found, found.false_alarms_ns[:3])}{', …' if count > 3 else ''}" if count else "0"
+    times_ns = [alarm.t_ns for alarm in found.score.false_alarms]
+    count = len(times_ns)
+    return f"{count}, at {_times(found, times_ns[:3])}{', …' if count > 3 else ''}" if count else "0"
 
 
 def _median_delay(found: Replay) -> str:
-    delays = [contact.delay_ms for contact in found.true_contacts or () if contact.delay_ms is not None]
+    delays = () if found.score is None else found.score.delays_ms
     return f"{statistics.median(delays):.1f}" if delays else "–"
 
 
@@ -261,7 +263,7 @@ def as_json(found: Replay) -> dict[str, Any]:
         "cycles": found.cycles,
         "attempts": found.attempts,
         "contacts": None
-        if found.true_contacts is None
+        if found.score is None
         else [
             {
                 "number": contact.number,
@@ -271,13 +273,13 @@ def as_json(found: Replay) -> dict[str, Any]:
                 "detected_s": None if contact.detected_ns is None else found.time_s(contact.detected_ns),
                 "delay_ms": contact.delay_ms,
             }
-            for contact in found.true_contacts
+            for contact in found.score.contacts
         ],
         "detections_s": [found.time_s(t_ns) for t_ns in found.detections_ns],
         "false_alarms_s": None
-        if found.false_alarms_ns is None
-        else [found.time_s(t_ns) for t_ns in found.false_alarms_ns],
-        "missed": found.missed,
+        if found.score is None
+        else [found.time_s(alarm.t_ns) for alarm in found.score.false_alarms],
+        "missed": None if found.score is None else found.score.missed,
         "adaptation_s": list(found.adaptation_s),
         "parameters": {name: value if math.isfinite(value) else None for name, value in found.parameters.items()},
         "states": [

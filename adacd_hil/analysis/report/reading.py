@@ -263,14 +263,13 @@ def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth |
         contact_index=truth.contact_index[rows],
         force_N=None if truth.force_N is None else truth.force_N[rows],
         time_s=truth.time_s[rows],
+        attempt=None if truth.attempt is None else truth.attempt[rows],
     )
 
 
 def _unjudged(run: Run) -> str:
     """Say in one line how many detections the truth can't judge, because it begins later or ends before; "" if none."""
-    truth = run.truth
-    outside = [d for d in find_detections(run) if truth is not None and not truth.covers(int(run.cycle[d.row]))]
-    return describe_unjudged(len(outside))
+    return describe_unjudged(sum(not detection.raised.is_known for detection in find_detections(run)))
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:

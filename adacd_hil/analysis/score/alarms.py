@@ -1,52 +1,71 @@
-"""Detections of a run, and the true contacts that explain them.
+"""Alarms of a scheme, from the arrays of a run or from decisions as they come, and of a stream that decides nothing.
 
-A *detection* is a transition to REACT by a contact, in whatever state. It belongs to a true contact if it falls between
-the onset and one time constant after the true torque, filtered, is back within the threshold; else it is a false alarm.
+A scheme raises an alarm with a transition to REACT by a contact, in whatever state: the certified scheme detects while
+it adapts and while it parks, too. While it is in REACT or STOPPED it is still about the contact before. REACT without a
+joint over its threshold and without a report is an arm that is held for another reason, and no alarm.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import Run
-from adacd_hil.analysis.score.touches import Touch, forgotten_s, threshold_at
+from adacd_hil.analysis.run import Mask, Run
 from adacd_hil.analysis.sections import is_interrupted
 from adacd_hil.records import ContactReport, SchemeState
 
 
+class Alarm(NamedTuple):
+    """An alarm. is_armed: raised by armed detection, which is in MONITOR; is_known: the truth covers that time."""
+
+    t_ns: int
+    is_armed: bool
+    is_known: bool = True
+
+
+def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> Mask:
+    """Mark the cycles (n,) that begin to react, from the states before them and their own."""
+    return np.asarray((state == SchemeState.REACT) & ~is_interrupted(previous))
+
+
+def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> Mask:
+    """Mark of samples over a threshold, at ascending times (n,), those that begin an alarm: after more than a pause.
+
+    last: the sample before them, of which they may go on; None: there was none.
+    """
+    begins = np.diff(at, prepend=at[:1] if last is None else [last]) > pause
+    if last is None:
+        begins[:1] = True
+    return np.asarray(begins)
+
+
 class Detection(NamedTuple):
-    """A transition to REACT: its row of the run, its time, and the report at the alarm and at the end of the window."""
+    """An alarm of a run: its row, its time, and the report at the alarm and at the end of the window."""
 
     row: int
     detected_s: float
+    raised: Alarm
     alarm: ContactReport | None
     final: ContactReport | None
 
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
-    """Find the transitions to REACT by a contact and the reports that belong to them by their cycle."""
-    is_react = run.state == SchemeState.REACT
-    rows = np.flatnonzero(is_react[1:] & ~is_interrupted(run.state[:-1])) + 1
+    """Find the alarms of a run and the reports that belong to them by their cycle."""
+    rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     time_s = run.time_s()
     detections = []
-    for row in rows:
+    for row in rows.tolist():
         cycle = int(run.cycle[row])
         final = finals.get(cycle)
         alarm = alarms.get(cycle, final)
         if alarm is None and run.contact_joints is not None and not run.contact_joints[row]:
-            continue  # held because the host was late
-        detections.append(Detection(int(row), float(time_s[row]), alarm, final))
+            continue
+        raised = Alarm(
+            int(run.t_ns[row]),
+            bool(run.state[row - 1] == SchemeState.MONITOR),
+            run.truth is None or run.truth.covers(cycle),
+        )
+        detections.append(Detection(row, float(time_s[row]), raised, alarm, final))
     return tuple(detections)
-
-
-def assign(run: Run, touches: tuple[Touch, ...], detections: tuple[Detection, ...]) -> tuple[int | None, ...]:
-    """Give for each detection the index of the true contact that explains it, the last of several, or None."""
-    starts_s = np.array([touch.onset_s for touch in touches])
-    ends_s = np.array([forgotten_s(run, touch, run.a_rad_s, threshold_at(run, touch.onset_s)) for touch in touches])
-    owners = []
-    for detection in detections:
-        fitting = np.flatnonzero((starts_s <= detection.detected_s) & (detection.detected_s <= ends_s))
-        owners.append(int(fitting[-1]) if fitting.size else None)
-    return tuple(owners)

@@ -1,6 +1,6 @@
 """The contacts of a run: each true one with its detection and what the scheme reports of it.
 
-A true contact is *armed* if the scheme is in MONITOR at its onset. `law_ms` and `ideal_ms` are those of the paper's
+Which are armed and what found them: `adacd_hil.analysis.score.judge`. `law_ms` and `ideal_ms` are those of the paper's
 filter, or of the fastest channel of the certified scheme's bank.
 """
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.alarms import Detection
+from adacd_hil.analysis.score.judge import JudgedContact, Score
 from adacd_hil.analysis.score.touches import Touch, channels_at, ideal_response, row_at
 from adacd_hil.analysis.sections import Section, section_at
 from adacd_hil.records import JOINTS, ContactReport, Location, SchemeState, Vector
@@ -78,18 +79,15 @@ def list_contacts(
     sections: tuple[Section, ...],
     touches: tuple[Touch, ...],
     detections: tuple[Detection, ...],
-    owners: tuple[int | None, ...],
+    score: Score,
 ) -> tuple[Contact, ...]:
-    """List the true contacts with the first detection of each; without the truth the detections.
-
-    owners: of each detection, see `alarms.assign`.
-    """
+    """List the true contacts with the detection that found each; without the truth the detections."""
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
-    first = {owner: detection for detection, owner in reversed(list(zip(detections, owners, strict=True)))}
+    raised = {detection.raised.t_ns: detection for detection in detections}
     return tuple(
-        _contact(run, run.first_contact + place, sections, touch, first.get(place))
-        for place, touch in enumerate(touches)
+        _contact(run, sections, touch, judged, None if judged.detected_ns is None else raised[judged.detected_ns])
+        for touch, judged in zip(touches, score.contacts, strict=True)
     )
 
 
@@ -160,7 +158,7 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: D
 
 
 def _contact(
-    run: Run, number: int, sections: tuple[Section, ...], touch: Touch, detection: Detection | None
+    run: Run, sections: tuple[Section, ...], touch: Touch, judged: JudgedContact, detection: Detection | None
 ) -> Contact:
     truth = run.truth
     assert truth is not None
@@ -182,16 +180,15 @@ def _contact(
         ideal_ms = float(run.truth_time_s(slice(crossing, crossing + 1))[0] - touch.onset_s) * 1e3
     peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
     reported = _reported(detection)
-    state = _state_at(run, touch.onset_s)
     return Contact(
-        number=number,
+        number=judged.number,
         section=section_at(sections, touch.onset_s),
-        state=state.name,
-        link=touch.link,
+        state=_state_at(run, touch.onset_s).name,
+        link=judged.link,
         onset_s=touch.onset_s,
         end_s=touch.end_s,
-        is_armed=state is SchemeState.MONITOR,
-        delay_ms=delay_s * 1e3 if detection else None,
+        is_armed=judged.is_armed,
+        delay_ms=judged.delay_ms,
         law_ms=min(steps_s) * 1e3 if steps_s else None,
         ideal_ms=ideal_ms,
         direction_ok=_is_direction_right(reported["direction"], until_final.sum(axis=0)),

@@ -1,9 +1,9 @@
 """What the paper's scheme made of the same stream, where it ran beside the certified one.
 
 It adapts when that one does, ends by eq. (15) and compares with its own thresholds, but decides nothing: a contact that
-is reacted to has been found by the other. So a *detection* of it is the first sample over its threshold, while it is
-armed, that a true contact explains; a *false alarm* is one that none explains, counted once in 10 time constants. While
-the payload is changed it does not detect.
+is reacted to has been found by the other. So its residual is judged as a stream (`judge.StreamJudge`), with a pause
+of 10 time constants; a false alarm counts until the user asks to finish. While the payload is changed it does not
+detect.
 """
 
 from collections.abc import Sequence
@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.analysis.run import Mask, PaperStream, Run
-from adacd_hil.analysis.score.touches import Touch, forgotten_s, row_at, true_contacts
+from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.score.judge import Score, StreamJudge
+from adacd_hil.analysis.score.touches import Touch, touch_window
 from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.records import Vector
 
@@ -47,37 +48,33 @@ class Beside:
 
 @dataclass(frozen=True)
 class Reached:
-    """What the paper's scheme reached over all cycles: see `Beside`; of each contact when it detected it, s."""
+    """What the paper's scheme reached over all cycles: see `Beside`."""
 
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
-    detected_s: tuple[float | None, ...]
-    false_alarms_s: tuple[float, ...]
+    score: Score
 
 
-def evaluate_beside(run: Run, stream: PaperStream, sections: Sequence[Section], reached: Reached) -> Beside:
-    """Judge the paper's scheme. reached: by all its cycles, see `untouched`."""
-    time_s = run.time_s()
-    armed = stream.is_armed & ~_parked(time_s, sections, float(time_s[-1]))
+def evaluate_beside(run: Run, reached: Reached) -> Beside:
+    """Give what the paper's scheme came to. reached: by all its cycles, see `untouched`."""
+    score, has_truth = reached.score, run.truth is not None
     contacts = [
         BesideContact(
-            number=number,
-            is_armed=bool(armed[max(row_at(run, touch.onset_s) - 1, 0)]),
-            detected_s=detected_s,
-            delay_ms=None if detected_s is None else (detected_s - touch.onset_s) * 1e3,
+            number=judged.number,
+            is_armed=judged.is_armed,
+            detected_s=None if judged.detected_ns is None else (judged.detected_ns - run.zero_ns) * 1e-9,
+            delay_ms=judged.delay_ms,
         )
-        for number, (touch, detected_s) in enumerate(
-            zip(true_contacts(run), reached.detected_s, strict=True), run.first_contact
-        )
+        for judged in score.contacts
     ]
-    has_truth = run.truth is not None
+    false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
     return Beside(
         adaptation_s=reached.adaptation_s,
         frozen_residual_max_Nm=reached.frozen_residual_max_Nm,
         contacts=tuple(contacts),
-        false_alarms=len(reached.false_alarms_s) if has_truth else None,
-        false_alarms_s=reached.false_alarms_s if has_truth else None,
-        missed=sum(contact.is_armed and contact.detected_s is None for contact in contacts) if has_truth else None,
+        false_alarms=len(false_s) if has_truth else None,
+        false_alarms_s=false_s if has_truth else None,
+        missed=score.missed if has_truth else None,
     )
 
 
@@ -96,13 +93,16 @@ class BesideGatherer:
     """Gathers what the paper's scheme reached, piece by piece."""
 
     def __init__(self, run: Run, sections: Sequence[Section], touches: Sequence[Touch]) -> None:
+        assert run.beside is not None
         a = run.settings.filter.a_rad_s
         threshold = np.array(run.settings.detector.threshold_Nm)
+        time_s = run.time_s()
+        armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
+        windows = [touch_window(run, touch, a, threshold, armed) for touch in touches]
+        self._judge = StreamJudge(windows, round(SETTLING_TIME_CONSTANTS / a * 1e9))
         self._sections = sections
-        self._windows = [(touch.onset_s, forgotten_s(run, touch, a, threshold)) for touch in touches]
         self._finish_cycle = run.finish_cycle
         self._span = None if run.truth is None else run.truth.span
-        self._pause_s = SETTLING_TIME_CONSTANTS / a
         self._end_s = float(run.time_s()[-1]) if run.cycle.size else 0.0
         self._adaptations = [
             (section.label, section.start_s, _left_s(section, sections))
@@ -113,9 +113,6 @@ class BesideGatherer:
         self._largest: dict[str, Vector | None] = dict.fromkeys(
             section.label for section in sections if section.kind == "detection"
         )
-        self._detected_s: list[float | None] = [None] * len(touches)
-        self._false_s: list[float] = []
-        self._last_s = -np.inf  # of what no contact explains
 
     def add(self, piece: Run, time_s: Vector, free: Mask) -> None:
         """Take in the next cycles, at such times (n,); free: those in which nothing touches the arm (n,)."""
@@ -123,19 +120,10 @@ class BesideGatherer:
         assert stream is not None
         armed = stream.is_armed & ~_parked(time_s, self._sections, self._end_s)
         over = armed & (np.abs(stream.tau_ext_hat) > stream.threshold).any(axis=1)
-        unexplained = over if self._finish_cycle is None else over & (piece.cycle < self._finish_cycle)
-        unexplained = unexplained.copy()
-        if self._span is not None:  # of what the emulator didn't record nobody knows
-            unexplained &= self._span.covers(piece.cycle)
-        for number, (start_s, end_s) in enumerate(self._windows):
-            if start_s > time_s[-1] or end_s < time_s[0]:
-                continue
-            explained = slice(np.searchsorted(time_s, start_s), np.searchsorted(time_s, end_s, side="right"))
-            unexplained[explained] = False
-            first = np.flatnonzero(over[explained])
-            if first.size and self._detected_s[number] is None:
-                self._detected_s[number] = float(time_s[explained][first[0]])
-        self._add_false_alarms(time_s[unexplained])
+        is_judged = np.ones(over.size, np.bool_) if self._span is None else self._span.covers(piece.cycle)
+        if self._finish_cycle is not None:
+            is_judged &= piece.cycle < self._finish_cycle
+        self._judge.add(piece.t_ns, over, is_judged)
         for label, start_s, left_s in self._adaptations:
             if self._adaptation_s[label] is None and start_s <= time_s[-1] and left_s >= time_s[0]:
                 # In the first cycle of ADAPT it is still what it was before.
@@ -149,20 +137,13 @@ class BesideGatherer:
                 values = stream.tau_ext_hat[rows][free[rows] & armed[rows]]
                 self._largest[section.label] = larger(self._largest[section.label], values)
 
-    def _add_false_alarms(self, times_s: Vector) -> None:
-        """Take in when it was over its threshold and no contact explains it: each that comes after a pause counts."""
-        if times_s.size:
-            begins = np.diff(times_s, prepend=self._last_s) > self._pause_s
-            self._false_s += times_s[begins].tolist()
-            self._last_s = float(times_s[-1])
-
     def reached(self) -> Reached:
         """Sum up what has been taken in."""
         largest = {
             label: None if values is None else (float(values[0]), float(values[1]))
             for label, values in self._largest.items()
         }
-        return Reached(self._adaptation_s, largest, tuple(self._detected_s), tuple(self._false_s))
+        return Reached(self._adaptation_s, largest, self._judge.score())
 
 
 def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:

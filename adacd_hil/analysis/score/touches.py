@@ -1,21 +1,27 @@
-"""True contacts, and what an ideal detector with the run's filters and thresholds makes of them."""
+"""True contacts of a run, what an ideal detector with its filters and thresholds makes of them, and their judgement."""
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.score.alarms import Detection
+from adacd_hil.analysis.score.judge import Score, TouchWindow, judge
 from adacd_hil.analysis.timing import Cycles
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.bank import channels_of, step_response
 
 
 class Touch(NamedTuple):
-    """A true contact: its rows [first, last] of the truth, and times since motion start."""
+    """A true contact: its number, its rows [first, last] of the truth, and times since motion start."""
 
+    number: int
     first: int
     last: int
     link: int
@@ -28,22 +34,26 @@ def true_contacts(run: Run) -> tuple[Touch, ...]:
     truth = run.truth
     if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
         return ()
-    index = truth.contact_index
-    edges = np.flatnonzero(index[1:] != index[:-1]) + 1
-    starts = np.concatenate(([0], edges))
-    ends = np.concatenate((edges, [index.size]))
-    time_s = run.truth_time_s()
+    time_s, last = run.truth_time_s(), truth.cycle.size - 1
     return tuple(
         Touch(
-            int(start),
-            int(end) - 1,
-            int(truth.contact_link[start]),
-            float(time_s[start]),
-            float(time_s[min(end, index.size - 1)]),
+            number, start, end - 1, int(truth.contact_link[start]), float(time_s[start]), float(time_s[min(end, last)])
         )
-        for start, end in zip(starts, ends, strict=True)
-        if index[start] >= 0
+        for number, (start, end) in enumerate(contact_rows(truth.contact_index, truth.attempt), run.first_contact)
     )
+
+
+def contact_rows(index: NDArray[Any], attempt: Cycles | None) -> list[tuple[int, int]]:
+    """Give from which row to before which each contact of a truth lasts; index, attempt (m,): of its rows.
+
+    Another index is another contact, though nobody lets go in between. What goes on as an attempt begins is another
+    one, too: the scheme begins anew.
+    """
+    is_edge = index[1:] != index[:-1]
+    if attempt is not None:
+        is_edge |= attempt[1:] != attempt[:-1]
+    bounds = [0, *(np.flatnonzero(is_edge) + 1).tolist(), len(index)]
+    return [(start, end) for start, end in pairwise(bounds) if end > start and index[start] >= 0]
 
 
 def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
@@ -144,11 +154,30 @@ def ideal_response(run: Run, touch: Touch, channel: Channel) -> Vector:
     return channel.respond(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s)
 
 
-def forgotten_s(run: Run, touch: Touch, a_rad_s: float, threshold: Vector) -> float:
-    """Give when a detection can no longer stem from a contact.
+def forgotten_after_s(tau_ext: Vector, cycle: Cycles, period_s: float, a_rad_s: float, threshold: Vector) -> float:
+    """Give how long after its end an alarm may still stem from a contact, s.
 
-    One time constant after its true torque, filtered with `a_rad_s`, is back within the threshold (2,).
+    One time constant after its true torque (k, 2), filtered with `a_rad_s`, is back within the threshold (2,).
     """
-    response = ideal_response(run, touch, Channel(a_rad_s, None, threshold))
-    excess = float(np.max(np.abs(response[-1]) / threshold))
-    return touch.end_s + (1.0 + math.log(max(1.0, excess))) / a_rad_s
+    response = filtered(tau_ext, cycle, period_s, a_rad_s)[-1]
+    excess = float(np.max(np.abs(response) / threshold))
+    return (1.0 + math.log(max(1.0, excess))) / a_rad_s
+
+
+def touch_window(run: Run, touch: Touch, a_rad_s: float, threshold: Vector, armed: Mask) -> TouchWindow:
+    """Give a contact as it is judged; armed (n,): the cycles of the run in which detection is armed."""
+    truth = run.truth
+    assert truth is not None
+    rows = slice(touch.first, touch.last + 2)
+    after_s = forgotten_after_s(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s, a_rad_s, threshold)
+    row = row_at(run, touch.onset_s)
+    onset_ns, forgotten_ns = (run.zero_ns + round(at_s * 1e9) for at_s in (touch.onset_s, touch.end_s + after_s))
+    is_armed = bool(row > 0 and armed[row - 1])
+    return TouchWindow(touch.number, touch.link, onset_ns, forgotten_ns, is_armed)
+
+
+def judge_run(run: Run, touches: Sequence[Touch], detections: Sequence[Detection]) -> Score:
+    """Judge the alarms of a run's own scheme."""
+    armed = run.state == SchemeState.MONITOR
+    windows = [touch_window(run, touch, run.a_rad_s, threshold_at(run, touch.onset_s), armed) for touch in touches]
+    return judge(windows, [detection.raised for detection in detections])

@@ -237,6 +237,7 @@ def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None
         payload_kg=rows.payload_kg,
         theta=rows.theta,
         force_N=None if rows.force_N is None else rows.force_N[of_host],
+        attempt=rows.attempt[of_host],
         time_s=None if time_s is None else time_s[of_host],
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
         span=None if rows.span is None else host_span(rows.span, begins),

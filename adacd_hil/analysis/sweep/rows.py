@@ -73,9 +73,8 @@ def failed(subject: Subject, row: Row, error: str) -> Values:
 
 def finished(subject: Subject, row: Row, found: Replay) -> Values:
     """Make a row of a replay."""
-    truth = found.true_contacts
-    armed = [contact for contact in truth or () if contact.is_armed]
-    delays_ms = [contact.delay_ms for contact in truth or () if contact.delay_ms is not None]
+    score = found.score
+    delays_ms = () if score is None else score.delays_ms
     took_s = found.adaptation_s
     last = found.states[-1] if found.states else None
     return _labels(subject, row) | {
@@ -91,10 +90,10 @@ def finished(subject: Subject, row: Row, found: Replay) -> Values:
         "adaptation_last_s": took_s[-1] if took_s else None,
         "monitored_s": found.monitored_s,
         "detections": len(found.detections_ns),
-        "touches_armed": None if truth is None else len(armed),
-        "touches_found": None if truth is None else len(delays_ms),
-        "missed": found.missed,
-        "false_alarms": found.false_alarms,
+        "touches_armed": None if score is None else score.armed,
+        "touches_found": None if score is None else len(delays_ms),
+        "missed": None if score is None else score.missed,
+        "false_alarms": None if score is None else len(score.false_alarms),
         "delay_median_ms": statistics.median(delays_ms) if delays_ms else None,
         "delay_max_ms": max(delays_ms, default=None),
         **{f"theta_hat.{name}": value for name, value in found.parameters.items()},

@@ -41,7 +41,10 @@ FARTHEST: Final = 100.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What replays of all logs with the same settings came to. missed, false_alarms: None without the truth."""
+    """What replays of all logs with the same settings came to. missed, false_alarms: None without the truth.
+
+    armed_false_alarms: of them those in MONITOR, where the hours are counted.
+    """
 
     adaptation_s: tuple[float, ...]
     unfinished: int
@@ -49,6 +52,7 @@ class Outcome:
     false_alarms: int | None
     hours: float
     delays_ms: tuple[float, ...]
+    armed_false_alarms: int
 
     def as_json(self) -> dict[str, Any]:
         """Give it in plain values."""
@@ -216,12 +220,12 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
 
 def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> Outcome:
     took_s = [each for _, found in replays for each in found.adaptation_s]
-    judged = [found for _, found in replays if found.true_contacts is not None]
+    judged = [(found, found.score) for _, found in replays if found.score is not None]
     armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
     contacts = [
         contact
         for log, found in replays
-        for contact in found.true_contacts or ()
+        for contact in (() if found.score is None else found.score.contacts)
         if (log.path, contact.number) in armed
     ]
     delays = [contact.delay_ms for contact in contacts if contact.delay_ms is not None]
@@ -229,9 +233,10 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> Outcome:
         adaptation_s=tuple(each for each in took_s if each is not None),
         unfinished=sum(each is None for each in took_s),
         missed=len(armed) - len(delays) if judged else None,
-        false_alarms=sum(found.false_alarms or 0 for found in judged) if judged else None,
-        hours=sum(found.monitored_s for found in judged) / 3600.0,
+        false_alarms=sum(len(score.false_alarms) for _, score in judged) if judged else None,
+        hours=sum(found.monitored_s for found, _ in judged) / 3600.0,
         delays_ms=tuple(delays),
+        armed_false_alarms=sum(score.armed_false_alarms for _, score in judged),
     )
 
 
@@ -246,8 +251,8 @@ def _problems(choice: Choice, outcome: Outcome, own: Outcome, rate_per_h: float)
         problems.append(f"{outcome.missed} missed")
     if least_rate_per_h(choice.checked.alarms, choice.checked.hours) > rate_per_h:
         problems.append(f"{choice.checked.alarms} false alarms in the half to check on")
-    elif outcome.false_alarms and least_rate_per_h(outcome.false_alarms, outcome.hours) > rate_per_h:
-        problems.append(f"{outcome.false_alarms} false alarms")
+    elif least_rate_per_h(outcome.armed_false_alarms, outcome.hours) > rate_per_h:
+        problems.append(f"{outcome.armed_false_alarms} false alarms")
     return tuple(problems)
 
 

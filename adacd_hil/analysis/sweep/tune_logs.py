@@ -17,23 +17,23 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.host_cycles import AttemptBegins, host_span
 from adacd_hil.analysis.motion import APART_S, LoggedMotion, Progress, read_motion, schemes
-from adacd_hil.analysis.replay.replay import contacts_beside
 from adacd_hil.analysis.replay.source import LogSource
-from adacd_hil.analysis.replay.truth_contacts import TrueContact
 from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
+from adacd_hil.analysis.score.judge import explained_until
+from adacd_hil.analysis.score.truth_contacts import TrueContact, contacts_beside
 from adacd_hil.analysis.thresholds import BLOCK_S
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stretch import EVER_NS, WHOLE, Stretch
-from adacd_hil.records import SchemeState
+from adacd_hil.records import JOINTS, SchemeState, Vector
 
 _TENTHS = 10
 
 
 class Window(NamedTuple):
-    """The rows [first, last] of a log in which a true contact can be detected, from its onset until it is forgotten."""
+    """The rows [first, last] of a log in which a true contact explains an alarm, see `score.judge`."""
 
     number: int
     link: int
@@ -105,11 +105,12 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: Stret
     windows = None
     if truth is not None:
         begins = _begins(motion, index)
-        windows = tuple(
-            _window(number, contact, index, own, None if count == 1 else place)
-            for number, contact in _on_cycles(truth.contacts, begins)
+        contacts = [
+            contact
+            for contact in _on_cycles(truth.contacts, begins)
             if stretch.is_whole or index.cycle[0] <= contact.onset <= index.cycle[-1]
-        )
+        ]
+        windows = _windows(contacts, index, own, None if count == 1 else place)
         is_free = motion.is_free & host_span(truth.span, np.array(begins)).covers(index.cycle)
         apart = round(APART_S / motion.period_s)
         for window in windows:
@@ -122,24 +123,26 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: Stret
 
 
 class _Cycles(NamedTuple):
-    """Number, time and state of N cycles (N,)."""
+    """Number, time, state and threshold of N cycles (N,), (N, 2)."""
 
     cycle: NDArray[np.int64]
     t_ns: NDArray[np.int64]
     state: NDArray[np.uint8]
+    threshold: Vector
 
 
 class _Index:
     """Gathers the cycles of a log, in arrays that grow where they are: joined in the end, they would be there twice."""
 
     def __init__(self) -> None:
-        self._cycle, self._t_ns, self._state = array("q"), array("q"), array("B")
+        self._cycle, self._t_ns, self._state, self._threshold = array("q"), array("q"), array("B"), array("d")
 
     def add(self, scheme: Series) -> None:
         """Take in the next piece of /scheme."""
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
         self._state.frombytes(scheme["state"].astype(np.uint8).tobytes())
+        self._threshold.frombytes(scheme["threshold"].astype(np.float64).tobytes())
 
     def joined(self) -> _Cycles:
         """Give all of them; nothing can be added after that."""
@@ -147,6 +150,7 @@ class _Index:
             np.frombuffer(self._cycle, np.int64),
             np.frombuffer(self._t_ns, np.int64),
             np.frombuffer(self._state, np.uint8),
+            np.frombuffer(self._threshold).reshape(-1, JOINTS),
         )
 
 
@@ -162,26 +166,41 @@ def _begins(motion: LoggedMotion, index: _Cycles) -> list[int]:
     return begins
 
 
-def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[tuple[int, TrueContact]]:
-    """Give the contacts, numbered from 1, on the host's cycles, but for those of attempts that the log lacks."""
-    for number, contact in enumerate(contacts, start=1):
+def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[TrueContact]:
+    """Give the contacts on the host's cycles, but for those of attempts that the log lacks."""
+    for contact in contacts:
         if contact.attempt < len(begins):
-            yield number, contact.counted_from(begins[contact.attempt])
+            yield contact.counted_from(begins[contact.attempt])
 
 
-def _window(number: int, contact: TrueContact, index: _Cycles, settings: Settings, place: int | None) -> Window:
-    cycle, state = index.cycle, index.state
-    period_s = settings.bus.period_s
-    is_certified = settings.scheme == "certified"
-    slowest_rad_s = settings.certified.cutoffs_rad_s[0] if is_certified else settings.filter.a_rad_s
-    forgotten_s = contact.forgotten_after_s(period_s, slowest_rad_s, np.array(settings.detector.threshold_Nm))
-    first = min(int(np.searchsorted(cycle, contact.onset)), len(cycle) - 1)
-    last = int(np.searchsorted(cycle, contact.end + forgotten_s / period_s, side="right")) - 1
-    return Window(
-        number=number,
-        link=contact.link,
-        first=first,
-        last=max(last, first),
-        is_armed=bool(first > 0 and state[first - 1] == SchemeState.MONITOR),
-        is_chosen_on=(number if place is None else place) % 2 == (1 if place is None else 0),
+def _windows(
+    contacts: Sequence[TrueContact], index: _Cycles, settings: Settings, place: int | None
+) -> tuple[Window, ...]:
+    """Give the windows of contacts on the host's cycles. place: of the log; None where there is one log only."""
+    if not contacts:
+        return ()
+    firsts = [min(int(np.searchsorted(index.cycle, contact.onset)), len(index.cycle) - 1) for contact in contacts]
+    zero_ns = int(index.t_ns[0])
+    since_ns = [
+        np.rint(np.interp([getattr(contact, name) for contact in contacts], index.cycle, index.t_ns - zero_ns))
+        for name in ("onset", "end")
+    ]
+    onsets_ns, ends_ns = (zero_ns + each.astype(np.int64) for each in since_ns)
+    forgotten_ns = [
+        contact.forgotten_ns(end_ns, settings, index.threshold[first])
+        for contact, end_ns, first in zip(contacts, ends_ns.tolist(), firsts, strict=True)
+    ]
+    until_ns = explained_until(onsets_ns, np.array(forgotten_ns))
+    return tuple(
+        Window(
+            number=contact.number,
+            link=contact.link,
+            first=first,
+            last=max(last, first),
+            is_armed=bool(first > 0 and index.state[first - 1] == SchemeState.MONITOR),
+            is_chosen_on=(contact.number if place is None else place) % 2 == (1 if place is None else 0),
+        )
+        for contact, first, last in zip(
+            contacts, firsts, (np.searchsorted(index.t_ns, until_ns, side="right") - 1).tolist(), strict=True
+        )
     )

@@ -1,0 +1,175 @@
+"""The judge: which alarm is about which true contact, what was found, how late, what was missed, what was false.
+
+A true contact explains alarms from its onset until it is forgotten: until one time constant after its true torque,
+filtered, is back within the threshold (`touches.forgotten_after_s`). An alarm is about the last contact that began
+before it, as long as that contact, or one before it, is not forgotten; so an alarm is about one contact at most. The
+first alarm about a contact finds it. An alarm about none is *false*, in whatever state it was raised, unless the
+emulator did not record what was true then: nobody knows about such an alarm.
+
+A contact is *armed* if detection was armed in the logged cycle before its onset. It is *missed* if it is armed and
+nothing found it. A contact that began before the log did is not armed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.score.alarms import Alarm, begins_of
+
+Times = NDArray[np.int64]
+
+
+class TouchWindow(NamedTuple):
+    """A true contact as it is judged; is_reacting: the scheme still reacted to something else at its onset."""
+
+    number: int
+    link: int
+    onset_ns: int
+    forgotten_ns: int
+    is_armed: bool
+    is_reacting: bool = False
+
+
+class JudgedContact(NamedTuple):
+    """What became of a true contact; detected_ns: None if nothing found it."""
+
+    number: int
+    link: int
+    onset_ns: int
+    is_armed: bool
+    detected_ns: int | None
+
+    @property
+    def delay_ms(self) -> float | None:
+        """Time from onset to detection."""
+        return None if self.detected_ns is None else (self.detected_ns - self.onset_ns) * 1e-6
+
+    @property
+    def is_missed(self) -> bool:
+        """Whether detection was armed and did not find it."""
+        return self.is_armed and self.detected_ns is None
+
+
+@dataclass(frozen=True)
+class Score:
+    """What became of true contacts, in order, and which alarms were false; unjudged: those the truth does not cover."""
+
+    contacts: tuple[JudgedContact, ...]
+    false_alarms: tuple[Alarm, ...]
+    unjudged: tuple[Alarm, ...] = ()
+
+    @property
+    def armed(self) -> int:
+        """How many contacts began while detection was armed."""
+        return sum(contact.is_armed for contact in self.contacts)
+
+    @property
+    def missed(self) -> int:
+        """How many of those were not found."""
+        return sum(contact.is_missed for contact in self.contacts)
+
+    @property
+    def armed_false_alarms(self) -> int:
+        """How many false alarms armed detection raised: those that the time it was armed for can be set against."""
+        return sum(alarm.is_armed for alarm in self.false_alarms)
+
+    @property
+    def delays_ms(self) -> tuple[float, ...]:
+        """Delays of all contacts that were found, armed or not."""
+        return tuple(contact.delay_ms for contact in self.contacts if contact.delay_ms is not None)
+
+    def since(self, first_ns: int) -> "Score":
+        """Leave out what began before a time."""
+        return Score(
+            tuple(contact for contact in self.contacts if contact.onset_ns >= first_ns),
+            tuple(alarm for alarm in self.false_alarms if alarm.t_ns >= first_ns),
+            tuple(alarm for alarm in self.unjudged if alarm.t_ns >= first_ns),
+        )
+
+
+def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
+    """Give the last instant at which each of k contacts, in order, explains an alarm; integers in any one unit (k,)."""
+    until: Times = np.maximum.accumulate(np.asarray(forgotten, np.int64))
+    until[:-1] = np.minimum(until[:-1], np.asarray(onsets, np.int64)[1:] - 1)
+    return until
+
+
+def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
+    """Give the place of the contact that each of n alarms is about (n,), -1 for none; until: of `explained_until`."""
+    places = np.searchsorted(onsets, at, side="right") - 1
+    if not len(onsets):
+        return np.asarray(places)
+    return np.asarray(np.where(at <= until[places], places, -1))
+
+
+def judge(touches: Sequence[TouchWindow], alarms: Sequence[Alarm], crossings_ns: Sequence[int] = ()) -> Score:
+    """Judge alarms by true contacts, both in order.
+
+    crossings_ns: when some threshold is first exceeded, of a scheme replayed on a motion that is not its own: while it
+    still reacts, it can raise no alarm, and a crossing finds the contacts that begin meanwhile.
+    """
+    onsets, until = _bounds(touches)
+    about = owners(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
+    found = _first(about, [alarm.t_ns for alarm in alarms])
+    crossed = _first(owners(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)
+    for place, touch in enumerate(touches):
+        if touch.is_reacting and place in crossed:
+            found.setdefault(place, crossed[place])
+    unexplained = [alarm for alarm, place in zip(alarms, about, strict=True) if place < 0]
+    return Score(
+        _judged(touches, found),
+        tuple(alarm for alarm in unexplained if alarm.is_known),
+        tuple(alarm for alarm in alarms if not alarm.is_known),
+    )
+
+
+class StreamJudge:
+    """Judges a statistic that is compared with a threshold sample by sample and decides nothing, piece by piece.
+
+    The first sample over the threshold that is about a contact finds it. Samples about none are a false alarm; those
+    that follow the one before by no more than `pause_ns` belong to the same one.
+    """
+
+    def __init__(self, touches: Sequence[TouchWindow], pause_ns: int) -> None:
+        self._touches = touches
+        self._onsets, self._until = _bounds(touches)
+        self._pause_ns = pause_ns
+        self._found: dict[int, int] = {}
+        self._false: list[Alarm] = []
+        self._last_ns: int | None = None  # of what no contact explains
+
+    def add(self, t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]) -> None:
+        """Take in the next samples (n,). is_judged: where an alarm that no contact explains counts as false."""
+        rows = np.flatnonzero(is_over)
+        about = owners(t_ns[rows], self._onsets, self._until)
+        self._found = _first(about.tolist(), t_ns[rows].tolist()) | self._found
+        false_ns = t_ns[rows[(about < 0) & is_judged[rows]]]
+        self._false += [Alarm(at, True) for at in false_ns[begins_of(false_ns, self._pause_ns, self._last_ns)].tolist()]
+        if len(false_ns):
+            self._last_ns = int(false_ns[-1])
+
+    def score(self) -> Score:
+        """Judge what has been taken in."""
+        return Score(_judged(self._touches, self._found), tuple(self._false))
+
+
+def _bounds(touches: Sequence[TouchWindow]) -> tuple[Times, Times]:
+    onsets = np.array([touch.onset_ns for touch in touches], np.int64)
+    return onsets, explained_until(onsets, np.array([touch.forgotten_ns for touch in touches], np.int64))
+
+
+def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
+    """Give the first time about each contact, by its place."""
+    first = dict(zip(reversed(about), reversed(times_ns), strict=True))
+    first.pop(-1, None)
+    return first
+
+
+def _judged(touches: Sequence[TouchWindow], found: dict[int, int]) -> tuple[JudgedContact, ...]:
+    return tuple(
+        JudgedContact(touch.number, touch.link, touch.onset_ns, touch.is_armed, found.get(place))
+        for place, touch in enumerate(touches)
+    )

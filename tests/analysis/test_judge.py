@@ -1,0 +1,135 @@
+"""The one judge: which alarm is about which contact, what was found, how late, and what was false."""
+
+import numpy as np
+import pytest
+
+from adacd_hil.analysis.score.alarms import Alarm, begins_of, enters_react
+from adacd_hil.analysis.score.judge import Score, StreamJudge, TouchWindow, explained_until, judge
+from adacd_hil.analysis.score.touches import contact_rows
+from adacd_hil.records import SchemeState
+
+MS = 1_000_000
+
+
+def touch(onset_ms, forgotten_ms, number=1, is_armed=True, is_reacting=False):
+    return TouchWindow(number, 1, onset_ms * MS, forgotten_ms * MS, is_armed, is_reacting)
+
+
+def alarms(*at_ms, **changes):
+    return [Alarm(at * MS, True)._replace(**changes) for at in at_ms]
+
+
+def found_ms(score: Score):
+    return [contact.delay_ms for contact in score.contacts]
+
+
+def false_ms(score: Score):
+    return [alarm.t_ns / MS for alarm in score.false_alarms]
+
+
+@pytest.mark.parametrize(
+    ("at_ms", "delay_ms", "false"),
+    [(99, None, 1), (100, 0.0, 0), (107, 7.0, 0), (300, 200.0, 0), (301, None, 1)],
+    ids=["before", "onset", "during", "forgotten", "later"],
+)
+def test_a_contact_explains_alarms_from_its_onset_until_it_is_forgotten(at_ms, delay_ms, false):
+    score = judge([touch(100, 300)], alarms(at_ms))
+    assert found_ms(score) == [delay_ms]
+    assert len(score.false_alarms) == false
+
+
+def test_an_alarm_finds_the_last_contact_that_began_before_it_and_no_other():
+    score = judge([touch(100, 300), touch(200, 400, number=2)], alarms(205))
+    assert found_ms(score) == [None, 5.0]
+    assert score.missed == 1
+
+
+def test_what_an_earlier_contact_left_is_explained_after_a_later_one_is_forgotten():
+    score = judge([touch(100, 400), touch(150, 200, number=2)], alarms(300))
+    assert false_ms(score) == []
+    assert found_ms(score) == [None, 150.0]
+
+
+def test_the_first_alarm_about_a_contact_finds_it():
+    assert found_ms(judge([touch(100, 300)], alarms(110, 120))) == [10.0]
+
+
+def test_a_contact_that_is_not_armed_is_not_missed():
+    score = judge([touch(100, 300, is_armed=False)], [])
+    assert (score.missed, score.armed, len(score.contacts)) == (0, 0, 1)
+
+
+def test_what_the_truth_does_not_cover_is_neither_false_nor_right():
+    score = judge([], [*alarms(10), *alarms(20, is_known=False)])
+    assert false_ms(score) == [10.0]
+    assert [alarm.t_ns for alarm in score.unjudged] == [20 * MS]
+
+
+def test_false_alarms_of_armed_detection_are_told_apart():
+    score = judge([], [*alarms(10), *alarms(20, is_armed=False)])
+    assert (len(score.false_alarms), score.armed_false_alarms) == (2, 1)
+
+
+@pytest.mark.parametrize(("is_reacting", "delay_ms"), [(True, 4.0), (False, None)])
+def test_a_crossing_finds_a_contact_that_begins_while_the_scheme_still_reacts(is_reacting, delay_ms):
+    window = touch(100, 300, is_armed=False, is_reacting=is_reacting)
+    assert found_ms(judge([window], [], crossings_ns=[104 * MS, 150 * MS])) == [delay_ms]
+
+
+def test_an_alarm_outweighs_a_crossing():
+    window = touch(100, 300, is_armed=False, is_reacting=True)
+    assert found_ms(judge([window], alarms(120), crossings_ns=[104 * MS])) == [20.0]
+
+
+def test_of_a_stretch_only_what_begins_in_it_counts():
+    score = judge([touch(100, 150), touch(200, 250, number=2)], alarms(50, 105, 205, 300))
+    later = score.since(200 * MS)
+    assert [contact.number for contact in later.contacts] == [2]
+    assert false_ms(later) == [300.0]
+
+
+def stream(touches, over_ms, judged=lambda t_ms: t_ms == t_ms, pieces=1):
+    t_ms = np.arange(1000)
+    over = np.isin(t_ms, over_ms)
+    streamed = StreamJudge(touches, 100 * MS)
+    for part in np.array_split(t_ms, pieces):
+        streamed.add(part * MS, over[part], judged(part))
+    return streamed.score()
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 1000])
+def test_a_stream_is_judged_the_same_in_whatever_pieces_it_comes(pieces):
+    touches = [touch(100, 300), touch(200, 400, number=2)]
+    score = stream(touches, [50, 105, 106, 203, 500, 600, 701], pieces=pieces)
+    assert found_ms(score) == [5.0, 3.0]
+    assert false_ms(score) == [50.0, 500.0, 701.0]
+
+
+def test_a_stream_finds_contacts_where_its_false_alarms_do_not_count():
+    score = stream([touch(100, 300)], [50, 105, 500], judged=lambda t_ms: t_ms < 50)
+    assert (found_ms(score), false_ms(score)) == ([5.0], [])
+
+
+def test_samples_no_further_apart_than_the_pause_are_one_alarm():
+    at = np.array([10, 15, 21, 40])
+    assert at[begins_of(at, 5)].tolist() == [10, 21, 40]
+    assert at[begins_of(at, 5, last=6)].tolist() == [21, 40]
+    assert begins_of(at[:0], 5).tolist() == []
+
+
+def test_reacting_begins_once_until_the_stop_is_over():
+    m, r, s = SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED
+    previous, state = np.array([m, m, r, r, s, s], np.uint8), np.array([m, r, r, s, r, m], np.uint8)
+    assert enters_react(previous, state).tolist() == [False, True, False, False, False, False]
+
+
+def test_another_index_or_another_attempt_is_another_contact():
+    index = np.array([-1.0, 0, 0, 1, 1, -1, 1, 1])
+    attempt = np.array([0, 0, 0, 0, 0, 0, 0, 1])
+    assert contact_rows(index, None) == [(1, 3), (3, 5), (6, 8)]
+    assert contact_rows(index, attempt) == [(1, 3), (3, 5), (6, 7), (7, 8)]
+    assert contact_rows(np.zeros(0), None) == []
+
+
+def test_windows_of_contacts_do_not_overlap():
+    assert explained_until(np.array([100, 150, 900]), np.array([400, 200, 950])).tolist() == [149, 400, 950]
