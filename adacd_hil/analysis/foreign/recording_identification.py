@@ -4,14 +4,16 @@ The fit learns whatever is in its recording, a touch too; where the map names a 
 """
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adacd_hil.analysis.foreign.recording_import import Recording, Stretch
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
+from adacd_hil.analysis.score.judge import explained_until, owners
 from adacd_hil.log.errors import LogError
 from adacd_hil.records import Vector
 from adacd_hil.scheme import offline
@@ -175,20 +177,18 @@ def watch(
     delays: list[float] = []
     touches: int | None = None
     for stretch, detection in zip(recording.stretches, detections, strict=True):
-        bounds = _touches(stretch)
-        early = round(recording.blur_s / recording.period_s)
-        late = round(settings.isolation_s / settings.period_s)
-        for contact in detection.contacts:
-            is_true = None
-            if stretch.is_touched is not None:
-                is_true = any(first - early <= contact.sample <= last + late for first, last in bounds)
+        samples = np.array([contact.sample for contact in detection.contacts], np.int64)
+        about = _owners(stretch, samples, recording, settings)
+        for contact, place in zip(detection.contacts, about.tolist(), strict=True):
+            is_true = None if stretch.is_touched is None else place >= 0
             start_s = stretch.start_s + contact.sample * recording.period_s
             spells.append(Spell(start_s, contact.link + 1, contact.direction, is_true))
         if stretch.is_touched is not None:
+            bounds = _touches(stretch)
             touches = (touches or 0) + len(bounds)
-            delays += _delays(
-                bounds, [contact.sample for contact in detection.contacts], early, late, recording.period_s
-            )
+            places, firsts = np.unique(about, return_index=True)
+            found = firsts[places >= 0]
+            delays += ((samples[found] - bounds[about[found], 0]) * recording.period_s).tolist()
     return Watched(
         recording=recording,
         tau_ext_hat=tuple(detection.tau_ext_hat for detection in detections),
@@ -200,17 +200,18 @@ def watch(
     )
 
 
-def _touches(stretch: Stretch) -> list[tuple[int, int]]:
-    """Return the first and the last sample of each touch."""
+def _touches(stretch: Stretch) -> NDArray[np.int64]:
+    """Return the first and the last sample of each touch (k, 2)."""
     if stretch.is_touched is None:
-        return []
+        return np.zeros((0, 2), np.int64)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], stretch.is_touched, [False])).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]
+    return edges.reshape(-1, 2) - (0, 1)
 
 
-def _delays(
-    bounds: Iterable[tuple[int, int]], samples: Sequence[int], early: int, late: int, period_s: float
-) -> list[float]:
-    """Return how long after its beginning each touch was found, of those that were."""
-    found = [next((k - first for k in samples if first - early <= k <= last + late), None) for first, last in bounds]
-    return [delay * period_s for delay in found if delay is not None]
+def _owners(
+    stretch: Stretch, samples: NDArray[np.int64], recording: Recording, settings: OfflineSettings
+) -> NDArray[np.int64]:
+    """Return which touch each contact is about, -1 for none, as far as the touches' times are known."""
+    firsts, lasts = _touches(stretch).T
+    onsets = firsts - round(recording.blur_s / recording.period_s)
+    return owners(samples, onsets, explained_until(onsets, lasts + round(settings.isolation_s / settings.period_s)))

@@ -11,7 +11,7 @@ import numpy as np
 from adacd_hil.analysis.host_cycles import host_span
 from adacd_hil.analysis.score.alarms import Alarm, enters_react
 from adacd_hil.analysis.score.judge import Score, TouchWindow, judge
-from adacd_hil.analysis.score.truth_contacts import TrueContact, TrueContacts
+from adacd_hil.analysis.score.truth_contacts import HostCycles, TrueContact, TrueContacts, windows_of
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
@@ -19,7 +19,6 @@ from adacd_hil.records import FaultReason, SchemeState, Vector
 from adacd_hil.scheme.batch import SchemeBatch
 from adacd_hil.scheme.selection import layout_of
 
-_REACTING = (SchemeState.REACT, SchemeState.STOPPED)
 _LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 
 
@@ -41,15 +40,6 @@ class Adaptation(NamedTuple):
     theta_hat: tuple[float, ...]
 
 
-class _Begun(NamedTuple):
-    """A true contact that has begun: when, and in which state and with which threshold that found the scheme."""
-
-    contact: TrueContact
-    onset_ns: int
-    before: SchemeState
-    threshold: Vector
-
-
 class OutcomeGatherer:
     """Takes in the decisions of one replay. `truth`: the true contacts, None where nobody knows them."""
 
@@ -61,11 +51,10 @@ class OutcomeGatherer:
         self.state = SchemeState.INIT
         self._settings = settings
         self._truth = truth
-        self._coming: list[TrueContact] = []  # of this attempt, on the host's cycles
-        self._begun: _Begun | None = None  # a contact whose end is yet to come
+        self._contacts: list[TrueContact] = []  # of this attempt, on the host's cycles
+        self._kept: list[HostCycles] = []  # of this attempt
         self._touches: list[TouchWindow] = []
         self._alarms: list[tuple[int, Alarm]] = []  # with the cycle of each
-        self._last: tuple[int, int] | None = None  # cycle and time of the sample before, in this attempt
         self._begins: list[int] = []  # first cycle of each attempt
         self._theta = layout_of(settings).slices["theta_hat"]
         self._threshold = layout_of(settings).slices["threshold"]
@@ -79,7 +68,7 @@ class OutcomeGatherer:
         if count == 0:
             return
         over = batch.contact_joints != 0
-        self._follow_contacts(ticks, batch)
+        self._keep(ticks, batch)
         rises = np.flatnonzero(over & ~np.concatenate(([self._was_over], over[:-1])))
         self._was_over = bool(over[-1])
         self._crossings += ticks.t_ns[rises].tolist()
@@ -103,35 +92,15 @@ class OutcomeGatherer:
         self.theta_hat = tuple(batch.block[-1, self._theta].tolist())
         self.state = SchemeState(batch.state[-1])
 
-    def _follow_contacts(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Note when true contacts begin and end, between the cycles that they lie between, and what was so then."""
-        last = int(ticks.cycle[-1])
-        while True:
-            if self._begun is not None and self._begun.contact.end <= last:
-                self._end_contact(self._time_ns(ticks, self._begun.contact.end))
-            elif self._begun is None and self._coming and self._coming[0].onset <= last:
-                contact = self._coming.pop(0)
-                row = int(np.searchsorted(ticks.cycle, contact.onset))
-                before = SchemeState(batch.previous_state[row])
-                threshold = batch.block[row, self._threshold].copy()
-                self._begun = _Begun(contact, self._time_ns(ticks, contact.onset), before, threshold)
-            else:
-                break
-        self._last = last, int(ticks.t_ns[-1])
-
-    def _time_ns(self, ticks: Ticks, cycle: int) -> int:
-        cycles, times_ns = ticks.cycle, ticks.t_ns
-        if self._last is not None:
-            cycles, times_ns = np.append(self._last[0], cycles), np.append(self._last[1], times_ns)
-        return int(times_ns[0]) + round(float(np.interp(cycle, cycles, times_ns - times_ns[0])))
-
-    def _end_contact(self, end_ns: int) -> None:
-        if self._begun is None:
+    def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
+        """Keep the cycles between which true contacts begin and end, and the first and the last one."""
+        if self._truth is None:
             return
-        (contact, onset_ns, before, threshold), self._begun = self._begun, None
-        forgotten_ns = contact.forgotten_ns(end_ns, self._settings, threshold)
-        is_armed, is_reacting = before is SchemeState.MONITOR, before in _REACTING
-        self._touches.append(TouchWindow(contact.number, contact.link, onset_ns, forgotten_ns, is_armed, is_reacting))
+        instants = [(contact.onset, contact.end) for contact in self._contacts]
+        after = np.searchsorted(ticks.cycle, np.array(instants, np.int64).reshape(-1))
+        rows = np.unique(np.clip(np.concatenate((after - 1, after, [0, len(ticks.cycle)])), 0, len(ticks.cycle) - 1))
+        threshold = batch.block[rows, self._threshold]
+        self._kept.append(HostCycles(ticks.cycle[rows], ticks.t_ns[rows], batch.previous_state[rows], threshold))
 
     def _enter(self, transition: Transition, theta_hat: Vector) -> None:
         self.transitions.append(transition)
@@ -157,14 +126,16 @@ class OutcomeGatherer:
         self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
         if self._truth is not None:
             mine = (contact for contact in self._truth.contacts if contact.attempt == attempt)
-            self._coming = [contact.counted_from(cycle) for contact in mine]
-        self._was_over, self._last = False, None
+            self._contacts = [contact.counted_from(cycle) for contact in mine]
+        self._was_over = False
 
     def end(self) -> None:
         """Take note that an attempt, or the log, has ended."""
         self._give_up()
-        if self._last is not None:
-            self._end_contact(self._last[1])
+        if self._kept:
+            host = HostCycles(*map(np.concatenate, zip(*self._kept, strict=True)))
+            self._touches += windows_of(self._contacts, host, self._settings)
+            self._kept = []
 
     @property
     def detections_ns(self) -> list[int]:

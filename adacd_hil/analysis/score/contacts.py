@@ -19,7 +19,7 @@ from adacd_hil.records import JOINTS, ContactReport, Location, SchemeState, Vect
 from adacd_hil.scheme.classification import WINDOW_S
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Contact:
     """A true contact and its detection, or on a real arm a detection alone.
 
@@ -34,37 +34,37 @@ class Contact:
     """
 
     number: int
-    section: str | None
+    section: str | None = None
     state: str
-    link: int | None
-    onset_s: float | None
-    end_s: float | None
+    link: int | None = None
+    onset_s: float | None = None
+    end_s: float | None = None
     is_armed: bool
-    detected_s: float | None
-    delay_ms: float | None
-    law_ms: float | None
-    ideal_ms: float | None
-    link_at_alarm: int | None
-    link_detected: int | None
-    direction: tuple[int, int] | None
-    direction_ok: bool | None
-    tau_ext_Nm: tuple[float, float] | None
-    tau_ext_peak_hat_Nm: tuple[float, float] | None
-    torque_error_ratio: float | None
-    true_force_N: float | None
-    level: str | None
-    kind: str | None
-    reaction: str | None
-    location: str | None
-    is_two_sided: bool | None
-    tau_ext_peak_sigma_Nm: tuple[float | None, float | None] | None
-    impulse_Nm_s: tuple[float, float] | None
-    impulse_sigma_Nm_s: tuple[float | None, float | None] | None
-    force_N: float | None
-    force_sigma_N: float | None
-    lever_m: float | None
-    lever_sigma_m: float | None
-    blind_deg: float | None
+    detected_s: float | None = None
+    delay_ms: float | None = None
+    law_ms: float | None = None
+    ideal_ms: float | None = None
+    link_at_alarm: int | None = None
+    link_detected: int | None = None
+    direction: tuple[int, int] | None = None
+    direction_ok: bool | None = None
+    tau_ext_Nm: tuple[float, float] | None = None
+    tau_ext_peak_hat_Nm: tuple[float, float] | None = None
+    torque_error_ratio: float | None = None
+    true_force_N: float | None = None
+    level: str | None = None
+    kind: str | None = None
+    reaction: str | None = None
+    location: str | None = None
+    is_two_sided: bool | None = None
+    tau_ext_peak_sigma_Nm: tuple[float | None, float | None] | None = None
+    impulse_Nm_s: tuple[float, float] | None = None
+    impulse_sigma_Nm_s: tuple[float | None, float | None] | None = None
+    force_N: float | None = None
+    force_sigma_N: float | None = None
+    lever_m: float | None = None
+    lever_sigma_m: float | None = None
+    blind_deg: float | None = None
 
     @property
     def at_s(self) -> float:
@@ -93,39 +93,38 @@ def list_contacts(
 
 def _reported(detection: Detection | None) -> dict[str, Any]:
     """Give what the reports of a detection say."""
-    alarm = detection.alarm if detection else None
-    last = (detection.final or alarm) if detection else None
-    said: dict[str, Any] = {
-        "detected_s": detection.detected_s if detection else None,
-        "link_at_alarm": alarm.link if alarm else None,
-        "link_detected": last.link if last else None,
-        "direction": last.direction if last else None,
-        "tau_ext_peak_hat_Nm": last.tau_ext_peak if last else None,
-        "impulse_Nm_s": last.impulse if last else None,
+    if detection is None:
+        return {}
+    said: dict[str, Any] = {"detected_s": detection.detected_s}
+    last = detection.final or detection.alarm
+    if detection.alarm is None or last is None:
+        return said
+    said |= {
+        "link_at_alarm": detection.alarm.link,
+        "link_detected": last.link,
+        "direction": last.direction,
+        "tau_ext_peak_hat_Nm": last.tau_ext_peak,
+        "impulse_Nm_s": last.impulse,
     }
-    is_told = last is not None and last.location is not Location.NOT_SOUGHT
-    return said | (_told(last) if last is not None and is_told else dict.fromkeys(_TOLD))
-
-
-_TOLD = (
-    "level", "kind", "reaction", "location", "is_two_sided", "tau_ext_peak_sigma_Nm", "impulse_sigma_Nm_s",
-    "force_N", "force_sigma_N", "lever_m", "lever_sigma_m", "blind_deg",
-)  # fmt: skip
-"""Of a contact, what only the certified scheme tells."""
+    return said if last.location is Location.NOT_SOUGHT else said | _told(last)
 
 
 def _told(report: ContactReport) -> dict[str, Any]:
-    has_force, has_lever = math.isfinite(report.force_sigma), math.isfinite(report.lever_sigma)
-    peak_1, peak_2 = map(_finite, report.tau_ext_peak_sigma)
-    impulse_1, impulse_2 = map(_finite, report.impulse_sigma)
-    values = (
-        report.level.name, report.kind.name, report.reaction.name, report.location.name, report.is_two_sided,
-        (peak_1, peak_2), (impulse_1, impulse_2),
-        report.force_N if has_force else None, _finite(report.force_sigma),
-        report.lever_m if has_lever else None, _finite(report.lever_sigma),
-        math.degrees(report.blind_rad),
-    )  # fmt: skip
-    return dict(zip(_TOLD, values, strict=True))
+    """Give what only the certified scheme tells."""
+    return {
+        "level": report.level.name,
+        "kind": report.kind.name,
+        "reaction": report.reaction.name,
+        "location": report.location.name,
+        "is_two_sided": report.is_two_sided,
+        "tau_ext_peak_sigma_Nm": tuple(map(_finite, report.tau_ext_peak_sigma)),
+        "impulse_sigma_Nm_s": tuple(map(_finite, report.impulse_sigma)),
+        "force_N": report.force_N if math.isfinite(report.force_sigma) else None,
+        "force_sigma_N": _finite(report.force_sigma),
+        "lever_m": report.lever_m if math.isfinite(report.lever_sigma) else None,
+        "lever_sigma_m": _finite(report.lever_sigma),
+        "blind_deg": math.degrees(report.blind_rad),
+    }
 
 
 def _finite(value: float) -> float | None:
@@ -142,17 +141,7 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: D
         number=number,
         section=section_at(sections, detection.detected_s),
         state=_state_at(run, detection.detected_s).name,
-        link=None,
-        onset_s=None,
-        end_s=None,
         is_armed=True,
-        delay_ms=None,
-        law_ms=None,
-        ideal_ms=None,
-        direction_ok=None,
-        tau_ext_Nm=None,
-        torque_error_ratio=None,
-        true_force_N=None,
         **_reported(detection),
     )
 
@@ -191,9 +180,9 @@ def _contact(
         delay_ms=judged.delay_ms,
         law_ms=min(steps_s) * 1e3 if steps_s else None,
         ideal_ms=ideal_ms,
-        direction_ok=_is_direction_right(reported["direction"], until_final.sum(axis=0)),
+        direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),
         tau_ext_Nm=(float(peak[0]), float(peak[1])),
-        torque_error_ratio=_torque_ratio(reported["tau_ext_peak_hat_Nm"], peak),
+        torque_error_ratio=_torque_ratio(reported.get("tau_ext_peak_hat_Nm"), peak),
         true_force_N=None if truth.force_N is None else float(truth.force_N[rows][is_seen].max()),
         **reported,
     )

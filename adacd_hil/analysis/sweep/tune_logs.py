@@ -19,15 +19,15 @@ from adacd_hil.analysis.host_cycles import AttemptBegins, host_span
 from adacd_hil.analysis.motion import APART_S, LoggedMotion, Progress, read_motion, schemes
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
-from adacd_hil.analysis.score.judge import explained_until
-from adacd_hil.analysis.score.truth_contacts import TrueContact, contacts_beside
+from adacd_hil.analysis.score.judge import Times, TouchWindow, explained_until
+from adacd_hil.analysis.score.truth_contacts import HostCycles, TrueContact, contacts_beside, windows_of
 from adacd_hil.analysis.thresholds import BLOCK_S
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stretch import EVER_NS, WHOLE, Stretch
-from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.records import JOINTS
 
 _TENTHS = 10
 
@@ -104,13 +104,13 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: Stret
     is_chosen_on = np.full(blocks, place % 2 == 0) if count > 1 else tenths % 2 == 0
     windows = None
     if truth is not None:
-        begins = _begins(motion, index)
+        begins = _begins(motion)
         contacts = [
             contact
             for contact in _on_cycles(truth.contacts, begins)
-            if stretch.is_whole or index.cycle[0] <= contact.onset <= index.cycle[-1]
+            if stretch.is_whole or index.cycle[0] <= contact.onset
         ]
-        windows = _windows(contacts, index, own, None if count == 1 else place)
+        windows = _windows(windows_of(contacts, index, own), index.t_ns, None if count == 1 else place)
         is_free = motion.is_free & host_span(truth.span, np.array(begins)).covers(index.cycle)
         apart = round(APART_S / motion.period_s)
         for window in windows:
@@ -122,46 +122,34 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: Stret
     return TunedLog(path, digest, settings, motion, index.t_ns, windows, is_chosen_on, stretch)
 
 
-class _Cycles(NamedTuple):
-    """Number, time, state and threshold of N cycles (N,), (N, 2)."""
-
-    cycle: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
-    state: NDArray[np.uint8]
-    threshold: Vector
-
-
 class _Index:
     """Gathers the cycles of a log, in arrays that grow where they are: joined in the end, they would be there twice."""
 
     def __init__(self) -> None:
-        self._cycle, self._t_ns, self._state, self._threshold = array("q"), array("q"), array("B"), array("d")
+        self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
 
     def add(self, scheme: Series) -> None:
         """Take in the next piece of /scheme."""
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
-        self._state.frombytes(scheme["state"].astype(np.uint8).tobytes())
+        self._before.frombytes(scheme["previous_state"].astype(np.uint8).tobytes())
         self._threshold.frombytes(scheme["threshold"].astype(np.float64).tobytes())
 
-    def joined(self) -> _Cycles:
+    def joined(self) -> HostCycles:
         """Give all of them; nothing can be added after that."""
-        return _Cycles(
+        return HostCycles(
             np.frombuffer(self._cycle, np.int64),
             np.frombuffer(self._t_ns, np.int64),
-            np.frombuffer(self._state, np.uint8),
+            np.frombuffer(self._before, np.uint8),
             np.frombuffer(self._threshold).reshape(-1, JOINTS),
         )
 
 
-def _begins(motion: LoggedMotion, index: _Cycles) -> list[int]:
+def _begins(motion: LoggedMotion) -> list[int]:
     """List the first cycle of each attempt, those before the stretch included."""
     attempts = AttemptBegins()
-    if motion.bounds_ns is None:
-        attempts.add(index.cycle, index.state)
-    else:
-        for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
-            attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+    for scheme in schemes(motion.path, (EVER_NS[0], (motion.bounds_ns or EVER_NS)[1])):
+        attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
     begins: list[int] = attempts.begins.tolist()
     return begins
 
@@ -173,34 +161,20 @@ def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterat
             yield contact.counted_from(begins[contact.attempt])
 
 
-def _windows(
-    contacts: Sequence[TrueContact], index: _Cycles, settings: Settings, place: int | None
-) -> tuple[Window, ...]:
-    """Give the windows of contacts on the host's cycles. place: of the log; None where there is one log only."""
-    if not contacts:
-        return ()
-    firsts = [min(int(np.searchsorted(index.cycle, contact.onset)), len(index.cycle) - 1) for contact in contacts]
-    zero_ns = int(index.t_ns[0])
-    since_ns = [
-        np.rint(np.interp([getattr(contact, name) for contact in contacts], index.cycle, index.t_ns - zero_ns))
-        for name in ("onset", "end")
-    ]
-    onsets_ns, ends_ns = (zero_ns + each.astype(np.int64) for each in since_ns)
-    forgotten_ns = [
-        contact.forgotten_ns(end_ns, settings, index.threshold[first])
-        for contact, end_ns, first in zip(contacts, ends_ns.tolist(), firsts, strict=True)
-    ]
-    until_ns = explained_until(onsets_ns, np.array(forgotten_ns))
+def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> tuple[Window, ...]:
+    """Give the rows of contacts. place: of the log; None where there is one log only."""
+    onsets_ns = np.array([touch.onset_ns for touch in touches], np.int64)
+    until_ns = explained_until(onsets_ns, np.array([touch.forgotten_ns for touch in touches], np.int64))
+    firsts = np.searchsorted(t_ns, onsets_ns).tolist()
+    lasts = (np.searchsorted(t_ns, until_ns, side="right") - 1).tolist()
     return tuple(
         Window(
-            number=contact.number,
-            link=contact.link,
+            number=touch.number,
+            link=touch.link,
             first=first,
             last=max(last, first),
-            is_armed=bool(first > 0 and index.state[first - 1] == SchemeState.MONITOR),
-            is_chosen_on=(contact.number if place is None else place) % 2 == (1 if place is None else 0),
+            is_armed=touch.is_armed,
+            is_chosen_on=(touch.number if place is None else place) % 2 == (1 if place is None else 0),
         )
-        for contact, first, last in zip(
-            contacts, firsts, (np.searchsorted(index.t_ns, until_ns, side="right") - 1).tolist(), strict=True
-        )
+        for touch, first, last in zip(touches, firsts, lasts, strict=True)
     )
