@@ -29,6 +29,7 @@ from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import ADAPTATIONS
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.score_words import why_not_found
 from adacd_hil.analysis.score.touches import filtered, row_at
 from adacd_hil.analysis.sections import Section
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
@@ -497,5 +498,5 @@ def _describe(axes: Axes, contact: Contact) -> None:
     elif contact.detected_s is not None:
         text, colour = f"detected at {contact.detected_s:.2f} s", COLOURS["muted"]
     else:
-        text, colour = ("missed" if contact.is_armed else "not armed"), COLOURS["alarm"]
+        text, colour = why_not_found(contact.is_armed), COLOURS["alarm"]
     note(axes, text, colour)

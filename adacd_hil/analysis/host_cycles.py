@@ -53,11 +53,6 @@ class Span(NamedTuple):
         return np.asarray((cycle >= self.first) & (cycle <= self.last))
 
 
-def describe_unjudged(detections: int) -> str:
-    """Say in one line how many detections lie outside of what the emulator recorded; "" if none."""
-    return f"the truth doesn't cover {detections} detections, which are not judged" if detections else ""
-
-
 def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
     """Turn the emulator's cycles (m,) of attempts (m,) into the host's; begins: first cycle of each attempt."""
     return np.asarray(cycle + whole_rounds(begins)[np.minimum(attempt, len(begins) - 1)])

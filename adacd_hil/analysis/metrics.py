@@ -33,7 +33,6 @@ from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.alarms import find_detections
 from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h
 from adacd_hil.analysis.score.contacts import Contact, list_contacts
-from adacd_hil.analysis.score.paper_beside import evaluate_beside
 from adacd_hil.analysis.score.touches import judge_run, true_contacts
 from adacd_hil.analysis.sections import Section, rows_of, split_sections
 from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_reactions
@@ -139,9 +138,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         dropped=run.dropped,
         evidence=evidence,
         paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
-        verdict=give_verdict(
-            run, sections, contacts, false_s, missed, adaptation_s, payload_kg, evidence, faults, causes, data
-        ),
+        verdict=give_verdict(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
         is_clean=is_identified
         and missed == 0
         and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
@@ -152,11 +149,14 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
 def _evidence(run: Run, sections: tuple[Section, ...], untouched: Untouched) -> Evidence | None:
     if run.certified is None:
         return None
-    beside = None
-    if run.beside is not None and untouched.beside is not None:
-        beside = evaluate_beside(run, untouched.beside)
     return evaluate_certified(
-        run, run.certified, sections, untouched.margins, untouched.promotions, beside, untouched.smallest_push
+        run,
+        run.certified,
+        sections,
+        untouched.margins,
+        untouched.promotions,
+        untouched.beside,
+        untouched.smallest_push,
     )
 
 

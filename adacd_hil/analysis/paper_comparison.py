@@ -12,6 +12,7 @@ from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.score.paper_beside import Beside
+from adacd_hil.analysis.score.score_words import found_text
 from adacd_hil.analysis.sections import Section
 from adacd_hil.analysis.untouched import Residual
 from adacd_hil.analysis.verdict import LISTED
@@ -111,7 +112,7 @@ def compare_with_paper(
     found = [contact for contact in armed if contact.delay_ms is not None]
     has_truth = run.truth is not None
     rows += [
-        ("Contacts detected", "–", beside[8], f"{len(found)} of {len(armed)}" if has_truth else str(len(contacts))),
+        ("Contacts detected", "–", beside[8], found_text(len(found), len(armed)) if has_truth else str(len(contacts))),
         ("Median delay", "–", beside[9], _median_text([c.delay_ms for c in found if c.delay_ms is not None])),
         ("False alarms", "–", beside[10], str(false_alarms) if has_truth else "–"),
     ]
@@ -166,7 +167,7 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
         _residual_text(frozen, 1),
         *same[1:],
         f"{seen[0]:.2f} s" if seen else "–",
-        "–" if beside.missed is None else f"{len(found)} of {len(armed)}",
+        "–" if beside.missed is None else found_text(len(found), len(armed)),
         _median_text([contact.delay_ms for contact in found if contact.delay_ms is not None]),
         "–" if beside.false_alarms is None else str(beside.false_alarms),
     )

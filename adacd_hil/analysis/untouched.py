@@ -15,7 +15,7 @@ import numpy as np
 from adacd_hil.analysis.evidence import ChannelMargin, MarginGatherer
 from adacd_hil.analysis.run import Mask, Run
 from adacd_hil.analysis.score.alarms import Detection, find_detections
-from adacd_hil.analysis.score.paper_beside import SETTLING_TIME_CONSTANTS, BesideGatherer, Reached, larger
+from adacd_hil.analysis.score.paper_beside import SETTLING_TIME_CONSTANTS, Beside, BesideGatherer, larger
 from adacd_hil.analysis.score.touches import Touch, true_contacts
 from adacd_hil.analysis.sections import Section, rows_of, split_sections
 from adacd_hil.analysis.smallest_push import PushGatherer, SmallestPush
@@ -41,7 +41,7 @@ class Untouched:
     residuals: dict[str, Residual]
     margins: dict[str, tuple[ChannelMargin, ...]]
     promotions: int
-    beside: Reached | None
+    beside: Beside | None
     smallest_push: SmallestPush | None
 
 
@@ -134,7 +134,7 @@ class UntouchedGatherer:
         labels = [section.label for section in self._sections]
         residuals = {label: self._residuals[label].residual() for label in labels if label in self._residuals}
         margins = {label: self._done[label] for label in labels if label in self._done}
-        beside = None if self._beside is None else self._beside.reached()
+        beside = None if self._beside is None else self._beside.beside()
         return Untouched(residuals, margins, self._promotions, beside, self._push.smallest_push())
 
 

@@ -7,7 +7,8 @@ from adacd_hil.analysis.cyclic_data import CyclicData, data_text
 from adacd_hil.analysis.endings import Fault
 from adacd_hil.analysis.evidence import Evidence
 from adacd_hil.analysis.run import Run
-from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.judge import Score
+from adacd_hil.analysis.score.score_words import number_of, score_sentence
 from adacd_hil.analysis.sections import Section
 
 LISTED: Final = 4
@@ -17,9 +18,7 @@ LISTED: Final = 4
 def give_verdict(
     run: Run,
     sections: tuple[Section, ...],
-    contacts: tuple[Contact, ...],
-    false_s: tuple[float, ...],
-    missed: int,
+    score: Score,
     adaptation_s: dict[str, float | None],
     payload_kg: dict[str, float | None],
     evidence: Evidence | None,
@@ -33,7 +32,10 @@ def give_verdict(
         return f"No cycle was run: {cause}."
     done = "identified" if evidence is None else "certified"
     identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
-    text = f"{_contacts_text(run, contacts, false_s, missed)}; {identified}"
+    found = score_sentence(score)
+    if run.truth is None:
+        found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
+    text = f"{found}; {identified}"
     if evidence is not None and not evidence.is_anchored:
         text += ", with torque offsets that nothing anchors"
     if evidence is not None and evidence.paper_beside is not None:
@@ -89,37 +91,11 @@ def _beside_text(times_s: list[float | None]) -> str:
     return f"; the paper's scheme on the same stream {took}"
 
 
-def _contacts_text(run: Run, contacts: tuple[Contact, ...], false_s: tuple[float, ...], missed: int) -> str:
-    if run.truth is None:
-        return f"{_number(len(contacts), 'detection')}, whose truth is not recorded"
-    armed = [contact for contact in contacts if contact.is_armed]
-    delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
-    within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
-    if not armed:
-        found = "no contact while detection was armed"
-    elif missed:
-        found = f"{len(armed) - missed} of {_number(len(armed), 'contact')} detected{within}, {missed} missed"
-    else:
-        found = f"{'the one contact' if len(armed) == 1 else f'all {len(armed)} contacts'} detected{within}"
-    false = "none false" if not false_s else _number(len(false_s), "false alarm")
-    if not armed and not false_s:
-        false = "no false alarm"
-    disarmed = [contact for contact in contacts if not contact.is_armed]
-    outside = f", {len(disarmed)} more while it was not armed" if disarmed else ""
-    early = sum(contact.detected_s is not None for contact in disarmed)
-    outside += f" ({early} of them detected)" if early else ""
-    return f"{found}{outside}, {false}"
-
-
 def _summary(times_s: list[float | None], failed: str) -> str:
     """Sum up many adaptations, of which some took their time: the shortest, the longest, and how many failed."""
     took_s = [time_s for time_s in times_s if time_s is not None]
     text = f"{min(took_s):.2f} to {max(took_s):.2f} s, {len(took_s)} times"
     return text if len(took_s) == len(times_s) else f"{text}, and {failed} {len(times_s) - len(took_s)} times"
-
-
-def _number(count: int, noun: str) -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:

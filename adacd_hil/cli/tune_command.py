@@ -120,7 +120,7 @@ def _as_text(found: "Tuning") -> str:
 
 def _cells(checked: "Found") -> tuple[str, ...]:
     """Say what thresholds come to in one half, a cell for each figure."""
-    from adacd_hil.analysis.sweep.tune_roc import delay_figures
+    from adacd_hil.analysis.score.score_words import delay_figures
 
     low, high = checked.share_bounds
     return (
@@ -133,7 +133,7 @@ def _cells(checked: "Found") -> tuple[str, ...]:
 
 
 def _row(candidate: "Candidate") -> tuple[str, ...]:
-    from adacd_hil.analysis.sweep.tune_roc import delay_figures
+    from adacd_hil.analysis.score.score_words import delay_figures
 
     outcome = candidate.outcome
     median_ms, _, _ = delay_figures(outcome.delays_ms)

@@ -16,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.host_cycles import describe_unjudged
 from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.replay.attempts import Stretch
 from adacd_hil.analysis.replay.outcome import Adaptation, OutcomeGatherer, Transition
@@ -29,6 +28,7 @@ from adacd_hil.analysis.replay.scheme_comparison import (
 )
 from adacd_hil.analysis.replay.source import LogSource, Part, Source
 from adacd_hil.analysis.score.judge import Score
+from adacd_hil.analysis.score.score_words import unjudged_sentence
 from adacd_hil.analysis.score.truth_contacts import TrueContacts, contacts_beside
 from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
@@ -376,7 +376,7 @@ def _result(player: _Player, source: Source, tolerance: float, first_ns: int) ->
     gatherer.end()
     score = gatherer.score()
     score = None if score is None else score.since(first_ns)
-    if unjudged := describe_unjudged(0 if score is None else len(score.unjudged)):
+    if unjudged := unjudged_sentence(0 if score is None else len(score.unjudged)):
         notes.append(unjudged)
     if comparison is not None:
         for cycle, t_ns, logged, asked in player.requests.unexplained:

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from adacd_hil.analysis.replay.replay import Replay
+from adacd_hil.analysis.score.score_words import found_text, why_not_found
 from adacd_hil.config import SUCCESSORS, ConfigError, Settings, parse, parse_toml, to_toml
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
@@ -207,8 +208,7 @@ def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
         cells = (
             "–" if contact is None
             else f"after {contact.delay_ms:.1f} ms" if contact.delay_ms is not None
-            else "missed" if contact.is_armed
-            else "not armed"
+            else why_not_found(contact.is_armed)
             for contact in known
         )  # fmt: skip
         rows.append((name, *cells))
@@ -218,7 +218,7 @@ def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
 def _detected(found: Replay) -> str:
     if found.score is None:
         return str(len(found.detections_ns))
-    return f"{len(found.score.delays_ms)} of {len(found.score.contacts)}"
+    return found_text(len(found.score.delays_ms), len(found.score.contacts))
 
 
 def _times(found: Replay, times_ns: Sequence[int]) -> str:

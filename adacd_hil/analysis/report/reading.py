@@ -14,7 +14,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.host_cycles import describe_unjudged
 from adacd_hil.analysis.metrics import Gathered
 from adacd_hil.analysis.replay.source import settings_of
 from adacd_hil.analysis.report.cut_points import settling_s, widen
@@ -24,6 +23,7 @@ from adacd_hil.analysis.report.scheme_rows import SchemeRows, run_of_piece
 from adacd_hil.analysis.run import Run, StretchOfRun, Truth
 from adacd_hil.analysis.score.alarms import find_detections
 from adacd_hil.analysis.score.foreign_truth import foreign_truth
+from adacd_hil.analysis.score.score_words import unjudged_sentence
 from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.analysis.score.truth_reading import TruthRows, host_truth, read_truth
 from adacd_hil.analysis.timing import CycleColumns, columns_of_series
@@ -269,7 +269,7 @@ def _truth_within(truth: Truth | None, bounds_s: tuple[float, float]) -> Truth |
 
 def _unjudged(run: Run) -> str:
     """Say in one line how many detections the truth can't judge, because it begins later or ends before; "" if none."""
-    return describe_unjudged(sum(not detection.raised.is_known for detection in find_detections(run)))
+    return unjudged_sentence(sum(not detection.raised.is_known for detection in find_detections(run)))
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:

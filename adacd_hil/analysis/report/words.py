@@ -7,6 +7,7 @@ from typing import Final
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.run import StretchOfRun
 from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.score_words import why_not_found
 
 NONE: Final = "–"
 
@@ -43,7 +44,7 @@ _CONTACT_HEAD: Final = (
 def _contact_words(contact: Contact) -> tuple[str, ...]:
     delay = number_text(contact.delay_ms, 0)
     if contact.detected_s is None:
-        delay = "missed" if contact.is_armed else "not armed"
+        delay = why_not_found(contact.is_armed)
     onset_s = contact.detected_s if contact.onset_s is None else contact.onset_s
     return (
         str(contact.number),

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adacd_hil.analysis.run import Mask, Run
-from adacd_hil.analysis.score.judge import Score, StreamJudge
+from adacd_hil.analysis.score.judge import StreamJudge
 from adacd_hil.analysis.score.touches import Touch, touch_window
 from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.records import Vector
@@ -46,38 +46,6 @@ class Beside:
     missed: int | None
 
 
-@dataclass(frozen=True)
-class Reached:
-    """What the paper's scheme reached over all cycles: see `Beside`."""
-
-    adaptation_s: dict[str, float | None]
-    frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
-    score: Score
-
-
-def evaluate_beside(run: Run, reached: Reached) -> Beside:
-    """Give what the paper's scheme came to. reached: by all its cycles, see `untouched`."""
-    score, has_truth = reached.score, run.truth is not None
-    contacts = [
-        BesideContact(
-            number=judged.number,
-            is_armed=judged.is_armed,
-            detected_s=None if judged.detected_ns is None else (judged.detected_ns - run.zero_ns) * 1e-9,
-            delay_ms=judged.delay_ms,
-        )
-        for judged in score.contacts
-    ]
-    false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
-    return Beside(
-        adaptation_s=reached.adaptation_s,
-        frozen_residual_max_Nm=reached.frozen_residual_max_Nm,
-        contacts=tuple(contacts),
-        false_alarms=len(false_s) if has_truth else None,
-        false_alarms_s=false_s if has_truth else None,
-        missed=score.missed if has_truth else None,
-    )
-
-
 def larger(largest: Vector | None, values: Vector) -> Vector | None:
     """Give the larger of the sizes of `values` (k, …) and of what was the largest of each so far (…).
 
@@ -100,6 +68,7 @@ class BesideGatherer:
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
         windows = [touch_window(run, touch, a, threshold, armed) for touch in touches]
         self._judge = StreamJudge(windows, round(SETTLING_TIME_CONSTANTS / a * 1e9))
+        self._zero_ns, self._has_truth = run.zero_ns, run.truth is not None
         self._sections = sections
         self._finish_cycle = run.finish_cycle
         self._span = None if run.truth is None else run.truth.span
@@ -137,13 +106,30 @@ class BesideGatherer:
                 values = stream.tau_ext_hat[rows][free[rows] & armed[rows]]
                 self._largest[section.label] = larger(self._largest[section.label], values)
 
-    def reached(self) -> Reached:
+    def beside(self) -> Beside:
         """Sum up what has been taken in."""
-        largest = {
-            label: None if values is None else (float(values[0]), float(values[1]))
-            for label, values in self._largest.items()
-        }
-        return Reached(self._adaptation_s, largest, self._judge.score())
+        score = self._judge.score()
+        zero_ns = self._zero_ns
+        false_s = tuple((alarm.t_ns - zero_ns) * 1e-9 for alarm in score.false_alarms)
+        return Beside(
+            adaptation_s=self._adaptation_s,
+            frozen_residual_max_Nm={
+                label: None if values is None else (float(values[0]), float(values[1]))
+                for label, values in self._largest.items()
+            },
+            contacts=tuple(
+                BesideContact(
+                    contact.number,
+                    contact.is_armed,
+                    None if contact.detected_ns is None else (contact.detected_ns - zero_ns) * 1e-9,
+                    contact.delay_ms,
+                )
+                for contact in score.contacts
+            ),
+            false_alarms=len(false_s) if self._has_truth else None,
+            false_alarms_s=false_s if self._has_truth else None,
+            missed=score.missed if self._has_truth else None,
+        )
 
 
 def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:

@@ -18,9 +18,10 @@ from adacd_hil.analysis.false_alarms import TooLittleMotionError
 from adacd_hil.analysis.replay.replay import Replay, replay_many
 from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.analysis.score.confidence_bounds import least_rate_per_h
+from adacd_hil.analysis.score.score_words import delay_figures
 from adacd_hil.analysis.sweep.tune_detectors import observe_detectors
 from adacd_hil.analysis.sweep.tune_logs import TunedLog, read_logs
-from adacd_hil.analysis.sweep.tune_roc import Choice, choose, delay_figures
+from adacd_hil.analysis.sweep.tune_roc import Choice, choose
 from adacd_hil.analysis.sweep.tune_scheme import (
     Changes,
     candidates,

@@ -8,8 +8,9 @@ from typing import Any
 
 from adacd_hil import __version__
 from adacd_hil.analysis.replay.what_if import apply_settings, changed_keys, keep_facts
+from adacd_hil.analysis.score.score_words import delays_phrase, rate_phrase, share_phrase
 from adacd_hil.analysis.sweep.tune import Candidate, Tuning, free_hours
-from adacd_hil.analysis.sweep.tune_roc import Found, delay_figures
+from adacd_hil.analysis.sweep.tune_roc import Found
 from adacd_hil.clock import wall_ns
 from adacd_hil.config import ConfigError, Settings, builtin_names, load_settings, to_toml
 
@@ -77,19 +78,10 @@ def _plain(path: Path) -> str:
 
 def in_words(found: Found) -> str:
     """Say what thresholds come to in one half."""
-    text = f"{found.alarms} false alarms in {found.hours:.4f} h, 95 % bound {found.rate_bound_per_h:.3g} per hour"
+    text = rate_phrase(found.alarms, found.hours, found.rate_bound_per_h)
     if found.contacts is None:
         return text
-    low, high = found.share_bounds
-    text += f"; {len(found.delays_ms)} of {found.contacts} contacts found ({100 * low:.0f} to {100 * high:.0f} %)"
-    return text + delays_in_words(found.delays_ms)
-
-
-def delays_in_words(delays_ms: tuple[float, ...]) -> str:
-    """Say how delays are distributed; nothing of none."""
-    if not delays_ms:
-        return ""
-    return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms))
+    return f"{text}; {share_phrase(found.delays_ms, found.contacts, found.share_bounds)}"
 
 
 def outcome_in_words(candidate: Candidate) -> str:
@@ -100,4 +92,4 @@ def outcome_in_words(candidate: Candidate) -> str:
         text += f" of {min(outcome.adaptation_s):.2f} to {max(outcome.adaptation_s):.2f} s"
     if outcome.missed is None:
         return text
-    return text + f", {outcome.missed} missed, {outcome.false_alarms} false alarms{delays_in_words(outcome.delays_ms)}"
+    return text + f", {outcome.missed} missed, {outcome.false_alarms} false alarms{delays_phrase(outcome.delays_ms)}"

@@ -5,7 +5,6 @@ one factor make its ROC. Alarms are counted where thresholds were not chosen; co
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -21,6 +20,7 @@ from adacd_hil.analysis.false_alarms import (
     largest_ratio,
 )
 from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h, share_bounds
+from adacd_hil.analysis.score.score_words import delay_figures
 from adacd_hil.analysis.thresholds import BLOCK_S
 from adacd_hil.records import Vector
 
@@ -102,14 +102,6 @@ class Found(NamedTuple):
             "share_bounds": self.share_bounds,
             "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
         }
-
-
-def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Give median, 90th percentile and largest."""
-    if not delays_ms:
-        return None, None, None
-    median, p90, largest = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist()
-    return median, p90, largest
 
 
 @dataclass(frozen=True)
