@@ -104,7 +104,7 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: Stret
     is_chosen_on = np.full(blocks, place % 2 == 0) if count > 1 else tenths % 2 == 0
     windows = None
     if truth is not None:
-        begins = _begins(motion)
+        begins = _begins(motion, parts)
         contacts = [
             contact
             for contact in _on_cycles(truth.contacts, begins)
@@ -126,10 +126,12 @@ class _Index:
     """Gathers the cycles of a log, in arrays that grow where they are: joined in the end, they would be there twice."""
 
     def __init__(self) -> None:
+        self.attempts = AttemptBegins()
         self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
 
     def add(self, scheme: Series) -> None:
         """Take in the next piece of /scheme."""
+        self.attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
         self._before.frombytes(scheme["previous_state"].astype(np.uint8).tobytes())
@@ -145,11 +147,13 @@ class _Index:
         )
 
 
-def _begins(motion: LoggedMotion) -> list[int]:
+def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
     """List the first cycle of each attempt, those before the stretch included."""
-    attempts = AttemptBegins()
-    for scheme in schemes(motion.path, (EVER_NS[0], (motion.bounds_ns or EVER_NS)[1])):
-        attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+    attempts = parts.attempts
+    if motion.bounds_ns is not None:
+        attempts = AttemptBegins()
+        for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
+            attempts.add(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
     begins: list[int] = attempts.begins.tolist()
     return begins
 
