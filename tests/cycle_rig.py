@@ -16,9 +16,9 @@ from adacd_hil.log.recorder import Recorder
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.tap import Tap
-from firmware_sim.bench import Bench
-from firmware_sim.bus_model import QueuedBus
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.bus.bus_model import QueuedBus
+from firmware_sim.scenario.scenario import load_scenario
 
 CODEC = load_codec()
 

@@ -29,10 +29,10 @@ from adacd_hil.control.tare_file import Tare, read_tare
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile
 from adacd_hil.wire.codec import CodecError, load_codec
-from firmware_sim.faults import FaultSettings
-from firmware_sim.main import cli as emulator_cli
-from firmware_sim.scenario import Scenario, load_scenario
-from firmware_sim.scenario_list import check as check_scenario
+from firmware_sim.cli.emulator_main import cli as emulator_cli
+from firmware_sim.cli.scenario_list import check as check_scenario
+from firmware_sim.scenario.faults import FaultSettings
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 Complaints = list[str]
 

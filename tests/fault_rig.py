@@ -23,9 +23,9 @@ from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.tap import Tap
-from firmware_sim.bench import Bench
-from firmware_sim.bus_model import QueuedBus
-from firmware_sim.scenario import Scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.bus.bus_model import QueuedBus
+from firmware_sim.scenario.scenario import Scenario
 
 CODEC = load_codec()
 PERIOD_NS = 1_000_000

@@ -11,8 +11,8 @@ from adacd_hil.control.session import Session
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import Scenario, load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 CODEC = load_codec()
 

@@ -22,7 +22,7 @@ from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import ArmBatch, ArmState
 from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.codec import Codec
-from firmware_sim.bench import Bench
+from firmware_sim.bench.bench import Bench
 
 
 class Live(NamedTuple):

@@ -13,8 +13,8 @@ from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import load_scenario
 
 CODEC = load_codec()
 ENABLED_CYCLE = 203  # in lockstep always the same

@@ -7,7 +7,7 @@ import pytest
 
 from adacd_hil.config import FRICTION_TERMS, ConfigError, Settings, load_settings, merge, parse, renewed, to_toml
 from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
-from adacd_hil.scheme import certified_memory
+from adacd_hil.scheme.kernel import certified_memory
 
 SEVEN = [0.1] * 7
 AT_REST = {"period_s": 2.0, "cosine": [[0.1], [0.2]], "sine": [[0.0], [0.0]]}

@@ -22,9 +22,9 @@ from adacd_hil.config import load_settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import FRAME_DTYPE
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.main import main as emulator_main
+from firmware_sim.cli.emulator_main import main as emulator_main
 
 PAGE_NAMES = [str(path.relative_to(ROOT)) for path in PAGES]
 COMMAND = re.compile(r"(\$ )?(\.venv/bin/)?(adacd-hil|firmware-sim|make|tools/\S+|python|pip|can_\w+) \S")

@@ -25,9 +25,9 @@ from adacd_hil.log.run_folder import TRUTH_NAME
 from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import crc8
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
-from firmware_sim.truth import TruthLog
+from firmware_sim.bench.bench import Bench
+from firmware_sim.bench.truth import TruthLog
+from firmware_sim.scenario.scenario import load_scenario
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]
 

@@ -10,7 +10,7 @@ from fault_rig import deviations, play, run_lockstep
 from fault_table import CASES, Case, covering, rows_of
 from long_cases import long_but
 
-from firmware_sim.faults import KINDS
+from firmware_sim.scenario.faults import KINDS
 
 FAULTS_PAGE = Path(__file__).parent.parent / "docs" / "emulator" / "faults.md"
 

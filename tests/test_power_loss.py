@@ -7,7 +7,7 @@ from lockstep_rig import play
 from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings, parse
 from adacd_hil.log.reader import RunLog
 from adacd_hil.wire.bus import Frame
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario.scenario import Scenario
 
 pytestmark = pytest.mark.slow
 

@@ -9,9 +9,9 @@ from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.cli.outcome import outcome_of
 from adacd_hil.config import parse, to_short_toml, to_toml
 from adacd_hil.log.reader import read_log
-from firmware_sim.expectation import deviations
-from firmware_sim.faults import KINDS
-from firmware_sim.scenario import Scenario, builtin_scenarios, load_scenario
+from firmware_sim.scenario.expectation import deviations
+from firmware_sim.scenario.faults import KINDS
+from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario
 
 NAMES = builtin_scenarios()
 GROUPS = {"experiment", "people", "mechanics", "measurement", "faults"}

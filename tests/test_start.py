@@ -33,7 +33,7 @@ def interrupted(program: str, place: str, **given: object) -> "subprocess.Comple
 @pytest.mark.parametrize("place", ["MAIN", "click", "numpy", "importlib.metadata"])
 @pytest.mark.parametrize("program", ENDS)
 def test_ctrl_c_during_imports_ends_as_later(program: str, place: str) -> None:
-    main = {"adacd-hil": "adacd_hil.cli.main", "firmware-sim": "firmware_sim.main"}[program]
+    main = {"adacd-hil": "adacd_hil.cli.main", "firmware-sim": "firmware_sim.cli.emulator_main"}[program]
     done = interrupted(program, place.replace("MAIN", main))
     assert (done.returncode, done.stdout, done.stderr) == (ENDS[program][0], b"", ENDS[program][1])
 

@@ -28,7 +28,7 @@ NMT_RESET_NODE = 129
 SENSOR_EDS = {"arm": "torque_sensor.eds", "arm_stock": "int32_sensor.eds"}
 DRIVE_EDS = {"arm": "drive.eds", "arm_stock": "stock_drive.eds"}
 # By SYNC: a stall of the machine stops the arm's time too, and no watchdog mistakes it for a dead master.
-EMULATOR = (sys.executable, "-m", "firmware_sim.main", "run", "-i", "socketcan", "--scenario", "idle")
+EMULATOR = (sys.executable, "-m", "firmware_sim.cli.emulator_main", "run", "-i", "socketcan", "--scenario", "idle")
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.config import ConfigError, load_settings, parse_toml, read_toml
 from adacd_hil.control.tare_file import read_tare
 from adacd_hil.device.profile import load_profile
-from firmware_sim.scenario import load_scenario
+from firmware_sim.scenario.scenario import load_scenario
 
 DEEP = 100_000
 MOST_PEAK_BYTES = 100 << 20

@@ -26,9 +26,9 @@ from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import ArmCommand, FaultReason, SchemeState
 from adacd_hil.wire.bus import Bus, BusError, EmbeddedBus, Frame
 from adacd_hil.wire.tap import Tap
-from firmware_sim.bench import Bench
-from firmware_sim.lockstep_bus import make_lockstep_bus
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.bus.lockstep_bus import make_lockstep_bus
+from firmware_sim.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.slow
 

@@ -24,8 +24,8 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
 from adacd_hil.wire.bus import Bus, Frame
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import Scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import Scenario
 
 ATTACK_S = 4.29
 """When an attack begins, since the drives were enabled: both joints move, joint 1 at its fastest, 100 deg/s."""

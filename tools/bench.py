@@ -38,13 +38,13 @@ from adacd_hil.log.channels import ChannelId, pack_scheme
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import ArmState, FaultReason, Request
-from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.mechanics_settings import MechanicsSettings
-from firmware_sim.scenario import load_scenario
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.bench.bench import Bench
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.scenario.scenario import load_scenario
 
 SYNC_ID = 0x080
 REPEATS = 20_000

@@ -38,7 +38,7 @@ from witnessed_run import Played, play_witnessed  # noqa: E402
 from adacd_hil.cli.table import format_table  # noqa: E402
 from adacd_hil.config import OperatorSettings, RequestSettings, Settings, load_settings, parse  # noqa: E402
 from adacd_hil.records import SchemeState  # noqa: E402
-from firmware_sim.scenario import Scenario  # noqa: E402
+from firmware_sim.scenario.scenario import Scenario  # noqa: E402
 
 PLACES = (
     ("feedback", "drive1"), ("feedback", "drive2"), ("torque", "sensor1"), ("torque", "sensor2"),

@@ -25,8 +25,8 @@ from typing import Any
 
 from adacd_hil.cli.table import format_table
 from adacd_hil.config import ConfigError, load_settings
-from firmware_sim.expectation import deviations
-from firmware_sim.scenario import builtin_scenarios, load_scenario
+from firmware_sim.scenario.expectation import deviations
+from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 
 CONFIGS = ("paper", "certified")
 

@@ -9,8 +9,8 @@ from lab import PERIOD_S, Motion, Recording, paper_motion
 from adacd_hil.config import Settings
 from adacd_hil.control.excitation import Excitation
 from adacd_hil.records import JOINTS, SchemeState
-from adacd_hil.scheme import certified_memory, loop
-from adacd_hil.scheme.observation import CONTACT_SHIFT
+from adacd_hil.scheme.kernel import certified_memory, loop
+from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
 
 WIDE_FILTER = 1
 """Filter of the bank that is undone for the external torque, as in contact reports."""
@@ -75,7 +75,7 @@ class CertifiedScheme:
 
     @staticmethod
     def _undo(y: np.ndarray, cutoff_rad_s: float) -> np.ndarray:
-        """Undo a filter, as `adacd_hil.scheme.contact.undo_filter` does."""
+        """Undo a filter, as `adacd_hil.scheme.contact.contact_estimate.undo_filter` does."""
         decay = np.exp(-cutoff_rad_s * PERIOD_S)
         sharp = y.copy()
         sharp[1:] = (y[1:] - decay * y[:-1]) / (1.0 - decay)

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.records import Vector
-from adacd_hil.scheme import kernel
+from adacd_hil.scheme.kernel import paper_kernel
 
 ADAPTING, TESTING, ARMED = 0, 1, 2
-_LEARN = int(kernel.LEARN)
-_ARMED = int(kernel.ARMED)
-_ADAPTED = int(kernel.Observation.ADAPTED)
-_CONTACT_SHIFT = int(kernel.CONTACT_SHIFT)
+_LEARN = int(paper_kernel.LEARN)
+_ARMED = int(paper_kernel.ARMED)
+_ADAPTED = int(paper_kernel.Observation.ADAPTED)
+_CONTACT_SHIFT = int(paper_kernel.CONTACT_SHIFT)
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,9 @@ class PaperScheme:
         phase, over = np.zeros(n, np.int64), np.zeros(n, np.int64)
         armed, theta = np.full(len(begins), -1), np.zeros((len(begins), p))
         _run_paper(
-            kernel.constants_of(self._settings), kernel.new_memory(p), kernel.new_block(p), recording.q, recording.dq,
-            recording.tau_J, np.array(begins), phase, over, tau_ext_hat, wide, threshold, armed, theta,
+            paper_kernel.constants_of(self._settings), paper_kernel.new_memory(p), paper_kernel.new_block(p),
+            recording.q, recording.dq, recording.tau_J, np.array(begins), phase, over, tau_ext_hat, wide, threshold,
+            armed, theta,
         )  # fmt: skip
         return Outcome(phase, over, tau_ext_hat, wide, threshold, np.sign(tau_ext_hat), tuple(armed.tolist()), theta)
 
@@ -103,13 +104,13 @@ def _run_paper(
     for k in range(q.shape[0]):
         for index in range(begins.shape[0]):
             if begins[index] == k:
-                kernel.begin_adaptation(constants, memory, block)
+                paper_kernel.begin_adaptation(constants, memory, block)
                 adaptation, mode = index, _LEARN
         out = block[0]
         out["q"][:] = q[k]
         out["dq"][:] = dq[k]
         out["tau_J"][:] = tau_J[k]
-        observation = kernel.step(constants, memory, block, 1, 1, mode)
+        observation = paper_kernel.step(constants, memory, block, 1, 1, mode)
         phase[k] = ARMED if mode == _ARMED else ADAPTING
         over[k] = observation >> _CONTACT_SHIFT if mode == _ARMED else 0
         tau_ext_hat[k] = out["tau_ext_hat"]
@@ -127,7 +128,7 @@ def true_residual(recording: Recording, cutoff_rad_s: float, lag_s: float = 0.0)
     lag_s: by how much the torque is delayed to meet the velocity.
     """
     settings = load_settings("paper", "S")
-    constants = kernel.constants_of(_with_cutoff(settings, cutoff_rad_s))
+    constants = paper_kernel.constants_of(_with_cutoff(settings, cutoff_rad_s))
     count = len(settings.estimator.parameter_names)
     whole = int(lag_s / PERIOD_S)
     share = lag_s / PERIOD_S - whole
@@ -136,7 +137,7 @@ def true_residual(recording: Recording, cutoff_rad_s: float, lag_s: float = 0.0)
     tau_J = tau_J - np.array(recording.arm.torque_offset_Nm)
     out = np.zeros((len(tau_J), 2))
     _run_true(
-        constants, kernel.new_memory(count), kernel.new_block(count), recording.q, recording.dq, tau_J,
+        constants, paper_kernel.new_memory(count), paper_kernel.new_block(count), recording.q, recording.dq, tau_J,
         recording.theta, out,
     )  # fmt: skip
     return out
@@ -160,7 +161,7 @@ def _run_true(
         out["dq"][:] = dq[k]
         out["tau_J"][:] = tau_J[k]
         out["theta_hat"][:] = theta[k]
-        kernel.step(constants, memory, block, 1, 1, 0)
+        paper_kernel.step(constants, memory, block, 1, 1, 0)
         tau_ext_hat[k] = out["tau_ext_hat"]
 
 

@@ -30,7 +30,7 @@ from lab import (
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.score.alarms import begins_of
-from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.scheme.model.regressor import inverse_dynamics
 
 PAYLOAD_KG = 1.0
 SETTLE_S = 0.6

@@ -23,12 +23,12 @@ from adacd_hil.records import (
     SchemeState,
     Vector,
 )
-from adacd_hil.scheme import kernel
-from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
-from adacd_hil.scheme.supervisor import Supervisor
-from adacd_hil.scheme.touch import Touch
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.scenario import Scenario
+from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.pipeline.contact_course import Touch
+from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.scenario.scenario import Scenario
 
 SIGMA_NM = np.array([0.03, 0.015])
 """Standard deviation of the external torque with the filter undone, profile P."""
@@ -74,9 +74,9 @@ class Rig:
         self._body = Body(scenario, settings.bus.period_s)
         self._body.start_scenario()
         self._theta = np.array(self._theta_of())
-        self._constants = kernel.constants_of(settings)
-        self._memory, self._block = kernel.new_memory(7), kernel.new_block(7)
-        kernel.begin_adaptation(self._constants, self._memory, self._block)
+        self._constants = paper_kernel.constants_of(settings)
+        self._memory, self._block = paper_kernel.new_memory(7), paper_kernel.new_block(7)
+        paper_kernel.begin_adaptation(self._constants, self._memory, self._block)
         self._block[0]["theta_hat"][:] = self._theta
         self._collision_Nm = np.array(settings.detector.collision_Nm)
         self._touch = Touch(settings)
@@ -116,7 +116,7 @@ class Rig:
         self._torques = [arm.tau_J, *self._torques[:2]]
         delayed = (1.0 - LAG_SHARE) * self._torques[1] + LAG_SHARE * self._torques[2]
         block["q"][:], block["dq"][:], block["tau_J"][:] = arm.q, arm.dq, delayed
-        observation = kernel.step(self._constants, self._memory, self._block, 1, 1, kernel.ARMED)
+        observation = paper_kernel.step(self._constants, self._memory, self._block, 1, 1, paper_kernel.ARMED)
         observation &= ~int(Observation.COLLISION)
         if np.any(np.abs(block["tau_ext_hat"]) > self._collision_Nm):
             observation |= int(Observation.COLLISION)

@@ -25,7 +25,7 @@ from touch_trials import PERIOD_S, HandLoop
 
 from adacd_hil.cli.table import format_table
 from adacd_hil.records import SchemeState, Vector
-from adacd_hil.scheme.belief import payload_direction
+from adacd_hil.scheme.identify.belief import payload_direction
 
 SIZES_KG = (0.05, 0.1, 0.2, 0.5, 1.0)
 ERRORS = ("Coulomb friction", "viscous friction", "torque offset")

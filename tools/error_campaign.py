@@ -30,13 +30,13 @@ from adacd_hil.cli.table import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme import certified_memory, loop
-from adacd_hil.scheme.bank import channels_of, step_response
-from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
-from adacd_hil.scheme.sensitivity import AGREES
-from firmware_sim.arms import Arm
-from firmware_sim.mechanics_settings import MechanicsSettings
-from firmware_sim.sensor_settings import SensorSettings
+from adacd_hil.scheme.detect.sensitivity import AGREES
+from adacd_hil.scheme.kernel import certified_memory, loop
+from adacd_hil.scheme.model.bank import channels_of, step_response
+from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from firmware_sim.arm.arms import Arm
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.sensor_settings import SensorSettings
 
 Array = NDArray[np.float64]
 

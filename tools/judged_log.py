@@ -11,7 +11,7 @@ from witnessed_run import Played, Truth
 
 from adacd_hil.config import Settings
 from adacd_hil.log.reader import read_log
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario.scenario import Scenario
 
 
 def judged_log(log_path: Path, truth_path: Path, settings: Settings, scenario: Scenario) -> Played:

@@ -7,8 +7,8 @@
                pushes=(Push(25.0, 0.5, (0.3, 0.0)),))
     r.q, r.dq, r.tau_J (n, 2) as on the wire; r.tau_ext (n, 2), r.theta (n, 7) true; r.tau_c commanded; r.motion.q_d ...
 
-It is `firmware_sim.body` itself in a compiled loop with the joint controller and the cycle of delay of the wire, so a
-record equals, bit for bit, what the emulator measures under the same commands. Deterministic per seed.
+It is `firmware_sim.body.body` itself in a compiled loop with the joint controller and the cycle of delay of the wire,
+so a record equals, bit for bit, what the emulator measures under the same commands. Deterministic per seed.
 """
 
 from collections.abc import Sequence
@@ -23,13 +23,13 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import ArmSettings
 from adacd_hil.control.controller import HANDOVER_S, _torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
-from firmware_sim.arms import ARMS, Arm
-from firmware_sim.body import Body, _advance, _contact_in_force, _sample
-from firmware_sim.contact import ONSET_TICK, TICK_S, ContactSettings, ticks
-from firmware_sim.motor import PEAK
-from firmware_sim.plant import COULOMB, DQ, JOINT_TORQUE, TAU, TORQUE_LIMIT, VISCOUS, Q, external_torque
-from firmware_sim.scenario import PayloadSettings, Scenario
-from firmware_sim.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.plant import COULOMB, DQ, JOINT_TORQUE, TAU, TORQUE_LIMIT, VISCOUS, Q, external_torque
+from firmware_sim.arm.scripted_contact import ONSET_TICK, TICK_S, ContactSettings, ticks
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+from firmware_sim.body.body import Body, _advance, _contact_in_force, _sample
+from firmware_sim.body.motor import PEAK
+from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
 __all__ = [
     "PERIOD_S", "ContactSettings", "LabArm", "Motion", "Push", "Recording", "cut", "join", "multisine", "paper_motion",

@@ -8,10 +8,10 @@ from lab_motion import PERIOD_S
 from numpy.typing import NDArray
 
 from adacd_hil.config import load_settings
-from firmware_sim.arms import ARMS, Arm, Link
-from firmware_sim.drive_settings import DriveSettings
-from firmware_sim.mechanics_settings import MechanicsSettings
-from firmware_sim.sensor_settings import SensorSettings
+from firmware_sim.arm.arms import ARMS, Arm, Link
+from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.sensor_settings import SensorSettings
 
 Pair = tuple[float, float]
 

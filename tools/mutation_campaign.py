@@ -239,7 +239,7 @@ def _main_of(program: str) -> Callable[[], None]:
     if program == "adacd-hil":
         from adacd_hil.cli.main import main
     else:
-        from firmware_sim.main import main
+        from firmware_sim.cli.emulator_main import main
     return main
 
 
@@ -366,7 +366,7 @@ def import_everything() -> None:
         if "writer" not in name and "live" not in name:
             with contextlib.suppress(ImportError):
                 importlib.import_module(name)
-    importlib.import_module("firmware_sim.main")
+    importlib.import_module("firmware_sim.cli.emulator_main")
     from adacd_hil import scheduling
 
     # Locked memory would have all that is loaded here count for every case, and real time would keep others waiting.

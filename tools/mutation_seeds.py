@@ -14,9 +14,9 @@ from adacd_hil.control.history_file import FORMAT, CertificateRecord, History, d
 from adacd_hil.log.editing.cut import Stretch, cut
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import read_frames
-from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.wire.codec import contract_folder
-from firmware_sim.scenario import builtin_scenarios
+from firmware_sim.scenario.scenario import builtin_scenarios
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLE = ROOT / "docs" / "examples" / "foreign"

@@ -15,11 +15,11 @@ from witnessed_run import User
 from adacd_hil.config import ConfigError, Settings, load_settings, parse, to_toml
 from adacd_hil.records import Request
 from adacd_hil.wire.codec import Codec, load_codec
-from firmware_sim.body_regions import BODY_REGIONS
-from firmware_sim.contracts import CONTRACTS as DBCS
-from firmware_sim.fault_plan import FaultPlan
-from firmware_sim.faults import FRAME_NODES, KINDS, SIGNAL_NODES, FaultSettings
-from firmware_sim.scenario import Scenario
+from firmware_sim.arm.body_regions import BODY_REGIONS
+from firmware_sim.bench.fault_plan import FaultPlan
+from firmware_sim.canopen.contracts import CONTRACTS as DBCS
+from firmware_sim.scenario.faults import FRAME_NODES, KINDS, SIGNAL_NODES, FaultSettings
+from firmware_sim.scenario.scenario import Scenario
 
 CONTRACTS = ("arm", "arm_fd", "arm_stock")
 CONFIGURATION = {"arm_fd": "fd", "arm_stock": "stock", "arm_fd_500us": "fd_500us"}

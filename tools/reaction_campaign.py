@@ -24,9 +24,9 @@ from adacd_hil.cli.table import format_table
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.quintic import corner_to_corner
 from adacd_hil.records import Reaction, SchemeState, Vector
-from firmware_sim.body_regions import BODY_REGIONS
-from firmware_sim.scenario import Scenario
-from firmware_sim.touch_settings import BodySettings
+from firmware_sim.arm.body_regions import BODY_REGIONS
+from firmware_sim.arm.touch_settings import BodySettings
+from firmware_sim.scenario.scenario import Scenario
 
 AFTER_S = 1.0
 BEFORE_S = 0.25

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.scheme import chain, estimator, filters, offline, regressor
-from adacd_hil.scheme.urdf import read_urdf
+from adacd_hil.scheme.identify import estimator, offline
+from adacd_hil.scheme.model import chain, filters, regressor
+from adacd_hil.scheme.model.urdf import read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK, BLOCKS = 100, 300

@@ -17,7 +17,7 @@ from pathlib import Path
 from adacd_hil.analysis.replay.replay import Replay, replay
 from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.config import ConfigError
-from firmware_sim.scenario import builtin_scenarios
+from firmware_sim.scenario.scenario import builtin_scenarios
 
 _SHOWN = 3
 

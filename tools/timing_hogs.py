@@ -33,7 +33,7 @@ from adacd_hil.config import load_settings
 from adacd_hil.log.reader import Series, read_log
 from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 from adacd_hil.records import SchemeState
-from firmware_sim.scenario import load_scenario
+from firmware_sim.scenario.scenario import load_scenario
 
 COUNTED = ("command-counter", "sync-counter", "log-not-whole")
 """Rules that a log with gaps can't be judged by."""

@@ -19,9 +19,10 @@ from mujoco_arm import MujocoArm
 from planar_arm import THETA
 
 from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
-from adacd_hil.scheme import certified_kernel, certified_memory, earlier, fit_samples
-from adacd_hil.scheme.belief import payload_direction
-from adacd_hil.scheme.certificate_watch import BY_WORD
+from adacd_hil.scheme.identify import earlier, fit_samples
+from adacd_hil.scheme.identify.belief import payload_direction
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
 from adacd_hil.structured import Structured
 
 FREE = replace(

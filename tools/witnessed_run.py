@@ -26,8 +26,8 @@ from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.records import TRUTH_LAYOUT, Request, SchemeState
 from adacd_hil.wire.bus import EmbeddedBus
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import Scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import Scenario
 
 START_ALLOWED_S = 40.0
 """Longest from the beginning of an attempt until it moves or has failed: boot, commissioning, enabling."""

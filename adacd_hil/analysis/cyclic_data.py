@@ -17,7 +17,7 @@ from adacd_hil.analysis.run import CheckCounts, Mask, Run
 from adacd_hil.analysis.timing import CycleColumns, Cycles
 from adacd_hil.config import DataSettings, Settings
 from adacd_hil.device.data_watch import SHORTEST_SHARE, WINDOW_S
-from adacd_hil.scheme.supervisor import POWERED
+from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.wire.e2e import E2eStatus
 
 _POWERED: Final = tuple(int(state) for state in POWERED)

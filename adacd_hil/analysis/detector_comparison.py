@@ -23,7 +23,7 @@ from adacd_hil.analysis.thresholds import BLOCK_S, Statistics
 from adacd_hil.log.errors import LogError
 from adacd_hil.output_files import replace_file
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme import detectors
+from adacd_hil.scheme.detect import detectors
 
 STEPS_NM: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 ROC_STEP_NM: Final = 0.1

@@ -16,7 +16,7 @@ from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.analysis.smallest_push import SmallestPush
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, SchemeState, Vector
-from adacd_hil.scheme.bank import channels_of
+from adacd_hil.scheme.model.bank import channels_of
 
 
 @dataclass(frozen=True)

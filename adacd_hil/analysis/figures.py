@@ -33,7 +33,7 @@ from adacd_hil.analysis.score.score_words import why_not_found
 from adacd_hil.analysis.score.touches import filtered, row_at
 from adacd_hil.analysis.sections import Section
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
-from adacd_hil.scheme.bank import channels_of
+from adacd_hil.scheme.model.bank import channels_of
 
 CLOSE_UPS: Final = 24
 """Contacts shown close up; six rows of four are a page."""

@@ -20,7 +20,7 @@ from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import LogStream
 from adacd_hil.log.stretch import WHOLE, Stretch, begin_of_log
 from adacd_hil.records import SchemeState, Vector
-from adacd_hil.scheme import detectors
+from adacd_hil.scheme.detect import detectors
 
 APART_S: Final = 0.6
 """Six time constants of the slowest filter."""

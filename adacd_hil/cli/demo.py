@@ -22,10 +22,10 @@ from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME
 from adacd_hil.output_files import in_words
 from adacd_hil.records import SchemeState
 from adacd_hil.wire.bus import Bus, EmbeddedBus
-from firmware_sim.bench import Bench
-from firmware_sim.contracts import playable_contract
-from firmware_sim.scenario import Scenario, load_scenario, named_profile
-from firmware_sim.truth import TruthLog
+from firmware_sim.bench.bench import Bench
+from firmware_sim.bench.truth import TruthLog
+from firmware_sim.canopen.contracts import playable_contract
+from firmware_sim.scenario.scenario import Scenario, load_scenario, named_profile
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.report.report import Report

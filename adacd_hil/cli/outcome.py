@@ -6,7 +6,7 @@ from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import FaultReason
-from firmware_sim.expectation import Outcome
+from firmware_sim.scenario.expectation import Outcome
 
 
 def outcome_of(summary: SessionSummary, truth_path: Path) -> Outcome:
@@ -31,7 +31,7 @@ def outcome_of(summary: SessionSummary, truth_path: Path) -> Outcome:
 
 
 def _end(summary: SessionSummary) -> str:
-    """Say how the run ended, by the names of `firmware_sim.expectation`."""
+    """Say how the run ended, by the names of `firmware_sim.scenario.expectation`."""
     if not summary.has_started:
         return "refused"
     if summary.result is None:

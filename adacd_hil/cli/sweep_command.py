@@ -120,7 +120,7 @@ def _plan(
     version = f"{__version__} {program_digest()}"
     if logs:
         return plan_logs(_files(logs), variants, config, profile, version)
-    from firmware_sim.scenario import load_scenario
+    from firmware_sim.scenario.scenario import load_scenario
 
     for scenario in scenarios:
         load_scenario(scenario, base.arm.profile, None)

@@ -42,9 +42,9 @@ from adacd_hil.records import (
     SchemeOutput,
     SchemeState,
 )
-from adacd_hil.scheme.last_certificate import Certificate
-from adacd_hil.scheme.selection import pipeline_of
-from adacd_hil.scheme.supervisor import KEPT_IN, POWERED
+from adacd_hil.scheme.identify.last_certificate import Certificate
+from adacd_hil.scheme.pipeline.selection import pipeline_of
+from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, POWERED
 from adacd_hil.wire.tap import Tap
 
 FAULT_LINGER_S = 0.5

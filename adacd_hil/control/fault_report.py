@@ -9,8 +9,8 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import ArmWatch
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmState, FaultReason, SchemeState
-from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
-from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
 
 
 class FaultReport:

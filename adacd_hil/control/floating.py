@@ -13,7 +13,7 @@ import numpy as np
 
 from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme import regressor
+from adacd_hil.scheme.model import regressor
 
 TURNED_rad_s = 0.05
 """Slower than this a joint counts as standing, and Coulomb friction is compensated in proportion."""

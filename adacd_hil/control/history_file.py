@@ -22,7 +22,7 @@ from adacd_hil.device.network import Identity
 from adacd_hil.input_files import read_input
 from adacd_hil.output_files import dangling_link, replacing
 from adacd_hil.records import Event
-from adacd_hil.scheme.last_certificate import Certificate
+from adacd_hil.scheme.identify.last_certificate import Certificate
 
 HISTORY_NAME = "history.toml"
 FORMAT = 1

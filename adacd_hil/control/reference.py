@@ -16,7 +16,7 @@ from adacd_hil.control.admittance import Admittance
 from adacd_hil.control.excitation import Excitation
 from adacd_hil.control.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
 from adacd_hil.records import JOINTS, ArmState, Reaction, SchemeOutput, SchemeState, Vector
-from adacd_hil.scheme.reaction import Withdrawal
+from adacd_hil.scheme.contact.reaction import Withdrawal
 
 SHORTEST_APPROACH_S = 0.6
 """Shortest way to the corner when it must also be stopped: from 100 °/s this stays below 400 °/s²."""

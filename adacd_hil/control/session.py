@@ -29,7 +29,7 @@ from adacd_hil.log.setup import MOST_VIEWERS, LiveSetup
 from adacd_hil.output_files import place_file
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
-from adacd_hil.scheme.last_certificate import Certificate
+from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.tap import Tap

@@ -13,7 +13,7 @@ from adacd_hil.config import RequestSettings, Settings, load_settings
 from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import Piece
-from firmware_sim.scenario import load_scenario
+from firmware_sim.scenario.scenario import load_scenario
 
 FIRST_S = 2.0
 

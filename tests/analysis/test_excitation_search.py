@@ -13,8 +13,8 @@ from adacd_hil.analysis.excitation import TOLERANCE, NoExcitationError, Search
 from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError, ExcitationSettings, Settings, TrajectorySettings, load_settings
 from adacd_hil.control.excitation import Excitation
-from adacd_hil.scheme.certified_memory import constants_of
-from adacd_hil.scheme.regressor import regressor
+from adacd_hil.scheme.kernel.certified_memory import constants_of
+from adacd_hil.scheme.model.regressor import regressor
 
 TWO = ((-0.04, 0.01), (-0.04, 0.01))
 NO_SINE = ((0.0, 0.0), (0.0, 0.0))

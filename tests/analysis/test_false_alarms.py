@@ -23,7 +23,7 @@ from adacd_hil.analysis.false_alarms import (
     resolution,
     white_noise,
 )
-from adacd_hil.scheme.margin import MarginWatch
+from adacd_hil.scheme.detect.margin import MarginWatch
 
 BLOCK_S = 0.1
 T = 1e-3

@@ -16,8 +16,8 @@ from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import WHOLE, Stretch
-from adacd_hil.scheme.offline import model_of
-from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.scheme.identify.offline import model_of
+from adacd_hil.scheme.model.regressor import inverse_dynamics
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "foreign"
 THETA = np.array([0.19205, 0.034125, 0.020175, 0.03, 0.015, 0.0375, 0.02])
@@ -157,7 +157,7 @@ def test_rotors_are_parameters_only_of_motors(tmp_path: Path, example) -> None:
 
 
 def identify_names(described):
-    from adacd_hil.scheme import offline
+    from adacd_hil.scheme.identify import offline
 
     return offline.model_of(described.urdf.chain, described.arm.has_rotors).parameter_names
 

@@ -18,8 +18,8 @@ from adacd_hil.cli.demo import resolve, run_embedded
 from adacd_hil.config import to_toml
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY
-from firmware_sim.scenario import load_scenario
-from firmware_sim.truth import TruthLog
+from firmware_sim.bench.truth import TruthLog
+from firmware_sim.scenario.scenario import load_scenario
 
 CONFIG = 'name = "mine"\n[filter]\na_rad_s = 10.0\n'
 

@@ -30,7 +30,7 @@ from adacd_hil.log.reader import Series
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.log.stretch import Stretch, start_of_log
 from adacd_hil.records import CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme.selection import layout_of
+from adacd_hil.scheme.pipeline.selection import layout_of
 
 PIECE = 333
 

@@ -11,8 +11,8 @@ from adacd_hil.config import to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import CERTIFICATE_EVENTS
-from adacd_hil.scheme import anchor
-from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
+from adacd_hil.scheme.identify import anchor
+from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

@@ -11,7 +11,7 @@ from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.topic_records import record_dtype
 from adacd_hil.records import Event, scheme_layout
-from adacd_hil.scheme.batch import SchemeBatch
+from adacd_hil.scheme.pipeline.batch import SchemeBatch
 
 SETTINGS = load_settings("paper")
 LAYOUT = scheme_layout(7)

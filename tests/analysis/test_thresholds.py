@@ -25,7 +25,7 @@ from adacd_hil.cli.main import cli
 from adacd_hil.config import parse, read_toml
 from adacd_hil.log.errors import LogError
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.detectors import DetectorSettings
+from adacd_hil.scheme.detect.detectors import DetectorSettings
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 compiled_only = pytest.mark.skipif(INTERPRETED, reason="minutes of recording take minutes when interpreted")

@@ -32,8 +32,8 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.stretch import Stretch, begin_of_log
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.selection import layout_of
-from firmware_sim.scenario import load_scenario
+from adacd_hil.scheme.pipeline.selection import layout_of
+from firmware_sim.scenario.scenario import load_scenario
 
 M, A = SchemeState.MONITOR, SchemeState.ADAPT
 

@@ -12,8 +12,8 @@ from adacd_hil.config import parse
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import Scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import Scenario
 
 USAGE, BUS_MISSING = 2, 5
 OFFSET = (0.3, -0.2)

@@ -12,7 +12,7 @@ from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_ot
 from adacd_hil.commission.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.config import load_settings
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.device import NmtState
+from firmware_sim.nodes.device import NmtState
 
 COMMAND = CODEC.message("Drive1Command")
 pytestmark = pytest.mark.slow

@@ -11,7 +11,7 @@ from adacd_hil.config import ConfigError
 from adacd_hil.control.history_file import use_history
 from adacd_hil.given_path import GivenPath
 from adacd_hil.output_files import dangling_link
-from firmware_sim.main import cli as emulator_cli
+from firmware_sim.cli.emulator_main import cli as emulator_cli
 
 USAGE = 2
 ON_BUS = ("-i", "virtual", "-c", "x")

@@ -11,8 +11,8 @@ from adacd_hil.commission.tare_session import TareSession
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import load_scenario
 
 CODEC = load_codec()
 FEEDBACK_IDS, TORQUE_IDS = (0x181, 0x182), (0x183, 0x184)

@@ -15,9 +15,9 @@ from adacd_hil.control.floating import Floating
 from adacd_hil.control.quintic import corner_to_corner
 from adacd_hil.control.reference import Reference
 from adacd_hil.records import ArmState, ContactKind, FaultReason, Reaction, SchemeOutput, SchemeState, Vector
-from firmware_sim.contact import ContactSettings
-from firmware_sim.scenario import Scenario
-from firmware_sim.touch_settings import BodySettings
+from firmware_sim.arm.scripted_contact import ContactSettings
+from firmware_sim.arm.touch_settings import BodySettings
+from firmware_sim.scenario.scenario import Scenario
 
 PERIOD_S = 1e-3
 START_DEG = (-30.0, -60.0)

@@ -23,7 +23,7 @@ from adacd_hil.control.session import LiveAddress
 from adacd_hil.log.layout import LAYOUT_NAME
 from adacd_hil.log.live.robot_description import ROBOT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
-from adacd_hil.scheme.urdf import read_urdf
+from adacd_hil.scheme.model.urdf import read_urdf
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.e2e import E2eStatus
 

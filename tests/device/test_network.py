@@ -12,8 +12,8 @@ from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.slow
 

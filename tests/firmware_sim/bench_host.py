@@ -11,9 +11,9 @@ from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.contracts import CONTRACTS
-from firmware_sim.scenario import Scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.canopen.contracts import CONTRACTS
+from firmware_sim.scenario.scenario import Scenario
 
 CODEC = load_codec()
 EDS = {1: "drive.eds", 2: "drive.eds", 3: "torque_sensor.eds", 4: "torque_sensor.eds"}

@@ -6,11 +6,10 @@ import math
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from firmware_sim.arms import ARMS, Arm
-from firmware_sim.contact import TICK_S
-from firmware_sim.mechanics import gravity_torque, integrate_mechanics, observe, work_space
-from firmware_sim.mechanics_settings import MechanicsSettings
-from firmware_sim.plant import (
+from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.mechanics import gravity_torque, integrate_mechanics, observe, work_space
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.plant import (
     DQ,
     DSHAFT,
     INERTIA,
@@ -26,6 +25,7 @@ from firmware_sim.plant import (
     fit_payload,
     mass_matrix,
 )
+from firmware_sim.arm.scripted_contact import TICK_S
 
 NOBODY = np.zeros(0)
 NO_TOUCH = np.zeros((0, 0))

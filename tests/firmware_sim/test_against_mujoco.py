@@ -9,9 +9,9 @@ from general_arm import NOBODY, GeneralArm, without_friction
 from long_cases import long_but
 
 from adacd_hil.control.quintic import corner_to_corner
-from firmware_sim.contact import TICK_S, ContactSettings
-from firmware_sim.mechanics_settings import MechanicsSettings
-from firmware_sim.plant import CURRENT_LOOP_RAD_S, DSHAFT, SHAFT, TAU, mass_matrix
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.plant import CURRENT_LOOP_RAD_S, DSHAFT, SHAFT, TAU, mass_matrix
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
 
 POINT_PAYLOAD = (1.0, (0.0, 0.0), 0.0)
 BODY_PAYLOAD = (1.5, (0.05, 0.08), 0.01)

@@ -18,7 +18,7 @@ from bench_host import (
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.wire.bus import EmbeddedBus, Frame
-from firmware_sim.bench import Bench
+from firmware_sim.bench.bench import Bench
 
 TWITCH = [{"at_s": 0.02, "link": 2, "point_m": 0.3, "force_N": 20.0, "duration_s": 0.02}]
 

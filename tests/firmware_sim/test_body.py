@@ -12,11 +12,11 @@ import pytest
 
 from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.arms import ARMS
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.contact import ContactSettings
-from firmware_sim.scenario import PayloadSettings, Scenario, load_scenario
-from firmware_sim.sensing import TORQUE_LSB_NM
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.scripted_contact import ContactSettings
+from firmware_sim.arm.sensing import TORQUE_LSB_NM
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.scenario.scenario import PayloadSettings, Scenario, load_scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 OFF = (DriveMode.OFF, DriveMode.OFF)

@@ -4,7 +4,7 @@ import pytest
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.wire.bus import EmbeddedBus, Frame, InterfaceDownError, TransmitQueueError
-from firmware_sim.bus_model import QueuedBus
+from firmware_sim.bus.bus_model import QueuedBus
 
 
 class Rig:

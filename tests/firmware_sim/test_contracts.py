@@ -13,8 +13,8 @@ from bench_host import ENABLE, SHUTDOWN, START, SWITCH_ON, BenchHost, quiet_scen
 from adacd_hil.config import ConfigError, load_settings
 from adacd_hil.device.contract import load_contract
 from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
-from firmware_sim.contracts import CONTRACTS, contract_of, playable_contract
-from firmware_sim.sensing import TORQUE_LSB_NM
+from firmware_sim.arm.sensing import TORQUE_LSB_NM
+from firmware_sim.canopen.contracts import CONTRACTS, contract_of, playable_contract
 
 BY_DEFAULT = ("arm", "arm_fd")
 """Contracts whose drives need no mapping by a master."""

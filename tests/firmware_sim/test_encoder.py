@@ -7,11 +7,11 @@ import pytest
 
 from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.encoder import NOISE_TICKS, encoder_numbers, read_angle
-from firmware_sim.scenario import Scenario
-from firmware_sim.sensing import POSITION_LSB_RAD, to_counts
-from firmware_sim.sensor_settings import SensorSettings
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, to_counts
+from firmware_sim.arm.sensor_settings import SensorSettings
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.body.encoder import NOISE_TICKS, encoder_numbers, read_angle
+from firmware_sim.scenario.scenario import Scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 OFF = (DriveMode.OFF, DriveMode.OFF)

@@ -3,8 +3,8 @@
 import pytest
 
 from adacd_hil.config import ConfigError, parse
-from firmware_sim.expectation import ExpectSettings, Outcome, deviations
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario.expectation import ExpectSettings, Outcome, deviations
+from firmware_sim.scenario.scenario import Scenario
 
 EXPECTED = ExpectSettings(
     adaptations=1, contacts=2, false_alarms=1, false_alarms_most=3, adaptation_s=(5.0, 6.0), delay_ms=30.0, force_N=80.0

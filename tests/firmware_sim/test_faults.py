@@ -6,8 +6,8 @@ import pytest
 
 from adacd_hil.config import ConfigError, parse, to_toml
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.faults import KINDS, MOST_ROWS, FaultSettings, device_ids, own_messages
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario.faults import KINDS, MOST_ROWS, FaultSettings, device_ids, own_messages
+from firmware_sim.scenario.scenario import Scenario
 
 AT = {"at_s": 1.0}
 EXAMPLES = {

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from general_arm import GeneralArm, one_joint
 
-from firmware_sim.contact import TICK_S
-from firmware_sim.friction import advance_bristle, bristle_rate
-from firmware_sim.mechanics_settings import MechanicsSettings
-from firmware_sim.plant import BRISTLE, DQ, DSHAFT, SHAFT, WARMTH, Q
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.plant import BRISTLE, DQ, DSHAFT, SHAFT, WARMTH, Q
+from firmware_sim.arm.plant_friction import advance_bristle, bristle_rate
+from firmware_sim.arm.scripted_contact import TICK_S
 
 COULOMB_NM, STATIC_NM, STRIBECK_RAD_S = 0.5, 0.8, 0.1
 STRIBECK = {"static_Nm": (STATIC_NM, 0.0), "stribeck_velocity_rad_s": (STRIBECK_RAD_S, 0.1)}

@@ -17,10 +17,10 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.log.reader import read_log
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import Bus, Frame
-from firmware_sim.bench import Bench
-from firmware_sim.departure import Departure
-from firmware_sim.main import EPILOG, main
-from firmware_sim.service import Service, StopRequest
+from firmware_sim.bench.bench import Bench
+from firmware_sim.cli.departure import Departure
+from firmware_sim.cli.emulator_main import EPILOG, main
+from firmware_sim.cli.service import Service, StopRequest
 
 SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
 
@@ -218,11 +218,11 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
     clock = VirtualClock()
     bus = ScriptedBus(clock, StopRequest(), 0)
     bus.script.extend(((t_ms + 1) * MS, can_id, data) for t_ms, can_id, data in enabling_script(60))
-    monkeypatch.setattr("firmware_sim.main.MonotonicClock", lambda: clock)
-    monkeypatch.setattr("firmware_sim.main.wall_ns", lambda: 10**18)
-    monkeypatch.setattr("firmware_sim.main.open_devices_end", lambda *_: bus)
-    monkeypatch.setattr("firmware_sim.main.request_realtime", lambda: RealtimeGrant("SCHED_OTHER"))
-    monkeypatch.setattr("firmware_sim.main.freeze_garbage", lambda: None)
+    monkeypatch.setattr("firmware_sim.cli.emulator_main.MonotonicClock", lambda: clock)
+    monkeypatch.setattr("firmware_sim.cli.emulator_main.wall_ns", lambda: 10**18)
+    monkeypatch.setattr("firmware_sim.cli.emulator_main.open_devices_end", lambda *_: bus)
+    monkeypatch.setattr("firmware_sim.cli.emulator_main.request_realtime", lambda: RealtimeGrant("SCHED_OTHER"))
+    monkeypatch.setattr("firmware_sim.cli.emulator_main.freeze_garbage", lambda: None)
     scenario = tmp_path / "scenario.toml"
     scenario.write_text(LOST_TORQUE)
     options = ("--scenario", str(scenario), "--clock", clock_mode, "--out", str(tmp_path), "--once")
@@ -273,7 +273,16 @@ def test_without_once_a_silent_host_is_waited_for():
 
 
 def spawn(folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "firmware_sim.main", "run", *arguments, "--out", str(folder), "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "firmware_sim.cli.emulator_main",
+        "run",
+        *arguments,
+        "--out",
+        str(folder),
+        "--json",
+    ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -15,12 +15,12 @@ from long_cases import long_but
 
 from adacd_hil.config import ConfigError, parse
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.arms import ARMS
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.contact import TICK_S, ContactSettings
-from firmware_sim.mechanics_settings import LARGEST_SUBSTEPS, MechanicsSettings
-from firmware_sim.plant import DQ, DSHAFT, MECHANICAL_STATE, Q, accelerate, fit_payload, integrate
-from firmware_sim.scenario import PayloadSettings, Scenario
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.mechanics_settings import LARGEST_SUBSTEPS, MechanicsSettings
+from firmware_sim.arm.plant import DQ, DSHAFT, MECHANICAL_STATE, Q, accelerate, fit_payload, integrate
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 ELASTIC = {"stiffness_Nm_rad": (6000.0, 2000.0), "rotor_inertia_kg_m2": (0.3, 0.05)}
@@ -394,7 +394,7 @@ def test_a_faster_arm_gets_more_substeps_up_to_their_bound():
 SPRING_MASS = """
 import math, sys
 import numpy as np
-import firmware_sim.touch
+import firmware_sim.arm.touch_forces
 from adacd_hil.compiled import compiled
 
 @compiled
@@ -405,11 +405,11 @@ def touch(numbers, time_s, q1, q2, dq1, dq2, contact_state, rates_out):
     rates_out[1] = -torque / numbers[0, 1]
     return torque, 0.0
 
-firmware_sim.touch.touch = touch
+firmware_sim.arm.touch_forces.touch = touch
 sys.path.insert(0, sys.argv[1])
 from general_arm import MechanicsSettings, one_joint, work_space
-from firmware_sim.mechanics import integrate_mechanics
-from firmware_sim.plant import MECHANICAL_STATE, fit_payload
+from firmware_sim.arm.mechanics import integrate_mechanics
+from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload
 
 arm, inertia = one_joint()
 mechanics = MechanicsSettings(rotor_inertia_kg_m2=(0.1, 0.1)).numbers(arm)

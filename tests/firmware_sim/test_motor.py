@@ -10,12 +10,11 @@ from bench_host import ENABLE, FAULT_RESET, BenchHost, quiet_scenario
 
 from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.bench import Bench
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.contact import TICK_S
-from firmware_sim.drive_node import Motor
-from firmware_sim.drive_settings import DriveSettings
-from firmware_sim.motor import (
+from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.bench.bench import Bench
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.body.motor import (
     EFFORT,
     available_torque,
     command_torque,
@@ -25,7 +24,8 @@ from firmware_sim.motor import (
     motor_state,
     winding_temperature,
 )
-from firmware_sim.scenario import Scenario
+from firmware_sim.nodes.drive_node import Motor
+from firmware_sim.scenario.scenario import Scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 OFF = (DriveMode.OFF, DriveMode.OFF)

@@ -18,8 +18,8 @@ from bench_host import (
 )
 
 from adacd_hil.wire.codec import contract_folder
-from firmware_sim.device import NmtState
-from firmware_sim.watchdogs import Watchdog
+from firmware_sim.canopen.watchdogs import Watchdog
+from firmware_sim.nodes.device import NmtState
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001
 WRONG_LENGTH, VALUE_RANGE, NO_DATA = 0x06070010, 0x06090030, 0x08000024

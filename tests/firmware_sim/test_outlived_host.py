@@ -16,9 +16,9 @@ from test_main import MS, ScriptedBus, enabling_script
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.bench import Bench
-from firmware_sim.departure import Departure
-from firmware_sim.service import Service, StopRequest
+from firmware_sim.bench.bench import Bench
+from firmware_sim.cli.departure import Departure
+from firmware_sim.cli.service import Service, StopRequest
 
 REST_RAD_S = 0.02
 FAULT, REACTION = 0x08, 0x0F

@@ -9,9 +9,8 @@ import pinocchio
 import pytest
 
 from adacd_hil.compiled import compiled
-from firmware_sim.arms import ARMS, Arm
-from firmware_sim.contact import TICK_S, ContactSettings
-from firmware_sim.plant import (
+from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.plant import (
     DQ,
     MECHANICAL_STATE,
     PAYLOAD,
@@ -24,6 +23,7 @@ from firmware_sim.plant import (
     integrate,
     mass_matrix,
 )
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
 
 NOBODY = np.zeros(0)
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")

@@ -15,10 +15,10 @@ from adacd_hil.control.session import Session
 from adacd_hil.log.formats.mcap_frame_writer import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import topic_bytes
 from adacd_hil.wire.bus import EmbeddedBus, Frame
-from firmware_sim.recorded_bench import RecordedBench
-from firmware_sim.recorded_cycles import RecordedCycles
-from firmware_sim.scenario import load_scenario
-from firmware_sim.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from firmware_sim.bench.recorded_bench import RecordedBench
+from firmware_sim.bench.recorded_cycles import RecordedCycles
+from firmware_sim.canopen.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from firmware_sim.scenario.scenario import load_scenario
 
 SYNC, NMT = 0x080, 0x000
 FEEDBACKS, TORQUES = (0x181, 0x182), (0x183, 0x184)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from adacd_hil.config import ConfigError
-from firmware_sim.arms import ARMS
-from firmware_sim.contact import contact_force, contact_torque
-from firmware_sim.scenario import builtin_scenarios, load_scenario
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.scripted_contact import contact_force, contact_torque
+from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 
 CONTACT = "{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
 LATER = "{ at_s = 2.0, link = 1, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from firmware_sim.main import main
-from firmware_sim.scenario import builtin_scenarios, load_scenario
+from firmware_sim.cli.emulator_main import main
+from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 
 GOOD_CONTACT = "{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
 

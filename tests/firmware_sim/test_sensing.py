@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from firmware_sim.contact import TICK_S
-from firmware_sim.sensing import (
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     TORQUE_LSB_NM,
     TRACKING_RAD_S,

@@ -10,11 +10,9 @@ import pytest
 
 from adacd_hil.config import ConfigError, parse, to_toml
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.contact import TICK_S
-from firmware_sim.drive_settings import DriveSettings
-from firmware_sim.scenario import Scenario, load_scenario
-from firmware_sim.sensing import (
+from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,
     TorqueNoise,
@@ -22,7 +20,9 @@ from firmware_sim.sensing import (
     torque_counts,
     track,
 )
-from firmware_sim.sensor_settings import SensorSettings
+from firmware_sim.arm.sensor_settings import SensorSettings
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 EVERY_SENSOR_ERROR = {

@@ -8,15 +8,13 @@ import pytest
 from bench_host import START, BenchHost, quiet_scenario
 from scipy import signal
 
-import firmware_sim.bench
+import firmware_sim.bench.bench
 from adacd_hil.config import parse
-from firmware_sim.body import Body, DriveMode
-from firmware_sim.contact import TICK_S
-from firmware_sim.scenario import Scenario
-from firmware_sim.sensing import TORQUE_LSB_NM, TorqueNoise, torque_counts
-from firmware_sim.sensor_node import SensorNode
-from firmware_sim.sensor_settings import SensorSettings
-from firmware_sim.torque_transducer import (
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.sensing import TORQUE_LSB_NM, TorqueNoise, torque_counts
+from firmware_sim.arm.sensor_settings import SensorSettings
+from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.body.torque_transducer import (
     AMPLIFIED,
     HELD,
     INDEX,
@@ -30,6 +28,8 @@ from firmware_sim.torque_transducer import (
     transducer_numbers,
     walk_offset,
 )
+from firmware_sim.nodes.sensor_node import SensorNode
+from firmware_sim.scenario.scenario import Scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)
 OFF = (DriveMode.OFF, DriveMode.OFF)
@@ -337,7 +337,7 @@ def test_a_sensor_of_smaller_range_flags_its_overload_in_the_frame(monkeypatch, 
     def make(device, codec, number, *_ends):
         return SensorNode(device, codec, number, converter_ends(scenario.sensors, number - 1))
 
-    monkeypatch.setattr(firmware_sim.bench, "SensorNode", make)
+    monkeypatch.setattr(firmware_sim.bench.bench, "SensorNode", make)
     host = BenchHost(scenario)
     host.nmt(START)
     host.take()
@@ -357,5 +357,5 @@ def test_a_sensor_tells_the_temperature_of_its_joint(monkeypatch, temperature_C,
             return SensorNode(device, codec, number)
         return SensorNode(device, codec, number, temperature_C=lambda: temperature_C)
 
-    monkeypatch.setattr(firmware_sim.bench, "SensorNode", make)
+    monkeypatch.setattr(firmware_sim.bench.bench, "SensorNode", make)
     assert BenchHost().read(3, 0x2111) == centidegrees

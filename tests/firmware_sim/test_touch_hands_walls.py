@@ -8,11 +8,10 @@ import pytest
 from touched_arm import TouchedArm
 
 from adacd_hil.config import ConfigError
-from firmware_sim.arms import ARMS
-from firmware_sim.contact import TICK_S, ContactSettings, contact_torque
-from firmware_sim.plant import DQ, MECHANICAL_STATE, Q, fit_payload, integrate, mass_matrix
-from firmware_sim.scenario import load_scenario
-from firmware_sim.touch import (
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.plant import DQ, MECHANICAL_STATE, Q, fit_payload, integrate, mass_matrix
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_torque
+from firmware_sim.arm.touch_forces import (
     ENERGY,
     PRESENCE,
     SHIFT,
@@ -25,7 +24,8 @@ from firmware_sim.touch import (
     largest_rate_rad_s,
     touch,
 )
-from firmware_sim.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.scenario.scenario import load_scenario
 
 POSE = (0.3, 0.7)
 

@@ -10,8 +10,8 @@ from test_faults import example, scenario_of
 from adacd_hil.config import parse
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.scenario import Scenario
-from firmware_sim.truth import SCENARIO_NAME, TruthLog
+from firmware_sim.bench.truth import SCENARIO_NAME, TruthLog
+from firmware_sim.scenario.scenario import Scenario
 
 pytestmark = pytest.mark.slow
 

@@ -19,9 +19,9 @@ from bench_host import (
 from test_main import ScriptedBus, enabling_script
 
 from adacd_hil.clock import VirtualClock
-from firmware_sim.bench import Bench
-from firmware_sim.departure import Departure
-from firmware_sim.service import Service, StopRequest
+from firmware_sim.bench.bench import Bench
+from firmware_sim.cli.departure import Departure
+from firmware_sim.cli.service import Service, StopRequest
 
 SYNC, COMMAND, HEARTBEAT, OPERATIONAL, LENGTH = 1, 2, 3, 4, 5
 CODES = {SYNC: 0x8700, COMMAND: 0x8250, HEARTBEAT: 0x8130, OPERATIONAL: 0x8100, LENGTH: 0x8210}

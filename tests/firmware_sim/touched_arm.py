@@ -1,15 +1,14 @@
-"""A frictionless arm touched by things, integrated by classical RK4: what the tests of `firmware_sim.touch` look at."""
+"""A frictionless arm touched by things, integrated by classical RK4, for tests of `firmware_sim.arm.touch_forces`."""
 
 import math
 
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from firmware_sim.arms import ARMS, Arm
-from firmware_sim.contact import TICK_S
-from firmware_sim.plant import COULOMB, DQ, MECHANICAL_STATE, VISCOUS, Q, accelerate, fit_payload, mass_matrix
-from firmware_sim.scenario import Scenario
-from firmware_sim.touch import (
+from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.plant import COULOMB, DQ, MECHANICAL_STATE, VISCOUS, Q, accelerate, fit_payload, mass_matrix
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.touch_forces import (
     THING_STATE,
     TOUCH_HEADER,
     TOUCH_TRUTH,
@@ -19,6 +18,7 @@ from firmware_sim.touch import (
     touch,
     touch_table,
 )
+from firmware_sim.scenario.scenario import Scenario
 
 HISTORY = ("time_s", "q1", "q2", "dq1", "dq2", "force", "link", "index", "power", "energy", "tau1", "tau2")
 NOBODY = np.zeros(0)

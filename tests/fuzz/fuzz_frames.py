@@ -10,8 +10,8 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import load_scenario
 
 CanFrame = tuple[int, bytes]
 SHORT_RUN = '[operator]\nscript = [{ at_s = 0.3, request = "finish" }]\n'

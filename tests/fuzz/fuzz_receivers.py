@@ -24,14 +24,14 @@ from adacd_hil.config import load_settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, Request, SchemeState
-from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import CodecError, MessageCodec, load_codec
 from adacd_hil.wire.e2e import E2eStatus
-from firmware_sim.bench import Bench
-from firmware_sim.body import DriveMode
-from firmware_sim.drive_states import DriveState
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.body.body import DriveMode
+from firmware_sim.nodes.drive_states import DriveState
+from firmware_sim.scenario.scenario import load_scenario
 
 CODEC = load_codec()
 

@@ -34,8 +34,8 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.wire.bus import EmbeddedBus
-from firmware_sim.bench import Bench
-from firmware_sim.scenario import load_scenario
+from firmware_sim.bench.bench import Bench
+from firmware_sim.scenario.scenario import load_scenario
 
 RUNS = Path(__file__).parent / "runs"
 BLOCK_CYCLES = 250

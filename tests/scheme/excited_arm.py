@@ -11,8 +11,8 @@ from adacd_hil.compiled import compiled
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.excitation import Excitation
 from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme import certified_kernel, certified_memory, loop
-from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory, loop
+from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
 
 PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")

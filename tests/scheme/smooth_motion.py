@@ -4,8 +4,8 @@ import numpy as np
 
 from adacd_hil.config import Settings, load_settings, merge, parse
 from adacd_hil.records import scheme_layout
-from adacd_hil.scheme import kernel
-from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.model.regressor import inverse_dynamics
 
 PLACES = scheme_layout(7).slices
 
@@ -38,12 +38,12 @@ def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, period
     """Run the compiled step over a record; return blocks (n, size)."""
     count = q.shape[0]
     ones = np.ones(count, dtype=np.int64)
-    memory = kernel.new_memory(7)
-    blocks = np.repeat(kernel.new_block(7), count)
-    constants = kernel.constants_of(settings)
-    kernel.begin_adaptation(constants, memory, blocks[:1])
+    memory = paper_kernel.new_memory(7)
+    blocks = np.repeat(paper_kernel.new_block(7), count)
+    constants = paper_kernel.constants_of(settings)
+    paper_kernel.begin_adaptation(constants, memory, blocks[:1])
     blocks[0]["theta_hat"] = theta_hat
-    kernel.step_record(
+    paper_kernel.step_record(
         constants,
         memory,
         np.ascontiguousarray(q),

@@ -10,9 +10,11 @@ from long_cases import long_but
 from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme import anchor, certified_memory, sight, tail
-from adacd_hil.scheme.certificate_watch import THIS_RUN_ONLY
-from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.detect import sight, tail
+from adacd_hil.scheme.identify import anchor
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
+from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
 
 COMMISSION_S = 0.1
 LARGEST_ERROR_NM = 0.06

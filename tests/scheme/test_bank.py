@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from adacd_hil.scheme import bank, filters
+from adacd_hil.scheme.model import bank, filters
 
 T = 1e-3
 CUTOFF = np.array([10.0, 50.0, 200.0])

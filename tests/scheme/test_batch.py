@@ -9,9 +9,9 @@ from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.control.excitation import Excitation
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState, certified_layout, scheme_layout
-from adacd_hil.scheme.batch import arm_at
-from adacd_hil.scheme.margin import MarginWatch
-from adacd_hil.scheme.selection import layout_of, pipeline_of
+from adacd_hil.scheme.detect.margin import MarginWatch
+from adacd_hil.scheme.pipeline.batch import arm_at
+from adacd_hil.scheme.pipeline.selection import layout_of, pipeline_of
 
 REST = 60
 """Cycles at rest, the first of them without drives."""

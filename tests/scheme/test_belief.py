@@ -8,7 +8,9 @@ import scipy.optimize
 from excited_arm import NAMES, SETTINGS
 from planar_arm import PAYLOAD_1KG
 
-from adacd_hil.scheme import bank, belief, certified_memory
+from adacd_hil.scheme.identify import belief
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.model import bank
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]

@@ -5,10 +5,10 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState
-from adacd_hil.scheme.batch import arm_at
-from adacd_hil.scheme.calm import ArmFinding, is_calm
-from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
-from adacd_hil.scheme.supervisor import Supervisor
+from adacd_hil.scheme.pipeline.batch import arm_at
+from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor.skip_conditions import ArmFinding, is_calm
+from adacd_hil.scheme.supervisor.supervisor import Supervisor
 
 SETTINGS = settings_with(
     safety={"commission_s": 0.012, "phase_timeout_s": 0.15},

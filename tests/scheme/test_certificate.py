@@ -5,7 +5,8 @@ import pytest
 from excited_arm import NAMES, SETTINGS
 
 from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.scheme import certificate, certified_kernel, certified_memory
+from adacd_hil.scheme.identify import certificate
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]

@@ -13,8 +13,10 @@ from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
-from adacd_hil.scheme import certificate, certified_kernel, certified_memory, lost_samples
-from adacd_hil.scheme.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.detect import lost_samples
+from adacd_hil.scheme.identify import certificate
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 
 COUNT = len(NAMES)
 OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]

@@ -10,11 +10,11 @@ from excited_arm import PERIOD_S, SETTINGS, ExcitedLoop, arm_state, play, record
 from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.records import ContactLevel, FaultReason, Reaction, Request, SchemeState, certified_layout, scheme_layout
-from adacd_hil.scheme import certified_kernel, certified_memory
-from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
-from adacd_hil.scheme.margin import MarginWatch
-from adacd_hil.scheme.observation import CONTACT_SHIFT
-from adacd_hil.scheme.pipeline import Pipeline
+from adacd_hil.scheme.detect.margin import MarginWatch
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
 
 PLACES = certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count).slices
 BEFORE = 12

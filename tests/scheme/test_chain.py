@@ -5,7 +5,7 @@ import pytest
 from serial_arms import PLANAR_LENGTH_M, planar_chain, random_chain, random_state, seven_joint_arm
 
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES
-from adacd_hil.scheme import chain, regressor
+from adacd_hil.scheme.model import chain, regressor
 
 SEEDS = range(20)
 G_M_S2 = 9.81

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from smooth_motion import PLACES, run_kernel, settings_with
 
-from adacd_hil.scheme import kernel
-from adacd_hil.scheme.contact import Isolation, follow_contact
+from adacd_hil.scheme.contact.contact_estimate import Isolation, follow_contact
+from adacd_hil.scheme.kernel import paper_kernel
 
 T = 1e-3
 
@@ -47,9 +47,9 @@ class Touch:
     def __init__(self, window_cycles=50):
         settings = settings_with()
         self.constants, self.memory, self.block = (
-            kernel.constants_of(settings),
-            kernel.new_memory(7),
-            kernel.new_block(7),
+            paper_kernel.constants_of(settings),
+            paper_kernel.new_memory(7),
+            paper_kernel.new_block(7),
         )
         self.isolation = Isolation(window_cycles, settings.filter.a_rad_s)
         self.reports = []
@@ -58,8 +58,10 @@ class Touch:
         has_begun = False
         for cycle, torque in enumerate(tau_ext):
             self.block[0]["tau_J"][:] = -torque
-            mode = kernel.ARMED | (kernel.REPORTING if self.isolation.is_open else 0)
-            joints = kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> kernel.CONTACT_SHIFT
+            mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.isolation.is_open else 0)
+            joints = (
+                paper_kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> paper_kernel.CONTACT_SHIFT
+            )
             if joints and not has_begun:
                 has_begun = True
                 self.isolation.begin(cycle)

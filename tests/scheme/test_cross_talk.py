@@ -8,7 +8,7 @@ from excited_arm import SETTINGS, play, record
 from planar_arm import THETA
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme import certified_memory
+from adacd_hil.scheme.kernel import certified_memory
 
 SHARE = 0.02
 SENSORS = np.array([[1.0 + SHARE, SHARE], [SHARE, 1.0 - SHARE]])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from smooth_motion import PLACES, run_kernel, settings_with
 
-from adacd_hil.scheme import kernel
-from adacd_hil.scheme.detector import follow_standstill, joints_over
+from adacd_hil.scheme.detect.detector import follow_standstill, joints_over
+from adacd_hil.scheme.kernel import paper_kernel
 
 T = 1e-3
 BEGIN = 100
@@ -15,7 +15,7 @@ def alarms(tau_ext, settings=None):
     """Let the arm stand still under tau_ext (n, 2); return the joints that are over per sample as (n, 2)."""
     still = np.zeros_like(tau_ext)
     settings = settings_with() if settings is None else settings
-    blocks = run_kernel(settings, still, still, -tau_ext, np.zeros(7), kernel.ARMED)
+    blocks = run_kernel(settings, still, still, -tau_ext, np.zeros(7), paper_kernel.ARMED)
     return np.abs(blocks[:, PLACES["tau_ext_hat"]]) > blocks[:, PLACES["threshold"]]
 
 
@@ -76,7 +76,7 @@ def test_the_environment_pushing_toward_positive_q_is_a_positive_external_torque
 
 def test_thresholds_are_out_of_force_while_disarmed():
     still = np.zeros((5, 2))
-    blocks = run_kernel(settings_with(), still, still, still, np.zeros(7), kernel.LEARN)
+    blocks = run_kernel(settings_with(), still, still, still, np.zeros(7), paper_kernel.LEARN)
     assert np.all(np.isposinf(blocks[:, PLACES["threshold"]]))
 
 
@@ -104,10 +104,14 @@ def test_each_joint_is_compared_with_its_own_threshold():
 
 
 def test_thresholds_go_out_of_force_when_the_scheme_disarms():
-    memory, block, constants = kernel.new_memory(7), kernel.new_block(7), kernel.constants_of(settings_with())
-    kernel.step(constants, memory, block, 1, 1, kernel.ARMED)
+    memory, block, constants = (
+        paper_kernel.new_memory(7),
+        paper_kernel.new_block(7),
+        paper_kernel.constants_of(settings_with()),
+    )
+    paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.ARMED)
     assert block[0]["threshold"].tolist() == [0.15, 0.15]
-    kernel.step(constants, memory, block, 1, 1, 0)
+    paper_kernel.step(constants, memory, block, 1, 1, 0)
     assert np.all(np.isposinf(block[0]["threshold"]))
 
 
@@ -116,7 +120,7 @@ def thresholds(dq, F_c, samples=1000):
     dq = np.tile(np.asarray(dq, float), (samples, 1))
     theta = np.zeros(7)
     theta[5:] = F_c
-    blocks = run_kernel(settings_with(), np.zeros_like(dq), dq, np.zeros_like(dq), theta, kernel.ARMED)
+    blocks = run_kernel(settings_with(), np.zeros_like(dq), dq, np.zeros_like(dq), theta, paper_kernel.ARMED)
     return blocks[:, PLACES["threshold"]]
 
 

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 from adacd_hil.config import ConfigError
-from adacd_hil.scheme.detectors import (
+from adacd_hil.scheme.detect.detectors import (
     DetectorSettings,
     autocovariance,
     constants_of,
@@ -17,7 +17,7 @@ from adacd_hil.scheme.detectors import (
     new_memory,
     record,
 )
-from adacd_hil.scheme.regressor import inverse_dynamics
+from adacd_hil.scheme.model.regressor import inverse_dynamics
 
 T = 1e-3
 SETTINGS = DetectorSettings(onset_samples=(4, 16))

@@ -10,9 +10,11 @@ from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme import bank, certified_memory, doubt
-from adacd_hil.scheme.certificate_watch import BY_WORD
-from adacd_hil.scheme.doubt import Doubt
+from adacd_hil.scheme.identify import doubt
+from adacd_hil.scheme.identify.doubt import Doubt
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.model import bank
+from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
 
 PAYLOAD, COULOMB1 = range(2)
 

@@ -10,8 +10,9 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme import anchor, certified_memory, earlier, later_samples
-from adacd_hil.scheme.certificate_watch import BY_WORD
+from adacd_hil.scheme.identify import anchor, earlier, later_samples
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)

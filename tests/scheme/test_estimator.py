@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.estimator import reset_gain, update
+from adacd_hil.scheme.identify.estimator import reset_gain, update
 
 R = 1000.0
 P0 = np.array([8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5])

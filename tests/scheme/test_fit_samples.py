@@ -7,7 +7,8 @@ from planar_arm import THETA
 from test_earlier import FREE, HeldLoop, states
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme import certified_memory, fit_samples
+from adacd_hil.scheme.identify import fit_samples
+from adacd_hil.scheme.kernel import certified_memory
 
 
 class Fit:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.config import FRICTION_TERMS
-from adacd_hil.scheme.friction import (
+from adacd_hil.scheme.model.friction import (
     ASYMMETRIC,
     DAHL_LONG,
     DAHL_SHORT,

@@ -11,8 +11,9 @@ from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added, states
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme import certified_memory, earlier, last_certificate
-from adacd_hil.scheme.certificate_watch import BY_WORD, THIS_RUN_ONLY
+from adacd_hil.scheme.identify import earlier, last_certificate
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD, THIS_RUN_ONLY
 
 DATE = "2026-11-22T10:00:00Z"
 

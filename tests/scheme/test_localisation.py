@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.records import Location
-from adacd_hil.scheme.localisation import blind_angle, blind_angle_of_link1, on_link1, on_link2
+from adacd_hil.scheme.contact.localisation import blind_angle, blind_angle_of_link1, on_link1, on_link2
 
 L1, L2 = 0.35, 0.30
 LENGTHS = (L1, L2)

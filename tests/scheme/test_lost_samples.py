@@ -5,8 +5,9 @@ import pytest
 from excited_arm import PERIOD_S, SETTINGS, record
 from planar_arm import THETA
 
-from adacd_hil.scheme import certified_kernel, certified_memory, lost_samples
-from adacd_hil.scheme.observation import Observation
+from adacd_hil.scheme.detect import lost_samples
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.supervisor.observation import Observation
 
 K = certified_memory.constants_of(SETTINGS)[0]
 MODE = certified_kernel.WATCH | certified_kernel.REFINE

@@ -11,8 +11,9 @@ from scipy.signal import butter, filtfilt
 from test_position import CABLE_NM, FREE, cabled, learnt
 
 from adacd_hil.records import CERTIFICATE_EVENTS
-from adacd_hil.scheme import certified_kernel, missing_torque
-from adacd_hil.scheme.certificate_watch import CertificateWatch
+from adacd_hil.scheme.identify import missing_torque
+from adacd_hil.scheme.kernel import certified_kernel
+from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
 
 
 class Found(NamedTuple):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.regressor import inverse_dynamics, mass_matrix
+from adacd_hil.scheme.model.regressor import inverse_dynamics, mass_matrix
 
 pinocchio = pytest.importorskip("pinocchio")
 

@@ -14,10 +14,10 @@ from smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 
 from adacd_hil.config import load_settings
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, scheme_layout
-from adacd_hil.scheme import kernel
-from adacd_hil.scheme.observation import Observation
-from adacd_hil.scheme.pipeline import Pipeline
-from adacd_hil.scheme.regressor import is_positive_definite
+from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.model.regressor import is_positive_definite
+from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.supervisor.observation import Observation
 
 NEVER_ALARM = {"detector": {"threshold_Nm": [50.0, 50.0]}}
 
@@ -382,18 +382,22 @@ def test_an_adaptation_begins_without_the_evidence_of_the_last():
     settings = settings_with(termination={"beta_Nm": 50.0, "hold_s": 0.1, "excitation_Nm2s": 0.0})
     q, dq, ddq = smooth_motion(np.arange(3000) * 1e-3)
     tau_J = torque_of(q, dq, ddq, THETA["M"])
-    memory, block, constants = kernel.new_memory(7), kernel.new_block(7), kernel.constants_of(settings)
-    kernel.begin_adaptation(constants, memory, block)
+    memory, block, constants = (
+        paper_kernel.new_memory(7),
+        paper_kernel.new_block(7),
+        paper_kernel.constants_of(settings),
+    )
+    paper_kernel.begin_adaptation(constants, memory, block)
     for k in range(len(q)):
         block[0]["q"][:], block[0]["dq"][:], block[0]["tau_J"][:] = q[k], dq[k], tau_J[k]
-        moving = kernel.step(constants, memory, block, 1, 1, kernel.LEARN)
+        moving = paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.LEARN)
     assert moving & Observation.ADAPTED
     assert block[0]["excitation"] > 1e-5
-    kernel.begin_adaptation(constants, memory, block)
+    paper_kernel.begin_adaptation(constants, memory, block)
     block[0]["dq"][:] = 0.0
-    kernel.step(constants, memory, block, 1, 1, kernel.LEARN)
+    paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.LEARN)
     assert block[0]["quiet_s"] == settings.bus.period_s
-    standing = [kernel.step(constants, memory, block, 1, 1, kernel.LEARN) for _ in range(200)]
+    standing = [paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.LEARN) for _ in range(200)]
     assert not any(observation & Observation.ADAPTED for observation in standing)
     assert block[0]["excitation"] < 1e-12
 
@@ -403,14 +407,18 @@ def test_an_adaptation_begins_without_the_evidence_of_the_last():
 def test_an_adaptation_needs_travel_and_speed_of_its_own(missing, sign):
     """What joint 2 did before this adaptation does not count in it."""
     settings = settings_with(termination={"beta_Nm": 50.0, "hold_s": 0.1, "excitation_Nm2s": 0.0, "travel_deg": 20.0})
-    memory, block, constants = kernel.new_memory(7), kernel.new_block(7), kernel.constants_of(settings)
+    memory, block, constants = (
+        paper_kernel.new_memory(7),
+        paper_kernel.new_block(7),
+        paper_kernel.constants_of(settings),
+    )
     moves = {"q": [(-0.5, -0.5), (0.5, 0.5)], "dq": [(-1.0, -1.0), (1.0, 1.0)]}
     seen = []
     for this_time in (moves, moves | {missing: [(0.4, sign * 0.3), (0.8, sign * 0.3)]}):
-        kernel.begin_adaptation(constants, memory, block)
+        paper_kernel.begin_adaptation(constants, memory, block)
         for k in range(200):
             block[0]["q"][:], block[0]["dq"][:] = this_time["q"][k % 2], this_time["dq"][k % 2]
-            observation = kernel.step(constants, memory, block, 1, 1, kernel.LEARN)
+            observation = paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.LEARN)
         seen.append(bool(observation & Observation.ADAPTED))
     assert seen == [True, False]
 
@@ -433,11 +441,15 @@ def test_gravity_is_learnt_where_the_axes_are_not_vertical():
     theta = np.append(THETA["M"] * [1, 1, 1, 1, 1, 0, 0], [2.0, 0.7])
     q, dq, ddq = smooth_motion(np.arange(20_000) * 1e-3)
     tau_J = torque_of(q, dq, ddq, theta)
-    memory, block, constants = kernel.new_memory(9), kernel.new_block(9), kernel.constants_of(settings)
-    kernel.begin_adaptation(constants, memory, block)
+    memory, block, constants = (
+        paper_kernel.new_memory(9),
+        paper_kernel.new_block(9),
+        paper_kernel.constants_of(settings),
+    )
+    paper_kernel.begin_adaptation(constants, memory, block)
     for k in range(len(q)):
         block[0]["q"][:], block[0]["dq"][:], block[0]["tau_J"][:] = q[k], dq[k], tau_J[k]
-        kernel.step(constants, memory, block, 1, 1, kernel.LEARN)
+        paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.LEARN)
     assert np.max(np.abs(block[0]["tau_ext_hat"])) < 0.05
     np.testing.assert_allclose(block[0]["theta_hat"][7:], [2.0, 0.7], rtol=0.02)
 
@@ -447,14 +459,14 @@ import sys
 import numpy as np
 from planar_arm import THETA, ClosedLoop
 from adacd_hil.config import load_settings
-from adacd_hil.scheme import kernel
+from adacd_hil.scheme.kernel import paper_kernel
 from smooth_motion import run_kernel, settings_with, smooth_motion, torque_of
 
 loop = ClosedLoop(load_settings("paper", "P"), THETA["P"])
 closed = np.array([output.block for output in loop.run(400)])
 q, dq, ddq = smooth_motion(np.arange(300) * 1e-3)
 tau_J = torque_of(q, dq, ddq, THETA["M"])
-record = run_kernel(settings_with(), q, dq, tau_J, np.zeros(7), kernel.LEARN | kernel.ARMED)
+record = run_kernel(settings_with(), q, dq, tau_J, np.zeros(7), paper_kernel.LEARN | paper_kernel.ARMED)
 np.savez(sys.argv[1], closed=closed, record=record)
 """
 
@@ -487,7 +499,7 @@ def test_nothing_compiles_in_the_cycle():
 
 
 def compiled_versions():
-    return [len(getattr(function, "signatures", ())) for function in (kernel.step, kernel.begin_adaptation)]
+    return [len(getattr(function, "signatures", ())) for function in (paper_kernel.step, paper_kernel.begin_adaptation)]
 
 
 def residuals_at(lateness_ns, epoch_ns=0, sample_period="measured"):

@@ -7,8 +7,8 @@ from planar_arm import THETA
 
 from adacd_hil.analysis.smallest_push import PushGatherer
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.observation import Observation
-from adacd_hil.scheme.sight import WITHIN_S
+from adacd_hil.scheme.detect.sight import WITHIN_S
+from adacd_hil.scheme.supervisor.observation import Observation
 
 SECONDS = 9.0
 

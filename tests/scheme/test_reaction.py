@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from smooth_motion import settings_with
 
-from adacd_hil.scheme.reaction import Withdrawal, time_optimal
+from adacd_hil.scheme.contact.reaction import Withdrawal, time_optimal
 
 T = 1e-3
 SETTINGS = settings_with()

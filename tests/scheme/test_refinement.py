@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from excited_arm import NAMES, SETTINGS
 
-from adacd_hil.scheme import anchor, certified_memory, refinement, sensitivity
+from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.identify import anchor, refinement
+from adacd_hil.scheme.kernel import certified_memory
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planar_arm import PAYLOAD_1KG, THETA, acceleration
 
-from adacd_hil.scheme.regressor import (
+from adacd_hil.scheme.model.regressor import (
     fill_momentum,
     fill_remainder,
     inverse_dynamics,

@@ -7,7 +7,7 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction
-from adacd_hil.scheme.report import ContactHistory, ContactReporter
+from adacd_hil.scheme.contact.contact_report import ContactHistory, ContactReporter
 
 SETTINGS = settings_with()
 SIGMA, THRESHOLD = np.array([0.03, 0.015]), np.array([0.15, 0.08])

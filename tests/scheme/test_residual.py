@@ -5,8 +5,8 @@ import pytest
 from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import PLACES, run_kernel, settings_with, smooth_motion, torque_of
 
-from adacd_hil.scheme import kernel
-from adacd_hil.scheme.filters import first_order_hold
+from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.model.filters import first_order_hold
 
 T = 1e-3
 LEFT_NM = 1e-5
@@ -113,7 +113,7 @@ def test_one_bad_number_does_not_stay_in_the_filters(motion, signal, value):
     _, q, dq, ddq = motion
     record = [q[:2000].copy(), dq[:2000].copy(), torque_of(q, dq, ddq, SMOOTH)[:2000].copy()]
     record[signal][700, 1] = value
-    blocks = run_kernel(settings_with(), *record, SMOOTH, kernel.LEARN)
+    blocks = run_kernel(settings_with(), *record, SMOOTH, paper_kernel.LEARN)
     assert np.max(np.abs(tau_ext_hat_of(blocks))) < LEFT_NM
 
 
@@ -193,8 +193,8 @@ def test_an_interval_far_from_the_nominal_one_is_a_gap(motion, interval_s):
     tau_J = torque_of(q, dq, ddq, SMOOTH)
     period_s, periods = np.full(len(q), T), np.ones(len(q), dtype=np.int64)
     period_s[1000], periods[1000] = interval_s, 6
-    odd = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, kernel.LEARN, period_s=period_s)
-    gap = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, kernel.LEARN, periods=periods)
+    odd = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, paper_kernel.LEARN, period_s=period_s)
+    gap = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, paper_kernel.LEARN, periods=periods)
     assert tau_ext_hat_of(odd).tobytes() == tau_ext_hat_of(gap).tobytes()
     assert odd[:, PLACES["theta_hat"]].tobytes() == gap[:, PLACES["theta_hat"]].tobytes()
 
@@ -215,8 +215,10 @@ def test_another_interval_throughout_is_the_same_as_another_period():
     t_s = np.arange(3000) * 1.3e-3
     q, dq, ddq = smooth_motion(t_s)
     tau_J = torque_of(q, dq, ddq, SMOOTH)
-    measured = run_kernel(settings_with(), q, dq, tau_J, np.zeros(7), kernel.LEARN, period_s=np.full(3000, 1.3e-3))
-    slower = run_kernel(settings_with(bus={"period_us": 1300}), q, dq, tau_J, np.zeros(7), kernel.LEARN)
+    measured = run_kernel(
+        settings_with(), q, dq, tau_J, np.zeros(7), paper_kernel.LEARN, period_s=np.full(3000, 1.3e-3)
+    )
+    slower = run_kernel(settings_with(bus={"period_us": 1300}), q, dq, tau_J, np.zeros(7), paper_kernel.LEARN)
     for name in ("tau_f", "tau_f_hat", "tau_ext_hat", "theta_hat", "excitation"):
         np.testing.assert_allclose(measured[:, PLACES[name]], slower[:, PLACES[name]], rtol=1e-12, atol=1e-15)
     assert slower[-1, PLACES["excitation"]] > 0.0

@@ -5,7 +5,7 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ContactLevel, Reaction
-from adacd_hil.scheme.response import BLIND_S, TURNED_CYCLES, Response
+from adacd_hil.scheme.contact.response import BLIND_S, TURNED_CYCLES, Response
 
 SETTINGS = settings_with(
     reaction={"contact": ["slow_down", "stop"], "collision": ["admittance", "withdraw"]},

@@ -5,7 +5,8 @@ import pytest
 import scipy.signal
 from excited_arm import NAMES, SETTINGS
 
-from adacd_hil.scheme import certified_memory, sensitivity
+from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.kernel import certified_memory
 
 CERTIFIED = SETTINGS.certified
 T = SETTINGS.bus.period_s

@@ -7,7 +7,9 @@ import pytest
 from excited_arm import SETTINGS, TouchedLoop
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme import bank, certified_memory, sensitivity, sight, tail
+from adacd_hil.scheme.detect import sensitivity, sight, tail
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.model import bank
 
 FILTERS = SETTINGS.filter_count
 

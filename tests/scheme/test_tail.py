@@ -6,8 +6,9 @@ import scipy.signal
 from excited_arm import SETTINGS
 from test_certified_kernel import COUNT, RECOVER, Kernel
 
-from adacd_hil.scheme import certified_kernel, certified_memory, sensitivity, tail
-from adacd_hil.scheme.observation import Observation
+from adacd_hil.scheme.detect import sensitivity, tail
+from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.supervisor.observation import Observation
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]

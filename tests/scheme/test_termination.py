@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.termination import add_information, has_moved, is_quiet, smallest_eigenvalue, widen
+from adacd_hil.scheme.identify.termination import add_information, has_moved, is_quiet, smallest_eigenvalue, widen
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_sim.arms import ARMS
-from firmware_sim.mechanics_settings import MechanicsSettings
-from firmware_sim.sensor_settings import SensorSettings
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
+from firmware_sim.arm.sensor_settings import SensorSettings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import error_campaign

@@ -21,7 +21,7 @@ from adacd_hil.cli.demo import Cast, run_embedded
 from adacd_hil.config import OperatorSettings, RequestSettings, load_settings, parse
 from adacd_hil.log.reader import Series
 from adacd_hil.records import TRUTH_LAYOUT
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario.scenario import Scenario
 
 
 @pytest.mark.long

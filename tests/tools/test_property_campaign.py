@@ -24,7 +24,7 @@ from wire_record import Passed, WireRecord
 from adacd_hil.config import load_settings, parse
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.wire.codec import contract_folder
-from firmware_sim.scenario import Scenario
+from firmware_sim.scenario.scenario import Scenario
 
 ADAPT, MONITOR, REACT, STOPPED = SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED
 

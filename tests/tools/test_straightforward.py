@@ -8,7 +8,7 @@ import pytest
 from scheme.smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 
 from adacd_hil.config import Settings
-from adacd_hil.scheme import kernel
+from adacd_hil.scheme.kernel import paper_kernel
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from straightforward import NumpyScheme
@@ -19,13 +19,17 @@ THETA = np.array([0.19, 0.034, 0.02, 0.08, 0.05, 0.1, 0.06])
 
 def run_compiled(settings: Settings, q: np.ndarray, dq: np.ndarray, tau_J: np.ndarray) -> np.ndarray:
     """Run the compiled step, first learning, then armed; return blocks (n, size)."""
-    constants, memory, block = kernel.constants_of(settings), kernel.new_memory(7), kernel.new_block(7)
-    kernel.begin_adaptation(constants, memory, block)
+    constants, memory, block = (
+        paper_kernel.constants_of(settings),
+        paper_kernel.new_memory(7),
+        paper_kernel.new_block(7),
+    )
+    paper_kernel.begin_adaptation(constants, memory, block)
     rows = []
     for k in range(LEARNED + WATCHED):
         for name, value in (("q", q[k]), ("dq", dq[k]), ("tau_J", tau_J[k])):
             block[0][name][:] = value
-        kernel.step(constants, memory, block, 1, 1, kernel.LEARN if k < LEARNED else kernel.ARMED)
+        paper_kernel.step(constants, memory, block, 1, 1, paper_kernel.LEARN if k < LEARNED else paper_kernel.ARMED)
         rows.append(block.view(np.float64).copy())
     return np.array(rows)
 

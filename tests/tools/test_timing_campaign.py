@@ -19,7 +19,7 @@ import yardstick
 from adacd_hil.cli.run import check_budget_of
 from adacd_hil.config import ConfigError, load_settings
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.scenario import load_scenario
+from firmware_sim.scenario.scenario import load_scenario
 
 MS = 1_000_000
 

@@ -16,8 +16,8 @@ from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.analysis.score.judge import explained_until, owners
 from adacd_hil.log.errors import LogError
 from adacd_hil.records import Vector
-from adacd_hil.scheme import offline
-from adacd_hil.scheme.offline import Certificate, Estimate, OfflineSettings
+from adacd_hil.scheme.identify import offline
+from adacd_hil.scheme.identify.offline import Certificate, Estimate, OfflineSettings
 
 FIT_SHARE = 0.6
 """Of a recording that is both fitted and tested: the part that is fitted."""

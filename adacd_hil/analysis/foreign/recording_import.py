@@ -27,7 +27,7 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import Stretch as Span
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
-from adacd_hil.scheme.offline import Record
+from adacd_hil.scheme.identify.offline import Record
 
 MOST_ROWS: Final = 4_000_000
 """Rows of a file that are kept, and samples that they become: an hour at 1 kHz, with a little to spare."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from adacd_hil.config import OperatorSettings, Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme.batch import SchemeBatch
+from adacd_hil.scheme.pipeline.batch import SchemeBatch
 
 
 class Script(Protocol):

@@ -16,8 +16,8 @@ from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.records import FaultReason, SchemeState, Vector
-from adacd_hil.scheme.batch import SchemeBatch
-from adacd_hil.scheme.selection import layout_of
+from adacd_hil.scheme.pipeline.batch import SchemeBatch
+from adacd_hil.scheme.pipeline.selection import layout_of
 
 _LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 

@@ -37,10 +37,10 @@ from adacd_hil.log.reader import LoggedContact
 from adacd_hil.log.stretch import EVER_NS, WHOLE
 from adacd_hil.log.stretch import Stretch as LogStretch
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme.batch import SchemeBatch, arm_at
-from adacd_hil.scheme.certified_pipeline import CertifiedPipeline
-from adacd_hil.scheme.pipeline import Pipeline
-from adacd_hil.scheme.selection import pipeline_of
+from adacd_hil.scheme.pipeline.batch import SchemeBatch, arm_at
+from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.pipeline.selection import pipeline_of
 from adacd_hil.wire.codec import Codec
 
 SCRIPTED: Final = "script"

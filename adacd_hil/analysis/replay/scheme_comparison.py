@@ -21,8 +21,8 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.provenance import arithmetic
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Vector
-from adacd_hil.scheme.batch import SchemeBatch
-from adacd_hil.scheme.selection import layout_of
+from adacd_hil.scheme.pipeline.batch import SchemeBatch
+from adacd_hil.scheme.pipeline.selection import layout_of
 
 TOLERANCE: Final = 1e-9
 """Least squares over a minute amplify a rounding error of 1e-16 by the condition number, up to 1e6."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from adacd_hil.analysis.run import CertifiedStream, Run
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
-from adacd_hil.scheme.bank import channels_of
+from adacd_hil.scheme.model.bank import channels_of
 
 FINEST: Final = {
     "rad": 2e-5,

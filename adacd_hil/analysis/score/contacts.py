@@ -16,7 +16,7 @@ from adacd_hil.analysis.score.judge import JudgedContact, Score
 from adacd_hil.analysis.score.touches import Touch, channels_at, ideal_response, row_at
 from adacd_hil.analysis.sections import Section, section_at
 from adacd_hil.records import JOINTS, ContactReport, Location, SchemeState, Vector
-from adacd_hil.scheme.classification import WINDOW_S
+from adacd_hil.scheme.contact.classification import WINDOW_S
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from adacd_hil.analysis.score.alarms import Detection
 from adacd_hil.analysis.score.judge import Score, TouchWindow, judge
 from adacd_hil.analysis.timing import Cycles
 from adacd_hil.records import JOINTS, SchemeState, Vector
-from adacd_hil.scheme.bank import channels_of, step_response
+from adacd_hil.scheme.model.bank import channels_of, step_response
 
 
 class Touch(NamedTuple):

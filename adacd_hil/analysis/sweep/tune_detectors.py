@@ -14,7 +14,7 @@ from adacd_hil.analysis.sweep.tune_logs import TunedLog
 from adacd_hil.analysis.sweep.tune_roc import Observed, Touched, rising
 from adacd_hil.analysis.thresholds import Statistics, run_detectors
 from adacd_hil.records import Vector
-from adacd_hil.scheme import detectors
+from adacd_hil.scheme.detect import detectors
 
 WARM_UP_S: Final = 0.6
 

@@ -20,8 +20,8 @@ from adacd_hil.analysis.sweep.tune_roc import Observed, Touched, rising
 from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import JOINTS, SchemeState, Vector
-from adacd_hil.scheme.batch import SchemeBatch
-from adacd_hil.scheme.selection import layout_of
+from adacd_hil.scheme.pipeline.batch import SchemeBatch
+from adacd_hil.scheme.pipeline.selection import layout_of
 
 _FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)
 _GAIN_FACTORS: Final = (1.0, 0.3, 3.0)

@@ -1,0 +1,1 @@
+"""What is known of a contact: link, direction, size, place, and the reaction to it."""

@@ -1,0 +1,1 @@
+"""Residuals, their thresholds, and what they let be seen."""

@@ -1,0 +1,314 @@
+"""Detectors of an external torque, all on one stream, each with one statistic per channel and joint.
+
+**The stream** is the external torque of one sample, unfiltered, in Nm, positive when the environment pushes toward +q.
+With M dq = Y_p theta and -C' dq + g + friction = Y_h theta, and a velocity that is `lag_s` older than the torque,
+
+    z = (Y_p,new - Y_p,old) theta / T + (Y_h,new + Y_h,old) theta / 2
+        - (tau_new + tau_old) / 2 + lag_s (tau_new - tau_old) / T
+
+the mean over the interval. Every detector here is a filter of z; the paper's residual is z through 1 / (s + a) times a.
+
+**A joint that stands still** can hold any torque up to F_c, which no model predicts. What that may do to a channel at
+most is F_c times the channel's own filter of the indicator "stands still", so it is taken off: a statistic is
+
+    |x| - allowance,                                           in Nm but for `likelihood ratio` and `cusum`
+
+and there is an alarm when it is above the threshold h of that channel and joint.
+
+channel            x
+first-order a      low-pass of cut-off a; a = 10 rad/s is the paper's
+smoothed a         the same with a second low-pass: a velocity from a tracking loop has noise that grows with frequency
+                   up to the loop's cut-off, which one pole passes on as it is
+band-pass          first-order at its upper less first-order at its lower cut-off
+observer K         generalised-momentum observer of gain K by the implicit trapezoid
+likelihood N       log-likelihood of a step that began N samples ago: the stream's own covariance whitens it; in sigmas
+cusum              sum of what the smoothed channel of highest cut-off has above a drift; in Nm s
+
+A step of tau_ext passes h of a first-order channel after -ln(1 - h / |tau_ext|) / a. Without the drift, the sum is h
+after h / |tau_ext|.
+
+Sources: De Luca and Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005
+(observer); Basseville and Nikiforov, "Detection of Abrupt Changes", 1993, chapters 2 and 7 (the last two).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import ConfigError, setting
+from adacd_hil.records import Vector
+from adacd_hil.scheme.model import regressor
+from adacd_hil.structured import Structured, packed, zeroed
+
+VELOCITY_LAG_S: Final = 1.25e-3
+"""The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of
+the interval and not a straight line over it."""
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """What the detectors of one stream are."""
+
+    cutoff_rad_s: tuple[float, ...] = setting(
+        (10.0, 50.0, 200.0), unit="rad/s", low=0.1, high=2000.0, meaning="first-order and smoothed channels"
+    )
+    smoothing_rad_s: float = setting(200.0, unit="rad/s", low=1.0, high=2000.0, meaning="second pole when smoothed")
+    band_rad_s: tuple[float, float] = setting(
+        (10.0, 100.0), unit="rad/s", low=0.1, high=2000.0, meaning="lower and upper cut-off of the band-pass"
+    )
+    observer_rad_s: tuple[float, ...] = setting(
+        (25.0, 100.0), unit="rad/s", low=0.1, high=2000.0, meaning="gains of the momentum observers"
+    )
+    onset_samples: tuple[int, ...] = setting(
+        (4, 8, 16, 32, 64, 128), low=1, high=1000, meaning="ages of the steps that the likelihood ratio knows"
+    )
+    drift_Nm: float = setting(0.02, unit="Nm", low=0.0, high=10.0, meaning="smoothed torque that cusum ignores")
+    standstill_rad_s: float = setting(
+        2e-3, unit="rad/s", low=0.0, high=1.0, meaning="a slower joint stands still; five times the velocity's noise"
+    )
+
+    def __post_init__(self) -> None:
+        if not self.band_rad_s[0] < self.band_rad_s[1]:
+            raise ConfigError(f"band_rad_s = {self.band_rad_s}: the lower cut-off is not below the upper one")
+        for name in ("cutoff_rad_s", "observer_rad_s", "onset_samples"):
+            if not getattr(self, name):
+                raise ConfigError(f"{name} is empty")
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the channels, in the order of the statistics."""
+        return (
+            *(f"first-order {a:g}" for a in self.cutoff_rad_s),
+            *(f"smoothed {a:g}" for a in self.cutoff_rad_s),
+            "band-pass",
+            *(f"observer {gain:g}" for gain in self.observer_rad_s),
+            *(f"likelihood {age}" for age in self.onset_samples),
+            "cusum",
+        )
+
+    @property
+    def detectors(self) -> dict[str, tuple[int, ...]]:
+        """Name the detectors and the channels of each; a joint is over when one of them is."""
+        count, gains, ages = len(self.cutoff_rad_s), len(self.observer_rad_s), len(self.onset_samples)
+        detectors = {
+            "paper": (0,),
+            "bank": tuple(range(count)),
+            "smoothed bank": (*range(1, count), *range(count, 2 * count)),
+            "band-pass": (2 * count,),
+        }
+        for place, gain in enumerate(self.observer_rad_s):
+            detectors[f"observer {gain:g}"] = (2 * count + 1 + place,)
+        first = 2 * count + 1 + gains
+        return detectors | {"likelihood ratio": tuple(range(first, first + ages)), "cusum": (first + ages,)}
+
+
+def likelihood_windows(
+    autocovariance: Vector, onset_samples: tuple[int, ...], lag_s: float, period_s: float, floor_Nm: float = 2e-3
+) -> Vector:
+    """Design one joint's likelihood weights (N, L), the newest sample's first, from the covariance (L,) of its z.
+
+    With the covariance R of the last L samples and the step's shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of this
+    covariance comes out with a standard deviation of 1, and no other window gives the step more. The shape is what a
+    critically damped loop of that lag makes of a step. floor_Nm: slow errors of the model, added as a constant of
+    unknown size; without them a window would trust averages longer than any model deserves.
+
+    Raises ValueError unless L is at least the largest age and the covariance is positive.
+    """
+    length = autocovariance.shape[0]
+    if length < max(onset_samples):
+        raise ValueError(f"a covariance of {length} samples for a step of {max(onset_samples)}")
+    if not autocovariance[0] > 0.0:
+        raise ValueError(f"the stream's variance is {autocovariance[0]} Nm²")
+    weights = np.zeros((len(onset_samples), length))
+    for row, age in enumerate(onset_samples):
+        since = 2.0 * period_s * (age - np.arange(length)) / max(lag_s, 1e-9)
+        shape = np.where(since > 0.0, 1.0 - (1.0 + since) * np.exp(-np.maximum(since, 0.0)), 0.0)
+        column = autocovariance + floor_Nm**2
+        whitened = solve_toeplitz(column, shape)
+        weights[row] = whitened / math.sqrt(float(whitened @ shape))
+    return weights
+
+
+def autocovariance(z: Vector, length: int) -> Vector:
+    """Estimate the covariance (length,) of a zero-mean series (n,) with itself; biased, so that it is positive.
+
+    Raises ValueError if the series is shorter than ten times that.
+    """
+    if z.shape[0] < 10 * length:
+        raise ValueError(f"{z.shape[0]} samples are too few for a covariance of {length}")
+    size = 1 << (z.shape[0] + length - 1).bit_length()
+    spectrum = np.abs(np.fft.rfft(z, size)) ** 2
+    return np.asarray(np.fft.irfft(spectrum, size)[:length] / z.shape[0])
+
+
+def constants_of(settings: DetectorSettings, weights: Vector, period_s: float) -> Structured:
+    """Put settings and the joints' likelihood weights (n, N, L) into the form that the compiled step reads."""
+    values: dict[str, Any] = {
+        "period_s": period_s,
+        "decay": np.exp(-np.array(settings.cutoff_rad_s) * period_s),
+        "smoothing": math.exp(-settings.smoothing_rad_s * period_s),
+        "band": np.exp(-np.array(settings.band_rad_s) * period_s),
+        "gain": settings.observer_rad_s,
+        "weights": weights,
+        "drift_Nm": settings.drift_Nm,
+    }
+    return packed(values)
+
+
+def new_memory(constants: Structured) -> Structured:
+    """Return the memory before the first sample: nothing was seen, nothing stood still. Last axis: x, allowance."""
+    _, joints, _, length = constants["weights"].shape
+    filters, gains = constants["decay"].size, constants["gain"].size
+    shapes: dict[str, tuple[int, ...]] = {
+        "low": (filters, joints, 2),
+        "smooth": (filters, joints, 2),
+        "band": (2, joints, 2),
+        "observer": (gains, joints, 2),
+        "ring": (length, joints, 2),
+        "head": (),
+        "up": (joints,),
+        "down": (joints,),
+    }
+    return zeroed(shapes)
+
+
+@compiled
+def step(constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, statistics: Vector) -> None:
+    """Take in z (n,) and fill the statistics (channels, n).
+
+    held_Nm (n,): the friction that may hold each joint, F_c if it stands still, else 0.
+    """
+    c, m = constants[0], memory[0]
+    decay, gain, weights = c["decay"], c["gain"], c["weights"]
+    length = m["ring"].shape[0]
+    head = (int(m["head"]) + 1) % length
+    m["head"] = head
+    for i in range(z.shape[0]):
+        row = 0
+        for part in range(2):
+            u = z[i] if part == 0 else held_Nm[i]
+            m["ring"][head, i, part] = u
+            for k in range(decay.shape[0]):
+                m["low"][k, i, part] = u + decay[k] * (m["low"][k, i, part] - u)
+                low = m["low"][k, i, part]
+                m["smooth"][k, i, part] = low + c["smoothing"] * (m["smooth"][k, i, part] - low)
+            for k in range(2):
+                m["band"][k, i, part] = u + c["band"][k] * (m["band"][k, i, part] - u)
+            for k in range(gain.shape[0]):
+                half = 0.5 * gain[k] * c["period_s"]
+                m["observer"][k, i, part] = ((1.0 - half) * m["observer"][k, i, part] + 2.0 * half * u) / (1.0 + half)
+        for k in range(decay.shape[0]):
+            statistics[row + k, i] = abs(m["low"][k, i, 0]) - m["low"][k, i, 1]
+            statistics[row + decay.shape[0] + k, i] = abs(m["smooth"][k, i, 0]) - m["smooth"][k, i, 1]
+        row += 2 * decay.shape[0]
+        band = m["band"][1, i, 0] - m["band"][0, i, 0]
+        statistics[row, i] = abs(band) - (m["band"][1, i, 1] + m["band"][0, i, 1])
+        row += 1
+        for k in range(gain.shape[0]):
+            statistics[row + k, i] = abs(m["observer"][k, i, 0]) - m["observer"][k, i, 1]
+        row += gain.shape[0]
+        for k in range(weights.shape[1]):
+            likelihood, allowance = 0.0, 0.0
+            for past in range(length):
+                place = head - past if past <= head else head - past + length
+                likelihood += weights[i, k, past] * m["ring"][place, i, 0]
+                allowance += abs(weights[i, k, past]) * m["ring"][place, i, 1]
+            statistics[row + k, i] = abs(likelihood) - allowance
+        row += weights.shape[1]
+        last = decay.shape[0] - 1
+        x, ignored = m["smooth"][last, i, 0], c["drift_Nm"] + m["smooth"][last, i, 1]
+        m["up"][i] = max(0.0, m["up"][i] + (x - ignored) * c["period_s"])
+        m["down"][i] = max(0.0, m["down"][i] - (x + ignored) * c["period_s"])
+        statistics[row, i] = max(m["up"][i], m["down"][i])
+
+
+@compiled
+def record(
+    constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, block_samples: int, peaks: Vector
+) -> None:
+    """Run `step` over N samples and keep the largest statistic of each block.
+
+    z, held_Nm (N, n); peaks (ceil(N / block_samples), channels, n). One sample per block keeps everything.
+    """
+    statistics = np.empty((peaks.shape[1], peaks.shape[2]))
+    for k in range(z.shape[0]):
+        step(constants, memory, z[k], held_Nm[k], statistics)
+        block = k // block_samples
+        for row in range(peaks.shape[1]):
+            for i in range(peaks.shape[2]):
+                if k % block_samples == 0 or statistics[row, i] > peaks[block, row, i]:
+                    peaks[block, row, i] = statistics[row, i]
+
+
+@compiled
+def stream(
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    theta: Vector,
+    interval_s: Vector,
+    lag_s: float,
+    standstill_rad_s: float,
+    first_coulomb: int,
+    z: Vector,
+    held_Nm: Vector,
+) -> None:
+    """Fill the stream and the friction that may hold (N, 2) of a recording; theta (N, p), interval_s (N,).
+
+    The first sample, and one whose interval is not positive (nobody knows what happened before it), has z = 0. Both
+    ends of an interval are judged by the theta of its end, so that a change of theta is no torque.
+    """
+    count, joints = q.shape
+    Y_p = np.zeros((2, joints, theta.shape[1]))
+    Y_h = np.zeros((2, joints, theta.shape[1]))
+    for k in range(count):
+        new, old = k % 2, (k + 1) % 2
+        regressor.fill_momentum(q[k], dq[k], Y_p[new])
+        regressor.fill_remainder(q[k], dq[k], Y_h[new])
+        for i in range(joints):
+            stands = abs(dq[k, i]) < standstill_rad_s
+            if stands:
+                Y_h[new, i, first_coulomb + i] = 0.0
+            held_Nm[k, i] = max(theta[k, first_coulomb + i], 0.0) if stands else 0.0
+            z[k, i] = 0.0
+            if k == 0 or not interval_s[k] > 0.0:
+                continue
+            for j in range(theta.shape[1]):
+                rate = (Y_p[new, i, j] - Y_p[old, i, j]) / interval_s[k]
+                z[k, i] += (rate + 0.5 * (Y_h[new, i, j] + Y_h[old, i, j])) * theta[k, j]
+            z[k, i] -= 0.5 * (tau_J[k, i] + tau_J[k - 1, i])
+            z[k, i] += lag_s * (tau_J[k, i] - tau_J[k - 1, i]) / interval_s[k]
+
+
+def make_stream(
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    theta: Vector,
+    interval_s: Vector,
+    lag_s: float = VELOCITY_LAG_S,
+    standstill_rad_s: float = 2e-3,
+) -> tuple[Vector, Vector]:
+    """Give the stream z and the friction that may hold, both (N, 2), Nm.
+
+    q, dq, tau_J (N, 2); theta (p,) or (N, p), p = 7 or 9; interval_s (N,), 0 or less where samples are missing before.
+    """
+    z, held_Nm = np.zeros(q.shape), np.zeros(q.shape)
+    every = np.ascontiguousarray(np.broadcast_to(theta, (q.shape[0], np.shape(theta)[-1])))
+    stream(q, dq, tau_J, every, interval_s, lag_s, standstill_rad_s, regressor.F_C1, z, held_Nm)
+    return z, held_Nm
+
+
+def likelihood_weights(z: Vector, settings: DetectorSettings, lag_s: float, period_s: float) -> Vector:
+    """Design the likelihood weights (n, N, L) of all joints from a contact-free stream z (n_samples, n)."""
+    length = max(settings.onset_samples) + 16
+    return np.array(
+        [
+            likelihood_windows(autocovariance(z[:, i], length), settings.onset_samples, lag_s, period_s)
+            for i in range(z.shape[1])
+        ]
+    ).reshape(z.shape[1], len(settings.onset_samples), length)

@@ -1,0 +1,336 @@
+"""The thresholds of the certified scheme: what each channel of the bank may show without a contact.
+
+    h = max(e sqrt((k_tau sigma_tau)² + nu² (M R M')_ii + (k_m g)² + G) + pull, tail) + F_c s
+
+- sigma_tau: white noise of the torque sensor through the channel. A filter of cut-off a leaves sigma sqrt(a T / 2), one
+  that is smoothed by s as well sigma sqrt(a s / (a + s) T / 2). A sensor at rest that is found noisier raises it.
+  Its steps add their own noise and pull (`follow_torque_step`).
+- nu, rad/s²: noise of the velocity through the momentum M(q) dq, as its largest value: it stems from the encoder's
+  counts and is bounded, not Gaussian. The bare filter multiplies it by a, and BARE; smoothing leaves 0.335 (s / 200) /
+  (1 + a / 600) of a (measured with 2^20 counts and a 200 Hz tracking loop, over hours of motion, 2026-11).
+- g² = w (u P + D) w': what the belief leaves open about this very motion, w the filtered regressor's row, and D what no
+  parameter explains however long one learns. u is the unit of P's variances: 1 for what the settings say of a good
+  model's residual, less or more as the residual without contact turns out to be. In smoothed channels g is smoothed,
+  too: a bound, since |F x| <= F |x|.
+- R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
+- e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`strain`).
+- G: what lost samples leave open (`lost_samples`). tail: floor by the largest residual seen (`tail`).
+- s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
+  where it is in the model, and as much more as these are uncertain.
+
+Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C, n); y, h (2 C - 1, n); W_f (C, n, p);
+M (n, n). Units: Nm.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import CertifiedSettings
+from adacd_hil.records import Vector
+from adacd_hil.scheme.contact import contact_estimate
+from adacd_hil.scheme.model import bank, friction
+
+SECOND_DIFFERENCE = 0.36
+"""Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""
+JUMP = 5.0
+"""Deviations of the noise as which a jump counts at most."""
+CHANGES, LARGEST_STEP_NM = 50.0, 0.2
+"""Changes of a torque sensor's value from which on the smallest is its step, and the largest step that is believed."""
+ROUGHNESS_S, ROUGHNESS_LOST_S = 0.3, 20.0
+"""Memory of the velocity's roughness, and with which it goes back while the joint moves."""
+STRAIN = 2.0
+LARGEST_STRAIN = 8.0
+"""A contact while learning doubles the thresholds, three times at most."""
+STRAIN_S = 10.0
+"""Time constant with which the strain goes back, and with which the residual's largest share is forgotten."""
+RELAXED = 0.6
+"""Share of its threshold that the residual must stay below for that."""
+RESTING, MOVING = 0.2, 0.05
+"""Share of standstill in a filter's memory from which on a joint counts as resting, and below which friction is what
+the model says it is."""
+AGREES = 0.4
+"""Share of its threshold that the smoothed channel has at least when the bare one finds a push: 0.5 to 0.75."""
+BARE = 1.15
+"""A bare filter leaves nothing else to average it: in 24 h of clean motion it came to 1.02 of a threshold without."""
+UNIT_PEAK = 4.0
+"""Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
+SMALLEST_UNIT = 0.05
+LARGEST_UNIT = 9.0
+"""Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
+UNIT_S = 20.0
+"""Memory of the unit: some swings of a slow motion."""
+UNIT_TEST_S = 0.3
+"""The same while a frozen model is tested: begun with a unit of 1 it ends near a quarter of it if all is well."""
+VELOCITY_STD_SHARE = 0.12
+"""Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
+
+_SMOOTHED_SHARE = 0.335 / 200.0
+_SMOOTHED_FALL_RAD_S = 600.0
+
+
+def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, Vector]:
+    """Return, by channel (2 C - 1,), (k_tau sigma_tau)² in Nm² and nu² in rad²/s⁴."""
+    a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
+    width = np.concatenate([a * s / (a + s), a[1:]])
+    smoothed = np.minimum(_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), 1.0)
+    share = np.concatenate([smoothed, np.full(a.size - 1, BARE)])
+    nu = certified.velocity_noise_rad_s * np.concatenate([a, a[1:]]) * share
+    gain = certified.noise_sigmas**2 * 0.5 * period_s * width
+    return {
+        "torque_variance": certified.torque_noise_Nm**2 * gain,
+        "torque_gain": gain,
+        "velocity_variance": nu**2,
+        "velocity_noise_rad_s": np.array(certified.velocity_noise_rad_s),
+        "roughness_share": np.array(period_s / ROUGHNESS_S),
+        "roughness_loss": np.array(period_s / ROUGHNESS_LOST_S),
+        "strain_share": np.array(period_s / STRAIN_S),
+        "unit_share": np.array(period_s / UNIT_S),
+        "unit_test_share": np.array(period_s / UNIT_TEST_S),
+        "velocity_std_rad_s": np.array(VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
+    }
+
+
+@compiled
+def follow_standstill(
+    dq: Vector,
+    before: Vector,
+    still_rad_s: float,
+    decay: Vector,
+    smoothing: float,
+    still: Vector,
+    still_smooth: Vector,
+) -> None:
+    """Filter with DC gain 1, into `still` (C, n) from 0 to 1, whether each joint may stand still, and smooth it.
+
+    before (n,): dq one sample ago. One that turns round between two samples has stood still, and its lag lets friction
+    turn a sample or two before the measured velocity does.
+    """
+    for c in range(still.shape[0]):
+        for i in range(dq.shape[0]):
+            has_turned = dq[i] * before[i] < 0.0
+            target = 1.0 if abs(dq[i]) < still_rad_s or has_turned else 0.0
+            still[c, i] = target + decay[c] * (still[c, i] - target)
+            still_smooth[c, i] = still[c, i] + smoothing * (still_smooth[c, i] - still[c, i])
+
+
+@compiled
+def follow_torque_step(k: Any, m: Any, tau_J: Vector) -> None:
+    """Take one sample into the sensors' step L (n,), the smallest change ever seen, and how far it pulls their mean.
+
+    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. Until
+    enough changes were seen L is 0: the first ones may be a push.
+    """
+    for i in range(tau_J.shape[0]):
+        change = abs(tau_J[i] - m["last"][2, i])  # nan of the first sample
+        if not change > 0.0:
+            continue
+        m["torque_changes"][i] += 1.0
+        m["torque_change_Nm"][i] = change if m["torque_changes"][i] == 1.0 else min(change, m["torque_change_Nm"][i])
+        step_Nm = min(m["torque_change_Nm"][i], LARGEST_STEP_NM)
+        if m["torque_changes"][i] >= CHANGES and step_Nm != m["torque_step_Nm"][i]:
+            m["torque_step_Nm"][i] = step_Nm
+            variance = k["torque_noise_Nm"] ** 2 * m["roughness"][i]
+            m["torque_pull_Nm"][i] = step_Nm / np.pi * math.exp(-2.0 * np.pi**2 * variance / step_Nm**2)
+
+
+@compiled
+def follow_velocity_noise(k: Any, m: Any, dq: Vector, is_steady: bool) -> None:
+    """Take one sample into the roughness (n,) of the velocity: its noise over the settings', squared.
+
+    Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
+    encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most. After a gap, or on
+    the line over one (is_steady: neither), a sample only becomes the last.
+
+    It is forgotten soon, but for what is kept (`keep_velocity_noise`).
+    """
+    floor = (SECOND_DIFFERENCE * k["velocity_noise_rad_s"]) ** 2
+    for i in range(dq.shape[0]):
+        ddq = dq[i] - m["dq_old"][i]
+        if is_steady and floor > 0.0:
+            square = (ddq - m["ddq_old"][i]) ** 2 / floor
+            square = min(square, JUMP**2 * m["roughness_now"][i])
+            now = max(m["roughness_now"][i] + k["roughness_share"] * (square - m["roughness_now"][i]), 1.0)
+            m["roughness_now"][i] = now
+            m["velocity_roughness"][i] = max(now, m["roughness_kept"][i])
+        m["ddq_old"][i] = ddq
+        m["dq_old"][i] = dq[i]
+
+
+@compiled
+def keep_velocity_noise(k: Any, m: Any) -> None:
+    """Keep the largest roughness (n,) of a sample that nothing touched, until motion shows less.
+
+    At rest an encoder that doesn't count shows no noise, and has it again with the first count.
+    """
+    for i in range(m["roughness_kept"].shape[0]):
+        now, kept = m["roughness_now"][i], m["roughness_kept"][i]
+        if abs(m["dq_old"][i]) > friction.SLOW_RAD_S:
+            kept -= k["roughness_loss"] * (kept - now)
+        m["roughness_kept"][i] = max(kept, now)
+
+
+@compiled
+def strain(m: Any, largest: float) -> None:
+    """Doubt the thresholds of the joints that are over theirs now: a contact while learning may be the model's failure.
+
+    Once it may be a hand; again and again it is what no parameter explains, such as backlash. Then the arm is armed
+    with higher thresholds rather than never.
+    """
+    for i in range(m["strain"].shape[0]):
+        for c in range(m["y"].shape[0]):
+            if not (abs(m["y"][c, i]) <= m["h"][c, i]):
+                m["strain"][i] = min(STRAIN * m["strain"][i], max(largest, m["strain"][i]))
+                break
+
+
+@compiled
+def relax(k: Any, m: Any) -> None:
+    """Take one sample without contact into the strain (n,): it goes back while the residual leaves room for it."""
+    for i in range(m["strain"].shape[0]):
+        share = 0.0
+        for c in range(m["y"].shape[0]):
+            share = max(share, abs(m["y"][c, i]) / m["h"][c, i])
+        m["peak_share"][i] = max(m["peak_share"][i], share)
+        m["used"][i] = max(share, m["used"][i] * (1.0 - k["strain_share"]))
+        if m["used"][i] < RELAXED:
+            m["strain"][i] = max(m["strain"][i] * (1.0 - k["strain_share"]), 1.0)
+
+
+@compiled
+def follow_unit(k: Any, m: Any, fit: int, share: float) -> None:
+    """Take one sample without contact into the unit (n,) of the belief's variances; share: what it counts.
+
+    fit: filter by whose residual. In a faster one the velocity's noise would count as the model's error.
+    """
+    for i in range(m["unit"].shape[0]):
+        w = m["W_f"][fit, i]
+        believed = k["residual_Nm"] ** 2 + m["held"][fit, i] ** 2
+        for j in range(w.shape[0]):
+            row = 0.0
+            for n in range(w.shape[0]):
+                row += m["P"][j, n] * w[n]
+            believed += w[j] * row
+        if not np.isfinite(believed):
+            continue
+        ratio = m["r"][fit, i] ** 2 / believed
+        unit = m["unit"][i] + share * (UNIT_PEAK * ratio - m["unit"][i])
+        m["unit"][i] = min(max(unit, SMALLEST_UNIT), LARGEST_UNIT)
+
+
+@compiled
+def fill_thresholds(k: Any, m: Any, h: Vector) -> None:
+    """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
+    filters = m["r"].shape[0]
+    for i in range(h.shape[1]):
+        momentum = momentum_noise(m, i)
+        hold = m["hold"][i]
+        for c in range(filters):
+            g = k["model_sigmas"] * np.sqrt(_doubt(k, m, m["W_f"][c, i], m["unit"][i]))
+            m["doubt"][c, i] = g + k["smoothing"] * (m["doubt"][c, i] - g)
+            h[c, i] = _threshold(k, m, c, i, momentum, m["doubt"][c, i]) + hold * m["still_smooth"][c, i]
+            if c > 0:
+                bare = filters + c - 1
+                h[bare, i] = _threshold(k, m, bare, i, momentum, g) + hold * m["still"][c, i]
+
+
+@compiled
+def momentum_noise(m: Any, joint: int) -> float:
+    """Return (M R M')_ii of a joint."""
+    total = 0.0
+    for j in range(m["M"].shape[1]):
+        total += m["velocity_roughness"][j] * m["M"][joint, j] ** 2
+    return float(total)
+
+
+@compiled
+def follow_friction(k: Any, m: Any) -> None:
+    """Fill the torque (n,) that friction may hold at standstill, and how much of it is in each filter (C, n) now, Nm.
+
+    Friction at rest is no noise that averages out: of a joint that mostly rested it is inf, so nothing is learnt.
+    """
+    for i in range(m["hold"].shape[0]):
+        m["hold"][i] = k["standstill_share"] * _static_friction(k, m, i)
+        for c in range(m["held"].shape[0]):
+            m["held"][c, i] = held_Nm(m, i, m["still"][c, i])
+
+
+@compiled
+def held_Nm(m: Any, joint: int, still: float) -> float:
+    """Return how much torque friction may hold in a filter whose memory is by `still` of standstill."""
+    return float(m["hold"][joint] * still) if still < RESTING else np.inf
+
+
+@compiled
+def _static_friction(k: Any, m: Any, joint: int) -> float:
+    """Return the most that friction is believed to hold of a joint that stands still, Nm."""
+    coulomb = int(k["first_coulomb"]) + joint
+    total = max(m["theta"][coulomb], 0.0) + np.sqrt(max(m["P"][coulomb, coulomb], 0.0))
+    for position in range(k["terms"].shape[0]):
+        if k["terms"][position] == friction.STRIBECK:
+            term = int(k["first_term"]) + position * m["r"].shape[1] + joint
+            total += max(m["theta"][term], 0.0) + np.sqrt(max(m["P"][term, term], 0.0))
+    return float(total)
+
+
+@compiled
+def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float) -> float:
+    """Return a channel's threshold but for standstill, and keep what it is without the floor."""
+    lost = m["lost"][bank.filter_of(channel, m["lost"].shape[0]), joint]
+    noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
+    noise += k["torque_gain"][channel] * m["torque_step_Nm"][joint] ** 2 / 12.0 + lost
+    m["h_model"][channel, joint] = m["strain"][joint] * np.sqrt(noise + g * g) + m["torque_pull_Nm"][joint]
+    return float(max(m["h_model"][channel, joint], m["tail_Nm"][channel, joint]))
+
+
+@compiled
+def fill_wide(k: Any, m: Any, c: int) -> None:
+    """Fill standard deviation and lower threshold (n,) of the external torque with filter c undone.
+
+    The undone filter is a mean over five samples of what went into it: its noise is white torque noise over five, and
+    of the velocity its change over five samples. A slow push is seen in the slow filters first: the threshold is the
+    least of all channels'.
+    """
+    samples = float(contact_estimate.WIDE_SAMPLES)
+    span_s = samples * k["period_s"]
+    for i in range(m["r"].shape[1]):
+        momentum = momentum_noise(m, i)
+        noise = k["torque_noise_Nm"] ** 2 * m["roughness"][i] / samples
+        velocity = 2.0 * (k["velocity_std_rad_s"] / span_s) ** 2 * momentum
+        doubt = m["doubt"][c, i] / k["model_sigmas"]
+        m["wide_sigma"][i] = np.sqrt(noise + velocity + doubt * doubt)
+        m["wide_threshold"][i] = np.min(m["h"][:, i])
+
+
+@compiled
+def _doubt(k: Any, m: Any, w: Vector, unit: float) -> float:
+    """Return w (u P + D) w'."""
+    total = 0.0
+    for j in range(w.shape[0]):
+        row = 0.0
+        for n in range(w.shape[0]):
+            row += m["P"][j, n] * w[n]
+        total += unit * w[j] * row + (k["model_error"][j] * m["theta"][j] * w[j]) ** 2
+    return max(total, 0.0)
+
+
+@compiled
+def joints_over(y: Vector, h: Vector) -> int:
+    """Return the joints that are over their threshold in any channel, as bits; what is not a number counts as over.
+
+    A bare channel needs the smoothed one of its filter to agree, see AGREES. A push makes them rise together; what a
+    step of the encoder or a gear's play leaves for a sample or two is in the bare one alone.
+    """
+    filters = (y.shape[0] + 1) // 2
+    joints = 0
+    for c in range(y.shape[0]):
+        for i in range(y.shape[1]):
+            is_over = not (abs(y[c, i]) <= h[c, i])
+            if is_over and c >= filters and np.isfinite(y[c, i]):
+                smoothed = bank.filter_of(c, filters)
+                is_over = not (abs(y[smoothed, i]) <= AGREES * h[smoothed, i])
+            if is_over:
+                joints |= 1 << i
+    return joints

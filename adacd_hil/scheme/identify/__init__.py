@@ -1,0 +1,1 @@
+"""What is learnt of an arm, and what judges it."""

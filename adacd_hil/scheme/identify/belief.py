@@ -1,0 +1,172 @@
+"""What is believed of the parameters: mean theta and covariance P, corrected by samples that have waited.
+
+The prior says in honest units what an arm may be; recursive least squares (`estimator`) corrects it. A filtered sample
+is no independent measurement: the noise of a filter of cut-off a is correlated over about 2 / a. A sample every
+T_learn therefore counts with the variance
+
+    R = sigma² 2 / (a T_learn),    sigma: what a good model leaves in the filtered residual, Nm rms,
+
+so that P means what it says. Friction of a joint that stands still is any torque up to the static one: what of it is in
+the filter counts as further deviation, and a joint that mostly rests teaches nothing.
+
+**Payload.** One of mass m at the tip adds m (l1² + l2², l1 l2, l2²) to (a1, a2, a3): the belief widens along this
+direction g by sigma_m² g g', and a little in each inertia for what is no point mass. All else stays known.
+
+**Lags.** Their column is the derivative of a torque that is measured with noise. Where the motion changes the torque
+little the column is mostly noise, and an estimate from it shrinks towards zero, the more the longer it goes on. So lags
+are learnt on the excitation, and *held* after it (`hold_lags`).
+
+**Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
+
+Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_still (h, n).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import Vector
+from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.identify import estimator, missing_torque
+from adacd_hil.scheme.model import bank, friction
+
+_SWEEPS = 200
+"""Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
+_SETTLED = 1e-9
+"""Nm or Nm s/rad that the last sweep may still have moved one of them by."""
+
+
+@compiled
+def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
+    """Set theta (p,) and P (p, p) to the prior and its standard deviations (p,)."""
+    theta[:] = prior
+    P[:] = 0.0
+    for j in range(theta.shape[0]):
+        P[j, j] = prior_std[j] ** 2
+
+
+@compiled
+def add_payload(direction: Vector, payload_std_kg: float, inertia_std: float, P: Vector) -> None:
+    """Widen P (p, p) in place by a payload: mass along `direction` (p,), and a rest in each of its parameters."""
+    for j in range(direction.shape[0]):
+        for k in range(direction.shape[0]):
+            P[j, k] += payload_std_kg**2 * direction[j] * direction[k]
+        if direction[j] != 0.0:
+            P[j, j] += inertia_std**2
+
+
+@compiled
+def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
+    """Widen P (p, p) in place by a random walk of the parameters, `drift_std` (p,) per √s, as far as it shows.
+
+    By |w| of the row W_f (n, p) that shows a parameter most, 1 at most. One that hardly shows would else be learnt from
+    the error of the others, such as friction that grows with the load from a load that hardly varies, and be far off
+    where it counts.
+    """
+    for j in range(drift_std.shape[0]):
+        shown = 0.0
+        for i in range(W_f.shape[0]):
+            shown = max(shown, abs(W_f[i, j]))
+        P[j, j] += (drift_std[j] * min(shown, 1.0)) ** 2 * elapsed_s
+
+
+@compiled
+def learn(k: Any, m: Any) -> bool:
+    """Put this sample, W_learnt (n, p) and tau_learnt (n,), into the ring; return whether the belief has changed.
+
+    It is corrected by the sample that has waited long enough, if one has.
+    """
+    W, tau_J, still = m["W_learnt"], m["tau_learnt"], m["still_smooth"][bank.LEARNT]
+    m["since_learnt"] += 1.0
+    if m["since_learnt"] < k["learn_every"]:
+        return False
+    m["since_learnt"] = 0.0
+    place = int(m["ring_next"])
+    has_waited = m["ring_used"] == m["ring_tau"].shape[0]
+    if has_waited:
+        for i in range(tau_J.shape[0]):
+            R = m["ring_R"][place, i]
+            w, tau = m["ring_W"][place, i], m["ring_tau"][place, i]
+            if np.inf == R:
+                continue
+            missing_torque.add(k, m, place, i)
+            epsilon, s = estimator.correct(w, tau, R, True, m["belief"], m["P_belief"], m["v"], m["K"])
+            m["fit_square"] += epsilon * epsilon / (s - R + R / k["correlated"])
+            m["fit_rows"] += 1.0
+    else:
+        m["ring_used"] += 1.0
+    m["ring_W"][place] = W
+    missing_torque.keep(k, m, place)
+    for i in range(still.shape[0]):
+        m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > friction.SLOW_RAD_S else 1.0
+    m["ring_tau"][place] = tau_J
+    if m["are_lags_held"] != 0.0:
+        _take_out_lags(k, m, place)
+    for i in range(tau_J.shape[0]):
+        m["ring_R"][place, i] = k["correlated"] * (k["residual_Nm"] ** 2 + sensitivity.held_Nm(m, i, still[i]) ** 2)
+    m["ring_next"] = (place + 1) % m["ring_tau"].shape[0]
+    return bool(has_waited)
+
+
+@compiled
+def hold_lags(k: Any, m: Any) -> None:
+    """Learn the lags no further; what is left open of them stays open, and moves nothing else."""
+    m["are_lags_held"] = 1.0
+    P = m["P_belief"]
+    first = int(k["base"]) + m["ring_tau"].shape[1]
+    for j in range(first, first + m["ring_tau"].shape[1]):
+        variance = P[j, j]
+        P[j, :] = 0.0
+        P[:, j] = 0.0
+        P[j, j] = variance
+
+
+@compiled
+def _take_out_lags(k: Any, m: Any, place: int) -> None:
+    joints = m["ring_tau"].shape[1]
+    first = int(k["base"]) + joints
+    for i in range(joints):
+        for j in range(first, first + joints):
+            m["ring_tau"][place, i] -= m["ring_W"][place, i, j] * m["belief"][j]
+            m["ring_W"][place, i, j] = 0.0
+
+
+@compiled
+def discard(m: Any) -> None:
+    """Throw away the samples that wait."""
+    m["ring_used"] = 0.0
+    m["since_learnt"] = 0.0
+
+
+@compiled
+def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
+    """Move theta (p,) in place so that none of its parameters first .. last - 1 is negative.
+
+    To the nearest such theta in the metric of P, theta + P lambda with lambda >= 0: each one that is negative is pushed
+    to zero and takes the others along as P says they belong together; one that was taken further is let go again
+    (Hildreth's method). P stays; it is no less uncertain for that.
+    """
+    pushed = np.zeros(last - first)
+    for _ in range(_SWEEPS):
+        moved = 0.0
+        for j in range(first, last):
+            if not P[j, j] > 0.0:
+                continue
+            push = max(-theta[j] / P[j, j], -pushed[j - first])
+            pushed[j - first] += push
+            for n in range(theta.shape[0]):
+                theta[n] += push * P[n, j]
+            moved = max(moved, abs(push) * P[j, j])
+        if moved < _SETTLED:
+            break
+    for j in range(first, last):
+        theta[j] = max(theta[j], 0.0)
+
+
+def payload_direction(link_length_m: tuple[float, float], count: int) -> Vector:
+    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,)."""
+    l1, l2 = link_length_m
+    direction = np.zeros(count)
+    direction[:3] = l1**2 + l2**2, l1 * l2, l2**2
+    return direction

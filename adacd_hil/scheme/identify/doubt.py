@@ -1,0 +1,318 @@
+"""What contacts have in common: a certificate that is wrong meets the same cause again and again.
+
+While a contact lasts and the arm still moves, the residual r of a filter is compared with what each single error c of
+the model would leave, w = -W_f c: a payload at the tip, a joint's Coulomb or viscous friction. Not a torque offset: who
+leans on the arm again and again leaves the same. From sums over the samples, held-back ones from before the contact
+included,
+
+    size = Σ r w / Σ w²,    share = (Σ r w)² / (Σ w² Σ r²),    sigma = RESIDUAL_NM sqrt(correlated / Σ w²)
+
+A joint that rested before held some torque, which the filter forgets as fast as its share s of standstill. What such
+a torque explains goes from r and w: r - s Σ r s / Σ s², w likewise. What a good model leaves in n samples, n
+RESIDUAL_NM², goes from Σ r²; of a contact that was found soon that is much.
+
+Contacts that no cause explains take the certificate back, too, where a person is not likely: MANY in a row, each but
+the first within HELD_S of going on; or weak ones, less than WEAK times their threshold, that are likelier at
+OFTEN_PER_H than at RARELY_PER_H by ODDS. Three in 6.8 min are.
+
+An arm that meets the next contact AT_REST_S after going on would never move far enough to tell what it is: the
+thresholds of the joints that showed it double, to MOST_STRAIN times at most, and fall back as in `sensitivity`.
+
+Shapes: c (h, p), sums (h,), of the share of standstill (h, n) and (n,).
+"""
+
+from collections import deque
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.identify import belief
+from adacd_hil.scheme.model import bank, friction
+from adacd_hil.structured import Structured
+
+WITHIN_S = 60.0
+"""How far back the end of a contact may lie."""
+RESIDUAL_NM = 0.012
+"""Rms that a good model leaves behind it."""
+FEWEST_LOADED, FEWEST = 2, 3
+"""Contacts that agree in a payload, or in another error."""
+SHARE, SHARE_OF_ALL = 0.75, 0.9
+"""Of a contact's squared residual that one error explains; of all their residuals, that a payload does."""
+LEAST_SHARE = 0.5
+"""Of a contact's Σ r² that stays, however much of it a good model may have left."""
+SPREAD_LOADED, SPREAD = 0.15, 0.3
+"""By how much of its size the contacts may differ, beside 2 sigma."""
+SURE = 8.0
+"""Sigmas that a size is at least."""
+PLAUSIBLE = 4.0
+"""Deviations of the prior that a friction is at most."""
+AT_ONCE_S = 3.0
+"""Another error than a payload strikes again so soon after the arm goes on; a person may wait."""
+AT_REST_S, MOST_STRAIN = 0.2, 4.0
+"""A contact so soon after going on is met at rest, and raises the thresholds of its joints, to this many times."""
+MANY, HELD_S = 10, 0.3
+"""So many contacts in a row, each so soon after going on, are no person's. No more are remembered."""
+WEAK = 1.5
+"""The residual of a weak contact comes to less than so many times its threshold."""
+RARELY_PER_H, OFTEN_PER_H, ODDS = 1.0, 30.0, 1000.0
+"""Weak contacts an hour of a person, and of a model that is wrong; how many times likelier the latter must be."""
+_FRICTIONS = (("Coulomb friction", "Nm"), ("viscous friction", "Nm s/rad"))
+TOLD_NOTHING = 0.6
+"""Share of standstill in a filter's memory from which on a sample of its joint tells nothing of a cause."""
+
+
+def constants_of(settings: Settings, count: int) -> dict[str, Vector]:
+    """Return `causes` (h, p): a payload of 1 kg, then by joint Coulomb and viscous friction."""
+    unit = np.eye(count)
+    first = PARAMETER_NAMES.index("F_c1"), PARAMETER_NAMES.index("F_v1")
+    rows = [belief.payload_direction(settings.arm.link_length_m, count)]
+    rows += [unit[place + i] for i in range(JOINTS) for place in first]
+    return {"causes": np.array(rows)}
+
+
+def shapes_of() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    causes = (1 + len(_FRICTIONS) * JOINTS,)
+    each = (JOINTS,)
+    return {
+        "cause_rw": causes, "cause_ww": causes, "cause_ws": (*causes, JOINTS),
+        "contact_rr": (), "contact_rows": (), "contact_peak": (), "contact_rs": each, "contact_ss": each,
+    }  # fmt: skip
+
+
+@compiled
+def react(memory: Structured, is_touched: bool, is_soon: bool) -> None:
+    """Take in that the arm reacts.
+
+    is_touched: to a touch; else there is nothing to weigh. is_soon: right after going on, so the thresholds double.
+    """
+    m = memory[0]
+    if not is_touched:
+        _clear(m)
+    elif is_soon:
+        sensitivity.strain(m, MOST_STRAIN)
+
+
+@compiled
+def _clear(m: Any) -> None:
+    m["cause_rw"][:] = 0.0
+    m["cause_ww"][:] = 0.0
+    m["cause_ws"][:] = 0.0
+    m["contact_rs"][:] = 0.0
+    m["contact_ss"][:] = 0.0
+    m["contact_rr"] = 0.0
+    m["contact_rows"] = 0.0
+    m["contact_peak"] = 0.0
+
+
+@compiled
+def begin(k: Any, m: Any) -> None:
+    """Begin a contact, with the samples that were held back."""
+    _clear(m)
+    _follow_peak(m)
+    for s in range(int(m["ring_used"])):
+        for i in range(m["ring_tau"].shape[1]):
+            if m["ring_still"][s, i] < TOLD_NOTHING:
+                _add(k, m, i, m["ring_W"][s, i], m["ring_tau"][s, i], m["ring_still"][s, i], k["learn_every"])
+
+
+@compiled
+def weigh(k: Any, m: Any) -> None:
+    """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
+    _follow_peak(m)
+    for i in range(m["tau_f"].shape[1]):
+        if m["still_smooth"][bank.LEARNT, i] < TOLD_NOTHING and abs(m["dq_old"][i]) > friction.SLOW_RAD_S:
+            _add(k, m, i, m["W_learnt"][i], m["tau_learnt"][i], m["still_smooth"][bank.LEARNT, i], 1.0)
+
+
+@compiled
+def _follow_peak(m: Any) -> None:
+    for c in range(m["y"].shape[0]):
+        for i in range(m["y"].shape[1]):
+            m["contact_peak"] = max(m["contact_peak"], abs(m["y"][c, i]) / m["h"][c, i])
+
+
+@compiled
+def _add(k: Any, m: Any, i: int, w: Vector, tau: float, still: float, weight: float) -> None:
+    """Take in one row w (p,) of joint i."""
+    r = -tau
+    for j in range(w.shape[0]):
+        r += w[j] * m["theta"][j]
+    m["contact_rr"] += weight * r * r
+    m["contact_rows"] += weight
+    m["contact_rs"][i] += weight * r * still
+    m["contact_ss"][i] += weight * still * still
+    for h in range(m["cause_rw"].shape[0]):
+        left = 0.0
+        for j in range(w.shape[0]):
+            left -= w[j] * k["causes"][h, j]
+        m["cause_rw"][h] += weight * r * left
+        m["cause_ww"][h] += weight * left * left
+        m["cause_ws"][h, i] += weight * left * still
+
+
+class Verdict(NamedTuple):
+    """What contacts look like. text: in words; is_payload: something was picked up, or put down."""
+
+    text: str
+    is_payload: bool
+
+
+class _Weighed(NamedTuple):
+    """One contact's sums (h,). waited_s: from when the arm went on to its begin; ended_s: when it was over.
+
+    peak: largest residual over its threshold; 0 of none.
+    """
+
+    rw: Vector
+    ww: Vector
+    rr: float
+    peak: float
+    waited_s: float
+    ended_s: float
+
+
+class Doubt:
+    """Remembers the contacts of a certificate, and tells whether one cause explains the last ones."""
+
+    def __init__(self, settings: Settings, constants: Structured, memory: Structured) -> None:
+        self._constants, self._memory = constants[0], memory
+        self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[bank.LEARNT] * settings.bus.period_s)
+        self._period_s = settings.bus.period_s
+        self._contacts: deque[_Weighed] = deque(maxlen=MANY)
+        self._monitored_s = 0.0
+        self._waited_s = 0.0
+        self._log_odds, self._weak = 0.0, 0
+        self._contradiction: Verdict | None = None
+
+    def compile(self) -> None:
+        """Call what is compiled once, on a copy, so that nothing compiles later."""
+        react(self._memory.copy(), True, True)
+
+    def forget(self) -> None:
+        """Begin with a new certificate."""
+        self._contacts.clear()
+        self._log_odds, self._weak = 0.0, 0
+
+    def go_on(self, cycle: int) -> None:
+        """Take in that the arm monitors from this cycle on."""
+        self._monitored_s = cycle * self._period_s
+
+    def begin(self, cycle: int, is_touched: bool, contradiction: Verdict | None = None) -> None:
+        """Take in that the arm reacts: to a touch or, as where the host is late, to none.
+
+        contradiction: what contradicts the certificate, if it reacts to that.
+        """
+        self._contradiction = contradiction
+        self._waited_s = cycle * self._period_s - self._monitored_s
+        likelier = (OFTEN_PER_H - RARELY_PER_H) / 3600.0 * self._waited_s
+        self._log_odds = max(self._log_odds - likelier, 0.0)
+        self._weak = self._weak if self._log_odds > 0.0 else 0
+        react(self._memory, is_touched, self._waited_s < AT_REST_S)
+
+    def end(self, cycle: int) -> Verdict | None:
+        """Take in that it has ended; return what the last ones look like, if they have one cause."""
+        if self._contradiction is not None:
+            return self._contradiction
+        now_s = cycle * self._period_s
+        last = _weighed(self._memory[0], self._waited_s, now_s)
+        self._contacts.append(last)
+        if 0.0 < last.peak < WEAK and last.waited_s >= AT_REST_S:
+            self._log_odds += np.log(OFTEN_PER_H / RARELY_PER_H)
+            self._weak += 1
+        while self._contacts[0].ended_s < now_s - WITHIN_S:
+            self._contacts.popleft()
+        return self._payload() or self._other() or self._unexplained()
+
+    def _payload(self) -> Verdict | None:
+        for count in range(FEWEST_LOADED, len(self._contacts) + 1):
+            last = list(self._contacts)[-count:]
+            rw, ww, rr = (sum(column) for column in zip(*((c.rw[0], c.ww[0], c.rr) for c in last), strict=True))
+            kg = self._common(last, 0, SPREAD_LOADED)
+            if kg is not None and rw * rw > SHARE_OF_ALL * ww * rr and abs(kg) > SURE * self._sigma(ww):
+                kg, sigma = self._size(last, 0)
+                what = "picked up" if kg > 0.0 else "put down"
+                return Verdict(f"{count} contacts look like {abs(kg):.2f} ± {sigma:.2f} kg {what}", is_payload=True)
+        return None
+
+    def _other(self) -> Verdict | None:
+        last = list(self._contacts)[-FEWEST:]
+        if len(last) < FEWEST or max(contact.waited_s for contact in last[1:]) > AT_ONCE_S:
+            return None
+        for h in sorted(range(1, len(last[0].rw)), key=partial(_explained, last), reverse=True):
+            size = self._common(last, h, SPREAD)
+            ww = sum(contact.ww[h] for contact in last)
+            if size is not None and abs(size) > SURE * self._sigma(ww) and self._can_be(h, size):
+                joint, kind = divmod(h - 1, len(_FRICTIONS))
+                text = _words(kind, joint, *self._size(last, h))
+                return Verdict(f"{len(last)} contacts look like {text}", is_payload=False)
+        return None
+
+    def _unexplained(self) -> Verdict | None:
+        """Return what is to be said if no person is likely to touch so."""
+        last = list(self._contacts)[-MANY:]
+        text = ""
+        if len(last) == MANY and max(contact.waited_s for contact in last[1:]) < HELD_S:
+            text = f"{MANY} contacts came within {HELD_S:g} s of going on each"
+        elif self._log_odds > np.log(ODDS):
+            text = f"{self._weak} contacts came to less than {WEAK:g} times their threshold"
+        if not text:
+            return None
+        return Verdict(
+            f"{text}, and no one error explains them: a light touch, or the arm has changed", is_payload=False
+        )
+
+    def _can_be(self, h: int, size: float) -> bool:
+        """Tell whether an arm may have so much more of a friction than the model: none has less than none."""
+        cause = self._constants["causes"][h]
+        total = float(cause @ self._memory[0]["theta"]) + size
+        return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._constants["prior_std"])
+
+    def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
+        """Return the size of cause h that explains each of the contacts, or None."""
+        ww = sum(contact.ww[h] for contact in contacts)
+        if not ww > 0.0:
+            return None
+        size = float(sum(contact.rw[h] for contact in contacts) / ww)
+        for contact in contacts:
+            rw, own = contact.rw[h], contact.ww[h]
+            if not rw * rw >= SHARE * own * contact.rr or not own > 0.0:
+                return None
+            if abs(rw / own - size) > spread * abs(size) + 2.0 * self._sigma(own):
+                return None
+        return size
+
+    def _size(self, contacts: list[_Weighed], h: int) -> tuple[float, float]:
+        """Return the size of cause h and twice its deviation; the first contact may have begun with the change."""
+        ww = sum(contact.ww[h] for contact in contacts[1:])
+        return float(sum(contact.rw[h] for contact in contacts[1:]) / ww), 2.0 * self._sigma(ww)
+
+    def _sigma(self, ww: float) -> float:
+        return float(RESIDUAL_NM * np.sqrt(self._correlated / ww))
+
+
+def _weighed(m: Any, waited_s: float, now_s: float) -> _Weighed:
+    """Return a contact's sums, less what each joint's torque at rest explains, and what a good model leaves."""
+    ss = np.maximum(m["contact_ss"], 1e-12)
+    rs, ws = m["contact_rs"], m["cause_ws"]
+    rw = m["cause_rw"] - ws @ (rs / ss)
+    ww = np.maximum(m["cause_ww"] - (ws * ws) @ (1.0 / ss), 0.0)
+    rr = float(m["contact_rr"] - np.sum(rs * rs / ss))
+    rr = max(rr - RESIDUAL_NM**2 * float(m["contact_rows"]), LEAST_SHARE * rr)
+    return _Weighed(rw, ww, rr, float(m["contact_peak"]), waited_s, now_s)
+
+
+def _explained(contacts: list[_Weighed], h: int) -> float:
+    """Return how much of the contacts' squared residuals cause h explains."""
+    return float(sum(contact.rw[h] ** 2 / contact.ww[h] for contact in contacts if contact.ww[h] > 0.0))
+
+
+def _words(kind: int, joint: int, size: float, sigma: float) -> str:
+    name, unit = _FRICTIONS[kind]
+    more = "more" if size > 0.0 else "less"
+    return f"{abs(size):.2f} ± {sigma:.2f} {unit} {more} {name} of joint {joint + 1} than was certified"

@@ -1,0 +1,367 @@
+"""Evidence that the model lacks a torque: one that depends on where the arm is, or that of elastic joints.
+
+Each sample that the belief learns, a row w of the regressor with its torque and variance R, also goes into the sums
+
+    L = Σ v v'/R,   b = Σ v r/R,   r = tau_f - w prior,   v = (w, x, e)
+
+with x the columns of `position` behind the filter that is learnt from, and e those of elastic joints: encoders on the
+motors see q + tau_J/K in place of q, which leaves M d²tau_J/dt² / K, filtered as the rest. From a prior N(0, S²) of the
+parameters less their mean, with x, with e, or without, each sum says how likely the samples are:
+
+    log evidence = ½ b' S M^-1 S b - ½ log det M,   M = I + S L S
+
+The model lacks a torque by place if x makes them e^GAIN times likelier, leaves less than 1 - SHARE of the weighted
+squares that the basic model leaves, and comes to LEAST_NM rms. Of clean arms, with every error of
+`tools/error_campaign.py` but a tilt and a cable, the gain was -25 to -3, or the share below 0.4; tilts of 0.5 and 1
+deg and a cable of 0.1 Nm came to a gain of 20 and more on a motion that shows them.
+
+Its joints are elastic if e makes them e^ELASTIC_GAIN times likelier, with x and without. The same errors came to a
+gain of -10 to 10, elastic joints that swing at 8 Hz to 380 and more, at 15 Hz to 10 after 1.4 s and 24 after 2.4 s, at
+25 Hz to -4 to 2. 1/K itself is not to be had: torque noise is in e, and makes it too small.
+
+Asked of an adaptation as a whole, when it refuses a fit. A torque by place is asked for while the arm monitors, too: of
+the first 2 s, the next 4, 8, 16 s and then of each 16 s of learnt samples. Not of longer ones: the drift of a sensor
+over a minute looks like this. There one stretch is not enough, since on one way much depends on the place: what it says
+must explain AGREES of the squares that the basic model leaves in a later one.
+
+Shapes: p parameters, n joints, f = p + n TERMS + n; evidence_L (n, f, f): by the joint of the row, lower half;
+evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n TERMS,): coefficients of the last
+stretch that came to a torque by place, all 0 if none did; missing_rms_Nm (n,): what was found last, 0 where nothing
+was; is_elastic: whether that was elasticity.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import Settings
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.identify.position import TERMS, fill
+from adacd_hil.scheme.model import bank
+
+EXPECTED_NM = 0.06
+"""Standard deviation of a coefficient, of an arm that has a cable."""
+EXPECTED_RAD_NM = 3e-3
+"""Standard deviation of 1/K, of an arm whose joints are elastic."""
+GAIN, SHARE, LEAST_NM = 8.0, 0.6, 0.01
+"""Of one stretch."""
+ELASTIC_GAIN = 20.0
+AGREES = 0.4
+LEAST_BACK = 0.2
+"""Share of a joint's samples that are of its less frequent direction: on a way in one direction what depends on speed,
+or on time, depends on the place."""
+STILL = 0.05
+"""Share of standstill in the filter's memory from which on friction may be any."""
+FIRST_S, LONGEST_S = 2.0, 16.0
+"""Learnt samples of which the first question is asked while the arm monitors, and each later one."""
+
+
+def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
+    """Return `evidence_std` (f,), and `evidence_first`, `evidence_longest` in learnt samples. prior_std (p,)."""
+    learn_s = settings.bus.period_s * settings.certified.learn_every
+    return {
+        "evidence_std": np.concatenate(
+            [prior_std, np.full(JOINTS * TERMS, EXPECTED_NM), np.full(JOINTS, EXPECTED_RAD_NM)]
+        ),
+        "smoothing_rad_s": np.array(settings.certified.smoothing_rad_s),
+        "evidence_first": np.array(round(FIRST_S / learn_s)),
+        "evidence_longest": np.array(round(LONGEST_S / learn_s)),
+    }
+
+
+def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name, of a model with this many parameters and a ring so long."""
+    full = count + JOINTS * TERMS + JOINTS
+    columns = (JOINTS, TERMS)
+    return {
+        "X": columns, "X_old": columns, "X_f": columns, "X_learnt": columns, "ring_X": (waiting, *columns),
+        "ring_E": (waiting, JOINTS, JOINTS),
+        "evidence_L": (JOINTS, full, full), "evidence_M": (full, full),
+        "evidence_b": (full,), "evidence_basic": (full,), "evidence_full": (full,), "evidence_row": (full,),
+        "evidence_scale": (full,),
+        "evidence_said": (JOINTS * TERMS,),
+        "evidence_yy": (), "evidence_weight": (JOINTS,), "evidence_ways": (JOINTS, 2),
+        "evidence_samples": (), "evidence_wanted": (),
+        "missing_rms_Nm": (JOINTS,), "is_elastic": (),
+    }  # fmt: skip
+
+
+@compiled
+def follow(m: Any, q: Vector, rates: Vector, smoothing: float, is_seen: bool) -> None:
+    """Take the columns (n, TERMS) over one period to what is learnt from; after a gap the filter resumes.
+
+    rates (3,): what one period does to the filter, see `filters.FirstOrderHold`; smoothing: to the pole behind it.
+    """
+    decay, weight_old, weight_new = rates[0], rates[1], rates[2]
+    X, X_old, X_f, X_learnt = m["X"], m["X_old"], m["X_f"], m["X_learnt"]
+    fill(q, X)
+    for i in range(q.shape[0]):
+        for term in range(TERMS):
+            if is_seen:
+                X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
+            X_old[i, term] = X[i, term]
+            X_learnt[i, term] = X_f[i, term] + smoothing * (X_learnt[i, term] - X_f[i, term])
+
+
+@compiled
+def keep(k: Any, m: Any, slot: int) -> None:
+    """Put the columns of this sample into a slot of the ring, where they wait with the row of the regressor.
+
+    The second derivative of a torque is that of its lag's column, which is the first.
+    """
+    m["ring_X"][slot] = m["X_learnt"]
+    joints = m["X_learnt"].shape[0]
+    first_lag = int(k["base"]) + joints
+    for i in range(joints):
+        lag = first_lag + i
+        ddtau_J = k["smoothing_rad_s"] * (m["W_f"][bank.LEARNT, i, lag] - m["W_learnt"][i, lag])
+        for joint in range(joints):
+            m["ring_E"][slot, joint, i] = m["M"][joint, i] * ddtau_J
+
+
+@compiled
+def clear(k: Any, m: Any) -> None:
+    """Begin anew: with another arm, as one with another payload, or with a certificate."""
+    _clear_sums(m)
+    m["evidence_said"][:] = 0.0
+    _clear_found(m)
+    m["evidence_wanted"] = k["evidence_first"]
+
+
+@compiled
+def _clear_found(m: Any) -> None:
+    m["missing_rms_Nm"][:] = 0.0
+    m["is_elastic"] = 0.0
+
+
+@compiled
+def _clear_sums(m: Any) -> None:
+    m["evidence_L"][:] = 0.0
+    m["evidence_b"][:] = 0.0
+    m["evidence_yy"] = 0.0
+    m["evidence_weight"][:] = 0.0
+    m["evidence_ways"][:] = 0.0
+    m["evidence_samples"] = 0.0
+
+
+@compiled
+def add(k: Any, m: Any, slot: int, joint: int) -> None:
+    """Take in the row of a joint from a slot of the ring, which is learnt; one that moves slowly tells nothing."""
+    if m["ring_still"][slot, joint] > STILL:
+        return
+    v, count = m["evidence_row"], m["belief"].shape[0]
+    R = m["ring_R"][slot, joint] + k["correlated"] * _rough_variance(k, m, joint)
+    v[:] = 0.0
+    v[:count] = m["ring_W"][slot, joint]
+    v[count + TERMS * joint : count + TERMS * (joint + 1)] = m["ring_X"][slot, joint]
+    v[_first_elastic(m) :] = m["ring_E"][slot, joint]
+    r = m["ring_tau"][slot, joint]
+    for j in range(count):
+        r -= v[j] * k["prior"][j]
+    L, b = m["evidence_L"][joint], m["evidence_b"]
+    for j in range(v.shape[0]):
+        if v[j] != 0.0:
+            b[j] += v[j] * r / R
+            for n in range(j + 1):
+                L[j, n] += v[j] * v[n] / R
+    m["evidence_ways"][joint, 1 if v[int(k["first_coulomb"]) + joint] > 0.0 else 0] += 1.0
+    m["evidence_yy"] += r * r / R
+    m["evidence_weight"][joint] += 1.0 / R
+
+
+@compiled
+def _rough_variance(k: Any, m: Any, joint: int) -> float:
+    """Return what a velocity that is noisier than the settings say leaves in what is learnt, Nm²: an encoder's steps.
+
+    At low speed they come slowly, so they count as the model's error does.
+    """
+    total = 0.0
+    for j in range(m["M"].shape[1]):
+        total += (m["velocity_roughness"][j] - 1.0) * m["M"][joint, j] ** 2
+    return float(sensitivity.VELOCITY_STD_SHARE**2 * k["velocity_variance"][bank.LEARNT] * total)
+
+
+@compiled
+def _first_elastic(m: Any) -> int:
+    return int(m["evidence_row"].shape[0] - m["missing_rms_Nm"].shape[0])
+
+
+@compiled
+def is_found_in_time(k: Any, m: Any) -> bool:
+    """Take in that a sample was learnt while the arm monitors; once in a while tell whether two stretches agree."""
+    m["evidence_samples"] += 1.0
+    if m["evidence_samples"] < m["evidence_wanted"]:
+        return False
+    _clear_found(m)
+    is_said = _is_by_place(k, m, _weigh_rigid(k, m))
+    said = m["evidence_full"][m["belief"].shape[0] : _first_elastic(m)].copy()
+    is_agreed = _is_said_again(k, m)
+    if is_said:
+        m["evidence_said"][:] = said
+    m["evidence_wanted"] = min(2.0 * m["evidence_wanted"], k["evidence_longest"])
+    _clear_sums(m)
+    return is_agreed
+
+
+@compiled
+def is_found(k: Any, m: Any) -> bool:
+    """Tell whether the model lacks a torque, by all samples there are; fill `missing_rms_Nm` (n,), `is_elastic`."""
+    _clear_found(m)
+    rigid = _weigh_rigid(k, m)
+    b, count, first, full = m["evidence_b"], m["belief"].shape[0], _first_elastic(m), m["evidence_full"]
+    by_place = _log_evidence(m, b, _scale_of(k, m, count, first), full)
+    both = _log_evidence(m, b, _scale_of(k, m, count, full.shape[0]), full)
+    elastic = _log_evidence(m, b, _scale_of(k, m, first, full.shape[0]), full)
+    if min(elastic - rigid, both - by_place) > ELASTIC_GAIN:
+        _fill_missing(m)
+        m["is_elastic"] = 1.0
+        return True
+    return _is_by_place(k, m, rigid)
+
+
+@compiled
+def _weigh_rigid(k: Any, m: Any) -> float:
+    """Fill `evidence_basic` (f,) with the model as it is, and return its log evidence."""
+    return float(_log_evidence(m, m["evidence_b"], _scale_of(k, m, 0, 0), m["evidence_basic"]))
+
+
+@compiled
+def _scale_of(k: Any, m: Any, first: int, last: int) -> Vector:
+    """Return the prior's deviations (f,) of the model and of columns first .. last - 1 beside it, 0 for the others."""
+    scale, count = m["evidence_scale"], m["belief"].shape[0]
+    scale[:] = 0.0
+    scale[:count] = k["evidence_std"][:count]
+    scale[first:last] = k["evidence_std"][first:last]
+    return scale  # type: ignore[no-any-return]
+
+
+@compiled
+def _is_by_place(k: Any, m: Any, rigid: float) -> bool:
+    """Tell whether the place explains what the model, of this log evidence, leaves; fill `missing_rms_Nm` (n,)."""
+    if k["position_torque_Nm"] != 0.0:
+        return False
+    basic, full = m["evidence_basic"], m["evidence_full"]
+    scale = _scale_of(k, m, m["belief"].shape[0], _first_elastic(m))
+    gain = _log_evidence(m, m["evidence_b"], scale, full) - rigid
+    if not (gain > GAIN and _squares_left(m, full) < (1.0 - SHARE) * _squares_left(m, basic)):
+        return False
+    largest = 0.0
+    for i in range(m["missing_rms_Nm"].shape[0]):
+        ways = m["evidence_ways"][i]
+        if np.min(ways) >= LEAST_BACK * np.sum(ways):
+            largest = max(largest, _rms_Nm(m, i))
+    if largest > LEAST_NM:
+        _fill_missing(m)
+    return bool(largest > LEAST_NM)
+
+
+@compiled
+def _is_said_again(k: Any, m: Any) -> bool:
+    """Tell whether what an earlier stretch has said explains this one, of which `evidence_basic` is the model."""
+    _clear_found(m)
+    said, count, basic, full = m["evidence_said"], m["belief"].shape[0], m["evidence_basic"], m["evidence_full"]
+    if k["position_torque_Nm"] != 0.0 or not np.any(said != 0.0):
+        return False
+    b = m["evidence_row"]
+    b[:] = m["evidence_b"]
+    for i in range(m["evidence_L"].shape[0]):
+        for j in range(count):
+            for n in range(said.shape[0]):
+                b[j] -= m["evidence_L"][i, count + n, j] * said[n]
+    _log_evidence(m, b, _scale_of(k, m, 0, 0), full)
+    full[count : count + said.shape[0]] = said
+    left = _squares_left(m, basic)
+    explained = left - _squares_left(m, full)
+    is_agreed = 0.5 * explained > GAIN and explained > AGREES * left
+    if is_agreed:
+        _fill_missing(m)
+    return bool(is_agreed)
+
+
+@compiled
+def _fill_missing(m: Any) -> None:
+    for i in range(m["missing_rms_Nm"].shape[0]):
+        m["missing_rms_Nm"][i] = _rms_Nm(m, i)
+
+
+@compiled
+def _rms_Nm(m: Any, joint: int) -> float:
+    """Return by how much the two models differ on a joint's samples."""
+    apart = m["evidence_row"]
+    for j in range(apart.shape[0]):
+        apart[j] = m["evidence_full"][j] - m["evidence_basic"][j]
+    square = _quadratic(m["evidence_L"][joint], apart)
+    return float(np.sqrt(square / max(m["evidence_weight"][joint], 1e-12)))
+
+
+@compiled
+def _log_evidence(m: Any, b: Vector, s: Vector, x: Vector) -> float:
+    """Return the log evidence of the columns with a deviation s (f,) above 0, up to what all have; fill x (f,)."""
+    M, joints, count = m["evidence_M"], m["evidence_L"].shape[0], s.shape[0]
+    log_det, square = 0.0, 0.0
+    for j in range(count):
+        x[j] = s[j] * b[j]
+        if s[j] == 0.0:
+            M[j, :j] = 0.0
+            M[j, j] = 1.0
+            continue
+        for n in range(j + 1):
+            total = 0.0
+            for i in range(joints):
+                total += m["evidence_L"][i, j, n]
+            total = s[j] * total * s[n] + (1.0 if n == j else 0.0)
+            for i in range(n):
+                total -= M[j, i] * M[n, i]
+            M[j, n] = total / M[n, n] if n < j else np.sqrt(max(total, 1e-12))
+        log_det += 2.0 * math.log(M[j, j])
+        for n in range(j):
+            x[j] -= M[j, n] * x[n]
+        x[j] /= M[j, j]
+        square += x[j] * x[j]
+    for j in range(count - 1, -1, -1):
+        for n in range(j + 1, count):
+            x[j] -= M[n, j] * x[n]
+        x[j] /= M[j, j]
+    for j in range(count):
+        x[j] *= s[j]
+    return 0.5 * (square - log_det)
+
+
+@compiled
+def _squares_left(m: Any, x: Vector) -> float:
+    """Return Σ (r - v x)² / R."""
+    total = m["evidence_yy"]
+    for j in range(x.shape[0]):
+        total -= 2.0 * x[j] * m["evidence_b"][j]
+    for i in range(m["evidence_L"].shape[0]):
+        total += _quadratic(m["evidence_L"][i], x)
+    return float(max(total, 0.0))
+
+
+@compiled
+def _quadratic(L: Vector, x: Vector) -> float:
+    """Return x' L x of which L (f, f) holds the lower half."""
+    total = 0.0
+    for j in range(x.shape[0]):
+        if x[j] != 0.0:
+            total += L[j, j] * x[j] * x[j]
+            for n in range(j):
+                total += 2.0 * L[j, n] * x[j] * x[n]
+    return float(max(total, 0.0))
+
+
+def describe(m: Any) -> list[str]:
+    """Say how large the torque is that the model lacks, in one line; none where none was found."""
+    missing_Nm = m["missing_rms_Nm"].tolist()
+    if not any(missing_Nm):
+        return []
+    torques = " and ".join(f"{rms:.3f} Nm rms in joint {i + 1}" for i, rms in enumerate(missing_Nm))
+    if m["is_elastic"]:
+        return [f"the torque of an elastic joint, {torques}, is missing in the model, which has rigid ones"]
+    return [
+        f"a torque that depends on where the arm is, {torques}, is missing in the model: a cable, a base that is not "
+        "level, or a hand's spring"
+    ]

@@ -1,0 +1,454 @@
+"""Identification and detection of an arm with n joints on recorded arrays, without bus or emulator.
+
+The steps, each a function over a `Record`:
+
+- `identify`: recursive least squares of all parameters that the torque can tell: base parameters of the links, F_v and
+  F_c of each joint, an offset of each torque sensor, and, where torques are those of motors, the inertia of each rotor
+  as the joint feels it through the gear. It starts from what is known before, with honest uncertainty (`Prior`), and
+  ends with the uncertainty P that is left.
+- `certify`: the same parameters, frozen, on motion that was not used. It says how large the residual is, and how much
+  larger than noise and P explain: what the model lacks.
+- `detect`: the external torque of each joint, its threshold, and the contacts.
+
+    tau_ext_hat = -(tau_f - W_f theta_hat),    threshold = k sqrt(noise² + lack² + w P w') + F_c at standstill
+
+with w the joint's row of W_f. noise is what the filter leaves of the sensor's white noise: with the impulse response
+h_0 = w_new, h_j = E^(j - 1) (E w_new + w_old) of the first-order hold its variance is sum h_j² of the sensor's.
+Filtered noise is not white; samples taken every D periods carry rho = E^D of each other, so the fit counts one as a
+measurement of variance noise² (1 + rho) / (1 - rho), which gives a long record the information that it has.
+
+White noise of the velocity goes through the filter's direct path a Y_p: it shows as a M delta_dq in the residual, which
+is not correlated. With 1 mrad/s at a = 50 rad/s that is 0.1 Nm on an arm of 2 kg m², more than the torque sensor's.
+
+A force on a link loads the joints before it and none behind: the link of a contact is that of the outermost joint over
+its threshold until the isolation window ends. A force through a joint's axis is blind to that joint.
+
+`_run` is the only place that knows filters and estimator.
+
+Shapes: k samples, n joints, p parameters. Filters with DC gain 1 (b = a). Units: Nm, or N for a prismatic joint.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from adacd_hil.compiled import compiled
+from adacd_hil.config import setting
+from adacd_hil.records import Vector
+from adacd_hil.scheme.detect import detector
+from adacd_hil.scheme.identify import estimator
+from adacd_hil.scheme.model import chain, filters
+from adacd_hil.scheme.model.chain import BaseParameters, Chain, Indices, Scratch
+
+_UNKNOWN_LINK = (
+    10.0,
+    *(2.0,) * 3,
+    *(1.0,) * 6,
+)  # kg, kg m, kg m²: no link of an arm that a human works beside has more
+
+
+@dataclass(frozen=True)
+class OfflineSettings:
+    """What is asked of a record's sensors, filters and thresholds."""
+
+    noise_Nm: tuple[float, ...] = setting(unit="Nm", low=1e-6, meaning="rms of each torque sensor's white noise")
+    period_s: float = setting(1e-3, unit="s", low=1e-5, high=0.1, meaning="time between two samples")
+    velocity_noise_rad_s: float = setting(
+        0.0, unit="rad/s", low=0.0, high=1.0, meaning="rms of the measured velocities' white noise"
+    )
+    fit_cutoff_rad_s: float = setting(10.0, unit="rad/s", low=0.1, high=2000.0, meaning="filter of the fit")
+    detection_cutoff_rad_s: float = setting(
+        50.0, unit="rad/s", low=0.1, high=2000.0, meaning="filter of certificate and detection"
+    )
+    fit_every: int = setting(20, unit="samples", low=1, high=10_000, meaning="between two corrections")
+    deviations: float = setting(6.0, low=1.0, high=100.0, meaning="threshold over the residual's standard deviation")
+    standstill_rad_s: float = setting(0.01, unit="rad/s", low=0.0, meaning="below it a joint may hold its friction")
+    isolation_s: float = setting(0.05, unit="s", low=0.0, high=1.0, meaning="from detection until the link is told")
+
+
+@dataclass(frozen=True)
+class Record:
+    """What was measured, time-first (k, n), at a fixed period. Raises ValueError if it is not whole."""
+
+    q: Vector
+    dq: Vector
+    tau_J: Vector
+
+    def __post_init__(self) -> None:
+        for name in ("q", "dq", "tau_J"):
+            values = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, values)
+            if values.ndim != 2 or values.shape != self.q.shape:
+                raise ValueError(f"{name} has shape {values.shape}, not (k, n) as q {self.q.shape}")
+            if not np.all(np.isfinite(values)):
+                sample, joint = np.argwhere(~np.isfinite(values))[0]
+                raise ValueError(f"{name}[{sample}, {joint}] is not finite")
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """The columns of an arm: base parameters of the links, F_v, F_c, the torque sensors' offsets, then the rotors."""
+
+    chain: Chain
+    base: BaseParameters
+    has_rotors: bool = False
+
+    @cached_property
+    def joints(self) -> int:
+        """Number of joints, n."""
+        return len(self.chain.axis)
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Name the p parameters."""
+        kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
+        per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
+        return (*self.base.names, *per_joint)
+
+    def place_of(self, kind: str) -> slice:
+        """Return the parameters of one kind: "base", "F_v", "F_c", "offset" or, where there are some, "rotor"."""
+        first, n = self.base.columns.size, self.joints
+        starts = {"F_v": first, "F_c": first + n, "offset": first + 2 * n, "rotor": first + 3 * n}
+        return slice(0, first) if kind == "base" else slice(starts[kind], starts[kind] + n)
+
+
+def model_of(arm: Chain, has_rotors: bool = False) -> ArmModel:
+    """Find the columns of an arm; takes about 0.1 s for seven joints.
+
+    has_rotors: torques are those of geared motors, which turn their rotors too; a link-side sensor doesn't see them.
+    """
+    return ArmModel(arm, chain.find_base(arm), has_rotors)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters theta (p,) and their covariance P (p, p)."""
+
+    theta: Vector
+    P: Vector
+
+
+def prior(
+    model: ArmModel,
+    theta_full: Vector | None = None,
+    deviation_full: Vector | None = None,
+    F_v: float = 10.0,
+    F_c: float = 10.0,
+    offset_Nm: float = 1.0,
+    rotor_kg_m2: float = 2.0,
+) -> Estimate:
+    """Return what is known before any motion.
+
+    theta_full (10 n,): the designer's parameters, zero if unknown. deviation_full (10 n,): their standard deviations;
+    without, any link that a human could stand beside. F_v, F_c, offset_Nm, rotor_kg_m2: standard deviations from zero.
+    """
+    n = model.joints
+    deviation = np.tile(_UNKNOWN_LINK, n) if deviation_full is None else deviation_full
+    rest = np.repeat([F_v, F_c, offset_Nm, *((rotor_kg_m2,) if model.has_rotors else ())], n) ** 2
+    theta = np.zeros(len(model.parameter_names))
+    if theta_full is not None:
+        theta[model.place_of("base")] = model.base.map @ theta_full
+    links = (model.base.map * deviation**2) @ model.base.map.T
+    return Estimate(theta, scipy.linalg.block_diag(links, np.diag(rest)))
+
+
+def with_payload(model: ArmModel, estimate: Estimate, mass_kg: float, at_m: tuple[float, float, float]) -> Estimate:
+    """Return the estimate after an unknown mass was fitted at a known place: one unknown, a rank-one increase of P.
+
+    mass_kg: standard deviation of the mass, from zero. at_m: in the frame of the last link.
+    """
+    change = np.zeros(model.base.place.size)
+    change[-chain.PER_LINK :] = chain.point_mass(mass_kg, at_m)
+    in_base = np.zeros(estimate.theta.size)
+    in_base[model.place_of("base")] = model.base.map @ change
+    return Estimate(estimate.theta, estimate.P + np.outer(in_base, in_base))
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The frozen model on motion that was not used for the fit."""
+
+    residual_rms_Nm: Vector  # (n,)
+    residual_max_Nm: Vector  # (n,)
+    lack_Nm: Vector  # (n,), standard deviation of what neither noise nor P explains
+    margin: float  # smallest ratio of threshold to residual, over all joints and samples; below 1 is a false alarm
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One contact; joints and links are counted from 0."""
+
+    sample: int  # of detection
+    link: int
+    first_joint: int  # the one that crossed first
+    direction: tuple[int, ...]  # (n,), sign of tau_ext_hat of each joint when it crossed, 0 if it did not
+
+
+@dataclass(frozen=True)
+class Detection:
+    """External torque and threshold of each sample and joint (k, n), Nm, and the contacts in order."""
+
+    tau_ext_hat: Vector
+    threshold: Vector
+    contacts: tuple[Contact, ...]
+
+
+def identify(model: ArmModel, record: Record, before: Estimate, settings: OfflineSettings) -> Estimate:
+    """Correct an estimate by a record of free motion. Raises ValueError if record and model differ in joints."""
+    theta, P = before.theta.copy(), before.P.copy()
+    _trace(model, record, theta, P, settings, settings.fit_cutoff_rad_s, is_learning=True)
+    return Estimate(theta, P)
+
+
+def certify(model: ArmModel, record: Record, estimate: Estimate, settings: OfflineSettings) -> Certificate:
+    """Test a frozen estimate on a record of free motion that `identify` has not seen. Raises as `identify`."""
+    trace = _trace(model, record, estimate.theta, estimate.P, settings, settings.detection_cutoff_rad_s)
+    residual = np.abs(trace.tau_ext_hat)
+    mean_square = np.mean(residual**2, axis=0)
+    lack = np.sqrt(np.maximum(mean_square - np.mean(trace.deviation**2, axis=0), 0.0))
+    with np.errstate(divide="ignore"):
+        margin = float(np.min(_threshold(trace, settings, np.zeros(model.joints)) / residual))
+    return Certificate(np.sqrt(mean_square), np.max(residual, axis=0), lack, margin)
+
+
+def detect(
+    model: ArmModel,
+    record: Record,
+    estimate: Estimate,
+    settings: OfflineSettings,
+    lack_Nm: Vector | None = None,
+) -> Detection:
+    """Find the contacts in a record. lack_Nm (n,): of `certify`, zero if not given. Raises as `identify`."""
+    trace = _trace(model, record, estimate.theta, estimate.P, settings, settings.detection_cutoff_rad_s)
+    threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
+    window = round(settings.isolation_s / settings.period_s)
+    return Detection(trace.tau_ext_hat, threshold, _contacts(trace.tau_ext_hat, threshold, window))
+
+
+def _contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[Contact, ...]:
+    """Split the samples over the threshold into contacts: one ends when a whole window is quiet."""
+    over = ~(np.abs(tau_ext_hat) <= threshold)
+    loud = np.flatnonzero(np.any(over, axis=1))
+    contacts = []
+    for begin in loud[np.diff(loud, prepend=-window - 2) > window]:
+        seen = over[begin : begin + window + 1]
+        joints = np.flatnonzero(np.any(seen, axis=0))
+        crossings = begin + np.argmax(seen, axis=0)
+        direction = [0] * over.shape[1]
+        for joint in joints:
+            value = tau_ext_hat[crossings[joint], joint]
+            direction[joint] = int(value > 0.0) - int(value < 0.0)
+        first = int(joints[np.argmin(crossings[joints])])
+        contacts.append(Contact(int(begin), int(joints[-1]), first, tuple(direction)))
+    return tuple(contacts)
+
+
+class _Trace(NamedTuple):
+    """What `_run` leaves of each sample, (k, n)."""
+
+    tau_ext_hat: Vector
+    deviation: Vector  # of tau_ext_hat, by noise and P
+    friction: Vector  # that a joint at standstill may hold
+
+
+def _threshold(trace: _Trace, settings: OfflineSettings, lack_Nm: Vector) -> Vector:
+    """Return the threshold of each sample and joint (k, n), Nm."""
+    return settings.deviations * np.sqrt(trace.deviation**2 + lack_Nm**2) + trace.friction
+
+
+class _Memory(NamedTuple):
+    """What lasts from one sample to the next, and scratch."""
+
+    Y_p: Vector
+    Y_h: Vector
+    input_old: Vector
+    S: Vector
+    W_f: Vector
+    W_scaled: Vector
+    WP: Vector
+    tau_old: Vector
+    tau_f: Vector
+    tau_f_hat: Vector
+    tau_scaled: Vector
+    standstill: Vector
+    unit: Vector
+    through: Vector
+    noise: Vector
+    Y_unit: Vector
+    Y_rest: Vector
+    v: Vector
+    K: Vector
+
+
+def _new_memory(joints: int, count: int) -> _Memory:
+    """Return the memory before the first sample."""
+    columns, joint, parameter = (joints, count), (joints,), (count,)
+    return _Memory(*(np.zeros(shape) for shape in (*(columns,) * 7, *(joint,) * 8, *(columns,) * 2, *(parameter,) * 2)))
+
+
+def _trace(
+    model: ArmModel,
+    record: Record,
+    theta: Vector,
+    P: Vector,
+    settings: OfflineSettings,
+    cutoff_rad_s: float,
+    is_learning: bool = False,
+) -> _Trace:
+    """Run a record through the filter; theta and P, contiguous then, are corrected in place if it learns."""
+    n = model.joints
+    if record.q.shape[1] != n or len(settings.noise_Nm) != n:
+        raise ValueError(
+            f"the arm has {n} joints, the record {record.q.shape[1]}, noise_Nm {len(settings.noise_Nm)} values"
+        )
+    hold = filters.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
+    after_one = hold.decay * hold.weight_new + hold.weight_old
+    gain = math.sqrt(hold.weight_new**2 + after_one**2 / (1.0 - hold.decay**2))
+    kept = hold.decay**settings.fit_every
+    memory = _new_memory(n, theta.size)
+    memory.Y_h[:, model.place_of("offset")] = np.eye(n)
+    trace = _Trace(*(np.zeros(record.q.shape) for _ in range(3)))
+    _run(
+        model.chain,
+        model.base.place,
+        model.place_of("F_v").start,
+        model.place_of("rotor").start if model.has_rotors else chain.NOT_USED,
+        record.q,
+        record.dq,
+        record.tau_J,
+        hold,
+        cutoff_rad_s,
+        gain * np.array(settings.noise_Nm),
+        (1.0 + kept) / (1.0 - kept),
+        cutoff_rad_s * settings.velocity_noise_rad_s,
+        settings.fit_every,
+        settings.standstill_rad_s,
+        is_learning,
+        np.ascontiguousarray(theta),
+        np.ascontiguousarray(P),
+        chain.new_scratch(model.chain),
+        memory,
+        trace,
+    )
+    return trace
+
+
+@compiled
+def _run(
+    arm: Chain,
+    place: Indices,
+    friction_column: int,
+    rotor_column: int,
+    q: Vector,
+    dq: Vector,
+    tau_J: Vector,
+    hold: filters.FirstOrderHold,
+    cutoff_rad_s: float,
+    noise_Nm: Vector,
+    R: float,
+    passed_rad_s2: float,
+    fit_every: int,
+    standstill_rad_s: float,
+    is_learning: bool,
+    theta: Vector,
+    P: Vector,
+    scratch: Scratch,
+    m: _Memory,
+    trace: _Trace,
+) -> None:
+    """Filter a record, estimate the external torque of each sample, and correct theta and P if it learns.
+
+    noise_Nm (n,): of the filtered torque. R: variance of a sample of the fit in units of noise_Nm². passed_rad_s2: the
+    velocity's noise behind the filter, still to be multiplied by the mass matrix.
+    """
+    n = q.shape[1]
+    F_c = theta[friction_column + n : friction_column + 2 * n]
+    for k in range(q.shape[0]):
+        chain.fill(arm, place, q[k], dq[k], scratch, m.Y_p, m.Y_h)
+        chain.fill_friction(dq[k], friction_column, m.Y_h)
+        _fill_rotors(dq[k], rotor_column, m.Y_p)
+        if k == 0:
+            filters.resume(
+                cutoff_rad_s, cutoff_rad_s, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f
+            )  # fmt: skip
+        else:
+            filters.advance_torque(hold.decay, hold.weight_old, hold.weight_new, m.tau_old, tau_J[k], m.tau_f)
+            filters.advance_regressor(
+                hold.decay,
+                hold.weight_old,
+                hold.weight_new,
+                cutoff_rad_s,
+                cutoff_rad_s,
+                m.Y_p,
+                m.Y_h,
+                m.input_old,
+                m.S,
+                m.W_f,
+            )
+        detector.follow_standstill(dq[k], standstill_rad_s, hold.decay, m.standstill)
+        detector.predict(m.W_f, theta, m.tau_f_hat)
+        detector.estimate_external(m.tau_f, m.tau_f_hat, 1.0, trace.tau_ext_hat[k])
+        if passed_rad_s2 > 0.0 and k % fit_every == 0:
+            _fill_mass(arm, place, rotor_column, q[k], theta, scratch, m.unit, m.Y_unit, m.Y_rest, m.through)
+        for i in range(n):
+            m.noise[i] = np.sqrt(noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
+        fill_deviation(m.W_f, P, m.noise, m.WP, trace.deviation[k])
+        for i in range(n):
+            trace.friction[k, i] = m.standstill[i] * max(F_c[i], 0.0)
+        if is_learning and k % fit_every == fit_every - 1:
+            for i in range(n):
+                weight = 1.0 / np.sqrt(R * noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
+                m.tau_scaled[i] = weight * m.tau_f[i]
+                for j in range(theta.shape[0]):
+                    m.W_scaled[i, j] = weight * m.W_f[i, j]
+            estimator.update(m.W_scaled, m.tau_scaled, 1.0, True, theta, P, m.v, m.K)
+
+
+@compiled
+def _fill_mass(
+    arm: Chain,
+    place: Indices,
+    rotor_column: int,
+    q: Vector,
+    theta: Vector,
+    scratch: Scratch,
+    unit: Vector,
+    Y_unit: Vector,
+    Y_rest: Vector,
+    through: Vector,
+) -> None:
+    """Fill `through` (n,) with the diagonal of M M'; unit (n,), Y_unit and Y_rest (n, p) are scratch."""
+    through[:] = 0.0
+    for j in range(q.shape[0]):
+        unit[:] = 0.0
+        unit[j] = 1.0
+        chain.fill(arm, place, q, unit, scratch, Y_unit, Y_rest)
+        _fill_rotors(unit, rotor_column, Y_unit)
+        for i in range(q.shape[0]):
+            mass = 0.0
+            for column in range(theta.shape[0]):
+                mass += Y_unit[i, column] * theta[column]
+            through[i] += mass * mass
+
+
+@compiled
+def _fill_rotors(dq: Vector, rotor_column: int, Y_p: Vector) -> None:
+    """Fill the columns of the rotors' inertia, one per joint from `rotor_column` on, if there are any."""
+    if rotor_column != chain.NOT_USED:
+        for i in range(dq.shape[0]):
+            Y_p[i, rotor_column + i] = dq[i]
+
+
+@compiled
+def fill_deviation(W_f: Vector, P: Vector, noise_Nm: Vector, WP: Vector, deviation: Vector) -> None:
+    """Fill the standard deviation (n,) of tau_f - W_f theta: sqrt(noise² + w P w'). WP (n, p) is scratch."""
+    np.dot(W_f, P, WP)
+    for i in range(W_f.shape[0]):
+        variance = noise_Nm[i] * noise_Nm[i]
+        for j in range(W_f.shape[1]):
+            variance += WP[i, j] * W_f[i, j]
+        deviation[i] = np.sqrt(max(variance, 0.0))

@@ -1,0 +1,339 @@
+"""A serial arm read from the text of a URDF: geometry, limits and the parameters that its author gave its links.
+
+Read are link, inertial, joint, origin, parent, child, axis, limit; the rest (shapes, transmissions, plugins) is passed
+over. Links on fixed joints become part of the link that carries them, whose frame is the URDF's frame of that link.
+Angles are rad, rpy as in the URDF: R = Rz(yaw) Ry(pitch) Rx(roll). Source: http://wiki.ros.org/urdf/XML.
+
+The arm must be one chain of moving joints. A joint that is no part of it, as a finger of a gripper, is named in
+`locked`: it counts as fixed at its zero.
+"""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from adacd_hil.records import Vector
+from adacd_hil.scheme.model.chain import PER_LINK, Chain
+
+MOVING = ("revolute", "continuous", "prismatic")
+STANDARD_GRAVITY_M_S2 = (0.0, 0.0, -9.80665)
+LARGEST = 1e18
+"""Of any number, in its unit: products of lengths, masses and speeds stay finite."""
+BASE = -1
+"""Index of what does not move."""
+
+
+class UrdfError(ValueError):
+    """A URDF that can't be used; the message is one line that names the link, joint or attribute."""
+
+
+class Pose(NamedTuple):
+    """Where a frame is in another."""
+
+    rotation: Vector  # (3, 3)
+    translation: Vector  # (3,), m
+
+    def then(self, other: "Pose") -> "Pose":
+        """Return where a frame is that `other` places in this one."""
+        return Pose(self.rotation @ other.rotation, self.translation + self.rotation @ other.translation)
+
+
+@dataclass(frozen=True)
+class SerialArm:
+    """An arm as its URDF tells it; n moving joints, from the base outward."""
+
+    name: str
+    chain: Chain
+    theta_full: Vector  # (10 n,), of the links with all that is fixed to them
+    joint_names: tuple[str, ...]  # (n,)
+    link_names: tuple[str, ...]  # (n,), the link that each joint moves
+    places: dict[str, tuple[int, Pose]]  # of every link: the index of the joint that carries it, or BASE, and where
+    position_low: Vector  # (n,), rad or m; -inf where there is no limit, as of every continuous joint
+    position_high: Vector  # (n,)
+    velocity_limit: Vector  # (n,), rad/s or m/s
+    torque_limit: Vector  # (n,), Nm or N
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Pose
+    axis: Vector
+    low: float
+    high: float
+    velocity: float
+    effort: float
+
+
+def read_urdf(
+    text: str | bytes,
+    gravity_m_s2: tuple[float, float, float] = STANDARD_GRAVITY_M_S2,
+    locked: Collection[str] = (),
+) -> SerialArm:
+    """Read a serial arm from the text of a URDF.
+
+    gravity_m_s2: in the frame of the root link. Raises UrdfError.
+    """
+    try:
+        robot = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: an encoding that is unknown
+        raise UrdfError(f"not XML: {error}") from error
+    if robot.tag != "robot":
+        raise UrdfError(f"the outermost element is <{robot.tag}>, not <robot>")
+    links = {name: _read_inertial(element, name) for name, element in _named(robot, "link").items()}
+    joints = [_read_joint(element, name, links) for name, element in _named(robot, "joint").items()]
+    unknown = [name for name in locked if name not in {joint.name for joint in joints}]
+    if unknown:
+        raise UrdfError(f'no joint "{unknown[0]}" to be locked')
+    return _assemble(robot.get("name", ""), links, joints, gravity_m_s2, locked)
+
+
+def _assemble(
+    name: str,
+    links: dict[str, Vector],
+    joints: list[_Joint],
+    gravity_m_s2: tuple[float, float, float],
+    locked: Collection[str],
+) -> SerialArm:
+    """Walk from the root outward and merge what is fixed."""
+    children: dict[str, list[_Joint]] = {link: [] for link in links}
+    carried: set[str] = set()
+    for joint in joints:
+        if joint.child in carried:
+            raise UrdfError(f'link "{joint.child}" is the child of more than one joint')
+        carried.add(joint.child)
+        children[joint.parent].append(joint)
+    roots = [link for link in links if link not in carried]
+    if len(roots) != 1:
+        raise UrdfError("no root: the joints are a loop" if not roots else f"more than one root link: {_list(roots)}")
+    moving: list[_Joint] = []
+    placed: list[Pose] = []
+    parameters: list[Vector] = []
+    places: dict[str, tuple[int, Pose]] = {}
+    here = Pose(np.eye(3), np.zeros(3))
+    following: str | None = roots[0]
+    while following is not None:
+        index = len(moving) - 1
+        outward = _merge(following, index, children, places, locked)
+        if index != BASE:
+            seen_from_link = [_moved(links[link], pose) for link, (carrier, pose) in places.items() if carrier == index]
+            parameters.append(np.sum(seen_from_link, axis=0))
+        if len(outward) > 1:
+            raise UrdfError(
+                f"the arm branches: joints {_list([joint.name for joint in outward])} move on the same link; "
+                "lock those that are no part of it"
+            )
+        following = None
+        if outward:
+            here = places[outward[0].parent][1]
+            moving.append(outward[0])
+            placed.append(here.then(outward[0].origin))
+            following = outward[0].child
+    lost = [link for link in links if link not in places]
+    if lost:
+        raise UrdfError(f'link "{lost[0]}" hangs on a loop, not on the root')
+    if not moving:
+        raise UrdfError("no joint moves")
+    chain = Chain(
+        np.array([pose.rotation for pose in placed]),
+        np.array([pose.translation for pose in placed]),
+        np.array([joint.axis for joint in moving]),
+        np.array([float(joint.kind == "prismatic") for joint in moving]),
+        np.array(gravity_m_s2, dtype=np.float64),
+    )
+    return SerialArm(
+        name,
+        chain,
+        np.concatenate(parameters),
+        tuple(joint.name for joint in moving),
+        tuple(joint.child for joint in moving),
+        places,
+        np.array([joint.low for joint in moving]),
+        np.array([joint.high for joint in moving]),
+        np.array([joint.velocity for joint in moving]),
+        np.array([joint.effort for joint in moving]),
+    )
+
+
+def _merge(
+    link: str,
+    index: int,
+    children: dict[str, list[_Joint]],
+    places: dict[str, tuple[int, Pose]],
+    locked: Collection[str],
+) -> list[_Joint]:
+    """Place `link` and all that is fixed to it; return the joints that move on it."""
+    outward = []
+    places[link] = (index, Pose(np.eye(3), np.zeros(3)))
+    waiting = [link]
+    while waiting:
+        at = waiting.pop()
+        for joint in children[at]:
+            if joint.kind == "fixed" or joint.name in locked:
+                places[joint.child] = (index, places[at][1].then(joint.origin))
+                waiting.append(joint.child)
+            else:
+                outward.append(joint)
+    return outward
+
+
+def _moved(parameters: Vector, pose: Pose) -> Vector:
+    """Return the parameters (10,) of a body seen from the frame in which `pose` places the body's own."""
+    mass, moment, inertia = parameters[0], parameters[1:4], _symmetric(parameters[4:])
+    at, turned = pose.translation, pose.rotation @ moment
+    about = pose.rotation @ inertia @ pose.rotation.T
+    about += 2.0 * (at @ turned) * np.eye(3) - np.outer(at, turned) - np.outer(turned, at)
+    about += mass * ((at @ at) * np.eye(3) - np.outer(at, at))
+    return np.concatenate([[mass], turned + mass * at, _six(about)])
+
+
+def _symmetric(six: Vector) -> Vector:
+    """Return the matrix (3, 3) of (xx, xy, yy, xz, yz, zz)."""
+    xx, xy, yy, xz, yz, zz = six
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _six(matrix: Vector) -> Vector:
+    """Return (xx, xy, yy, xz, yz, zz) of a symmetric matrix (3, 3)."""
+    return np.array([matrix[0, 0], matrix[0, 1], matrix[1, 1], matrix[0, 2], matrix[1, 2], matrix[2, 2]])
+
+
+def _read_inertial(link: Element, name: str) -> Vector:
+    """Return the parameters (10,) of a link in its own frame; a link without <inertial> has none."""
+    where = f'link "{name}"'
+    inertial = _only(link, "inertial", where)
+    if inertial is None:
+        return np.zeros(PER_LINK)
+    mass_element, inertia_element = _only(inertial, "mass", where), _only(inertial, "inertia", where)
+    if mass_element is None or inertia_element is None:
+        raise UrdfError(f"{where}: <inertial> needs <mass> and <inertia>")
+    mass = _number(mass_element, "value", where)
+    six = np.array([_number(inertia_element, key, where) for key in ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")])
+    if mass < 0.0:
+        raise UrdfError(f"{where}: mass {mass:g} kg is negative")
+    if np.min(np.linalg.eigvalsh(_symmetric(six))) < -1e-12 * np.max(np.abs(six)):
+        raise UrdfError(f"{where}: the inertia is not positive semidefinite")
+    about_mass_centre = np.concatenate([[mass, 0.0, 0.0, 0.0], six])
+    return _moved(about_mass_centre, _read_origin(inertial, where))
+
+
+def _read_joint(joint: Element, name: str, links: Collection[str]) -> _Joint:
+    """Read one joint."""
+    where = f'joint "{name}"'
+    kind = joint.get("type", "")
+    if kind != "fixed" and kind not in MOVING:
+        raise UrdfError(f'{where}: type "{kind}" is not one of {_list([*MOVING, "fixed"])}')
+    ends = []
+    for tag in ("parent", "child"):
+        end = _only(joint, tag, where)
+        link = end.get("link") if end is not None else None
+        if link is None:
+            raise UrdfError(f'{where}: no <{tag} link="...">')
+        if link not in links:
+            raise UrdfError(f'{where}: {tag} link "{link}" does not exist')
+        ends.append(link)
+    if _only(joint, "mimic", where) is not None:
+        raise UrdfError(f"{where}: <mimic> is not supported")
+    axis_element, limit = _only(joint, "axis", where), _only(joint, "limit", where)
+    axis = np.array([1.0, 0.0, 0.0]) if axis_element is None else _numbers(axis_element, "xyz", where)
+    length = float(np.linalg.norm(axis))
+    if kind != "fixed" and length < 1e-6:
+        raise UrdfError(f"{where}: the axis is zero")
+    low, high, velocity, effort = -math.inf, math.inf, math.inf, math.inf
+    if limit is not None and kind != "fixed":
+        if kind != "continuous":
+            low, high = _number(limit, "lower", where, 0.0), _number(limit, "upper", where, 0.0)
+        velocity, effort = _number(limit, "velocity", where, math.inf), _number(limit, "effort", where, math.inf)
+    if low > high:
+        raise UrdfError(f"{where}: lower limit {low:g} is above the upper {high:g}")
+    return _Joint(
+        name, kind, ends[0], ends[1], _read_origin(joint, where), axis / max(length, 1e-6), low, high, velocity, effort
+    )
+
+
+def _read_origin(element: Element, where: str) -> Pose:
+    """Read <origin>, the identity if there is none."""
+    origin = _only(element, "origin", where)
+    if origin is None:
+        return Pose(np.eye(3), np.zeros(3))
+    xyz, (roll, pitch, yaw) = _numbers(origin, "xyz", where, 0.0), _numbers(origin, "rpy", where, 0.0)
+    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    rotation = np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+    return Pose(rotation, xyz)
+
+
+def _named(robot: Element, tag: str) -> dict[str, Element]:
+    """Return the elements of one kind by name."""
+    found: dict[str, Element] = {}
+    for element in robot.findall(tag):
+        name = element.get("name")
+        if not name:
+            raise UrdfError(f"a <{tag}> has no name")
+        if name in found:
+            raise UrdfError(f'{tag} "{name}" is there twice')
+        found[name] = element
+    if tag == "link" and not found:
+        raise UrdfError("no <link>")
+    return found
+
+
+def _only(element: Element, tag: str, where: str) -> Element | None:
+    """Return the one child of a kind, or None."""
+    found = element.findall(tag)
+    if len(found) > 1:
+        raise UrdfError(f"{where}: more than one <{tag}>")
+    return found[0] if found else None
+
+
+def _number(element: Element, key: str, where: str, default: float | None = None) -> float:
+    """Read one finite number; an attribute that is missing is `default`, or an error if that is None."""
+    text = element.get(key)
+    if text is None:
+        if default is None:
+            raise UrdfError(f'{where}: <{element.tag}> has no attribute "{key}"')
+        return default
+    return _parse(text, f'{where}: <{element.tag} {key}="{text}">')
+
+
+def _numbers(element: Element, key: str, where: str, default: float | None = None) -> Vector:
+    """Read three finite numbers; as `_number`."""
+    text = element.get(key)
+    if text is None:
+        return np.full(3, _number(element, key, where, default))
+    named = f'{where}: <{element.tag} {key}="{text}">'
+    words = text.split()
+    if len(words) != 3:
+        raise UrdfError(f"{named} has {len(words)} numbers, not 3")
+    return np.array([_parse(word, named) for word in words])
+
+
+def _parse(word: str, where: str) -> float:
+    """Turn a word into a finite number that can be reckoned with."""
+    try:
+        value = float(word)
+    except ValueError:
+        raise UrdfError(f'{where}: "{word}" is not a number') from None
+    if not math.isfinite(value):
+        raise UrdfError(f"{where}: {word} is not finite")
+    if abs(value) > LARGEST:
+        raise UrdfError(f"{where}: {word} is more than {LARGEST:g}")
+    return value
+
+
+def _list(names: list[str]) -> str:
+    """Join names for a message."""
+    return ", ".join(f'"{name}"' for name in names)

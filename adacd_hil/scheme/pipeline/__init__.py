@@ -1,0 +1,1 @@
+"""One cycle in, one decision out: numbers, supervisor, contact reports."""

@@ -1,0 +1,212 @@
+"""What the certified scheme says of its certificates, and what the user says to that."""
+
+from enum import Enum, unique
+from typing import NamedTuple
+
+import numpy as np
+
+from adacd_hil.records import JOINTS, Event, SchemeState, Vector
+from adacd_hil.scheme.detect import sight, tail
+from adacd_hil.scheme.identify import anchor, earlier, last_certificate, missing_torque, position
+from adacd_hil.scheme.identify.doubt import Verdict
+from adacd_hil.scheme.identify.last_certificate import Certificate
+from adacd_hil.scheme.kernel import certified_kernel
+from adacd_hil.structured import Structured
+
+THIS_RUN_ONLY = "friction and inertia: by this run only"
+"""A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
+BY_WORD = "friction and inertia: by this run and the user's word, against "
+_THE_RUN = "what the run had learnt before"
+_TAKEN_BACK = "the certificate that was taken back"
+_CHANGED = (
+    "no one model explains the whole fit: something has touched the arm or let go while it was learnt, or the arm does "
+    "what the model doesn't know"
+)
+_BEGINS_ANEW = "no certificate, learning begins anew"
+_POSITION_REMEDY = "if it is the arm's, `arm.position_torque_Nm` lets the model have it, from the next start on"
+
+
+@unique
+class _Cause(Enum):
+    """What contradicts what: the name of its event, what follows, and what the user can do."""
+
+    READING = "anchor", "the drives stay off", "`accept` does without the tare"
+    ANCHOR = "anchor", _BEGINS_ANEW, "`accept` takes it for the sensor's zero"
+    CHANGED = "touch", _BEGINS_ANEW, "nobody may touch an arm that learns"
+    MORE = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm"
+    BY_PLACE = "position", _BEGINS_ANEW, _POSITION_REMEDY
+    ELASTIC = "elastic", _BEGINS_ANEW, "the model needs encoders on the links, or stiffer joints"
+    TOO_MUCH_BY_PLACE = "position", _BEGINS_ANEW, "who holds the arm shall let go, or that bound is too small"
+    MORE_THAN_LAST = "touch", _BEGINS_ANEW, "`accept` says that nobody touches the arm, which has changed"
+
+
+_CAUSES = {
+    certified_kernel.ANCHOR: _Cause.ANCHOR,
+    certified_kernel.CHANGED: _Cause.CHANGED,
+    certified_kernel.MORE: _Cause.MORE,
+    certified_kernel.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
+    certified_kernel.BY_PLACE: _Cause.BY_PLACE,
+    certified_kernel.ELASTIC: _Cause.ELASTIC,
+    certified_kernel.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
+}
+
+
+class _Refusal(NamedTuple):
+    """What was refused, in words; torques (n,) that were judged, their standard deviations. times: in a row."""
+
+    cause: _Cause
+    torque_Nm: Vector
+    std_Nm: Vector
+    lines: list[str]
+    times: int
+
+
+class _Certified(NamedTuple):
+    """The model when it was certified (p,), its covariance (p, p), whether with a payload, and what was said."""
+
+    theta: Vector
+    P: Vector
+    is_payload: bool
+    text: str
+
+
+class CertificateWatch:
+    """Says what the kernel has found, and hands it what the user accepts. last_utc: the last certificate's date."""
+
+    def __init__(self, constants: Structured, memory: Structured, last_utc: str) -> None:
+        self._constants, self._memory = constants[0], memory[0]
+        self._last = f"the certificate of {last_utc}"
+        self._last_utc = last_utc
+        self._refusal: _Refusal | None = None
+        self._vouched_against = ""
+        self._certified: list[_Certified] = []
+        self._is_standing = False
+
+    @property
+    def certificates(self) -> tuple[Certificate, ...]:
+        """All that were not taken back, in order."""
+        return tuple(last_certificate.certificate_of(self._constants, *certified) for certified in self._certified)
+
+    @property
+    def is_refusing(self) -> bool:
+        """Whether something has been refused since the last certificate, the user's last word or the enabling."""
+        return self._refusal is not None
+
+    def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
+        """Take in a new state; return what a certificate says."""
+        if state is SchemeState.ENABLE:
+            self._refusal = None
+        if state is not SchemeState.MONITOR or previous is not SchemeState.CERTIFY:
+            return None
+        self._refusal = None
+        known_by, self._vouched_against = self._known_by(), ""
+        level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
+        by_place = position.describe(self._constants, self._memory)
+        k, m = self._constants, self._memory
+        text = f"{anchor.describe(k, m)}; {sight.describe(m)}; {tail.describe(k, m)}; {known_by}{by_place}"
+        self._is_standing = True
+        self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
+        return Event(level, "certificate", text)
+
+    def _known_by(self) -> str:
+        if self._vouched_against:
+            return BY_WORD + self._vouched_against
+        is_compared = self._memory["is_last_believed"] and not self._memory["is_payload"]
+        return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
+
+    def refuse(self, is_reading: bool) -> Event | None:
+        """Take in, before its traces are gone, that the reading at rest or a fit is refused; return what is said."""
+        before = self._refusal
+        cause = _Cause.READING if is_reading else _CAUSES[int(self._memory["withheld_by"])]
+        offsets = slice(int(self._constants["base"]), int(self._constants["base"]) + JOINTS)
+        self._refusal = _Refusal(
+            cause,
+            self._memory["judged_Nm"].copy(),
+            np.sqrt(np.diag(self._memory["P_belief"])[offsets]),
+            self._describe(cause),
+            1 if before is None else before.times + 1,
+        )
+        if before is not None and before.cause is cause:
+            return None
+        name, what, remedy = cause.value
+        return Event("warning", name, "; ".join((*self._refusal.lines, what, remedy)))
+
+    def doubt(self, verdict: Verdict) -> Event:
+        """Say that contacts have taken the certificate back, and why."""
+        self._take_back()
+        remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
+        return Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}")
+
+    def revoke(self) -> Event:
+        """Take in, before what was kept is forgotten, that the user takes the certificate back."""
+        if self._memory["has_kept"]:
+            self._vouched_against = _THE_RUN
+        self._take_back()
+        return Event("warning", "revoked", "at the user's word the arm is learnt anew")
+
+    def _take_back(self) -> None:
+        if self._is_standing:
+            self._certified.pop()
+            self._vouched_against = _TAKEN_BACK
+        self._is_standing = False
+
+    def push(self, torque_Nm: Vector) -> Event:
+        """Say that the arm, stopped, is still pushed. torque_Nm (n,): external, filtered."""
+        torque = ", ".join(f"{value:.2f}" for value in torque_Nm)
+        remedy = "if nobody touches it the model is wrong, and `relearn` learns it anew"
+        return Event("warning", "touch", f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}")
+
+    def contradiction(self) -> Verdict:
+        """Return what contradicts the certificate while the arm monitors: an offset that drifts, a torque by place."""
+        cause = _CAUSES[int(self._memory["withheld_by"])]
+        return Verdict("; ".join(self._describe(cause)), is_payload=False)
+
+    def _describe(self, cause: _Cause) -> list[str]:
+        k, m = self._constants, self._memory
+        match cause:
+            case _Cause.READING:
+                lines = anchor.describe_refused(m, is_reading=True)
+            case _Cause.ANCHOR:
+                lines = [*anchor.describe_refused(m, is_reading=False), *missing_torque.describe(m)]
+            case _Cause.CHANGED:
+                lines = [_CHANGED]
+            case _Cause.MORE:
+                lines = [*earlier.describe_more(k, m), *missing_torque.describe(m)]
+            case _Cause.BY_PLACE | _Cause.ELASTIC:
+                lines = missing_torque.describe(m)
+            case _Cause.TOO_MUCH_BY_PLACE:
+                lines = position.describe_refused(k, m)
+            case _Cause.MORE_THAN_LAST:
+                lines = last_certificate.describe_more(m, self._last_utc)
+        return lines
+
+    def accept(self) -> Event:
+        """Believe what was refused last, because the user says so; return what there is to say of that."""
+        refusal, self._refusal = self._refusal, None
+        if refusal is None:
+            return Event("warning", "anchor", "nothing to accept: no certificate is withheld")
+        torque = ", ".join(f"{value:.3f}" for value in refusal.torque_Nm)
+        match refusal.cause:
+            case _Cause.READING:
+                anchor.accept_reading(self._memory)
+                what = f"the user accepts {torque} Nm at rest: the tare is not used"
+            case _Cause.ANCHOR:
+                anchor.accept(self._memory, refusal.torque_Nm, refusal.std_Nm)
+                what = f"the user accepts {torque} Nm as the zero of the sensors"
+            case _Cause.MORE_THAN_LAST:
+                last_certificate.forget(self._memory)
+                self._vouched_against = self._last
+                what = f"the user says that nobody touches the arm: {self._last} is not compared"
+            case _:
+                earlier.forget(self._memory)
+                self._vouched_against = _THE_RUN
+                what = "the user says that nobody touches the arm: what was learnt before is not compared"
+        return Event("warning", refusal.cause.value[0], what)
+
+    def describe(self) -> list[str]:
+        """Say what is refused, a line each; empty while nothing is."""
+        if self._refusal is None:
+            return []
+        is_reading = self._refusal.cause is _Cause.READING
+        withheld = [] if is_reading else [f"certificates withheld: {self._refusal.times}"]
+        return [*self._refusal.lines, *withheld, self._refusal.cause.value[2]]

@@ -1,0 +1,126 @@
+"""The table of the scheme's state machine: where each event leads from each state.
+
+A pair that is not in it leaves the state as it is. What raises the events: `adacd_hil.scheme.supervisor.supervisor`.
+"""
+
+from enum import Enum, IntEnum
+from types import MappingProxyType
+
+from adacd_hil.records import SchemeState
+
+
+class SchemeEvent(IntEnum):
+    """What can move the scheme to another state, in order of precedence."""
+
+    NONE = 0
+    FAULT = 1  # a check of the running arm failed, or a phase took too long
+    COLLISION = 2  # a joint is over its upper threshold
+    CONTACT = 3  # a joint is over its lower threshold
+    LATE = 4  # the host has missed so many deadlines that the arm is to be held
+    COMPLETE = 5  # a cycle with all its data
+    COMMISSIONED = 6  # enough complete cycles at rest in a row
+    ENABLED = 7  # both drives report Operation enabled
+    ADAPTED = 8  # eq. (15) with the evidence for it
+    FITTED = 9  # the estimate is ready to be tested
+    CERTIFIED = 10  # the frozen model has passed its test
+    REFUTED = 11  # the frozen model has failed its test
+    AT_REST = 12  # the arm has come to rest, the report is final, and all of it is to be acknowledged
+    CLEARED = 13  # nothing has pushed for a while, the report is final, and nothing is to be acknowledged
+    ACKNOWLEDGED = 14  # the user has acknowledged, no joint is over its threshold and the host is on time
+    PAYLOAD_ANNOUNCED = 15  # the user wants to change the payload
+    PAYLOAD_CHANGED = 16  # the user has changed the payload and the arm is at rest
+    REVOKED = 17  # the user takes back what is known of the arm, or acknowledges that it is doubted
+    DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
+    MOVED = 19  # the arm moves before all its drives are enabled
+    CONTRADICTED = 20  # what was learnt since contradicts the certificate: by an anchor, or by place
+
+
+class Back(Enum):
+    """A place in the table that depends on the past."""
+
+    TO_ORIGIN = "the state from which REACT was entered"
+
+
+TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, SchemeState | Back]] = MappingProxyType(
+    {
+        # Gathers nothing yet. Out: the first complete cycle; too late is a fault.
+        SchemeState.INIT: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COMPLETE: SchemeState.COMMISSION,
+        },
+        # Drives off, arm must lie still. Out: enough complete cycles at rest; too late is a fault.
+        SchemeState.COMMISSION: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COMMISSIONED: SchemeState.ENABLE,
+        },
+        # Drives are asked to enable. Out: both have; an arm that moves meanwhile must lie still again; too late is a
+        # fault; a contact once they have.
+        SchemeState.ENABLE: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
+            SchemeEvent.ENABLED: SchemeState.ADAPT,
+            SchemeEvent.MOVED: SchemeState.COMMISSION,
+        },
+        # Moves and learns. Out: eq. (15) with evidence; a fit to be tested; a contact; too late is a fault.
+        SchemeState.ADAPT: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
+            SchemeEvent.ADAPTED: SchemeState.MONITOR,
+            SchemeEvent.FITTED: SchemeState.CERTIFY,
+        },
+        # Moves on, the model frozen and tested. Out: the test's result; a contact; too late is a fault.
+        SchemeState.CERTIFY: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
+            SchemeEvent.CERTIFIED: SchemeState.MONITOR,
+            SchemeEvent.REFUTED: SchemeState.ADAPT,
+        },
+        # Moves, detection armed. Out: a contact; a host that is late; what was learnt since contradicts it; the
+        # announcement of a payload change; back from these, the doubt of the model.
+        SchemeState.MONITOR: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
+            SchemeEvent.LATE: SchemeState.REACT,
+            SchemeEvent.CONTRADICTED: SchemeState.REACT,
+            SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
+            SchemeEvent.DOUBTED: SchemeState.STOPPED,
+        },
+        # Reacts. Out, once the report is final: at rest, if it is to be acknowledged; else cleared.
+        SchemeState.REACT: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.AT_REST: SchemeState.STOPPED,
+            SchemeEvent.CLEARED: Back.TO_ORIGIN,
+        },
+        # Holds its place. Out: acknowledged while nothing pushes; the announcement of a payload change; a payload that
+        # contacts looked like; with the certificate taken back, even while something seems to push.
+        SchemeState.STOPPED: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.ACKNOWLEDGED: Back.TO_ORIGIN,
+            SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
+            SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
+            SchemeEvent.REVOKED: SchemeState.ADAPT,
+        },
+        # Parks. Out: the payload has been changed and the arm is at rest; a contact.
+        SchemeState.PAYLOAD: {
+            SchemeEvent.FAULT: SchemeState.FAULT,
+            SchemeEvent.COLLISION: SchemeState.REACT,
+            SchemeEvent.CONTACT: SchemeState.REACT,
+            SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
+        },
+        # Latched. Out: a new run.
+        SchemeState.FAULT: {},
+    }
+)
+
+
+def next_state(state: SchemeState, event: SchemeEvent, origin: SchemeState) -> SchemeState:
+    """Look up the table; a pair that is not in it leaves the state as it is.
+
+    origin: the state from which REACT was entered last.
+    """
+    following = TRANSITIONS[state].get(event, state)
+    return origin if following is Back.TO_ORIGIN else following

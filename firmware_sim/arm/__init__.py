@@ -1,0 +1,1 @@
+"""The emulated arm's mechanics, and what its parts are set to."""

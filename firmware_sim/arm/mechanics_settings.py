@@ -1,0 +1,319 @@
+"""Section `[mechanics]` of a scenario: what the arm does beyond rigid links with viscous and Coulomb friction.
+
+Everything is off by default, and a scenario without this section runs the rigid plant. Pairs are (joint 1, joint 2).
+Equations: `firmware_sim.arm.plant_friction`, `firmware_sim.arm.transmission`, `firmware_sim.arm.mechanics`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from adacd_hil.config import ConfigError, setting
+from adacd_hil.records import Vector
+from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, Arm
+from firmware_sim.arm.mechanics import (
+    DOWNHILL,
+    GRAVITY,
+    GRAVITY_M_S2,
+    HOLDING_BRAKE,
+    MECHANICS_NUMBERS,
+)
+from firmware_sim.arm.plant import (
+    MECHANICAL_STATE,
+    ROTOR,
+    STOP_DAMPING,
+    STOP_HIGH,
+    STOP_LOW,
+    STOP_STIFFNESS,
+    fit_payload,
+    mass_matrix,
+)
+from firmware_sim.arm.plant_friction import (
+    AMBIENT,
+    CAPACITY,
+    COOLING,
+    COULOMB_DROP,
+    FREE,
+    LOAD,
+    REFERENCE_C,
+    SIGMA0,
+    SIGMA1,
+    SIGMA2,
+    STRIBECK,
+    SURPLUS,
+    VISCOUS_DROP,
+)
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.transmission import (
+    BACKLASH,
+    DAMPING,
+    ENCODER_ON_LINK,
+    MOTOR_COULOMB,
+    MOTOR_VISCOUS,
+    RIPPLE,
+    RIPPLE_PERIODS,
+    RIPPLE_PHASE,
+    RIPPLE_SHARE,
+    ROTOR_INERTIA,
+    STIFFNESS,
+)
+
+ENCODER_SIDES: Final = ("motor", "link")
+
+LARGEST_OSCILLATION: Final = 0.05
+"""Largest ω h of the fastest oscillation. RK4 then damps it by (ω h)⁵/144 = 2e-9 of critical, far below any metal's."""
+LARGEST_DECAY: Final = 0.5
+"""Largest |λ| h of a damped mode; RK4 is stable up to 2.78 and at 0.5 follows a decay within 3e-4."""
+LARGEST_SUBSTEPS: Final = 16
+"""Bound on the cost of a tick. Up to 8000 rad/s oscillations meet the bound above; faster ones lose amplitude."""
+LARGEST_RATE: Final = 1.0
+"""Largest |λ| h with the most substeps: 160 000 rad/s. Beyond it a scenario is refused."""
+
+Pair = tuple[float, float]
+PayloadBody = tuple[float, Pair, float]
+"""Mass kg, centre of mass from the tip m, inertia about it kg m²."""
+
+
+@dataclass(frozen=True)
+class MechanicsSettings:
+    """The arm beyond the rigid plant."""
+
+    static_Nm: Pair = setting(
+        (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="F_s, friction at standstill; 0: the profile's Coulomb"
+    )
+    stribeck_velocity_rad_s: Pair = setting(
+        (0.05, 0.05), unit="rad/s", low=1e-4, high=100.0, meaning="v_s: how fast static falls to Coulomb friction"
+    )
+    sigma0_Nm_rad: Pair = setting(
+        (0.0, 0.0), unit="Nm/rad", low=0.0, high=1e7, meaning="LuGre: stiffness of the bristles; 0: no bristles"
+    )
+    sigma1_Nm_s: Pair = setting(
+        (0.0, 0.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="LuGre: damping of the bristles"
+    )
+    sigma2_Nm_s: Pair | None = setting(
+        None, unit="Nm s/rad", low=0.0, high=1e4, meaning="LuGre: viscous friction; absent: the profile's"
+    )
+    load_friction: Pair = setting(
+        (0.0, 0.0), low=0.0, high=0.9, meaning="growth of Coulomb friction per torque through the joint"
+    )
+    viscous_drop_per_K: Pair = setting(
+        (0.0, 0.0), unit="1/K", low=0.0, high=0.5, meaning="viscous friction falls by this share per kelvin above 25 °C"
+    )
+    coulomb_drop_per_K: Pair = setting(
+        (0.0, 0.0), unit="1/K", low=0.0, high=0.5, meaning="Coulomb and static friction likewise"
+    )
+    heat_capacity_J_K: Pair = setting(
+        (0.0, 0.0), unit="J/K", low=0.0, high=1e9, meaning="of the joint that its friction warms; 0: no warming"
+    )
+    cooling_s: Pair = setting(
+        (600.0, 600.0), unit="s", low=0.01, high=1e6, meaning="time constant of the joint's way back to ambient"
+    )
+    ambient_C: float = setting(
+        REFERENCE_C, unit="°C", low=-40.0, high=80.0, meaning="temperature around, and of the joints at power-on"
+    )
+    stiffness_Nm_rad: Pair = setting(
+        (0.0, 0.0), unit="Nm/rad", low=0.0, high=1e7, meaning="of the joint, motor to sensor; 0: stiff"
+    )
+    damping_Nm_s: Pair = setting((0.0, 0.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="beside that stiffness")
+    rotor_inertia_kg_m2: Pair = setting(
+        (0.0, 0.0), unit="kg m²", low=0.0, high=100.0, meaning="of motor and gear, seen from the joint (times N²)"
+    )
+    backlash_rad: Pair = setting((0.0, 0.0), unit="rad", low=0.0, high=0.5, meaning="whole width of the dead zone")
+    ripple_Nm: Pair = setting((0.0, 0.0), unit="Nm", low=0.0, high=100.0, meaning="amplitude of the torque ripple")
+    ripple_share: Pair = setting((0.0, 0.0), low=0.0, high=1.0, meaning="amplitude per motor torque, added to it")
+    ripple_periods: Pair = setting(
+        (100.0, 100.0), low=1.0, high=1e5, meaning="periods of the ripple per revolution of the joint"
+    )
+    ripple_phase_deg: Pair = setting((0.0, 0.0), unit="deg", low=-360.0, high=360.0, meaning="of the ripple at q = 0")
+    motor_viscous_Nm_s: Pair = setting(
+        (0.0, 0.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="friction before the sensor, which does not see it"
+    )
+    motor_coulomb_Nm: Pair = setting((0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="likewise, Coulomb")
+    holding_brake_Nm: Pair = setting(
+        (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="what the motor's brake holds while the drive is off"
+    )
+    encoder_side: str = setting("motor", choices=ENCODER_SIDES, meaning="which side of the spring the encoder reads")
+    stop_low_deg: Pair | None = setting(
+        None, unit="deg", low=-720.0, high=720.0, meaning="lower joint stops; absent: the profile's"
+    )
+    stop_high_deg: Pair | None = setting(
+        None, unit="deg", low=-720.0, high=720.0, meaning="upper joint stops; absent: the profile's"
+    )
+    stop_stiffness_Nm_rad: Pair = setting(
+        STOP_STIFFNESS_NM_RAD, unit="Nm/rad", low=1.0, high=1e7, meaning="of a joint stop"
+    )
+    stop_damping_Nm_s: Pair = setting(STOP_DAMPING_NM_S, unit="Nm s/rad", low=0.0, high=1e4, meaning="of a joint stop")
+    tilt_deg: float = setting(0.0, unit="deg", low=0.0, high=90.0, meaning="of the base; 90: the arm moves upright")
+    tilt_direction_deg: float = setting(
+        0.0, unit="deg", low=-360.0, high=360.0, meaning="downhill, from the base's x axis"
+    )
+
+    def __post_init__(self) -> None:
+        if (self.stop_low_deg is None) != (self.stop_high_deg is None):
+            raise ConfigError("`mechanics.stop_low_deg` and `mechanics.stop_high_deg` come together")
+        for joint in range(2):
+            if self.stiffness_Nm_rad[joint] == 0.0:
+                for name in ("backlash_rad", "damping_Nm_s"):
+                    value = getattr(self, name)[joint]
+                    if value > 0.0:
+                        raise ConfigError(f"`mechanics.{name}[{joint}]` = {value:g} needs a `stiffness_Nm_rad` above 0")
+            elif self.rotor_inertia_kg_m2[joint] == 0.0:
+                raise ConfigError(
+                    f"`mechanics.stiffness_Nm_rad[{joint}]` = {self.stiffness_Nm_rad[joint]:g} Nm/rad "
+                    "needs a `rotor_inertia_kg_m2` above 0 kg m²"
+                )
+            if self.stop_low_deg and self.stop_high_deg and self.stop_low_deg[joint] >= self.stop_high_deg[joint]:
+                raise ConfigError(
+                    f"`mechanics.stop_low_deg[{joint}]` = {self.stop_low_deg[joint]:g} deg is not below "
+                    f"stop_high_deg = {self.stop_high_deg[joint]:g} deg"
+                )
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether the rigid plant is all there is."""
+        return self == MechanicsSettings()
+
+    @property
+    def holding_torque_Nm(self) -> Pair:
+        """What the motors hold without power: their own friction, their brakes and their cogging."""
+        first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
+        return sum(first), sum(second)
+
+    def check(self, arm: Arm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
+        """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads."""
+        for joint in range(2):
+            static_Nm, coulomb_Nm = self.static_Nm[joint], arm.coulomb_Nm[joint]
+            if 0.0 < static_Nm < coulomb_Nm:
+                raise ConfigError(
+                    f"`mechanics.static_Nm[{joint}]` = {static_Nm:g} Nm is below the Coulomb friction of profile "
+                    f"{arm.name}, {coulomb_Nm:g} Nm"
+                )
+            if self.sigma0_Nm_rad[joint] > 0.0 and max(static_Nm, coulomb_Nm) == 0.0:
+                raise ConfigError(f"`mechanics.sigma0_Nm_rad[{joint}]` needs Coulomb or static friction above 0 Nm")
+            low_deg, high_deg = (stops[joint] for stops in self._stops_deg(arm))
+            if not low_deg <= start_deg[joint] <= high_deg:
+                raise ConfigError(
+                    f"`start_deg[{joint}]` = {start_deg[joint]:g} deg is beyond the joint's stops at "
+                    f"{low_deg:g} and {high_deg:g} deg"
+                )
+        fastest_rad_s = self.eigenvalues(arm, payloads)[1]
+        bound_rad_s = LARGEST_RATE * LARGEST_SUBSTEPS / TICK_S
+        if fastest_rad_s > bound_rad_s:
+            raise ConfigError(
+                f"`mechanics`: an eigenfrequency of {fastest_rad_s:.3g} rad/s is above {bound_rad_s:g} rad/s; "
+                "less stiffness or damping, or more inertia"
+            )
+
+    def arm_numbers(self, arm: Arm) -> Vector:
+        """Pack the arm with its stops for compiled functions (ARM_NUMBERS,)."""
+        numbers = arm.numbers()
+        low_deg, high_deg = self._stops_deg(arm)
+        for place, pair in (
+            (STOP_LOW, np.radians(low_deg)),
+            (STOP_HIGH, np.radians(high_deg)),
+            (STOP_STIFFNESS, self.stop_stiffness_Nm_rad),
+            (STOP_DAMPING, self.stop_damping_Nm_s),
+        ):
+            numbers[place : place + 2] = pair
+        return numbers
+
+    def _stops_deg(self, arm: Arm) -> tuple[Pair, Pair]:
+        if self.stop_low_deg is None or self.stop_high_deg is None:
+            return (-arm.stop_deg[0], -arm.stop_deg[1]), arm.stop_deg
+        return self.stop_low_deg, self.stop_high_deg
+
+    def numbers(self, arm: Arm) -> Vector:
+        """Pack for compiled functions (MECHANICS_NUMBERS,), by the places of friction, transmission and mechanics."""
+        numbers = np.zeros(MECHANICS_NUMBERS)
+
+        def put(place: int, pair: Sequence[float]) -> None:
+            numbers[place : place + 2] = pair
+
+        surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
+        put(SURPLUS, surplus)
+        put(STRIBECK, self.stribeck_velocity_rad_s)
+        put(SIGMA0, self.sigma0_Nm_rad)
+        put(SIGMA1, self.sigma1_Nm_s)
+        put(SIGMA2, self._sigma2(arm))
+        put(LOAD, self.load_friction)
+        put(VISCOUS_DROP, self.viscous_drop_per_K)
+        put(COULOMB_DROP, self.coulomb_drop_per_K)
+        put(CAPACITY, self.heat_capacity_J_K)
+        put(COOLING, self.cooling_s)
+        put(AMBIENT, (self.ambient_C, self.ambient_C))
+        put(STIFFNESS, self.stiffness_Nm_rad)
+        put(DAMPING, self.damping_Nm_s)
+        put(ROTOR_INERTIA, self.rotor_inertia_kg_m2)
+        put(BACKLASH, self.backlash_rad)
+        put(RIPPLE, self.ripple_Nm)
+        put(RIPPLE_SHARE, self.ripple_share)
+        put(RIPPLE_PERIODS, self.ripple_periods)
+        put(RIPPLE_PHASE, np.radians(self.ripple_phase_deg).tolist())
+        put(MOTOR_VISCOUS, self.motor_viscous_Nm_s)
+        put(MOTOR_COULOMB, self.motor_coulomb_Nm)
+        put(HOLDING_BRAKE, self.holding_brake_Nm)
+        numbers[ENCODER_ON_LINK : ENCODER_ON_LINK + 2] = self.encoder_side == "link"
+        numbers[GRAVITY] = GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
+        numbers[DOWNHILL] = math.radians(self.tilt_direction_deg)
+        for joint in range(2):
+            is_dry = arm.coulomb_Nm[joint] + surplus[joint] + self.load_friction[joint] > 0.0
+            is_stiff = self.stiffness_Nm_rad[joint] == 0.0
+            on_link = is_dry and self.sigma0_Nm_rad[joint] == 0.0
+            on_motor = is_stiff and self.motor_coulomb_Nm[joint] > 0.0
+            numbers[FREE + joint] = not (on_link or on_motor)
+        return numbers
+
+    def _sigma2(self, arm: Arm) -> Pair:
+        return arm.viscous_Nm_s if self.sigma2_Nm_s is None else self.sigma2_Nm_s
+
+    def eigenvalues(self, arm: Arm, payloads: Sequence[PayloadBody]) -> tuple[float, float]:
+        """Give the largest |Im λ| and |λ| in rad/s of the arm linearised about rest, bristles stuck and stops touched.
+
+        The largest of elbow angles from 0 to 180 degrees in steps of 45, with each of the payloads.
+        """
+        elastic = [joint for joint in range(2) if self.stiffness_Nm_rad[joint] > 0.0]
+        size = 2 + len(elastic)
+        stiffness, damping = np.zeros((size, size)), np.zeros((size, size))
+        viscous = self._sigma2(arm)
+        for joint in range(2):
+            stiffness[joint, joint] += self.sigma0_Nm_rad[joint]
+            damping[joint, joint] += self.sigma1_Nm_s[joint] + max(viscous[joint], arm.viscous_Nm_s[joint])
+            stiffness[joint, joint] += self.stop_stiffness_Nm_rad[joint]
+            damping[joint, joint] += self.stop_damping_Nm_s[joint]
+            motor = 2 + elastic.index(joint) if joint in elastic else joint
+            damping[motor, motor] += self.motor_viscous_Nm_s[joint]
+            if joint in elastic:
+                spring = np.zeros(size)
+                spring[[joint, motor]] = 1.0, -1.0
+                stiffness += self.stiffness_Nm_rad[joint] * np.outer(spring, spring)
+                damping += self.damping_Nm_s[joint] * np.outer(spring, spring)
+        oscillation, largest = 0.0, 0.0
+        for mass_kg, center_m, inertia_kg_m2 in payloads:
+            state = np.zeros(MECHANICAL_STATE)
+            fit_payload(state, arm.numbers(), mass_kg, center_m[0], center_m[1], inertia_kg_m2)
+            for joint in range(2):
+                state[ROTOR + joint] = 0.0 if joint in elastic else self.rotor_inertia_kg_m2[joint]
+            for elbow_rad in np.linspace(0.0, math.pi, 5):
+                mass = np.zeros((size, size))
+                m11, m12, m22 = mass_matrix(state, float(elbow_rad))
+                mass[:2, :2] = [[m11, m12], [m12, m22]]
+                for place, joint in enumerate(elastic, start=2):
+                    mass[place, place] = self.rotor_inertia_kg_m2[joint]
+                system = np.zeros((2 * size, 2 * size))
+                system[:size, size:] = np.eye(size)
+                system[size:, :size] = -np.linalg.solve(mass, stiffness)
+                system[size:, size:] = -np.linalg.solve(mass, damping)
+                eigenvalues = np.linalg.eigvals(system)
+                oscillation = max(oscillation, float(np.abs(eigenvalues.imag).max()))
+                largest = max(largest, float(np.abs(eigenvalues).max()))
+        return oscillation, largest
+
+    def substeps(self, arm: Arm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
+        """Choose the substeps of a 100 µs tick; touch_rad_s: fastest eigenfrequency of what touches the arm."""
+        oscillation, largest = self.eigenvalues(arm, payloads)
+        oscillation = max(oscillation, touch_rad_s)
+        needed = max(oscillation / LARGEST_OSCILLATION, largest / LARGEST_DECAY) * TICK_S
+        return min(max(1, math.ceil(needed)), LARGEST_SUBSTEPS)

@@ -1,0 +1,363 @@
+"""The rigid arm in motion: Lagrange's equations in absolute link angles, friction that truly holds, RK4.
+
+With φ₁ = q₁, φ₂ = q₁ + q₂ and the kinetic energy of `firmware_sim.arm.arms`, Lagrange gives
+
+    α φ̈₁ + h φ̈₂ = T₁ − h' φ̇₂²        h  =  β cos q₂ − σ sin q₂
+    γ φ̈₂ + h φ̈₁ = T₂ + h' φ̇₁²        h' = −β sin q₂ − σ cos q₂
+
+only centrifugal terms, no Coriolis ones: ∂T/∂φ₁ = −h' φ̇₁ φ̇₂ takes with it the part of d(h φ̇₂)/dt that has φ̇₁. σ is
+the payload's mass beside the axis of link 2 (`firmware_sim.arm.arms`), 0 for a payload on the axis. φ̇ = J q̇ with
+J = [[1, 0], [1, 1]] brings them to the joints, where the motors, the friction and the sensors are:
+(Jᵀ N J + R) q̈ = Jᵀ (...), with the inertia R of rotors that turn rigidly with their joints
+(`firmware_sim.arm.mechanics`; 0 here). Torque of joint i, Nm, on the link side of its sensor:
+
+    motor torque tau_J + external torque tau_ext − viscous friction F_v q̇ − Coulomb friction
+
+Coulomb friction opposes motion with F_c while the joint slips and holds with up to F_c while it sticks. A joint's
+`slip` is +1 or −1 while it moves and 0 while it sticks. Slips are constant within an integration step: when a
+velocity passes zero or a holding torque passes F_c, the step is cut at that instant and the slips are decided anew.
+
+A joint stop is a spring with damper that only pushes, on the link side; it counts as external torque, because it comes
+from outside the link.
+
+The motor torque follows its target with the first-order lag of the drive's current loop.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import Vector
+from firmware_sim.arm.scripted_contact import contact_force, contact_torque
+
+CURRENT_LOOP_RAD_S: Final = 2.0 * math.pi * 1000.0
+"""Bandwidth of the drive's torque loop; 1 kHz is usual for servo drives."""
+
+# Places in the vector that stands for an arm, see `firmware_sim.arm.arms.Arm.numbers`. They are here and not there
+# because compiled code contains them, and the cache of compiled code is keyed by the modules that compile.
+ALPHA: Final = 0  # kg m², without payload, as BETA and GAMMA
+BETA: Final = 1
+GAMMA: Final = 2
+LENGTH: Final = 3  # 3, 4: m
+VISCOUS: Final = 5  # 5, 6: Nm s/rad
+COULOMB: Final = 7  # 7, 8: Nm
+TORQUE_LIMIT: Final = 9  # 9, 10: Nm
+BRAKE_DAMPING: Final = 11  # 11, 12: Nm s/rad
+CURRENT_LOOP: Final = 13  # 13, 14: rad/s, bandwidth of the drives' torque loops
+MOMENT: Final = 15  # kg m, first moment of all masses about joint 1 with link 2 folded into joint 2; without payload
+STOP_LOW: Final = 16  # 16, 17: rad
+STOP_HIGH: Final = 18  # 18, 19: rad
+STOP_STIFFNESS: Final = 20  # 20, 21: Nm/rad
+STOP_DAMPING: Final = 22  # 22, 23: Nm s/rad
+ARM_NUMBERS: Final = 24
+
+# Places in the vector of the mechanical state.
+Q: Final = 0  # 0, 1: joint position, rad
+DQ: Final = 2  # 2, 3: joint velocity, rad/s
+TAU: Final = 4  # 4, 5: motor torque = joint torque, Nm
+PAYLOAD: Final = 6  # kg, part of the inertia below
+INERTIA: Final = 7  # 7, 8, 9: α, β, γ with payload, kg m²
+SKEW: Final = 10  # σ, kg m²
+ROTOR: Final = 11  # 11, 12: inertia of rotors that turn rigidly with their joints, kg m²
+SHAFT: Final = 13  # 13, 14: position of the motor side, rad; as q where the joint is stiff
+DSHAFT: Final = 15  # 15, 16: its velocity, rad/s
+JOINT_TORQUE: Final = 17  # 17, 18: torque through the sensor, Nm
+ENCODED: Final = 19  # 19, 20: position of the shaft that carries the encoder, rad
+BRISTLE: Final = 21  # 21, 22: deflection of LuGre's bristles, rad
+WARMTH: Final = 23  # 23, 24: temperature of the joint's lubricant, °C
+BRAKE: Final = 25  # 25, 26: torque of the holding brake that is closed, Nm
+MECHANICAL_STATE: Final = 27
+
+# A step is cut at most this often; a slip lasts much longer than a step, so three are never needed in practice.
+_LARGEST_CUTS: Final = 8
+# Bisections of a step to find the instant of a cut: 100 µs · 2⁻⁴⁰ is below the resolution of time within a step.
+_BISECTIONS: Final = 40
+
+
+@compiled
+def fit_payload(
+    state: Vector,
+    arm: Vector,
+    payload_kg: float,
+    along_m: float = 0.0,
+    beside_m: float = 0.0,
+    inertia_kg_m2: float = 0.0,
+) -> None:
+    """Change the payload, a body with its centre of mass at (along, beside) from the tip in the frame of link 2.
+
+    What is added was at rest: the momentum of the moving arm is shared with it, M q̇ stays. What is taken off leaves
+    with the speed that it has: q̇ stays. At rest both change nothing but the inertia.
+    """
+    added_kg = payload_kg - state[PAYLOAD]
+    m11, m12, m22 = mass_matrix(state, state[Q + 1])
+    momentum1 = m11 * state[DQ] + m12 * state[DQ + 1]
+    momentum2 = m12 * state[DQ] + m22 * state[DQ + 1]
+    length1_m, length2_m = arm[LENGTH], arm[LENGTH + 1]
+    state[PAYLOAD] = payload_kg
+    state[INERTIA] = arm[ALPHA] + payload_kg * length1_m * length1_m
+    reach_m = length2_m + along_m
+    state[INERTIA + 1] = arm[BETA] + payload_kg * length1_m * reach_m
+    state[INERTIA + 2] = arm[GAMMA] + payload_kg * reach_m * reach_m
+    state[INERTIA + 2] += payload_kg * beside_m * beside_m + inertia_kg_m2
+    state[SKEW] = payload_kg * length1_m * beside_m
+    if added_kg > 0.0 and (momentum1 != 0.0 or momentum2 != 0.0):
+        m11, m12, m22 = mass_matrix(state, state[Q + 1])
+        determinant = m11 * m22 - m12 * m12
+        state[DQ] = (m22 * momentum1 - m12 * momentum2) / determinant
+        state[DQ + 1] = (m11 * momentum2 - m12 * momentum1) / determinant
+
+
+@compiled
+def mass_matrix(state: Vector, q2: float) -> tuple[float, float, float]:
+    """Give m11, m12, m22 of Jᵀ N J + R at the elbow angle q2, kg m²."""
+    coupling = state[INERTIA + 1] * math.cos(q2)
+    if state[SKEW] != 0.0:
+        coupling -= state[SKEW] * math.sin(q2)
+    m22 = state[INERTIA + 2]
+    return state[INERTIA] + m22 + 2.0 * coupling + state[ROTOR], m22 + coupling, m22 + state[ROTOR + 1]
+
+
+@compiled
+def accelerate(
+    state: Vector,
+    arm: Vector,
+    slip1: int,
+    slip2: int,
+    torque1: float,
+    torque2: float,
+    q2: float,
+    dq1: float,
+    dq2: float,
+) -> tuple[float, float, float, float]:
+    """Give ddq1, ddq2 in rad/s² and the Coulomb friction of both joints in Nm, positive along +dq.
+
+    torque is motor plus external torque. A sticking joint has no acceleration; its friction is what it takes to hold,
+    be it more than F_c or not.
+    """
+    sine = state[INERTIA + 1] * math.sin(q2)
+    if state[SKEW] != 0.0:
+        sine += state[SKEW] * math.cos(q2)
+    m11, m12, m22 = mass_matrix(state, q2)
+    rate2 = dq1 + dq2
+    # Jᵀ of the centrifugal terms, less viscous friction
+    centrifugal2 = -sine * dq1 * dq1
+    drive1 = torque1 + sine * rate2 * rate2 + centrifugal2 - arm[VISCOUS] * dq1
+    drive2 = torque2 + centrifugal2 - arm[VISCOUS + 1] * dq2
+    friction1 = arm[COULOMB] * slip1
+    friction2 = arm[COULOMB + 1] * slip2
+    if slip1 != 0 and slip2 != 0:
+        net1 = drive1 - friction1
+        net2 = drive2 - friction2
+        determinant = m11 * m22 - m12 * m12
+        return (m22 * net1 - m12 * net2) / determinant, (m11 * net2 - m12 * net1) / determinant, friction1, friction2
+    if slip1 != 0:
+        ddq1 = (drive1 - friction1) / m11
+        return ddq1, 0.0, friction1, drive2 - m12 * ddq1
+    if slip2 != 0:
+        ddq2 = (drive2 - friction2) / m22
+        return 0.0, ddq2, drive1 - m12 * ddq2, friction2
+    return 0.0, 0.0, drive1, drive2
+
+
+@compiled
+def decide_slips(
+    state: Vector, arm: Vector, torque1: float, torque2: float, q2: float, dq1: float, dq2: float
+) -> tuple[int, int]:
+    """Say how each joint goes on: the sign of its velocity, or at standstill whether and which way it breaks away.
+
+    At standstill exactly one choice fits friction's law, because the inertia is positive definite: joints that stick
+    need no more than F_c, joints that slip accelerate the way they slip. Within rounding of the limit none may fit;
+    then the one that fits best is taken.
+    """
+    if dq1 != 0.0 and dq2 != 0.0:
+        return (1 if dq1 > 0.0 else -1), (1 if dq2 > 0.0 else -1)
+    best1, best2, best_violation = 0, 0, np.inf
+    for choice1 in (0, 1, -1):
+        if dq1 * choice1 < 0.0 or (dq1 != 0.0 and choice1 == 0):
+            continue
+        for choice2 in (0, 1, -1):
+            if dq2 * choice2 < 0.0 or (dq2 != 0.0 and choice2 == 0):
+                continue
+            ddq1, ddq2, friction1, friction2 = accelerate(state, arm, choice1, choice2, torque1, torque2, q2, dq1, dq2)
+            violation = 0.0
+            if dq1 == 0.0:
+                excess = -ddq1 * choice1 if choice1 != 0 else abs(friction1) - arm[COULOMB]
+                violation = max(violation, excess)
+            if dq2 == 0.0:
+                excess = -ddq2 * choice2 if choice2 != 0 else abs(friction2) - arm[COULOMB + 1]
+                violation = max(violation, excess)
+            if violation < best_violation:
+                best1, best2, best_violation = choice1, choice2, violation
+            if best_violation == 0.0:
+                return best1, best2
+    return best1, best2
+
+
+@compiled
+def _stop_torque(arm: Vector, joint: int, q: float, dq: float) -> float:
+    """Give the torque of a joint stop, Nm."""
+    if q > arm[STOP_HIGH + joint]:
+        push = -arm[STOP_STIFFNESS + joint] * (q - arm[STOP_HIGH + joint]) - arm[STOP_DAMPING + joint] * dq
+        return float(min(0.0, push))
+    if q < arm[STOP_LOW + joint]:
+        push = -arm[STOP_STIFFNESS + joint] * (q - arm[STOP_LOW + joint]) - arm[STOP_DAMPING + joint] * dq
+        return float(max(0.0, push))
+    return 0.0
+
+
+@compiled
+def external_torque(
+    arm: Vector, contact: Vector, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
+) -> tuple[float, float]:
+    """Give the external torque of a contact row and of the joint stops; an empty row: nobody touches the arm."""
+    stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
+    if contact.size == 0:
+        return stop1, stop2
+    ext1, ext2 = contact_torque(contact, contact_force(contact, elapsed_s), arm[LENGTH], q1, q2)
+    return ext1 + stop1, ext2 + stop2
+
+
+@compiled
+def follow_target(tau_Nm: float, target_Nm: float, turn: float) -> tuple[float, float]:
+    """Give the motor torque in the middle and at the end of a step of `turn` time constants.
+
+    The torque's distance from its target decays. In the middle of the step stands the value with which Simpson's rule
+    gives the exact impulse; the torque at the midpoint itself would be wrong by 1e-7 rad/s after a step of 3 Nm.
+    """
+    fall = -math.expm1(-turn)
+    middle = 0.25 * (6.0 * fall / turn - 2.0 + fall)
+    return target_Nm + (tau_Nm - target_Nm) * middle, tau_Nm + (target_Nm - tau_Nm) * fall
+
+
+@compiled
+def mirror_stiff_joints(state: Vector) -> None:
+    """Say what the sensors sit on where the joints are stiff: motor side is link side, joint torque is motor torque."""
+    for joint in range(2):
+        state[SHAFT + joint] = state[Q + joint]
+        state[DSHAFT + joint] = state[DQ + joint]
+        state[ENCODED + joint] = state[Q + joint]
+        state[JOINT_TORQUE + joint] = state[TAU + joint]
+
+
+@compiled
+def _runge_kutta(
+    state: Vector,
+    arm: Vector,
+    contact: Vector,
+    elapsed_s: float,
+    slip1: int,
+    slip2: int,
+    target1: float,
+    target2: float,
+    tau1: float,
+    tau2: float,
+    q1: float,
+    q2: float,
+    dq1: float,
+    dq2: float,
+    step_s: float,
+) -> tuple[float, float, float, float, float, float]:
+    """Advance q1, q2, dq1, dq2, tau1, tau2 by one step of classical RK4 with constant slips."""
+    half_s = 0.5 * step_s
+    mid1, end1 = follow_target(tau1, target1, arm[CURRENT_LOOP] * step_s)
+    mid2, end2 = follow_target(tau2, target2, arm[CURRENT_LOOP + 1] * step_s)
+
+    ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
+    a1, a2, _, _ = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
+
+    v1, v2 = dq1 + half_s * a1, dq2 + half_s * a2
+    p1, p2 = q1 + half_s * dq1, q2 + half_s * dq2
+    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2, v1, v2)
+    b1, b2, _, _ = accelerate(state, arm, slip1, slip2, mid1 + ext1, mid2 + ext2, p2, v1, v2)
+
+    w1, w2 = dq1 + half_s * b1, dq2 + half_s * b2
+    p1, p2 = q1 + half_s * v1, q2 + half_s * v2
+    ext1, ext2 = external_torque(arm, contact, elapsed_s + half_s, p1, p2, w1, w2)
+    c1, c2, _, _ = accelerate(state, arm, slip1, slip2, mid1 + ext1, mid2 + ext2, p2, w1, w2)
+
+    x1, x2 = dq1 + step_s * c1, dq2 + step_s * c2
+    p1, p2 = q1 + step_s * w1, q2 + step_s * w2
+    ext1, ext2 = external_torque(arm, contact, elapsed_s + step_s, p1, p2, x1, x2)
+    d1, d2, _, _ = accelerate(state, arm, slip1, slip2, end1 + ext1, end2 + ext2, p2, x1, x2)
+
+    sixth_s = step_s / 6.0
+    return (
+        q1 + sixth_s * (dq1 + 2.0 * (v1 + w1) + x1),
+        q2 + sixth_s * (dq2 + 2.0 * (v2 + w2) + x2),
+        dq1 + sixth_s * (a1 + 2.0 * (b1 + c1) + d1),
+        dq2 + sixth_s * (a2 + 2.0 * (b2 + c2) + d2),
+        end1,
+        end2,
+    )
+
+
+@compiled
+def _margin(
+    state: Vector,
+    arm: Vector,
+    contact: Vector,
+    elapsed_s: float,
+    slip1: int,
+    slip2: int,
+    after: tuple[float, float, float, float, float, float],
+) -> float:
+    """Say how well the slips still fit after a step: negative when a joint ought to have stopped or broken away."""
+    q1, q2, dq1, dq2, tau1, tau2 = after
+    margin = np.inf
+    if slip1 != 0:
+        margin = dq1 * slip1
+    if slip2 != 0:
+        margin = min(margin, dq2 * slip2)
+    if slip1 == 0 or slip2 == 0:
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
+        _, _, friction1, friction2 = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
+        if slip1 == 0:
+            margin = min(margin, arm[COULOMB] - abs(friction1))
+        if slip2 == 0:
+            margin = min(margin, arm[COULOMB + 1] - abs(friction2))
+    return margin
+
+
+@compiled
+def integrate(
+    state: Vector, arm: Vector, contact: Vector, elapsed_s: float, target1: float, target2: float, step_s: float
+) -> None:
+    """Advance the mechanical state by `step_s`, cutting the step where a joint stops, reverses or breaks away.
+
+    contact: row of the contact table, or empty. elapsed_s: time since that contact's onset at the start of the step.
+    target: what the drive's torque loops are asked for, Nm, constant over the step.
+    """
+    left_s = step_s
+    for cut in range(_LARGEST_CUTS):
+        q1, q2, dq1, dq2, tau1, tau2 = state[0], state[1], state[2], state[3], state[4], state[5]
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
+        slip1, slip2 = decide_slips(state, arm, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
+        advanced_s = left_s
+        after = _runge_kutta(
+            state, arm, contact, elapsed_s, slip1, slip2, target1, target2, tau1, tau2, q1, q2, dq1, dq2, left_s
+        )
+        margin = _margin(state, arm, contact, elapsed_s + left_s, slip1, slip2, after)
+        if margin < 0.0 and cut < _LARGEST_CUTS - 1:
+            fits_s = 0.0
+            for _ in range(_BISECTIONS):
+                middle_s = 0.5 * (fits_s + advanced_s)
+                trial = _runge_kutta(
+                    state, arm, contact, elapsed_s, slip1, slip2, target1, target2,
+                    tau1, tau2, q1, q2, dq1, dq2, middle_s,
+                )  # fmt: skip
+                if _margin(state, arm, contact, elapsed_s + middle_s, slip1, slip2, trial) < 0.0:
+                    advanced_s = middle_s
+                    after = trial
+                else:
+                    fits_s = middle_s
+        state[Q], state[Q + 1] = after[0], after[1]
+        # A velocity that has passed zero is zero: the joint stands, for this instant at least.
+        state[DQ] = after[2] if after[2] * slip1 > 0.0 else 0.0
+        state[DQ + 1] = after[3] if after[3] * slip2 > 0.0 else 0.0
+        state[TAU], state[TAU + 1] = after[4], after[5]
+        elapsed_s += advanced_s
+        left_s -= advanced_s
+        if left_s <= 0.0:
+            return

@@ -1,0 +1,145 @@
+"""People and things that touch the arm with a body of their own, as a scenario says them: bodies, hands, walls.
+
+Points and angles are in the world's frame: origin in joint 1, x along link 1 at q₁ = 0. Where the forces come from is
+in `firmware_sim.arm.touch_forces`.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from adacd_hil.config import ConfigError, setting
+from firmware_sim.arm.body_regions import BODY_REGIONS
+from firmware_sim.arm.scripted_contact import TICK_S, ticks
+
+_REACH_M: Final = 20.0
+"""Bound of coordinates: twice what two links of 5 m, the longest allowed, can reach."""
+
+
+def _ends(lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+    """Give base, elbow and tip."""
+    elbow = lengths_m[0] * math.cos(pose_rad[0]), lengths_m[0] * math.sin(pose_rad[0])
+    angle = pose_rad[0] + pose_rad[1]
+    return (0.0, 0.0), elbow, (elbow[0] + lengths_m[1] * math.cos(angle), elbow[1] + lengths_m[1] * math.sin(angle))
+
+
+@dataclass(frozen=True)
+class BodySettings:
+    """A body in the arm's way: a body region of ISO/TS 15066, or mass and stiffness in numbers."""
+
+    at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="when it steps in, since the drives were enabled")
+    link: int = setting(low=1, high=2, meaning="the link that meets it")
+    x_m: float = setting(unit="m", low=-_REACH_M, high=_REACH_M, meaning="where its centre stands, world")
+    y_m: float = setting(unit="m", low=-_REACH_M, high=_REACH_M, meaning="where its centre stands, world")
+    duration_s: float | None = setting(
+        None, unit="s", low=TICK_S, high=1e6, meaning="from at_s to its leaving; absent: it stays"
+    )
+    region: str | None = setting(None, choices=tuple(BODY_REGIONS), meaning="body region, for mass and stiffness")
+    mass_kg: float | None = setting(None, unit="kg", low=0.01, high=1000.0, meaning="what the arm pushes away")
+    stiffness_N_m: float | None = setting(None, unit="N/m", low=1.0, high=1e6, meaning="of its surface")
+    damping_N_s_m: float = setting(0.0, unit="N s/m", low=0.0, high=1e5, meaning="of its surface")
+    radius_m: float = setting(
+        0.0, unit="m", low=0.0, high=1.0, meaning="from its centre to its surface, half the width of the link added"
+    )
+    clamped: bool = setting(False, meaning="stands against a wall: it can't be pushed away")
+    gap_m: float | None = setting(None, unit="m", low=0.0, high=_REACH_M, meaning="room behind it; absent: no wall")
+    free_deg: float | None = setting(
+        None, unit="deg", low=-360.0, high=360.0, meaning="where it can be pushed; absent: normal to the link"
+    )
+
+    def __post_init__(self) -> None:
+        numbers = [name for name in ("mass_kg", "stiffness_N_m") if getattr(self, name) is not None]
+        if self.region is not None and numbers:
+            raise ConfigError(f"{numbers[0]} = {getattr(self, numbers[0])} is given by region {self.region!r}")
+        if self.region is None and len(numbers) < 2:
+            raise ConfigError("a body needs a region, or mass_kg and stiffness_N_m")
+        if self.clamped and self.gap_m:
+            raise ConfigError(f"gap_m = {self.gap_m} m: a clamped body has no gap")
+
+    @property
+    def onset_tick(self) -> int:
+        """First 100 µs tick in which it may stand there."""
+        return ticks(self.at_s)
+
+    @property
+    def mass(self) -> float:
+        """Mass, kg: its own, or its region's."""
+        return BODY_REGIONS[self.region].mass_kg if self.region is not None else float(self.mass_kg or 0.0)
+
+    @property
+    def stiffness(self) -> float:
+        """Stiffness, N/m: its own, or its region's."""
+        return BODY_REGIONS[self.region].stiffness_N_m if self.region is not None else float(self.stiffness_N_m or 0.0)
+
+    @property
+    def room_m(self) -> float:
+        """How far it can recede, inf without a wall behind it."""
+        if self.clamped:
+            return 0.0
+        return math.inf if self.gap_m is None else self.gap_m
+
+    def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
+        """Say how deep its link is in it in this pose; negative: how far away."""
+        ends = _ends(lengths_m, pose_rad)
+        (base_x, base_y), (end_x, end_y) = ends[self.link - 1], ends[self.link]
+        along_x, along_y = end_x - base_x, end_y - base_y
+        share = ((self.x_m - base_x) * along_x + (self.y_m - base_y) * along_y) / (along_x**2 + along_y**2)
+        share = min(max(share, 0.0), 1.0)
+        return self.radius_m - math.hypot(self.x_m - base_x - share * along_x, self.y_m - base_y - share * along_y)
+
+
+@dataclass(frozen=True)
+class HandSettings:
+    """A hand that grasps a point of a link and guides it: spring and damper to a point that moves at constant speed.
+
+    Stiffness and damping of a human hand that holds a posture: Mussa-Ivaldi, Hogan and Bizzi 1985; Tsuji et al. 1995.
+    """
+
+    at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="when it grasps, since the drives were enabled")
+    duration_s: float = setting(unit="s", low=TICK_S, high=1e6, meaning="from grasp to release")
+    link: int = setting(low=1, high=2, meaning="which link it grasps")
+    point_m: float = setting(unit="m", low=0.0, high=5.0, meaning="from the joint that carries the link")
+    move_to_m: tuple[float, float] | None = setting(
+        None, unit="m", low=-_REACH_M, high=_REACH_M, meaning="where it guides the point, world x and y"
+    )
+    direction_deg: float | None = setting(
+        None, unit="deg", low=-360.0, high=360.0, meaning="or the way it guides, until it lets go"
+    )
+    speed_m_s: float = setting(
+        0.1, unit="m/s", low=0.001, high=2.0, meaning="how fast it guides; without a way it holds the point"
+    )
+    stiffness_N_m: float = setting(400.0, unit="N/m", low=1.0, high=1e5, meaning="of the hand and arm")
+    damping_N_s_m: float = setting(40.0, unit="N s/m", low=0.0, high=1e4, meaning="of the hand and arm")
+    force_limit_N: float = setting(60.0, unit="N", low=0.1, high=1000.0, meaning="largest force")
+
+    def __post_init__(self) -> None:
+        if self.move_to_m is not None and self.direction_deg is not None:
+            raise ConfigError(f"direction_deg = {self.direction_deg} deg beside move_to_m: a hand has one way to go")
+
+
+@dataclass(frozen=True)
+class WallSettings:
+    """A fixed wall, a line in the plane; the ends of both links can meet it, not what lies between."""
+
+    x_m: float = setting(unit="m", low=-_REACH_M, high=_REACH_M, meaning="a point of it, world")
+    y_m: float = setting(unit="m", low=-_REACH_M, high=_REACH_M, meaning="a point of it, world")
+    normal_deg: float = setting(unit="deg", low=-360.0, high=360.0, meaning="its normal, toward the free side")
+    at_s: float = setting(0.0, unit="s", low=0.0, high=1e6, meaning="when it is put there")
+    duration_s: float | None = setting(
+        None, unit="s", low=TICK_S, high=1e6, meaning="from at_s to its removal; absent: it stays"
+    )
+    stiffness_N_m: float = setting(1e5, unit="N/m", low=100.0, high=1e6, meaning="of wall and link end together")
+    damping_s_m: float = setting(
+        0.5, unit="s/m", low=0.0, high=100.0, meaning="χ of Hunt and Crossley; restitution is about 1 - 2/3 χ v"
+    )
+
+    @property
+    def onset_tick(self) -> int:
+        """First 100 µs tick in which it may stand there."""
+        return ticks(self.at_s)
+
+    def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
+        """Say how far the worse of the two link ends is behind it in this pose; negative: in front."""
+        normal_x, normal_y = math.cos(math.radians(self.normal_deg)), math.sin(math.radians(self.normal_deg))
+        ends = _ends(lengths_m, pose_rad)[1:]
+        return max(-(x - self.x_m) * normal_x - (y - self.y_m) * normal_y for x, y in ends)

@@ -1,0 +1,166 @@
+"""Where a scenario's faults reach the bench: frames both ways, measured values, and the nodes themselves.
+
+`firmware_sim.bench.fault_plan` says what acts now; this lets it act. Host's frames that a fault delays are late by the
+time since the SYNC before them, because by SYNC nobody knows when within the period they came.
+"""
+
+from collections.abc import Callable, Sequence
+
+from adacd_hil.records import JOINTS
+from adacd_hil.wire.codec import Codec
+from firmware_sim.bench.fault_plan import EVERYBODY, ActionKind, FaultPlan, NodeAction
+from firmware_sim.body.body import Measurement
+from firmware_sim.canopen.object_dictionary import NEVER_NS, Send
+from firmware_sim.canopen.outbox import Outbox
+from firmware_sim.canopen.time_marks import MarkKind
+from firmware_sim.nodes.device import Device
+from firmware_sim.nodes.drive_node import DriveNode
+from firmware_sim.nodes.sensor_node import SensorNode
+from firmware_sim.scenario.scenario import Scenario
+
+Handler = Callable[[bytes, int], None]
+OnEvent = Callable[[int, str, str, str], None]
+"""Called with t_ns, level, name, text."""
+
+
+class Injector:
+    """The faults of one bench. Without any it costs one look at `is_quiet` per SYNC."""
+
+    def __init__(
+        self, scenario: Scenario, seed: int, period_ns: int, codec: Codec, outbox: Outbox, on_event: OnEvent | None
+    ) -> None:
+        """Begin before power-on. Raises ConfigError when a fault is about a frame that the contract hasn't."""
+        self.plan = FaultPlan(scenario.faults, seed, period_ns, codec)
+        self.has_faults = bool(scenario.faults)
+        self.now_ns = 0
+        self.on_event = on_event
+        self._outbox = outbox
+        self._is_acknowledged = True
+        self._power_on_ns = 0
+        self._started_ns: int | None = None
+        self._flooded_ns = 0  # up to here babbling nodes have sent
+        self._devices: Sequence[Device] = ()
+        self._drives: Sequence[DriveNode] = ()
+        self._sensors: Sequence[SensorNode] = ()
+
+    def attach(self, devices: Sequence[Device], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]) -> None:
+        """Connect the nodes."""
+        self._devices, self._drives, self._sensors = devices, drives, sensors
+
+    def power_on(self, t_ns: int) -> None:
+        """Let the time since power-on begin."""
+        self.now_ns = self._power_on_ns = t_ns
+
+    def start(self, t_ns: int) -> None:
+        """Let the scenario's time begin."""
+        self._started_ns = t_ns
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether frames and values are left alone now."""
+        return self.plan.is_quiet
+
+    @property
+    def due_ns(self) -> int:
+        """When a fault begins, ends or goes on."""
+        return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
+
+    def sender(self, place: int) -> Send:
+        """Return what a device sends by."""
+        outbox, plan = self._outbox, self.plan
+
+        def put(can_id: int, data: bytes) -> None:
+            if plan.is_quiet:
+                outbox.put(can_id, data)
+                return
+            for delay_ns, identifier, changed in plan.transmit(place, can_id, data):
+                if delay_ns:
+                    outbox.put_later(self.now_ns + delay_ns, identifier, changed)
+                else:
+                    outbox.put(identifier, changed)
+
+        return put if self.has_faults else outbox.put
+
+    def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
+        """Give a frame of the host, or what becomes of it, to a node (or to `EVERYBODY`); tell whether anything."""
+        if self.plan.is_quiet:
+            take(data, t_ns)
+            return True
+        frames = self.plan.receive(place, can_id, data)
+        for delay_ns, received in frames:
+            if delay_ns == 0:
+                take(received, t_ns)
+            else:
+                due_ns = t_ns + delay_ns
+                self._outbox.hold(due_ns, lambda received=received, due_ns=due_ns: take(received, due_ns))  # type: ignore[misc]
+        return bool(frames)
+
+    def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
+        """Give a frame of the host, or what becomes of it on its way to all, to a handler; tell whether anything."""
+        return self.receive(EVERYBODY, can_id, data, take, t_ns)
+
+    def advance(self, now_ns: int, stamp_ns: int) -> None:
+        """Let faults begin and end by now, and do what they do to nodes. `stamp_ns`: of the events that say so."""
+        self.now_ns = now_ns
+        scenario_ns = -1 if self._started_ns is None else now_ns - self._started_ns
+        for edge in self.plan.advance(scenario_ns, now_ns - self._power_on_ns):
+            if self.on_event is not None:
+                self.on_event(stamp_ns, "warning" if edge.begins else "info", f"fault {edge.row}", edge.text)
+        for action in self.plan.actions():
+            self._do(action, now_ns)
+        if self._is_acknowledged != self.plan.is_acknowledged:
+            self._is_acknowledged = self.plan.is_acknowledged
+            if self._outbox.is_paced:
+                self._outbox.mark(MarkKind.LIT if self._is_acknowledged else MarkKind.DARK)
+
+    def late_ns(self, period_ns: int) -> int:
+        """Draw how late this SYNC reaches the devices, ns; less than a period."""
+        return 0 if self.plan.is_quiet else min(self.plan.sync_delay_ns(), period_ns - 1)
+
+    def flood(self, period_ns: int) -> None:
+        """Let babbling nodes send what they send in the period that begins now."""
+        if self.plan.is_flooding:
+            self._flooded_ns = self.now_ns + period_ns
+            for offset_ns, can_id, data in self.plan.babble(period_ns):
+                self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
+
+    def hear(self, sync_id: int, data: bytes) -> tuple[int, ...]:
+        """Tell how often each node hears a SYNC that is on the bus once."""
+        plan = self.plan
+        return tuple(
+            len(plan.receive(place, sync_id, data)) * device.is_on_bus for place, device in enumerate(self._devices)
+        )
+
+    def sync(self, heard: Sequence[int], measured: Measurement, now_ns: int) -> None:
+        """Give a SYNC to the nodes that hear it, with what they take for measured."""
+        position, velocity, torque = self.plan.distort(*measured)
+        for joint, drive in enumerate(self._drives):
+            if heard[joint]:
+                is_distorted = velocity[joint] != measured.velocity_counts[joint]
+                drive.on_sync(position[joint], velocity[joint], now_ns, is_distorted=is_distorted)
+        for joint, sensor in enumerate(self._sensors):
+            if heard[JOINTS + joint]:
+                sensor.on_sync(torque[joint])
+
+    def _do(self, action: NodeAction, t_ns: int) -> None:
+        kind, place, value = action
+        device = self._devices[place]
+        match kind:
+            case ActionKind.POWER_OFF:
+                device.power_off(t_ns)
+            case ActionKind.POWER_ON:
+                device.power_on(t_ns)
+            case ActionKind.LEAVE_BUS:
+                device.leave_bus(t_ns)
+            case ActionKind.RETURN_TO_BUS:
+                device.return_to_bus(t_ns)
+            case ActionKind.EMERGENCY:
+                device.cry(int(value), t_ns)
+            case ActionKind.FAIL:
+                self._drives[place].fail(int(value), t_ns)
+            case ActionKind.MEND:
+                self._drives[place].mend()
+            case ActionKind.SENSOR_STATUS:
+                self._sensors[place - JOINTS].set_error(int(value))
+            case ActionKind.DRIFT:
+                device.clock.set_drift(value, t_ns)

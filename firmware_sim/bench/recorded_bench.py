@@ -1,0 +1,141 @@
+"""The emulated devices around a recorded arm: what answers SYNC comes from a recording, all else from live nodes.
+
+Object dictionary, NMT and CiA 402 states, heartbeats, status frames, EMCY and watchdogs are those of `Bench`, so any
+host can boot and command the devices. Torque moves nothing: the arm does what it did when it was recorded.
+"""
+
+from collections.abc import Callable, Sequence
+
+from adacd_hil.records import Vector
+from adacd_hil.wire.codec import Codec
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+from firmware_sim.bench.bench import Bench, ClockMode, Movable
+from firmware_sim.bench.recorded_cycles import RESETS, Answer, RecordedCycles
+from firmware_sim.body.body import DriveMode, Measurement
+from firmware_sim.canopen.contracts import Contract
+from firmware_sim.nodes.sensor_node import ROOM_TEMPERATURE_C
+from firmware_sim.scenario.scenario import Scenario
+
+_FEEDBACKS = ("Drive1Feedback", "Drive2Feedback")
+_TORQUE = DriveMode.TORQUE
+_TORQUES = ("Sensor1Torque", "Sensor2Torque")
+
+
+class RecordedBody:
+    """The arm as its recorded frames show it, for the nodes' objects and standstill; it knows no truth."""
+
+    is_torque_limited = (False, False)
+    motor_error_code = (0, 0)
+    joint_temperature_C = (ROOM_TEMPERATURE_C, ROOM_TEMPERATURE_C)
+
+    def __init__(self, codec: Codec) -> None:
+        self.motor_torque_Nm = (0.0, 0.0)
+        """What the motors would have if they followed at once."""
+        self._feedbacks = {codec.message(name).can_id: (place, name) for place, name in enumerate(_FEEDBACKS)}
+        self._torques = {codec.message(name).can_id: (place, name) for place, name in enumerate(_TORQUES)}
+        self._codec = codec
+        self._q_rad, self._dq_rad_s, self._torque_Nm = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+
+    @property
+    def drive_velocity_rad_s(self) -> tuple[float, float]:
+        """Velocity in the latest feedback of each drive."""
+        return self._dq_rad_s[0], self._dq_rad_s[1]
+
+    def show(self, answers: Sequence[Answer]) -> None:
+        """Take over what frames say; those of a wrong length say nothing."""
+        for can_id, data in answers:
+            for table in (self._feedbacks, self._torques):
+                if can_id in table:
+                    place, name = table[can_id]
+                    message = self._codec.message(name)
+                    if len(data) != message.length:
+                        continue
+                    values = dict(zip((s.name for s in message.signals), message.decode(data), strict=True))
+                    self._q_rad[place] = values.get("position", self._q_rad[place])
+                    self._dq_rad_s[place] = values.get("velocity", self._dq_rad_s[place])
+                    self._torque_Nm[place] = values.get("torque", self._torque_Nm[place])
+
+    def start_scenario(self) -> None:
+        """Do nothing: whatever happened is in the recording."""
+
+    def advance(
+        self,
+        torque_setpoint_Nm: Sequence[float],
+        drive_mode: Sequence[int],
+        tick_count: int | None = None,  # noqa: ARG002 (the protocol's signature)
+    ) -> None:
+        """Take note of the torque; SYNC brings the next cycle."""
+        first_Nm, second_Nm = torque_setpoint_Nm
+        self.motor_torque_Nm = first_Nm * (drive_mode[0] == _TORQUE), second_Nm * (drive_mode[1] == _TORQUE)
+
+    def sample(self) -> Measurement:
+        """Return the latest values in the converters' counts."""
+        return Measurement(
+            _counts(self._q_rad, POSITION_LSB_RAD),
+            _counts(self._dq_rad_s, VELOCITY_LSB_RAD_S),
+            _counts(self._torque_Nm, TORQUE_LSB_NM),
+        )
+
+    def truth(self, out: Vector) -> None:
+        """Leave everything as it is: nothing is known."""
+
+
+class RecordedBench(Bench):
+    """A bench whose cyclic frames come from a recording, or from somebody else on the bus."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        codec: Codec,
+        send: Callable[[int, bytes], None],
+        cycles: RecordedCycles | None,
+        *,
+        clock_mode: ClockMode = "sync",
+        contract: Contract | None = None,
+        on_answer: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Build everything as `Bench` does. `scenario`: without faults. Without `cycles` SYNC isn't answered."""
+        self._cycles = cycles
+        self._answers_now: tuple[Answer, ...] = ()
+        self._codec = codec
+        self._body_now = RecordedBody(codec)
+        self._is_reset = True
+        self._first_cycle = 0
+        super().__init__(scenario, codec, send, clock_mode=clock_mode, contract=contract, on_answer=on_answer)
+
+    def outlive_host(self) -> None:
+        """Do nothing: the recording moves the arm, with or without host."""
+
+    def _build_body(self) -> Movable:
+        return self._body_now
+
+    def _on_nmt(self, data: bytes, t_ns: int) -> None:
+        super()._on_nmt(data, t_ns)
+        self._is_reset = self._is_reset or data[:1] in (bytes([command]) for command in RESETS)
+
+    def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
+        if self._cycles is not None:
+            if self._is_reset:
+                self._is_reset = False
+                self._first_cycle = self.cycle
+                self._cycles.begin()
+            self._answers_now = self._cycles.take(self.cycle - self._first_cycle)
+            self._body_now.show(self._answers_now)
+        super()._answer(data, t_ns, late_ns)
+
+    @property
+    def _is_plain(self) -> bool:
+        is_whole = sorted(can_id for can_id, _ in self._answers_now) == sorted(self._answers)
+        return is_whole and super()._is_plain
+
+    def _listen(self) -> None:
+        super()._listen()
+        self._senders = ((0, self._send_recorded),) if self._senders else ()
+
+    def _send_recorded(self) -> None:
+        for can_id, data in self._answers_now:
+            self._outbox.put(can_id, data)
+
+
+def _counts(values: Sequence[float], lsb: float) -> tuple[int, int]:
+    return round(values[0] / lsb), round(values[1] / lsb)

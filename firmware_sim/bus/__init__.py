@@ -1,0 +1,1 @@
+"""A modelled CAN bus, and two processes in lockstep."""

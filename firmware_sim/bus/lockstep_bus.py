@@ -1,0 +1,365 @@
+"""The bus in lockstep: frames take their time, win arbitration by identifier, and carry modelled stamps.
+
+It stands between the host and a bus that has no time of its own (the embedded bus, vcan) and moves the host's virtual
+clock. The devices hand their frames over when SYNC is through, or later. Whenever the bus is free the lowest identifier
+of those that wait is sent, and is through after its number of bits; then it is received. The host's own frames wait in
+its transmit queue:
+
+    identifier  the lowest is sent first, as by a controller with a mailbox for each. SYNC goes out when it is due, or
+                one frame later; a command that has not begun by then acts one SYNC later.
+    fifo        in the order in which they were handed over, as in Linux's default queue. SYNC waits behind a late
+                command, and every frame behind one that loses to the devices'.
+
+What the host sends reaches the devices in the order in which it is through.
+
+How devices let time pass: `firmware_sim.canopen.time_marks`. Devices that send no marks are waited for, by the wall
+clock.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Final
+
+from adacd_hil.clock import VirtualClock
+from adacd_hil.config import Settings
+from adacd_hil.wire.budget import read_contract
+from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
+from adacd_hil.wire.codec import Codec
+from firmware_sim.bus.bus_model import DEFAULT_LENGTH
+from firmware_sim.bus.frame_time import FrameTime, exact_time, worst_time
+from firmware_sim.canopen.contracts import answers_to_sync
+from firmware_sim.canopen.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+
+NEVER_NS: Final = 1 << 62
+DEFAULT_BITRATE: Final = 1_000_000
+DEFAULT_DATA_BITRATE: Final = 5_000_000
+_CYCLIC_PERIODS: Final = 2
+"""For so many periods after a SYNC devices live by SYNC; after that the host lets time pass by ADVANCE."""
+
+
+Offer = tuple[int, int, int, bytes]
+"""A frame that waits for the bus; the smaller one wins: identifier, order among all, when it was handed over, data."""
+
+
+class LockstepBus(Bus):
+    """The host's end of a modelled bus. Single-threaded."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        clock: VirtualClock,
+        frame_time: FrameTime,
+        *,
+        period_ns: int,
+        sync_id: int = 0x080,
+        answers: Iterable[int] = (),
+        patience_s: float = 2.0,
+        queue_length: int = DEFAULT_LENGTH,
+        is_fifo: bool = False,
+    ) -> None:
+        """Take over a bus.
+
+        answers: identifiers that devices send on every SYNC. patience_s: by the wall clock, how long devices that send
+        no marks are waited for. queue_length: frames that wait at most while nobody acknowledges. is_fifo: the host's
+        frames leave in the order in which they were handed over.
+        """
+        self.channel = bus.channel
+        self._bus = bus
+        self._clock = clock
+        self._frame_time = frame_time
+        self._period_ns = period_ns
+        self._sync_id = sync_id
+        self._answers = frozenset(answers)
+        self._patience_s = patience_s
+        self._queue_length = queue_length
+        self._is_fifo = is_fifo
+        self._queue: list[Offer] = []  # the host's
+        self._offered: list[Offer] = []  # the devices'
+        self._received: deque[Frame] = deque()
+        """What is through, or surely will be unless the host sends before; see `_withdraw`."""
+        self._free_ns = 0
+        """When the last frame was through."""
+        self.sync_ns = -NEVER_NS
+        """When the last SYNC was through."""
+        self._count = 0
+        self._granted_ns = 0
+        """Up to here the devices have lived, as long as no SYNC comes."""
+        self._is_acknowledged = True
+        self._is_marked = False
+        """Whether the devices send marks."""
+        self._is_attached = False
+
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo it overtakes none."""
+        if self._is_fifo or not self._queue:
+            return ()
+        self._transmit_before(self._clock.now_ns())
+        return tuple([offer[0] for offer in self._queue])
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Queue a frame at the clock's present time. Raises TransmitQueueError while nobody acknowledges."""
+        now_ns = self._clock.now_ns()
+        if not self._is_attached:
+            self._attach()
+        if len(self._queue) >= self._queue_length:
+            self._transmit_before(now_ns)
+            if not self._is_acknowledged and len(self._queue) >= self._queue_length:
+                raise TransmitQueueError(
+                    f"transmit queue of {self.channel} is full with {self._queue_length} frames: nobody acknowledges"
+                )
+        if self._received:
+            self._withdraw(now_ns)
+        self._count += 1
+        self._queue.append((can_id, self._count, now_ns, data))
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
+
+        Raises SilenceError when nobody answers a SYNC, BusError.
+        """
+        if not self._is_attached:
+            self._attach()
+        limit_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while True:
+            if self._received:
+                if self._received[0].t_ns > limit_ns:
+                    break
+                frame = self._received.popleft()
+                self._clock.sleep_until_ns(frame.t_ns)
+                return frame
+            if not self._transmit_next(limit_ns) and not self._let_pass(limit_ns):
+                break
+        self._clock.sleep_until_ns(limit_ns)
+        return None
+
+    def recover(self) -> None:
+        """Drop what waits and what was received. Raises BusError when the bus behind it can't yet."""
+        self._bus.recover()
+        self._queue.clear()
+        self._offered.clear()
+        self._received.clear()
+
+    def close(self) -> None:
+        """Let what waits go out, then close the bus behind it."""
+        self._transmit_before(NEVER_NS)
+        self._bus.close()
+
+    def _transmit_before(self, limit_ns: int) -> None:
+        """Let everything win the bus, in its turn, that starts before `limit_ns`."""
+        while self._transmit_next(limit_ns):
+            pass
+
+    def _transmit_next(self, limit_ns: int) -> bool:
+        """Let the next frame win the bus, if one starts before `limit_ns`."""
+        queue = self._queue
+        if len(queue) == 1 and not self._offered:
+            return self._transmit_only(queue[0], limit_ns)
+        if not (self._offered or queue):
+            return False
+        while True:
+            waiting = self._offered
+            if queue and self._is_acknowledged:
+                waiting = [*waiting, *(queue[:1] if self._is_fifo else queue)]
+            if not waiting:
+                return False
+            start_ns = max(min([offer[2] for offer in waiting]), self._free_ns)
+            if start_ns >= limit_ns:
+                return False
+            if not self._must_ask(start_ns):
+                break
+            self._ask(start_ns)  # the devices may have something that comes first
+        winner = min([offer for offer in waiting if offer[2] <= start_ns])
+        can_id, _, _, data = winner
+        self._free_ns = start_ns + self._frame_time(can_id, data)
+        if winner in self._offered:
+            self._offered.remove(winner)
+            self._received.append(Frame(can_id, data, self._free_ns))
+        else:
+            queue.remove(winner)
+            self._forward(can_id, data)
+        return True
+
+    def _transmit_only(self, offer: Offer, limit_ns: int) -> bool:
+        """Let the only frame that waits win the bus, if it starts before `limit_ns`."""
+        can_id, _, t_ns, data = offer
+        start_ns = t_ns if t_ns > self._free_ns else self._free_ns
+        if start_ns >= limit_ns or not self._is_acknowledged:
+            return False
+        if self._must_ask(start_ns):
+            self._ask(start_ns)
+            return True  # whatever came: look again
+        self._free_ns = start_ns + self._frame_time(can_id, data)
+        self._queue.clear()
+        self._forward(can_id, data)
+        return True
+
+    def _must_ask(self, start_ns: int) -> bool:
+        """Whether devices that live by grants have not lived until then."""
+        return self._is_marked and start_ns > self._granted_ns and not self._is_cyclic(start_ns)
+
+    def _forward(self, can_id: int, data: bytes) -> None:
+        """Give a frame of the host's, which is through, to the devices; after SYNC take their answers."""
+        self._bus.send(can_id, data)
+        if can_id == self._sync_id:
+            self.sync_ns = self._free_ns
+            self._take_answers()
+
+    def _take_answers(self) -> None:
+        """Take what belongs to this SYNC. Raises SilenceError when nobody says anything."""
+        came: list[Frame] = []
+        missing = len(self._answers)
+        while missing:
+            frame = self._bus.receive(self._patience_s)
+            if frame is None:
+                break
+            if frame.can_id == DEVICE_MARK:
+                for earlier in came:
+                    self._offer(earlier, self.sync_ns)
+                self._take_marked(frame)
+                return
+            came.append(frame)
+            if frame.can_id in self._answers:
+                missing -= 1
+        if missing == len(self._answers) != 0 and not came:
+            raise SilenceError(f"silence on {self.channel} for {self._patience_s:g} s")
+        if len(came) == len(self._answers) and not (self._queue or self._offered):
+            self._line_up(came)
+        else:
+            for frame in came:
+                self._offer(frame, self.sync_ns)
+
+    def _take_marked(self, mark: Frame) -> None:
+        """Take frames by their release, from a mark up to the one that says that this was all."""
+        offset_ns = 0
+        frame: Frame | None = mark
+        while frame is not None:
+            if frame.can_id != DEVICE_MARK:
+                self._offer(frame, self.sync_ns + offset_ns)
+            else:
+                kind, time_ns = unpack_mark(frame.data) or (MarkKind.END, 0)
+                if kind is MarkKind.END:
+                    return
+                if kind is MarkKind.RELEASE:
+                    offset_ns = time_ns
+                else:
+                    self._note(kind)
+            frame = self._bus.receive(self._patience_s)
+
+    def _line_up(self, came: list[Frame]) -> None:
+        """Let answers that nothing competes with go one after the other, by identifier."""
+        came.sort()
+        through_ns = self._free_ns
+        for can_id, data, _, is_error in came:
+            if is_error:
+                self._received.append(Frame(can_id, data, through_ns, True))
+                continue
+            through_ns += self._frame_time(can_id, data)
+            self._received.append(Frame(can_id, data, through_ns))
+        self._free_ns = through_ns
+
+    def _withdraw(self, now_ns: int) -> None:
+        """Take back what was lined up and has not begun: the host sends something that may come first."""
+        while self._received:
+            last = self._received[-1]
+            start_ns = last.t_ns - (0 if last.is_error else self._frame_time(last.can_id, last.data))
+            if start_ns < now_ns or last.is_error:
+                return
+            self._received.pop()
+            self._free_ns = start_ns
+            self._offer(last, self.sync_ns)
+
+    def _offer(self, frame: Frame, t_ns: int) -> None:
+        """Let a device hand over a frame."""
+        if frame.is_error:
+            self._received.append(frame._replace(t_ns=t_ns))
+            return
+        self._count += 1
+        self._offered.append((frame.can_id, self._count, t_ns, frame.data))
+
+    def _is_cyclic(self, t_ns: int) -> bool:
+        """Whether the devices live by SYNC at a time."""
+        return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
+
+    def _let_pass(self, limit_ns: int) -> bool:
+        """Ask the devices to let time pass; tell whether that may have brought something."""
+        now_ns = self._clock.now_ns()
+        if self._is_cyclic(now_ns):
+            return False
+        if not self._is_marked:
+            return self._take_while((limit_ns - now_ns) * 1e-9)
+        return self._ask(limit_ns) or self._granted_ns < limit_ns
+
+    def _ask(self, until_ns: int) -> bool:
+        """Let the devices live until then, or until they send something; tell whether they did."""
+        self._bus.send(HOST_MARK, pack_mark(MarkKind.ADVANCE, until_ns))
+        return self._await_grant()
+
+    def _attach(self) -> None:
+        """Tell the devices what the clock reads, and find out whether they send marks. What came before is dropped."""
+        self._is_attached = True
+        while self._bus.receive(0.0) is not None:
+            pass
+        self._ask(self._clock.now_ns())
+
+    def _await_grant(self) -> bool:
+        """Take what comes until time is granted; tell whether a frame came."""
+        came: list[Frame] = []
+        while (frame := self._bus.receive(self._patience_s)) is not None:
+            if frame.can_id != DEVICE_MARK:
+                came.append(frame)
+                continue
+            kind, time_ns = unpack_mark(frame.data) or (MarkKind.END, 0)
+            if kind is MarkKind.GRANT:
+                self._is_marked = True
+                self._granted_ns = time_ns
+                break
+            self._note(kind)
+        else:
+            self._is_marked = False  # the devices that sent them have gone
+        for frame in came:
+            self._offer(frame, max(self._granted_ns, self._free_ns))
+        return bool(came)
+
+    def _take_while(self, timeout_s: float) -> bool:
+        """Take what the bus behind has; tell whether there was something."""
+        has_come = False
+        while (frame := self._bus.receive(timeout_s)) is not None:
+            timeout_s = 0.0
+            if frame.can_id == DEVICE_MARK:
+                mark = unpack_mark(frame.data)
+                if mark is not None:
+                    self._note(mark[0])
+                continue
+            has_come = True
+            self._offer(frame, self._free_ns)
+        return has_come
+
+    def _note(self, kind: MarkKind) -> None:
+        if kind in (MarkKind.DARK, MarkKind.LIT):
+            self._is_acknowledged = kind is MarkKind.LIT
+
+
+def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> LockstepBus:
+    """Model the bus of a contract at the rates that its DBC gives, as `settings.lockstep` says. Raises CodecError."""
+    bitrate, data_bitrate = bit_rates(codec)
+    make = worst_time if settings.lockstep.stuffing == "worst" else exact_time
+    frame_time = make(bitrate, data_bitrate)
+    return LockstepBus(
+        bus,
+        clock,
+        frame_time,
+        period_ns=settings.bus.period_ns,
+        sync_id=codec.message("Sync").can_id,
+        answers=answers_to_sync(codec),
+        patience_s=settings.bus.feedback_timeout_ms * 1e-3,
+        is_fifo=settings.lockstep.queue == "fifo",
+    )
+
+
+def bit_rates(codec: Codec) -> tuple[int, int]:
+    """Give the nominal and the data bit rate of a contract, bit/s; a DBC without them means 1 and 5 Mbit/s."""
+    if b'"Trigger"' not in codec.text:
+        return DEFAULT_BITRATE, DEFAULT_DATA_BITRATE
+    contract = read_contract(codec.text, codec.path.name)
+    return contract.bitrate or DEFAULT_BITRATE, contract.data_bitrate or DEFAULT_DATA_BITRATE

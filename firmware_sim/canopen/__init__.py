@@ -1,0 +1,1 @@
+"""Objects, PDOs and services of an emulated node."""

@@ -1,0 +1,380 @@
+"""The PDOs of one emulated device: RPDO1… and TPDO1… by CiA 301, whatever a master maps into them.
+
+transmission type   RPDO                        TPDO
+0                   acts at the next SYNC       at the SYNC after an event
+1 … 240             acts at the next SYNC       at every n-th SYNC
+254, 255            acts at once                on an event, and when the event timer ends
+
+An event is a change of an object that says how the device is (`events` of `Pdos`), or, in a PDO without such an object,
+any change of its content, looked for at every SYNC. An RPDO's event timer is its deadline. Frames whose mapping leads
+with the end-to-end header's objects are protected with the data ids of the message that has the PDO's default COB-ID.
+Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Protocol
+
+from adacd_hil.wire.codec import MessageCodec
+from adacd_hil.wire.e2e import E2eStatus
+from firmware_sim.canopen.object_dictionary import NEVER_NS, ObjectDictionary, Send
+from firmware_sim.canopen.pdo_record import EVENT_DRIVEN, PdoRecord
+
+RECEIVE, TRANSMIT = 0x1400, 0x1800
+COUNT = 4
+
+
+class PdoUser(Protocol):
+    """What a device does with its PDOs."""
+
+    def act(self, t_ns: int) -> None:
+        """Act on a frame that doesn't wait for SYNC; its values have been written."""
+
+    def mind_length(self, is_right: bool, t_ns: int) -> None:
+        """Take note of the length of a frame for the device."""
+
+
+class TransmitPdo(PdoRecord):
+    """One TPDO."""
+
+    is_received = False
+
+    def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
+        super().__init__(pdos, index, message)
+        self._pdos = pdos
+        self.is_due = False
+        """Whether an event has happened that the bus hasn't seen."""
+        self._reads: tuple[Callable[[], int], ...] = ()
+        self._sender = None if message is None or not message.is_protected else message.sender()
+        self.send: Callable[[], None] = lambda: None
+        """Sends the present values."""
+        self._syncs = 0
+        self._allowed_ns = 0
+        self._timer_due_ns = NEVER_NS
+        self._sent = b""
+        self.is_compared = False
+        """Whether its events are the changes of its content."""
+
+    def restart(self) -> None:
+        """Count the protected frames from their beginning."""
+        if self.message is not None and self.message.is_protected:
+            self._sender = self.message.sender()
+
+    def bind(self) -> None:
+        """Take over a new mapping."""
+        self._reads = tuple(self._pdos.dictionary.reader(*key) for key in self.layout.keys)
+        is_asynchronous = self.type == 0 or self.type in EVENT_DRIVEN
+        self.is_compared = is_asynchronous and not self._pdos.events.intersection(self.layout.keys)
+        self._syncs = 0
+        self.send = self._make_sender()
+
+    def begin(self, t_ns: int) -> None:
+        """Become active: an event-driven PDO begins with a frame."""
+        self.is_due = True
+        self._allowed_ns = t_ns
+        self._timer_due_ns = NEVER_NS
+
+    def _make_sender(self) -> Callable[[], None]:
+        """Bind what sending needs, so that a frame costs little more than reading its values."""
+        pdos, can_id, layout, reads, sender = self._pdos, self.can_id, self.layout, self._reads, self._sender
+        send, header_bytes, length = pdos.send, layout.header_bytes, layout.length
+        pack, pack_into = layout.packing.pack, layout.packing.pack_into
+        status_byte, status_shift = (1, 4) if header_bytes == 2 else (3, 0)
+
+        def send_protected() -> None:
+            frame = bytearray(length)
+            pack_into(frame, header_bytes, *[read() for read in reads])
+            frame[status_byte] = pdos.header_status() << status_shift & 0xFF
+            data = pdos.header = sender.protect(frame)  # type: ignore[union-attr]
+            send(can_id, data)
+
+        def send_protected_value() -> None:
+            frame = bytearray(length)
+            pack_into(frame, header_bytes, only())
+            frame[status_byte] = pdos.header_status() << status_shift & 0xFF
+            data = pdos.header = sender.protect(frame)  # type: ignore[union-attr]
+            send(can_id, data)
+
+        def send_plain() -> None:
+            send(can_id, pack(*[read() for read in reads]))
+
+        def send_pair() -> None:
+            send(can_id, pack(first(), second()))
+
+        if header_bytes and len(reads) == 1:
+            (only,) = reads
+            return send_protected_value
+        if header_bytes:
+            return send_protected
+        if len(reads) != 2:
+            return send_plain
+        first, second = reads
+        return send_pair
+
+    def on_sync(self) -> None:
+        """Send what this SYNC asks for: every n-th, or an event that waited."""
+        if self.type == 0:
+            self.compare()
+            if self.is_due:
+                self.is_due = False
+                self.send()
+            return
+        self._syncs += 1
+        if self._syncs >= self.type:
+            self._syncs = 0
+            self.send()
+
+    def compare(self) -> None:
+        """Find an event in a PDO whose events are the changes of its content."""
+        if self.is_compared:
+            content = self.layout.packing.pack(*[read() for read in self._reads])
+            if content != self._sent:
+                self._sent = content
+                self.is_due = True
+
+    def poll(self, t_ns: int) -> int:
+        """Send an event-driven PDO when an event or its timer asks for it; return when to look again."""
+        if (self.is_due and t_ns >= self._allowed_ns) or t_ns >= self._timer_due_ns:
+            self.is_due = False
+            self._allowed_ns = t_ns + self.inhibit_ns
+            self._timer_due_ns = t_ns + self.timer_ns if self.timer_ns else NEVER_NS
+            self.send()
+        return self._allowed_ns if self.is_due else self._timer_due_ns
+
+
+class ReceivePdo(PdoRecord):
+    """One RPDO."""
+
+    is_received = True
+
+    def __init__(self, pdos: "Pdos", index: int, message: MessageCodec | None) -> None:
+        super().__init__(pdos, index, message)
+        self._pdos = pdos
+        self.receiver = None if message is None or not message.is_protected else message.receiver()
+        """Checks the frames of the contract's message; None where that isn't protected."""
+        self.acted_ns: int | None = None
+        """When its last frame acted; None before the first."""
+        self.writes: tuple[Callable[[int], object], ...] = ()
+        """What takes the received values, in the order of the mapping."""
+        self.pending: tuple[int, ...] | None = None
+        """Values that wait for SYNC."""
+        self.is_command = False
+        """Whether this PDO counts as the device's command."""
+        self._is_length_wrong = False
+
+    def restart(self) -> None:
+        """Forget the sequence of the protected frames, and the last one."""
+        if self.receiver is not None:
+            self.receiver.restart()
+        self.forget()
+        self.acted_ns = None
+
+    def bind(self) -> None:
+        """Take over a new mapping."""
+        self.writes = tuple(self._pdos.writer(*key) for key in self.layout.keys)
+        self.is_command = False
+
+    def forget(self) -> None:
+        """Drop a frame that waits for SYNC."""
+        self.pending = None
+
+    def on_frame(self, data: bytes, t_ns: int) -> None:
+        """Take a frame in at the bench's time; one that fails a check changes nothing."""
+        layout = self.layout
+        if len(data) != layout.length:
+            self._is_length_wrong = True
+            self._pdos.user.mind_length(False, self._pdos.own_ns(t_ns))
+            return
+        if layout.header_bytes and self.receiver is not None:
+            if self.receiver.check(data) > E2eStatus.OK_SOME_LOST:
+                return
+            self._pdos.header = data
+        if self._is_length_wrong:
+            self._is_length_wrong = False
+            self._pdos.user.mind_length(True, self._pdos.own_ns(t_ns))
+        self.pending = layout.packing.unpack_from(data, layout.header_bytes)
+        if self.type in EVENT_DRIVEN:
+            self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
+
+    def is_late(self, t_ns: int) -> bool:
+        """Whether its deadline is over."""
+        return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
+
+
+class Pdos:
+    """All PDOs of one device."""
+
+    def __init__(
+        self,
+        dictionary: ObjectDictionary,
+        send: Send,
+        messages: Mapping[int, MessageCodec],
+        longest: int,
+        on_refresh: Callable[[], None],
+    ) -> None:
+        """`messages`: the contract's, by identifier. `longest`: frame, in bytes. `on_refresh`: after changes."""
+        self.dictionary = dictionary
+        self.send = send
+        self.longest = longest
+        self.user: PdoUser
+        self.header = bytes(4)
+        """Header of the last protected frame, received or sent."""
+        self.header_status: Callable[[], int] = int
+        """What goes into the status field of a header that is sent."""
+        self.events: frozenset[tuple[int, int]] = frozenset()
+        """Objects whose changes the device announces by `notify`."""
+        self._is_commanded = False  # a command has acted since the last SYNC, without waiting for one
+        self._writers: dict[tuple[int, int], Callable[[int], object]] = {}
+        self._on_refresh = on_refresh
+        self._is_operational = False
+        self._now_ns = 0
+        self.own_ns: Callable[[int], int] = lambda t_ns: t_ns
+        """Turns the bench's time, with which frames come, into the device's."""
+        self.on_sync: tuple[Callable[[], None], ...] = ()
+        """What sends the frames that belong to a SYNC."""
+        self.answers: frozenset[int] = frozenset()
+        """Identifiers of the frames that follow every SYNC."""
+        self._asynchronous: tuple[TransmitPdo, ...] = ()
+        self._compared: tuple[TransmitPdo, ...] = ()
+        self.has_compared = False
+        """Whether a PDO's events are the changes of its content."""
+        self._receiving: tuple[ReceivePdo, ...] = ()
+        self._waiting: tuple[ReceivePdo, ...] = ()
+        self._sending: frozenset[TransmitPdo] = frozenset()
+        self.receive = tuple(ReceivePdo(self, i, _message(self, messages, i)) for i in _records(self, RECEIVE))
+        self.transmit = tuple(TransmitPdo(self, i, _message(self, messages, i)) for i in _records(self, TRANSMIT))
+        dictionary.serve(0x2100, 1, lambda: self.header[0])
+        dictionary.serve(0x2100, 2, lambda: self.header[1])
+        dictionary.serve(0x2101, 1, lambda: int.from_bytes(self.header[:2], "little"))
+        dictionary.serve(0x2101, 2, lambda: self.header[2])
+        dictionary.serve(0x2101, 3, lambda: self.header[3])
+
+    @property
+    def is_commandable(self) -> bool:
+        """Whether a PDO is exchanged that brings commands."""
+        return any(pdo.is_command for pdo in self._receiving)
+
+    def brings(self, index: int, subindex: int) -> bool:
+        """Whether a PDO is exchanged that brings values of an object."""
+        return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
+
+    def accept(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
+        """Give received values of an object to a function instead of writing the object as SDO does."""
+        self._writers[index, subindex] = write
+
+    def writer(self, index: int, subindex: int) -> Callable[[int], object]:
+        """Return what takes the received values of an object. A value that the object can't take is dropped."""
+        return self._writers.get((index, subindex)) or (lambda value: self.dictionary.take_over(index, subindex, value))
+
+    def handlers(self) -> list[tuple[int, Callable[[bytes, int], None]]]:
+        """List the identifiers that are received now, with what takes their frames."""
+        return [(pdo.can_id, pdo.on_frame) for pdo in self._receiving]
+
+    def set_operational(self, is_operational: bool, t_ns: int) -> None:
+        """Begin or end the exchange with the NMT state."""
+        self._is_operational = is_operational
+        self._now_ns = t_ns
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take over a new configuration."""
+        self._receiving = tuple(pdo for pdo in self.receive if self._is_operational and pdo.is_active)
+        sending = tuple(pdo for pdo in self.transmit if self._is_operational and pdo.is_active)
+        for pdo in (*self._receiving, *sending):
+            pdo.bind()
+        for waiting in self.receive:
+            if waiting not in self._receiving or not waiting.is_synchronous:
+                waiting.forget()
+        for begun in sending:
+            if begun not in self._sending:
+                begun.begin(self._now_ns)
+        self._sending = frozenset(sending)
+        self.answers = frozenset(pdo.can_id for pdo in sending if pdo.type == 1)
+        self.on_sync = tuple(pdo.send if pdo.type == 1 else pdo.on_sync for pdo in sending if pdo.is_synchronous)
+        self._asynchronous = tuple(pdo for pdo in sending if not pdo.is_synchronous)
+        self._compared = tuple(pdo for pdo in self._asynchronous if pdo.is_compared)
+        self.has_compared = bool(self._compared)
+        self._waiting = tuple(pdo for pdo in self._receiving if pdo.is_synchronous)
+        self._find_commands()
+        self._on_refresh()
+
+    def _find_commands(self) -> None:
+        """Choose the PDOs that count as command: those with target torque, or, without it, with controlword."""
+        for key in ((0x6071, 0), (0x6040, 0)):
+            found = [pdo for pdo in self._receiving if key in pdo.layout.keys]
+            if found:
+                for pdo in found:
+                    pdo.is_command = True
+                return
+
+    def restart(self) -> None:
+        """Begin all end-to-end sequences anew."""
+        for pdo in (*self.receive, *self.transmit):
+            pdo.restart()
+
+    def act_on_sync(self, t_ns: int) -> bool:
+        """Let what waited for SYNC act; tell whether a command has acted since the SYNC before."""
+        is_commanded, self._is_commanded = self._is_commanded, False
+        return self._act(self._waiting, t_ns) or is_commanded
+
+    def act_at_once(self, pdo: ReceivePdo, t_ns: int) -> None:
+        """Let a frame act that doesn't wait for SYNC."""
+        self._is_commanded |= self._act((pdo,), t_ns)
+        self.user.act(t_ns)
+
+    @staticmethod
+    def _act(pdos: Iterable[ReceivePdo], t_ns: int) -> bool:
+        """Write what waits; tell whether a command was among it."""
+        is_commanded = False
+        for pdo in pdos:
+            values = pdo.pending
+            if values is not None:
+                pdo.pending = None
+                pdo.acted_ns = t_ns
+                for write, value in zip(pdo.writes, values, strict=False):
+                    write(value)
+                is_commanded = is_commanded or pdo.is_command
+        return is_commanded
+
+    def find_late(self, t_ns: int) -> bool:
+        """Whether an RPDO's deadline is over."""
+        return any(pdo.is_late(t_ns) for pdo in self._receiving)
+
+    @property
+    def deadline_ns(self) -> int:
+        """When the next deadline of an RPDO ends."""
+        ends = [pdo.acted_ns + pdo.timer_ns for pdo in self._receiving if pdo.timer_ns and pdo.acted_ns is not None]
+        return min(ends, default=NEVER_NS)
+
+    @property
+    def rejected_frames(self) -> int:
+        """Frames so far that failed the end-to-end check."""
+        receivers = [pdo.receiver for pdo in self.receive if pdo.receiver is not None]
+        return sum(receiver.counts[s] for receiver in receivers for s in E2eStatus if not s.is_valid)
+
+    def notify(self) -> None:
+        """Say that an object of `events` has changed."""
+        for pdo in self._sending:
+            if not pdo.is_compared:
+                pdo.is_due = True
+
+    def compare(self) -> bool:
+        """Look for changes of content; tell whether a frame is due."""
+        for pdo in self._compared:
+            pdo.compare()
+        return any(pdo.is_due for pdo in self._compared)
+
+    def poll(self, t_ns: int) -> int:
+        """Send what is due by event or time; return when to look again."""
+        due_ns = NEVER_NS
+        for pdo in self._asynchronous:
+            due_ns = min(due_ns, pdo.poll(t_ns))
+        return due_ns
+
+
+def _records(pdos: Pdos, first: int) -> list[int]:
+    return [index for index in range(first, first + COUNT) if pdos.dictionary.has(index, 1)]
+
+
+def _message(pdos: Pdos, messages: Mapping[int, MessageCodec], index: int) -> MessageCodec | None:
+    """Return the contract's message with the default COB-ID of a record."""
+    return messages.get(pdos.dictionary.value(index, 1) & 0x7FF)

@@ -1,0 +1,174 @@
+"""Communication and mapping record of one PDO: what a master may write when.
+
+A PDO is written while it is invalid (bit 31 of its COB-ID): number of entries to 0, entries, number of entries, valid.
+Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38, and table 34 (restricted identifiers).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Protocol
+
+from adacd_hil.wire.codec import MessageCodec
+from firmware_sim.canopen.mapping_objects import NOTHING, check_entry, lay_out
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, refuse
+
+EVENT_DRIVEN = (254, 255)
+"""Transmission types."""
+_TYPES = (*range(241), *EVENT_DRIVEN)
+_NOT_VALID = 1 << 31  # of a COB-ID
+_IS_EXTENDED = 1 << 29
+_MAPPING = 0x200  # from a communication record to its mapping record
+
+LAST_NODE = 32
+LISTENED_IDS = frozenset(base + node for base in (0x200, 0x300, 0x400, 0x500) for node in range(1, LAST_NODE + 1))
+"""Identifiers that an RPDO may have: those of RPDO1 to 4 of nodes 1 to 32. A real controller's acceptance filter is no
+wider, and the emulator's kernel filter is this one."""
+
+
+def _is_restricted(can_id: int) -> bool:
+    """Whether an identifier is none for PDOs: CiA 301, table 34, and SYNC and EMCY."""
+    lowest = (0x000, 0x080, 0x101, 0x581, 0x601, 0x6E0, 0x701)
+    highest = (0x07F, 0x100, 0x180, 0x5FF, 0x67F, 0x6FF, 0x7FF)
+    return any(low <= can_id <= high for low, high in zip(lowest, highest, strict=True))
+
+
+class PdoOwner(Protocol):
+    """Who has the PDO."""
+
+    dictionary: ObjectDictionary
+    longest: int
+
+    def refresh(self) -> None:
+        """Take over a new configuration."""
+
+
+class PdoRecord(ABC):
+    """Communication and mapping record of one PDO."""
+
+    is_received: bool
+
+    def __init__(self, owner: PdoOwner, index: int, message: MessageCodec | None) -> None:
+        dictionary = owner.dictionary
+        self.layout = NOTHING
+        self._owner = owner
+        self.message = message
+        self.can_id = dictionary.value(index, 1) & 0x7FF
+        self._is_valid = not dictionary.value(index, 1) & _NOT_VALID
+        self.type = dictionary.value(index, 2)
+        self.inhibit_ns = dictionary.value_or(0, index, 3) * 100_000
+        self.timer_ns = dictionary.value_or(0, index, 5) * 1_000_000
+        mapping = index + _MAPPING
+        self._entries = [
+            dictionary.value(mapping, sub) for sub in range(1, 65) if dictionary.has(mapping, sub)
+        ]  # sub-indices without gaps
+        self._count = dictionary.value(mapping, 0)
+        self._lay_out(self._count)
+        dictionary.watch(index, 1, self._identify, self._check_cob_id)
+        dictionary.watch(index, 2, self._set_type, _check_type)
+        dictionary.watch(index, 3, self._set_inhibit, self._check_inhibit)
+        dictionary.watch(index, 5, self._set_timer)
+        # Entries before their number: a reset restores them in this order.
+        for place in range(len(self._entries)):
+            dictionary.watch(mapping, place + 1, self._setter(place), self._entry_check(place))
+        dictionary.watch(mapping, 0, self._map, self._check_count)
+
+    @property
+    def is_active(self) -> bool:
+        """Whether it is exchanged in Operational."""
+        return self._is_valid and self._count > 0
+
+    @property
+    def is_synchronous(self) -> bool:
+        """Whether it goes by SYNC."""
+        return self.type not in EVENT_DRIVEN
+
+    @abstractmethod
+    def bind(self) -> None:
+        """Take over a new mapping."""
+
+    @abstractmethod
+    def restart(self) -> None:
+        """Begin anew after a reset."""
+
+    def _check_cob_id(self, value: int) -> None:
+        can_id = value & 0x7FF
+        if value & _IS_EXTENDED or value & 0x1FFFF800 or _is_restricted(can_id):
+            refuse(Abort.VALUE_RANGE)
+        if self.is_received and can_id not in LISTENED_IDS:
+            refuse(Abort.VALUE_RANGE)
+        if self._is_valid and not value & _NOT_VALID and can_id != self.can_id:
+            refuse(Abort.DEVICE_STATE)
+
+    def _identify(self, value: int) -> None:
+        self.can_id = value & 0x7FF
+        self._is_valid = not value & _NOT_VALID
+        self._owner.refresh()
+
+    def _set_type(self, value: int) -> None:
+        self.type = value
+        self._owner.refresh()
+
+    def _check_inhibit(self, value: int) -> None:
+        if self._is_valid and value * 100_000 != self.inhibit_ns:
+            refuse(Abort.DEVICE_STATE)
+
+    def _set_inhibit(self, tenths_ms: int) -> None:
+        self.inhibit_ns = tenths_ms * 100_000
+
+    def _set_timer(self, period_ms: int) -> None:
+        self.timer_ns = period_ms * 1_000_000
+        self._owner.refresh()
+
+    def _entry_check(self, place: int) -> Callable[[int], None]:
+        def check(value: int) -> None:
+            if value == self._entries[place]:
+                return
+            if self._is_valid or self._count != 0:
+                refuse(Abort.DEVICE_STATE)
+            if value != 0:
+                check_entry(self._owner.dictionary, value, self.is_received)
+
+        return check
+
+    def _setter(self, place: int) -> Callable[[int], None]:
+        def set_entry(value: int) -> None:
+            self._entries[place] = value
+
+        return set_entry
+
+    def _check_count(self, value: int) -> None:
+        if value == self._count:
+            return
+        if self._is_valid:
+            refuse(Abort.DEVICE_STATE)
+        if value > len(self._entries):
+            refuse(Abort.PDO_TOO_LONG)
+        self._lay_out(value)
+
+    def _map(self, value: int) -> None:
+        self._count = value
+        self._lay_out(value)
+        self._owner.refresh()
+
+    def _lay_out(self, count: int) -> None:
+        """Lay out the first `count` entries, or refuse and leave everything as it is."""
+        layout = lay_out(self._owner.dictionary, self._entries[:count], self.is_received, self._owner.longest)
+        if layout.header_bytes and not self._has_data_ids(layout.header_bytes):
+            refuse(Abort.INCOMPATIBLE)
+        self.layout = layout
+
+    def _has_data_ids(self, header_bytes: int) -> bool:
+        message = self.message
+        return message is not None and message.is_protected and _header_bytes(message) == header_bytes
+
+
+def _header_bytes(message: MessageCodec) -> int:
+    """Return how many bytes a protected message's end-to-end header takes."""
+    header = message.signals[: len(message.signals) - len(message.values)]
+    sizes = {s.container: 1 if s.mask else (s.raw_high - s.raw_low).bit_length() // 8 for s in header}
+    return sum(sizes.values())
+
+
+def _check_type(value: int) -> None:
+    if value not in _TYPES:
+        refuse(Abort.VALUE_RANGE)

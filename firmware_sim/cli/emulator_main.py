@@ -1,0 +1,263 @@
+"""`firmware-sim`: plays the arm on a CAN interface until it is told to stop."""
+
+import json
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, NoReturn
+
+import click
+
+from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.config import ConfigError
+from adacd_hil.given_path import WrittenPath
+from adacd_hil.log.errors import LogError, LogExistsError
+from adacd_hil.log.run_folder import TRUTH_NAME, check_free
+from adacd_hil.output_files import in_words, tidied
+from adacd_hil.records import Vector
+from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.terminal import in_line, one_line, open_terminals
+from adacd_hil.wire.bus import BusError, BusMissingError
+from adacd_hil.wire.codec import CodecError, load_codec
+from adacd_hil.wire.node_offset import move_contract
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.bench.bench import Bench, ClockMode
+from firmware_sim.bench.injector import OnEvent
+from firmware_sim.bench.truth import TruthLog
+from firmware_sim.canopen.contracts import CONTRACTS
+from firmware_sim.cli.departure import Departure
+from firmware_sim.cli.emulator_options import on_bus
+from firmware_sim.cli.emulator_play import play
+from firmware_sim.cli.scenario_list import as_text, check, describe_all, show, show_as_table
+from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
+from firmware_sim.scenario.scenario import Scenario, load_scenario
+
+
+class ExitCode(IntEnum):
+    """What the exit statuses mean."""
+
+    OK = 0
+    FAILURE = 1
+    USAGE = 2
+    BUS_MISSING = 5
+
+
+EPILOG = (
+    "Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus or the truth log failed); "
+    "2 wrong usage or configuration; 5 bus missing."
+)
+
+_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
+    (click.ClickException, ExitCode.USAGE),
+    (ConfigError, ExitCode.USAGE),
+    (CodecError, ExitCode.USAGE),
+    (BusMissingError, ExitCode.BUS_MISSING),
+    (BusError, ExitCode.FAILURE),
+    (LogExistsError, ExitCode.USAGE),
+    (LogError, ExitCode.FAILURE),
+    (OSError, ExitCode.FAILURE),
+)
+
+
+_CONTEXT = {"auto_envvar_prefix": "FIRMWARE_SIM", "help_option_names": ["-h", "--help"]}
+
+
+@click.group(epilog=EPILOG, context_settings=_CONTEXT)
+def cli() -> None:
+    """Play the drives, the torque sensors, the arm and the person who touches it, on a CAN bus."""
+
+
+@cli.command(epilog=EPILOG)
+@on_bus
+@click.option(
+    "--scenario",
+    default="paper",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="One that `firmware-sim list` names, or a TOML file.",
+)
+@click.option("--profile", type=click.Choice(list(ARMS)), help="Arm; default: the scenario's.")
+@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
+@click.option("--out", type=WrittenPath(file_okay=False), help=f"Folder for {TRUTH_NAME}; default: no log.")
+@click.option("--once", "is_once", is_flag=True, help="End with the first host that starts the nodes and goes.")
+@click.option("--json", "as_json", is_flag=True, help="Print how it went as JSON on stdout.")
+def run(
+    interface: str,
+    channel: str,
+    contract: str,
+    node_offset: int,
+    host_node: int,
+    clock_mode: ClockMode,
+    scenario: str,
+    profile: str | None,
+    seed: int | None,
+    out: Path | None,
+    is_once: bool,
+    as_json: bool,
+) -> int:
+    """Run the emulated arm; prints "ready" on stderr once its nodes have announced themselves."""
+    resolved = load_scenario(scenario, profile, seed)
+    codec = move_contract(load_codec(CONTRACTS[contract].path), node_offset, host_node)
+    clock = MonotonicClock()
+    with ExitStack() as stack:
+        if out is not None:
+            check_free(out / TRUTH_NAME)
+            stack.enter_context(tidied(out))
+        bus = open_devices_end(interface, channel, clock, codec)
+        stack.callback(bus.close)
+        stop = stack.enter_context(stop_by_signal())
+        truth = None
+        if out is not None:
+            metadata = {"scenario": resolved.name, "profile": resolved.profile, "seed": str(resolved.seed)}
+            _make_folder(out)
+            # By SYNC, time waits for the log; by wall clock nothing may.
+            truth = TruthLog(out / TRUTH_NAME, blocking=clock_mode == "sync", metadata=metadata, scenario=resolved)
+            stack.enter_context(truth)
+        departure = Departure(bus)
+        bench = Bench(resolved, codec, departure.send, clock_mode=clock_mode, on_answer=departure.go)
+        if truth is not None:
+            epoch_ns = wall_ns() - clock.now_ns()
+            bench.on_truth = _stamp_truth(truth, bench, epoch_ns)
+            bench.on_event = _stamp_events(truth, bench, epoch_ns)
+        service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
+        # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
+        for line in request_realtime().missing:
+            _complain(f"not granted: {line}")
+        freeze_garbage()
+        service.boot()
+        print("ready", file=sys.stderr, flush=True)
+        service.run()
+        return _report(bench, resolved, clock_mode, truth, as_json)
+
+
+@cli.command("list", epilog=EPILOG)
+@click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
+def list_scenarios(as_json: bool) -> int:
+    """List the scenarios that come with the package: name, group, what happens."""
+    described = describe_all()
+    if as_json:
+        print(json.dumps(described, indent=2, ensure_ascii=False))
+    else:
+        print(as_text([("name", "group", "about"), *((row["name"], row["group"], row["about"]) for row in described)]))
+    return ExitCode.OK
+
+
+@cli.command("show", epilog=EPILOG)
+@click.argument("scenario", metavar="NAME|FILE")
+@click.option("--all", "is_whole", is_flag=True, help="Everything, defaults included.")
+@click.option("--profile", type=click.Choice(list(ARMS)), help="Arm; default: the scenario's.")
+@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Of the sensor noise; default: the scenario's.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON in place of TOML.")
+def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int | None, as_json: bool) -> int:
+    """Print a scenario, resolved, as TOML that loads to the same: what differs from the defaults."""
+    resolved = load_scenario(scenario, profile, seed)
+    if as_json:
+        print(json.dumps(show_as_table(resolved, is_whole), indent=2, ensure_ascii=False))
+    else:
+        print(show(resolved, is_whole), end="")
+    return ExitCode.OK
+
+
+@cli.command("check", epilog="Exit status: 0 every file can be played; 2 one can't.")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option(
+    "--contract", type=click.Choice(list(CONTRACTS)), default="arm", show_default=True, help="Whose frames faults hit."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print what was found as JSON.")
+def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
+    """Check scenario files, a line per problem: file, key, value, bound and unit, nearest name."""
+    codec = load_codec(CONTRACTS[contract].path)
+    findings = [check(file, codec) for file in files]
+    if as_json:
+        print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
+    else:
+        print("\n".join(in_line(line) for finding in findings for line in finding.lines))
+    return ExitCode.USAGE if any(finding.problems for finding in findings) else ExitCode.OK
+
+
+cli.add_command(play)
+
+
+def _stamp_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> Callable[[int, int, Vector], None]:
+    """Stamp the truth by the host's clock in lockstep, else by the wall clock."""
+
+    def write(cycle: int, t_ns: int, block: Vector) -> None:
+        truth.write(cycle, t_ns if bench.is_paced else t_ns + epoch_ns, block)
+
+    return write
+
+
+def _stamp_events(truth: TruthLog, bench: Bench, epoch_ns: int) -> OnEvent:
+    """Stamp the beginnings and ends of faults as the truth."""
+
+    def write(t_ns: int, level: str, name: str, text: str) -> None:
+        truth.event(t_ns if bench.is_paced else t_ns + epoch_ns, level, name, text)
+
+    return write
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {path} can't be made a folder: {error.strerror}") from None
+
+
+def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool) -> ExitCode:
+    """Print how it went, having closed the truth log."""
+    described: dict[str, Any] = {
+        "scenario": scenario.name,
+        "profile": scenario.profile,
+        "seed": scenario.seed,
+        "clock": clock_mode,
+        "cycles": bench.cycle + 1,
+        "rejected_commands": [drive.rejected_commands for drive in bench.drives],
+        "drive_states": [drive.state.value for drive in bench.drives],
+        "error_codes": [drive.error_code for drive in bench.drives],
+    }
+    code = ExitCode.OK
+    if truth is not None:
+        summary = truth.close()
+        is_empty = not summary.messages and summary.is_complete  # no host came
+        if is_empty:
+            truth.discard()
+        described |= {
+            "truth": None if is_empty else str(summary.path),
+            "messages": summary.messages,
+            "dropped": summary.dropped,
+        }
+        if not summary.is_complete:
+            _complain(summary.error or f"{summary.path} lacks {summary.dropped} cycles: the disk was too slow")
+            code = ExitCode.FAILURE
+    if as_json:
+        print(json.dumps(described))
+    return code
+
+
+def _complain(line: str) -> None:
+    print(f"firmware-sim: {one_line(line)}", file=sys.stderr)
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line, by default that of this process, and exit with a documented status."""
+    if arguments is None:
+        open_terminals()
+    logging.getLogger("canopen").addHandler(logging.NullHandler())
+    try:
+        code = cli.main(arguments, prog_name="firmware-sim", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        code = ExitCode.USAGE
+    except (click.Abort, KeyboardInterrupt):
+        code = ExitCode.OK
+    except tuple(kind for kind, _ in _CODES) as error:
+        _complain(error.format_message() if isinstance(error, click.ClickException) else in_words(error))
+        code = next(code for kind, code in _CODES if isinstance(error, kind))
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""What the command line says about scenarios: which there are, what is in one, and what is wrong with a file."""
+
+import tomllib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from adacd_hil.config import ConfigError, find_problems, to_short_toml, to_toml
+from adacd_hil.wire.codec import Codec
+from firmware_sim.bench.fault_plan import FaultPlan
+from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table
+
+_PLANNED_PERIOD_NS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check of one file came to. `problems`: one line each; `checked`: what was looked at, if all is good."""
+
+    file: str
+    problems: tuple[str, ...]
+    checked: str = ""
+
+    @property
+    def lines(self) -> list[str]:
+        """The finding for a terminal."""
+        return [f"{self.file}: {problem}" for problem in self.problems] or [f"{self.file}: good: {self.checked}"]
+
+
+def describe_all() -> list[dict[str, Any]]:
+    """Describe the scenarios that come with the package, by group and name."""
+    scenarios = sorted((load_scenario(name) for name in builtin_scenarios()), key=lambda one: (one.group, one.name))
+    return [
+        {
+            "name": one.name,
+            "group": one.group,
+            "about": one.about,
+            "lasts_s": one.lasts_s,
+            "expect": "" if one.expect is None else one.expect.text,
+        }
+        for one in scenarios
+    ]
+
+
+def as_text(rows: Iterable[Sequence[str]]) -> str:
+    """Align rows in columns as wide as what is in them, the last one as it is."""
+    lines = list(rows)
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]) - 1)]
+    return "\n".join(
+        "  ".join([*(cell.ljust(width) for cell, width in zip(line, widths, strict=False)), line[-1]]).rstrip()
+        for line in lines
+    )
+
+
+def show(scenario: Scenario, is_whole: bool) -> str:
+    """Write a scenario as TOML that loads to the same: what differs from the defaults, or everything."""
+    return to_toml(scenario) if is_whole else to_short_toml(scenario)
+
+
+def show_as_table(scenario: Scenario, is_whole: bool) -> dict[str, Any]:
+    """Give the same as a table."""
+    return tomllib.loads(show(scenario, is_whole))
+
+
+def check(file: str, codec: Codec) -> Finding:
+    """Look for everything that keeps a scenario from being played under a contract."""
+    try:
+        table = read_table(file)
+    except ConfigError as error:
+        return Finding(file, (_in_file(str(error), file),))
+    problems = find_problems(Scenario, table)
+    if problems:
+        return Finding(file, tuple(problems))
+    scenario = load_scenario(file)
+    try:
+        FaultPlan(scenario.faults, scenario.seed, _PLANNED_PERIOD_NS, codec)
+    except ConfigError as error:
+        return Finding(file, (str(error),))
+    return Finding(file, (), _checked(scenario, codec))
+
+
+def _in_file(problem: str, file: str) -> str:
+    """Take the file's name off a problem that begins with it."""
+    return problem.removeprefix(f"scenario {file}").removeprefix(":").strip()
+
+
+def _checked(scenario: Scenario, codec: Codec) -> str:
+    counts = [
+        f"{len(rows)} of [[{key}]]"
+        for key in ("payloads", "contacts", "bodies", "hands", "walls", "faults")
+        if (rows := getattr(scenario, key))
+    ]
+    parts = ["keys, types and bounds", *counts, f"all of it against arm {scenario.profile}"]
+    if scenario.faults:
+        parts.append(f"frames of faults against contract {codec.path.stem}")
+    if scenario.expect is not None:
+        parts.append(f"expects {scenario.expect.text}")
+    return "; ".join(parts)

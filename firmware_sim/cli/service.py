@@ -1,0 +1,169 @@
+"""What carries frames and time between a bench and a bus."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from adacd_hil.clock import Clock
+from adacd_hil.terminal import hurry
+from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError, open_bus
+from adacd_hil.wire.codec import Codec
+from firmware_sim.bench.bench import LONGEST_ORPHANAGE_NS, Bench, ClockMode
+from firmware_sim.canopen.contracts import is_fd
+from firmware_sim.canopen.object_dictionary import NEVER_NS
+from firmware_sim.canopen.pdo_record import LISTENED_IDS
+from firmware_sim.canopen.time_marks import HOST_MARK
+from firmware_sim.cli.departure import Departure
+
+_IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
+_LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus
+_SILENCE_NS = 2_000_000_000  # a host that says nothing for this long has gone
+
+
+class StopRequest:
+    """Whether the user wants the emulator to end."""
+
+    def __init__(self) -> None:
+        self.is_made = False
+
+    def make(self, *_signal: object) -> None:
+        """Ask for the end; callable as a signal handler."""
+        self.is_made = True
+        hurry()
+
+
+class Service:
+    """Carries frames and time to a bench until a stop is requested."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        bus: Bus,
+        departure: Departure,
+        clock: Clock,
+        clock_mode: ClockMode,
+        stop: StopRequest,
+        is_once: bool = False,
+    ) -> None:
+        """Prepare. `departure`: where the bench puts its frames.
+
+        `is_once`: also end when the host that started the nodes stops or resets them or falls silent.
+        """
+        self._bench = bench
+        self._bus = bus
+        self._departure = departure
+        self._clock = clock
+        self._is_wall = clock_mode == "wall"
+        self._stop = stop
+        self._is_once = is_once
+        self._has_been_operational = False
+        self._time_ns = 0  # up to here the bench's time has followed the clock
+        self._heard_ns = 0  # last frame
+        self._gone_ns = NEVER_NS  # when the host was found to have gone
+
+    def boot(self) -> None:
+        """Announce the nodes, having dropped what the bus carried before. Raises BusError."""
+        while self._bus.receive(0.0) is not None and not self._stop.is_made:
+            pass
+        self._time_ns = self._heard_ns = self._clock.now_ns()
+        self._bench.boot(self._time_ns)
+        self._departure.go()
+
+    def run(self) -> None:
+        """Serve; an interface that goes down is awaited, as by a device whose cable is pulled. Raises BusError."""
+        while not self._stop.is_made:
+            try:
+                frame = self._serve()
+            except InterfaceDownError:
+                self._await_interface()
+                continue
+            if self._is_once and frame is None and self._is_host_gone() and self._is_settled():
+                return
+
+    def _serve(self) -> Frame | None:
+        """Wait for one frame and act on it; without one, let time pass."""
+        bench = self._bench
+        cycle = bench.cycle
+        frame = self._bus.receive(self._patience_s())
+        if frame is not None:
+            self._heard_ns = frame.t_ns
+            bench.on_frame(frame)
+            self._has_been_operational = self._has_been_operational or bench.is_operational
+        if bench.cycle != cycle:
+            self._time_ns = self._heard_ns
+        else:
+            self._pass_time(self._clock.now_ns() if frame is None else frame.t_ns, frame is None)
+        self._departure.go()
+        return frame
+
+    def _await_interface(self) -> None:
+        while not self._stop.is_made:
+            try:
+                self._bus.recover()
+            except BusError:
+                self._clock.sleep_until_ns(self._clock.now_ns() + _LONGEST_WAIT_NS)
+            else:
+                return
+
+    def _patience_s(self) -> float:
+        """Say how long to wait for a frame."""
+        if not self._is_wall:
+            return _IDLE_NS * 1e-9
+        due_ns = self._bench.due_ns - self._clock.now_ns()
+        return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
+
+    def _pass_time(self, now_ns: int, is_idle: bool) -> None:
+        """Tell the bench the time: by wall clock whenever no frame waits, by SYNC when none has come for a while.
+
+        A host in lockstep says the time itself, until it has gone. A host that has gone is outlived.
+        """
+        is_silent = now_ns - self._heard_ns > _SILENCE_NS
+        if is_silent:
+            self._bench.outlive_host()
+        if self._bench.is_paced:
+            self._time_ns = now_ns
+            if is_silent:
+                self._bench.release()
+            return
+        if self._is_wall:
+            if is_idle:
+                self._bench.advance_to(now_ns)
+        elif now_ns - self._time_ns >= _IDLE_NS:
+            self._bench.advance_to(self._bench.now_ns + now_ns - self._time_ns)
+            self._time_ns = now_ns
+
+    def _is_host_gone(self) -> bool:
+        is_silent = self._clock.now_ns() - self._heard_ns > _SILENCE_NS
+        return self._has_been_operational and (is_silent or not self._bench.is_operational)
+
+    def _is_settled(self) -> bool:
+        """Whether the arm of a host that has gone is at rest, or has been given the time for it."""
+        self._bench.outlive_host()
+        self._departure.go()
+        now_ns = self._clock.now_ns()
+        self._gone_ns = min(self._gone_ns, now_ns)
+        return not self._is_wall or self._bench.is_at_rest or now_ns - self._gone_ns > LONGEST_ORPHANAGE_NS
+
+
+@contextmanager
+def stop_by_signal() -> Iterator[StopRequest]:
+    """Let SIGINT, SIGTERM and SIGHUP ask for the end instead of ending the process; an ignored SIGHUP stays so."""
+    stop = StopRequest()
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # not started to outlive its terminal
+        numbers.append(signal.SIGHUP)
+    previous = {number: signal.signal(number, stop.make) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
+    """Open the devices' end of a bus; CAN FD only where the contract has such frames. Raises BusMissingError."""
+    heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
+    heard.add(HOST_MARK)
+    options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}
+    return open_bus(interface, channel, clock, sorted(heard), **options)

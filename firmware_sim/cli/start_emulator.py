@@ -1,0 +1,20 @@
+"""Where the console script `firmware-sim` enters."""
+
+from collections.abc import Callable
+from typing import NoReturn
+
+from adacd_hil.start import start_program
+
+INTERRUPTED = 0
+"""`firmware_sim.cli.emulator_main.ExitCode.OK`, which takes numpy to import: the emulator is ended by Ctrl-C."""
+
+
+def start_emulator() -> NoReturn:
+    """Import, run the command line and exit with a documented status."""
+
+    def load() -> Callable[[], NoReturn]:
+        from firmware_sim.cli.emulator_main import main
+
+        return main
+
+    start_program(load, INTERRUPTED)

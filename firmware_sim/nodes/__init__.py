@@ -1,0 +1,1 @@
+"""Drives and torque sensors on the bus."""

@@ -1,0 +1,308 @@
+"""One emulated CANopen device: NMT slave with object dictionary, PDOs, heartbeats, EMCY and watchdogs.
+
+It starts no thread: heartbeats and every other timer run on the time that comes in as `t_ns`. What a bench calls takes
+the bench's time; what a device and its application tell each other is in the time of its own clock.
+Source: CiA 301, 7.2 (services), 7.3 (NMT), 7.5.2.32 (0x1029, error behaviour).
+"""
+
+from collections.abc import Callable, Mapping
+from enum import IntEnum
+from pathlib import Path
+from typing import Protocol
+
+from adacd_hil.wire.codec import MessageCodec
+from firmware_sim.canopen.emergency_objects import ErrorReporter
+from firmware_sim.canopen.heartbeat_objects import HeartbeatConsumer, HeartbeatProducer
+from firmware_sim.canopen.mapping_objects import CLASSIC_BYTES
+from firmware_sim.canopen.node_clock import NodeClock
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, refuse
+from firmware_sim.canopen.pdo import Pdos, PdoUser
+from firmware_sim.canopen.sync_order import SyncCounts, SyncKind
+from firmware_sim.canopen.watchdogs import Watchdog, Watchdogs
+
+_GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
+_RECOVERED_FROM_BUS_OFF = 0x8140
+_CLEAR_HISTORY = (0x1003, 0)
+_LONGEST_OVERFLOW = 240
+
+
+class NmtState(IntEnum):
+    """NMT states, CiA 301 figure 46. Every state but the first ends by an NMT command."""
+
+    INITIALISING = 0  # by itself: boot-up message, then Pre-operational
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+_COMMANDED_STATES = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
+_EMCY_STATES = (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL)
+RESET_NODE, RESET_COMMUNICATION = 129, 130
+_OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
+
+
+class Application(PdoUser, Protocol):
+    """What a device does besides communicating."""
+
+    def leave_operational(self, t_ns: int) -> None:
+        """Act on leaving Operational; EMCY messages can still be sent."""
+
+    def enter_operational(self, t_ns: int) -> None:
+        """Act on entering Operational."""
+
+    def lose_heartbeat(self, t_ns: int) -> None:
+        """Report and act on the loss of the master's heartbeat, before the device leaves Operational."""
+
+    def find_heartbeat(self, t_ns: int) -> None:
+        """Act on the return of the master's heartbeat."""
+
+    def distrust_sync(self, t_ns: int) -> None:
+        """Act on SYNCs that are no time base."""
+
+    def note_error(self) -> None:
+        """Take note that the error register, 0x1001, may have changed."""
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether the device does what its objects must not be changed under."""
+
+    def restart(self, is_node_reset: bool) -> None:
+        """Begin anew: communication only, or all of the device."""
+
+
+class Device(ObjectDictionary):
+    """A CANopen device: everything but what its application does."""
+
+    def __init__(
+        self,
+        node_id: int,
+        eds_path: Path,
+        send: Send,
+        messages: Mapping[int, MessageCodec] | None = None,
+        longest_pdo: int = CLASSIC_BYTES,
+    ) -> None:
+        """Read the EDS; nothing is sent before `boot`. Raises OSError when the EDS can't be read.
+
+        `messages`: the contract's, by identifier. `longest_pdo` in bytes.
+        """
+        super().__init__(node_id, eds_path, self._send)
+        self.clock = NodeClock()
+        self.is_powered = True
+        self.is_on_bus = True
+        """Whether it has power and its controller takes part in the bus."""
+        self._is_bus_off = False
+        self.state = NmtState.INITIALISING
+        self.is_operational = False
+        self.is_faulty = False
+        """Whether the application is in a fault, 0x1001 bit 0."""
+        self.fault_bits = 0
+        """Bits of 0x1001 that name the kind of that fault."""
+        self.now_ns = 0
+        """Time of the last request, for what it starts."""
+        self.power_on_ns = 0
+        """When the device got its power, by its own clock."""
+        self.on_pdo_change: Callable[[], None] = lambda: None
+        """Called when other PDOs are exchanged than before."""
+        self._put_on_bus = send
+        self._application: Application | None = None
+        self._producer = HeartbeatProducer(self, self._send, lambda: self.state, lambda: self.now_ns)
+        self._consumer = HeartbeatConsumer(self, self)
+        self._errors = ErrorReporter(self, self._send, lambda: self.error_register, lambda: self.state in _EMCY_STATES)
+        self.watchdogs = Watchdogs(self)
+        self.sync_counts = SyncCounts(self)
+        self.is_locked = self._is_locked_at_work
+        self.watch(0x1006, 0, check=self._check_period)
+        self.sync_overflow = self.value(0x1019) if self.has(0x1019) else None
+        """0x1019: the last SYNC counter before 1, 0 for SYNCs without counter; None where the EDS lacks it."""
+        self.watch(0x1019, 0, self._set_overflow, self._check_overflow)
+        self.open_at_work = frozenset({_CLEAR_HISTORY})
+        """Objects that SDO may write while the device is at work."""
+        self.pdos = Pdos(self, send, messages or {}, longest_pdo, self._announce_pdos)
+        self.pdos.own_ns = self.clock.own_ns
+
+    @property
+    def error_register(self) -> int:
+        """0x1001."""
+        register = _GENERIC | _COMMUNICATION if self.watchdogs.tripped else 0
+        return register | (_GENERIC | self.fault_bits if self.is_faulty else 0)
+
+    @property
+    def is_sync_odd(self) -> bool:
+        """Whether an odd SYNC is remembered, so that right ones count."""
+        return bool(_OF_SYNC & self.watchdogs.tripped)
+
+    def attach(self, application: Application) -> None:
+        """Connect what the device does."""
+        self._application = application
+        self.pdos.user = application
+
+    def power_on(self, t_ns: int) -> None:
+        """Give the device power: its time begins, then it boots, with its defaults if it was off."""
+        self.is_powered = True
+        self.is_on_bus = not self._is_bus_off
+        self.power_on_ns = self.clock.own_ns(t_ns)
+        self._boot(self.power_on_ns)
+
+    def power_off(self, _t_ns: int) -> None:
+        """Take the power away: nothing is said or heard, and all that was written is forgotten."""
+        self.is_powered = self.is_on_bus = False
+        self._errors.reset()
+        self.is_operational = False
+        self.state = NmtState.INITIALISING
+        self.pdos.set_operational(False, self.now_ns)
+        self._reset(is_node_reset=True)
+
+    def leave_bus(self, t_ns: int) -> None:
+        """Take the controller off the bus; an operational device goes to Pre-operational, the default of 0x1029."""
+        self._is_bus_off = True
+        self.is_on_bus = False
+        if self.is_operational:
+            self._enter(NmtState.PRE_OPERATIONAL, self.clock.own_ns(t_ns))
+
+    def return_to_bus(self, t_ns: int) -> None:
+        """Let the controller take part again; the device says so."""
+        self._is_bus_off = False
+        self.is_on_bus = self.is_powered
+        if self.is_on_bus:
+            self._errors.report(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
+
+    def cry(self, code: int, t_ns: int) -> None:
+        """Send an EMCY at once, whatever its inhibit time, as a device out of control does."""
+        self._errors.report_at_once(code, self.clock.own_ns(t_ns))
+
+    def _boot(self, t_ns: int) -> None:
+        """Announce the device and enter Pre-operational."""
+        self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
+        self._producer.restart(t_ns)
+        self._enter(NmtState.PRE_OPERATIONAL, t_ns)
+
+    def on_nmt(self, data: bytes, t_ns: int) -> None:
+        """Obey an NMT command, if it is for this device."""
+        if len(data) != 2 or data[1] not in (0, self.node_id) or not self.is_on_bus:
+            return
+        self.now_ns = t_ns = self.clock.own_ns(t_ns)
+        command = data[0]
+        if command in _COMMANDED_STATES:
+            self._enter(_COMMANDED_STATES[command], t_ns)
+        elif command in (RESET_NODE, RESET_COMMUNICATION):
+            self._enter(NmtState.INITIALISING, t_ns)
+            self._reset(command == RESET_NODE)
+            self._boot(t_ns)
+
+    def on_sdo(self, data: bytes, t_ns: int) -> None:
+        """Answer an SDO request."""
+        if not self.is_on_bus:
+            return
+        self.now_ns = t_ns = self.clock.own_ns(t_ns)
+        if len(data) == 8 and self.state != NmtState.STOPPED:
+            self.on_request(data, t_ns)
+
+    def on_heartbeat(self, node_id: int, t_ns: int) -> None:
+        """Take note of another node's heartbeat."""
+        if self.is_on_bus:
+            self._consumer.on_heartbeat(node_id, self.clock.own_ns(t_ns))
+
+    def lose_heartbeat(self, t_ns: int) -> None:
+        """React to the master's silence: the application, then Pre-operational (CiA 301, default of 0x1029)."""
+        if self._application is not None:
+            self._application.lose_heartbeat(t_ns)
+        if self.is_operational:
+            self._enter(NmtState.PRE_OPERATIONAL, t_ns)
+
+    def find_heartbeat(self, t_ns: int) -> None:
+        """Let the application know that the master is back."""
+        if self._application is not None:
+            self._application.find_heartbeat(t_ns)
+
+    def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
+        """Take note of a SYNC in Operational, be it taken or not, and of those that were lost before it."""
+        if not (self.is_operational and self.is_on_bus):
+            return
+        t_ns = self.clock.own_ns(t_ns)
+        counts = self.sync_counts
+        counts.note(kind, lost)
+        if kind is SyncKind.WRONG_LENGTH:
+            self.trip(Watchdog.SYNC_LENGTH, t_ns)
+        elif kind is SyncKind.RIGHT:
+            self.clear(Watchdog.SYNC_LENGTH, t_ns)
+            if counts.is_in_order:
+                self.clear(Watchdog.SYNC_ORDER, t_ns)
+        else:
+            self.trip(Watchdog.SYNC_ORDER, t_ns)
+            if not counts.is_time_base and self._application is not None:
+                self._application.distrust_sync(t_ns)
+
+    def trip(self, watchdog: Watchdog, t_ns: int) -> None:
+        """Report a watchdog that trips; once, until it has cleared."""
+        self.watchdogs.trip(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+        if self._application is not None:
+            self._application.note_error()
+
+    def clear(self, watchdog: Watchdog, t_ns: int) -> None:
+        """Report that the cause of a tripped watchdog has gone, by an EMCY with code 0."""
+        if watchdog in self.watchdogs.tripped:
+            self.watchdogs.clear(watchdog, self._errors, t_ns, self._time_ms(t_ns))
+            if self._application is not None:
+                self._application.note_error()
+
+    def report_fault(self, code: int, t_ns: int) -> None:
+        """Send the EMCY of a fault that no watchdog found."""
+        self._errors.report(code, t_ns, time_ms=self._time_ms(t_ns))
+
+    def report_no_error(self, t_ns: int) -> None:
+        """Say by an EMCY with code 0 that a fault was reset."""
+        self._errors.report(0, t_ns)
+
+    def poll(self, t_ns: int) -> int:
+        """Do what is due by its own clock; return when something is due next."""
+        return min(self._producer.poll(t_ns), self._consumer.poll(t_ns), self._errors.poll(t_ns))
+
+    def _is_locked_at_work(self, index: int, subindex: int) -> bool:
+        """Whether SDO may not write an object now: while the device is at work, none but what changes nothing."""
+        is_at_work = self._application is not None and self._application.is_at_work
+        return is_at_work and (index, subindex) not in self.open_at_work
+
+    def _check_period(self, period_us: int) -> None:
+        """Keep the SYNC period as long as SYNCs are obeyed."""
+        if self.is_operational and period_us != self.value(0x1006):
+            refuse(Abort.DEVICE_STATE)
+
+    def _check_overflow(self, overflow: int) -> None:
+        """Accept 0 and 2 to 240, and a change at period 0 only: CiA 301, 7.5.2.22."""
+        if overflow == 1 or overflow > _LONGEST_OVERFLOW:
+            refuse(Abort.VALUE_RANGE)
+        if overflow != self.value(0x1019) and self.value(0x1006) != 0:
+            refuse(Abort.DEVICE_STATE)
+
+    def _set_overflow(self, overflow: int) -> None:
+        self.sync_overflow = overflow
+
+    def _announce_pdos(self) -> None:
+        self.on_pdo_change()
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        """Send what isn't a PDO; PDOs are exchanged in Operational only, and there a device is on the bus."""
+        if self.is_on_bus:
+            self._put_on_bus(can_id, data)
+
+    def _time_ms(self, t_ns: int) -> int:
+        return (t_ns - self.power_on_ns) // 1_000_000
+
+    def _enter(self, state: NmtState, t_ns: int) -> None:
+        was_operational, self.is_operational = self.is_operational, state == NmtState.OPERATIONAL
+        if was_operational and not self.is_operational and self._application is not None:
+            self._application.leave_operational(t_ns)
+        self.state = state
+        self.pdos.set_operational(self.is_operational, t_ns)
+        if self.is_operational and not was_operational and self._application is not None:
+            self._application.enter_operational(t_ns)
+
+    def _reset(self, is_node_reset: bool) -> None:
+        """Restore the EDS values: the communication profile's, or all."""
+        self.restore(0xFFFF if is_node_reset else 0x1FFF)
+        self.pdos.restart()
+        if is_node_reset:
+            self.watchdogs.reset()
+            self.sync_counts.reset()
+        if self._application is not None:
+            self._application.restart(is_node_reset)

@@ -1,0 +1,532 @@
+"""An emulated torque drive: CiA 402 state machine, cyclic synchronous torque (mode 10), watchdogs.
+
+A command frame is checked end to end when it arrives and, unless its PDO is mapped to act at once, acts at the next
+SYNC. The motor has torque only in Operation enabled with mode 10; Quick stop active and Fault reaction active
+brake, and so do shutdown and disable operation where 0x605B and 0x605C say so; everywhere else the arm coasts.
+
+Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
+0x6076, rated torque in mNm.
+
+While the motor is powered, SDO writes nothing but the controlword and clears the error history. While an RPDO brings
+the controlword, SDO writes only those that take the power away: Disable voltage and Quick stop.
+
+Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from adacd_hil.wire.codec import Codec
+from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S
+from firmware_sim.body.body import DriveMode
+from firmware_sim.canopen.object_dictionary import NEVER_NS, Abort, one_of, refuse
+from firmware_sim.canopen.watchdogs import ERROR_CODES, WARNINGS, Watchdog
+from firmware_sim.nodes.device import Device
+from firmware_sim.nodes.drive_states import STATE_BITS, DriveEvent, DriveState, decode_command, find_transition
+from firmware_sim.nodes.drive_stops import DISABLE, FAULT_REACTIONS, QUICK_STOPS, RAMPS, Standstill, Stop
+from firmware_sim.nodes.torque_limits import TorqueLimits
+
+CYCLIC_SYNCHRONOUS_TORQUE = 10
+_NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
+_NO_PATIENCE = 1 << 30  # a drive without 0x2200 doesn't count SYNCs
+_TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
+_BRAKE_WATCH_NS = 1_000_000  # how often a drive without SYNC looks whether it stands still
+
+_ENABLE_OPERATION_WORD = 0x0F
+_CONTROLWORD = (0x6040, 0)
+_WARNING, _REMOTE, _INTERNAL_LIMIT, _FOLLOWS_TARGET = 1 << 7, 1 << 9, 1 << 11, 1 << 12
+_DISARMING = (DriveEvent.DISABLE_VOLTAGE, DriveEvent.QUICK_STOP)
+_ENABLED = DriveState.OPERATION_ENABLED
+_POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+_KIND_BITS = {2: 1 << 1, 4: 1 << 3}  # of 0x1001 by first digit of the error code: current, temperature
+_RAMPED = {DriveEvent.SHUTDOWN: 0x605B, DriveEvent.SWITCH_ON: 0x605C}  # option codes of transitions 8 and 5
+_EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
+
+
+class Motor(NamedTuple):
+    """What the drive knows of its motor without the bus: velocity in rad/s, torque in Nm.
+
+    is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
+    fault that the motor's state calls for now, 0 for none.
+    """
+
+    velocity_rad_s: Callable[[], float]
+    torque_Nm: Callable[[], float]
+    is_limited: Callable[[], bool] = lambda: False
+    error_code: Callable[[], int] = lambda: 0
+
+
+class DriveNode:
+    """One drive on the bus. `motor_mode` and `torque_Nm` are what its motor is told until the next SYNC."""
+
+    def __init__(
+        self, device: Device, codec: Codec, number: int, motor: Motor, rated_torque_Nm: float, is_free_running: bool
+    ) -> None:
+        """Connect the node to its device.
+
+        `number`: 1 or 2, as in the DBC's names. `is_free_running`: time passes without SYNC, so SYNC is watched.
+        """
+        self.device = device
+        self.motor_mode = DriveMode.OFF
+        self.torque_Nm = 0.0
+        self.state = DriveState.START
+        self.has_news = False
+        """Whether something has changed that the bus hasn't been told."""
+        self._pdos = device.pdos
+        self._clock = device.clock
+        self._tripped = device.watchdogs.tripped
+        self._motor = motor
+        self.is_free_running = is_free_running
+        """Whether time passes without SYNC, so that SYNC is watched."""
+        self._rated_mNm = round(rated_torque_Nm * 1000)
+        self._velocity_lsb_rad_s = _velocity_lsb(codec, number)
+        self._position = self._velocity = 0
+        self._limits = TorqueLimits(device, self._pdos)
+        self._demand = self._acted_commands = 0
+        self._received_word: int | None = None
+        self._controlword = 0
+        self._error_code = 0
+        self._cause: Watchdog | None = None
+        self._failure = 0
+        self._is_found_by_time = False
+        self._stop = DISABLE
+        self._ramp_end: DriveEvent | None = None
+        self._is_braking = False
+        self._is_motor_limited = self._is_limiting = False
+        self._standstill = Standstill()
+        self._silent_syncs = _NO_COMMAND_YET
+        self._sync_ns = 0
+        self._mode = self._wanted_mode = 0
+        self._patience_syncs = device.value_or(_NO_PATIENCE, 0x2200)
+        self._period_us = device.value(0x1006)
+        self._tenth_periods = device.value_or(_TENTH_PERIODS, 0x2201)
+        self._serve(codec)
+        self._configure()
+        device.attach(self)
+        self.restart(is_node_reset=True)
+
+    def _serve(self, codec: Codec) -> None:
+        """Give the dictionary its live values."""
+        serve = self.device.serve
+        serve(0x2000, 1, lambda: codec.wire_version)
+        serve(0x2000, 2, lambda: codec.layout_digest)
+        serve(0x2202, 0, lambda: self._acted_commands & 0xFFFF)
+        serve(0x2212, 0, lambda: self._obstacle)
+        serve(0x603F, 0, lambda: self._error_code)
+        serve(0x6040, 0, lambda: self._controlword)
+        serve(0x6041, 0, lambda: self.statusword)
+        serve(0x6061, 0, lambda: self._mode)
+        serve(0x6064, 0, lambda: self._position)
+        serve(0x606C, 0, lambda: self._velocity)
+        serve(0x6074, 0, lambda: self._demand)
+        serve(0x6076, 0, lambda: self._rated_mNm)
+        serve(0x6077, 0, lambda: self._torque_permille)
+
+    def _configure(self) -> None:
+        """Act on what is written, by SDO or PDO."""
+        device = self.device
+        device.open_at_work |= {_CONTROLWORD}
+        self._pdos.events = _EVENTS
+        self._pdos.accept(*_CONTROLWORD, self._receive_word)
+        device.watch(*_CONTROLWORD, check=self._obey_by_sdo)
+        device.watch(0x605A, 0, check=one_of(*QUICK_STOPS))
+        device.watch(0x605B, 0, check=one_of(*RAMPS))
+        device.watch(0x605C, 0, check=one_of(*RAMPS))
+        device.watch(0x605E, 0, check=one_of(*FAULT_REACTIONS))
+        device.watch(0x6060, 0, self._want_mode, one_of(0, CYCLIC_SYNCHRONOUS_TORQUE))
+        device.watch(0x1006, 0, self._set_period)
+        device.watch(0x2200, 0, self._set_patience)
+        device.watch(0x2201, 0, self._set_tolerance)
+
+    @property
+    def is_enabled(self) -> bool:
+        """Whether the drive is in Operation enabled."""
+        return self.state is DriveState.OPERATION_ENABLED
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether the motor has power by command, so that neither watchdogs nor limits may change."""
+        return self.state in _POWERED
+
+    @property
+    def is_left_alone(self) -> bool:
+        """Whether it brakes because time, not SYNC, has shown that the master has gone, and it is still gone."""
+        is_reacting = self.state is DriveState.FAULT_REACTION_ACTIVE
+        return is_reacting and self._is_found_by_time and self._cause in self._tripped
+
+    @property
+    def rejected_commands(self) -> int:
+        """Command frames so far that failed the end-to-end check."""
+        return self._pdos.rejected_frames
+
+    @property
+    def statusword(self) -> int:
+        """0x6041. Target reached (bit 10) has no meaning in mode 10 and stays 0; so does all of set-point and halt."""
+        word = STATE_BITS[self.state] | _REMOTE
+        if Watchdog.COMMAND_PDO in self._tripped:
+            word |= _WARNING
+        if self._follows_target:
+            word |= _FOLLOWS_TARGET
+            if self._limits.is_limiting or self._is_motor_limited:
+                word |= _INTERNAL_LIMIT
+        return word
+
+    @property
+    def _follows_target(self) -> bool:
+        return self.state is _ENABLED and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None
+
+    @property
+    def error_code(self) -> int:
+        """0x603F: the fault that is latched, 0 for none."""
+        return self._error_code
+
+    def on_sync(self, position: int, velocity: int, t_ns: int, *, is_distorted: bool = False) -> None:
+        """Let the pending command act. `position`, `velocity`: sampled at this SYNC, in the body's LSBs.
+
+        `is_distorted`: the velocity isn't the motor's, so it counts where the contract has an LSB of its own, too.
+        """
+        t_ns = self._clock.own_ns(t_ns)
+        self._sync_ns = t_ns
+        self._position = position
+        lsb_rad_s = self._velocity_lsb_rad_s
+        if lsb_rad_s is None:
+            self._velocity = velocity
+        else:
+            speed_rad_s = velocity * VELOCITY_LSB_RAD_S if is_distorted else self._motor.velocity_rad_s()
+            self._velocity = round(speed_rad_s / lsb_rad_s)
+        if self._pdos.act_on_sync(t_ns):
+            self._silent_syncs = 0
+            self._acted_commands += 1
+        else:
+            self._miss_command(t_ns)
+        if self._tripped:
+            self._clear_watchdogs(t_ns)
+        if self._received_word is not None:
+            self._obey_received(t_ns)
+        if self._mode != self._wanted_mode:
+            self._change_mode()
+        self._watch_motor(t_ns)
+        if self._is_braking:
+            self._watch_standstill(t_ns)
+        self._drive_motor()
+        if self._pdos.has_compared and self._pdos.compare():
+            self.has_news = True
+
+    def act(self, t_ns: int) -> None:
+        """Obey a command that doesn't wait for SYNC."""
+        if self._received_word is not None:
+            self._obey_received(t_ns)
+        self._drive_motor()
+
+    def mind_length(self, is_right: bool, t_ns: int) -> None:
+        """Report a command frame of the wrong length, once until a right one comes."""
+        if not is_right:
+            self.device.trip(Watchdog.LENGTH, t_ns)
+        else:
+            self.device.clear(Watchdog.LENGTH, t_ns)
+
+    def on_lost_sync(self, t_ns: int) -> None:
+        """Live through a period whose SYNC never came, in a bench that counts periods by SYNC counters."""
+        t_ns = self._clock.own_ns(t_ns)
+        self._miss_command(t_ns)
+        self._watch_motor(t_ns)
+        if self._is_braking:
+            self._watch_standstill(t_ns)
+        self._drive_motor()
+
+    def poll(self, t_ns: int) -> int:
+        """Do what is due by time; return when something is due next."""
+        t_ns = self._clock.own_ns(t_ns)
+        due_ns = self.device.poll(t_ns)
+        self._feel_failure(t_ns)
+        if self.is_enabled:
+            due_ns = min(due_ns, self._watch_bus(t_ns))
+        if self._is_braking and (self.is_free_running or self.is_left_alone):
+            self._watch_standstill(t_ns)
+            due_ns = min(due_ns, t_ns + _BRAKE_WATCH_NS)
+        if self.has_news:
+            self.has_news = False
+            self._pdos.notify()
+        due_ns = min(due_ns, self._pdos.poll(t_ns))
+        self._drive_motor()
+        return self._clock.bench_ns(due_ns)
+
+    def fail(self, code: int, t_ns: int) -> None:
+        """Fault by itself, with an error code of 0x603F; what causes it stays until `mend`."""
+        self._failure = code
+        self._feel_failure(self._clock.own_ns(t_ns))
+
+    def mend(self) -> None:
+        """Let the cause of a failure be gone; the fault stays latched."""
+        self._failure = 0
+
+    def _feel_failure(self, t_ns: int) -> None:
+        """Fault for a failure that lasts, after a reset again."""
+        if self._failure and self.device.is_powered:
+            self._latch(self._failure, None, t_ns)
+
+    def leave_operational(self, t_ns: int) -> None:
+        """Fault: without PDOs there is no command."""
+        if self.state in _POWERED:
+            self._fault(Watchdog.OPERATIONAL, t_ns)
+
+    def enter_operational(self, t_ns: int) -> None:
+        """Clear the watchdog; a fault stays latched."""
+        self.device.clear(Watchdog.OPERATIONAL, t_ns)
+        self._find_command_pdo(t_ns)
+
+    def lose_heartbeat(self, t_ns: int) -> None:
+        """Fault when powered."""
+        if self.state in _POWERED:
+            self._fault(Watchdog.HEARTBEAT, t_ns, is_found_by_time=True)
+        else:
+            self.device.trip(Watchdog.HEARTBEAT, t_ns)
+
+    def find_heartbeat(self, t_ns: int) -> None:
+        """Clear the watchdog; a fault stays latched."""
+        self.device.clear(Watchdog.HEARTBEAT, t_ns)
+
+    def distrust_sync(self, t_ns: int) -> None:
+        """Fault when enabled: torque that acts at SYNC has no time."""
+        if self.is_enabled:
+            self._fault(Watchdog.SYNC, t_ns)
+
+    def note_error(self) -> None:
+        """Do nothing: a drive's status has no error register."""
+
+    def restart(self, is_node_reset: bool) -> None:
+        """Forget the last command; a node reset also runs the state machine from its start (0, 1)."""
+        self._received_word = None
+        if not is_node_reset:
+            return
+        self._error_code = 0
+        self._cause = None
+        self.device.is_faulty = False
+        self.device.fault_bits = 0
+        self._controlword = self._acted_commands = 0
+        self._limits.target = 0
+        self._mode = self._wanted_mode
+        self._ramp_end = None
+        self._silent_syncs = _NO_COMMAND_YET
+        self.state = DriveState.START
+        self._apply(DriveEvent.POWER_ON, 0)
+        self._apply(DriveEvent.INITIALISED, 0)
+        self._drive_motor()
+
+    def _receive_word(self, controlword: int) -> None:
+        self._received_word = controlword
+
+    def _obey_received(self, t_ns: int) -> None:
+        """Carry out the controlword of a PDO."""
+        controlword, self._received_word = self._received_word, None
+        if controlword is None:
+            return
+        if controlword != _ENABLE_OPERATION_WORD or self.state is not _ENABLED:
+            self._obey(controlword, t_ns)
+        self._controlword = controlword
+
+    def _obey_by_sdo(self, controlword: int) -> None:
+        if self._pdos.brings(*_CONTROLWORD) and decode_command(controlword, self._controlword) not in _DISARMING:
+            refuse(Abort.DEVICE_STATE)
+        self._obey(controlword, self.device.now_ns)
+        self._controlword = controlword
+        self._drive_motor()
+
+    def _obey(self, controlword: int, t_ns: int) -> None:
+        """Carry out a controlword."""
+        event = decode_command(controlword, self._controlword)
+        if event is None:
+            return
+        if event is not DriveEvent.ENABLE_OPERATION:
+            self.device.clear(Watchdog.COMMAND_PDO, t_ns)
+        if event is DriveEvent.FAULT_RESET:
+            self._reset_fault(t_ns)
+            return
+        if event is DriveEvent.ENABLE_OPERATION:
+            if self.state is DriveState.SWITCHED_ON and self._obstacle:
+                self.has_news |= Watchdog.COMMAND_PDO not in self._tripped
+                self.device.trip(Watchdog.COMMAND_PDO, t_ns)
+                return
+            if self.state is DriveState.QUICK_STOP_ACTIVE and not self._stop.stays:
+                return
+        if self.is_enabled and event in _RAMPED:
+            if self._ramp_end is None:
+                self._ramp_down(event, t_ns)
+            return
+        self._apply(event, t_ns)
+
+    def _ramp_down(self, event: DriveEvent, t_ns: int) -> None:
+        """Shut down or disable operation by way of its option code."""
+        stop = RAMPS[self.device.value_or(0, _RAMPED[event])]
+        if stop is DISABLE:
+            self._apply(event, t_ns)
+            return
+        self._ramp_end = event
+        self._brake(stop, t_ns)
+
+    def _apply(self, event: DriveEvent, t_ns: int) -> None:
+        transition = find_transition(self.state, event)
+        if transition is None:
+            return
+        self.state = transition.target
+        self._ramp_end = None
+        self._is_braking = False
+        self.motor_mode = DriveMode.TORQUE if self.is_enabled else DriveMode.OFF
+        self.has_news = True
+        if self.state is DriveState.QUICK_STOP_ACTIVE:
+            self._stop_by(QUICK_STOPS[self.device.value_or(2, 0x605A)], DriveEvent.QUICK_STOP_DONE, t_ns)
+        elif self.state is DriveState.FAULT_REACTION_ACTIVE:
+            self._stop_by(FAULT_REACTIONS[self.device.value_or(2, 0x605E)], DriveEvent.FAULT_REACTION_DONE, t_ns)
+
+    def _stop_by(self, stop: Stop, done: DriveEvent, t_ns: int) -> None:
+        if stop is DISABLE:
+            self._apply(done, t_ns)
+        else:
+            self._brake(stop, t_ns)
+
+    def _brake(self, stop: Stop, t_ns: int) -> None:
+        self._stop = stop
+        self.motor_mode = stop.mode
+        self._is_braking = True
+        self.has_news = True
+        self._standstill.begin(t_ns)
+
+    def _reset_fault(self, t_ns: int) -> None:
+        """Leave Fault, unless what caused it is still there."""
+        if self.state is not DriveState.FAULT or self._is_cause_present(t_ns):
+            return
+        self._apply(DriveEvent.FAULT_RESET, t_ns)
+        self._error_code = 0
+        self._cause = None
+        self.device.is_faulty = False
+        self.device.fault_bits = 0
+        self.device.report_no_error(t_ns)
+
+    def _fault(self, cause: Watchdog, t_ns: int, is_found_by_time: bool = False) -> None:
+        """Latch a fault; the first one counts."""
+        self._latch(ERROR_CODES[cause], cause, t_ns, is_found_by_time)
+
+    def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
+        if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
+            return
+        self._error_code = code
+        self._cause = cause
+        self._is_found_by_time = is_found_by_time
+        self.device.is_faulty = True
+        self.device.fault_bits = _KIND_BITS.get(code >> 12, 0)
+        self._limits.target = 0
+        self._apply(DriveEvent.FAULT_DETECTED, t_ns)
+        self._drive_motor()
+        if cause is None:
+            self.device.report_fault(code, t_ns)
+        else:
+            self.device.trip(cause, t_ns)
+
+    def _watch_motor(self, t_ns: int) -> None:
+        """Fault when the motor's state calls for it; note when limits come and go."""
+        code = self._motor.error_code()
+        if code:
+            self._latch(code, None, t_ns)
+        is_limited = self._motor.is_limited()
+        is_limiting = self._limits.is_limiting and self._follows_target
+        if is_limited != self._is_motor_limited or is_limiting != self._is_limiting:
+            self._is_motor_limited, self._is_limiting = is_limited, is_limiting
+            self.has_news = True
+
+    def _is_cause_present(self, t_ns: int) -> bool:
+        """Whether the drive fails, the motor is too hot, or a watchdog that stops it is tripped or would be at once."""
+        if self._failure or self._tripped - WARNINGS or self._motor.error_code():
+            return True
+        return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
+
+    def _clear_watchdogs(self, t_ns: int) -> None:
+        """At a SYNC: it has come, and maybe a command with it."""
+        if self.device.sync_counts.is_in_order:
+            self.device.clear(Watchdog.SYNC, t_ns)
+        if not self._is_command_missing(t_ns):
+            self.device.clear(Watchdog.COMMAND, t_ns)
+        self._find_command_pdo(t_ns)
+
+    def _find_command_pdo(self, t_ns: int) -> None:
+        if not self._obstacle:
+            self.device.clear(Watchdog.COMMAND_PDO, t_ns)
+
+    def _miss_command(self, t_ns: int) -> None:
+        self._silent_syncs += 1
+        if self.is_enabled and self._silent_syncs >= self._patience_syncs:
+            self._fault(Watchdog.COMMAND, t_ns)
+
+    def _watch_bus(self, t_ns: int) -> int:
+        """Fault when SYNC or commands stay away for too long; return when to look again."""
+        due_ns = NEVER_NS
+        if self.is_free_running:
+            patience_ns = self._period_us * self._tenth_periods * 100
+            if t_ns - self._sync_ns >= patience_ns:
+                self._fault(Watchdog.SYNC, t_ns, is_found_by_time=True)
+            due_ns = self._sync_ns + patience_ns
+        if self._pdos.find_late(t_ns):
+            self._fault(Watchdog.COMMAND, t_ns, is_found_by_time=True)
+        return min(due_ns, self._pdos.deadline_ns) if self.is_enabled else t_ns
+
+    @property
+    def _obstacle(self) -> int:
+        """0x2212, why there is no Operation enabled: 0 nothing, 1 no PDO is exchanged, 2 none brings commands."""
+        if self._pdos.is_commandable:
+            return 0
+        return 2 if self.device.is_operational else 1
+
+    def _is_command_missing(self, t_ns: int) -> bool:
+        return self._silent_syncs >= self._patience_syncs or self._pdos.find_late(t_ns)
+
+    def _watch_standstill(self, t_ns: int) -> None:
+        """End the braking once the motor stands still, or after the longest time."""
+        if not self._standstill.is_reached(self._motor.velocity_rad_s(), t_ns):
+            return
+        if self.state is DriveState.FAULT_REACTION_ACTIVE:
+            self._apply(DriveEvent.FAULT_REACTION_DONE, t_ns)
+        elif self._ramp_end is not None:
+            self._apply(self._ramp_end, t_ns)
+        elif not self._stop.stays:
+            self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
+
+    def _drive_motor(self) -> None:
+        """Tell the motor what the state allows: torque only in Operation enabled with mode 10."""
+        if self._follows_target:
+            self._demand = self._limits.demand()
+            self.torque_Nm = self._demand * self._rated_mNm * 1e-6
+        else:
+            self._demand = 0
+            self.torque_Nm = 0.0
+
+    @property
+    def _torque_permille(self) -> int:
+        permille = round(self._motor.torque_Nm() * 1e6 / self._rated_mNm)
+        return max(-0x8000, min(0x7FFF, permille))
+
+    def _want_mode(self, mode: int) -> None:
+        """Take another mode over: at the next SYNC while the motor has torque, at once elsewhere."""
+        self._wanted_mode = mode
+        if not self.is_enabled:
+            self._change_mode()
+
+    def _change_mode(self) -> None:
+        self.has_news |= self._mode != self._wanted_mode
+        self._mode = self._wanted_mode
+        self._drive_motor()
+
+    def _set_period(self, period_us: int) -> None:
+        if period_us:  # 0 is written to change 0x1019; SYNC is watched all the same
+            self._period_us = period_us
+
+    def _set_tolerance(self, tenth_periods: int) -> None:
+        self._tenth_periods = tenth_periods
+
+    def _set_patience(self, syncs: int) -> None:
+        self._patience_syncs = syncs
+
+
+def _velocity_lsb(codec: Codec, number: int) -> float | None:
+    """Return the contract's LSB of velocity in rad/s, None when it is the body's own."""
+    signals = codec.message(f"Drive{number}Feedback").signals
+    scale = next(signal.scale for signal in signals if signal.name == "velocity")
+    return None if scale == VELOCITY_LSB_RAD_S else scale

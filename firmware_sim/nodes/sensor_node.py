@@ -1,0 +1,165 @@
+"""An emulated joint torque sensor: a CiA 404 analogue input whose process value is the torque in the contract's LSB.
+
+On every SYNC it sends the value. Where the frame has an end-to-end header, the header's status carries the low bits of
+0x6150, so that an overload is seen in the very frame that it spoils.
+
+In Operational the sensor measures for somebody: SDO writes nothing but clears the error history. Autozero is asked for
+in Pre-operational; its samples are those of the SYNCs that follow, in whichever state.
+
+Source: CiA 404, objects 0x6125, 0x6150, 0x9130.
+"""
+
+from collections.abc import Callable
+
+from adacd_hil.wire.codec import Codec
+from firmware_sim.arm.sensing import TORQUE_COUNTS, TORQUE_LSB_NM
+from firmware_sim.canopen.object_dictionary import Abort, refuse
+from firmware_sim.canopen.watchdogs import Watchdog
+from firmware_sim.nodes.device import Device
+
+STATUS_NOT_VALID = 0x01
+STATUS_POSITIVE_OVERLOAD = 0x02
+STATUS_NEGATIVE_OVERLOAD = 0x04
+AUTOZERO_SIGNATURE = int.from_bytes(b"zero", "little")
+"""What 0x6125 takes."""
+AUTOZERO_SAMPLES = 64
+"""Samples whose mean becomes the zero: an eighth of the noise of one."""
+ROOM_TEMPERATURE_C = 25.0
+"""What 0x2111 says of a sensor that isn't told its joint's temperature."""
+
+_EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
+
+
+class SensorNode:
+    """One torque sensor on the bus."""
+
+    def __init__(
+        self,
+        device: Device,
+        codec: Codec,
+        number: int,
+        converter_ends: tuple[int, int] = TORQUE_COUNTS,
+        temperature_C: Callable[[], float] = lambda: ROOM_TEMPERATURE_C,
+    ) -> None:
+        """Connect the node to its device.
+
+        `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives.
+        `temperature_C`: of the joint, 0x2111.
+        """
+        self.device = device
+        self.has_news = False
+        """Whether something has changed that the bus hasn't been told."""
+        self._pdos = device.pdos
+        self._lowest_count, self._highest_count = converter_ends
+        signals = codec.message(f"Sensor{number}Torque").signals
+        scale_Nm = next(signal.scale for signal in signals if signal.name == "torque")
+        self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / scale_Nm)  # exact: contracts have decimal fractions
+        self._status = STATUS_NOT_VALID  # nothing measured yet
+        self._torque = self._counts = 0
+        self._zero_counts = 0.0
+        self._autozero_left = self._autozero_sum = 0
+        self._error_bits = 0
+        device.serve(0x2000, 1, lambda: codec.wire_version)
+        device.serve(0x2000, 2, lambda: codec.layout_digest)
+        device.serve(0x2110, 1, lambda: round(self._counts * self._lsbs_per_count))
+        device.serve(0x2111, 0, lambda: max(-0x8000, min(0x7FFF, round(100.0 * temperature_C()))))
+        device.serve(0x6150, 1, lambda: self._status)
+        device.serve(0x9130, 1, lambda: self._torque)
+        device.watch(0x6125, 1, check=self._start_autozero)
+        device.watch(0x6131, 1, check=self._check_unchanged(0x6131))
+        device.watch(0x6132, 1, check=self._check_unchanged(0x6132))
+        self._pdos.events = _EVENTS
+        self._pdos.header_status = lambda: self._status
+        device.attach(self)
+
+    def on_sync(self, counts: int) -> None:
+        """Take the torque that was sampled at this SYNC, in the converter's counts."""
+        status = self._error_bits
+        if counts >= self._highest_count:
+            status |= STATUS_POSITIVE_OVERLOAD | STATUS_NOT_VALID
+        elif counts <= self._lowest_count:
+            status |= STATUS_NEGATIVE_OVERLOAD | STATUS_NOT_VALID
+        if status != self._status:
+            self._status = status
+            self.has_news = True
+        if self._autozero_left:
+            self._autozero(counts)
+        self._torque = round((counts - self._zero_counts) * self._lsbs_per_count)
+        self._counts = counts
+        if self._pdos.has_compared and self._pdos.compare():
+            self.has_news = True
+
+    def set_error(self, bits: int) -> None:
+        """Let the sensor find fault with itself, from its next sample on: bits of 0x6150, 0 for none."""
+        self._error_bits = bits
+
+    def poll(self, t_ns: int) -> int:
+        """Do what is due by time; return when something is due next."""
+        clock = self.device.clock
+        t_ns = clock.own_ns(t_ns)
+        due_ns = self.device.poll(t_ns)
+        if self.has_news:
+            self.has_news = False
+            self._pdos.notify()
+        return clock.bench_ns(min(due_ns, self._pdos.poll(t_ns)))
+
+    def act(self, t_ns: int) -> None:
+        """Do nothing: a sensor takes no commands."""
+
+    def mind_length(self, is_right: bool, t_ns: int) -> None:
+        """Do nothing: a sensor takes no commands."""
+
+    def leave_operational(self, t_ns: int) -> None:
+        """Do nothing: the frames end by themselves."""
+
+    def enter_operational(self, t_ns: int) -> None:
+        """Do nothing: the frames begin by themselves."""
+
+    def lose_heartbeat(self, t_ns: int) -> None:
+        """Report it."""
+        self.device.trip(Watchdog.HEARTBEAT, t_ns)
+
+    def find_heartbeat(self, t_ns: int) -> None:
+        """Clear the error."""
+        self.device.clear(Watchdog.HEARTBEAT, t_ns)
+
+    def distrust_sync(self, t_ns: int) -> None:
+        """Do nothing: who measures by SYNC has been told."""
+
+    def note_error(self) -> None:
+        """Let the status frame say so."""
+        self.has_news = True
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether somebody relies on what it measures."""
+        return self.device.is_operational
+
+    def restart(self, is_node_reset: bool) -> None:
+        """Forget the zero at a node reset."""
+        if is_node_reset:
+            self._status = STATUS_NOT_VALID
+            self._torque = self._counts = 0
+            self._zero_counts = 0.0
+            self._autozero_left = 0
+
+    def _start_autozero(self, signature: int) -> None:
+        if signature != AUTOZERO_SIGNATURE:
+            refuse(Abort.CANNOT_STORE)
+        self._autozero_left = AUTOZERO_SAMPLES
+        self._autozero_sum = 0
+
+    def _autozero(self, counts: int) -> None:
+        self._autozero_sum += counts
+        self._autozero_left -= 1
+        if self._autozero_left == 0:
+            self._zero_counts = self._autozero_sum / AUTOZERO_SAMPLES
+
+    def _check_unchanged(self, index: int) -> Callable[[int], None]:
+        """Make a check that lets an object be written with the value that it has only."""
+
+        def check(value: int) -> None:
+            if value != self.device.value(index, 1):
+                refuse(Abort.VALUE_RANGE)
+
+        return check

@@ -1,0 +1,185 @@
+"""A scenario: which arm, where it starts, who touches it when, when the payload changes, and what goes wrong.
+
+Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
+package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults`, `expect` and
+`expect_certified` are for those who play a scenario and change nothing on the arm.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, toml_names
+from adacd_hil.records import Vector
+from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.mechanics_settings import MechanicsSettings, PayloadBody
+from firmware_sim.arm.scripted_contact import ContactSettings, ticks
+from firmware_sim.arm.sensor_settings import SensorSettings
+from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.scenario.expectation import ExpectSettings
+from firmware_sim.scenario.faults import FaultSettings, check_rows
+
+
+@dataclass(frozen=True)
+class PayloadSettings:
+    """One change of the payload."""
+
+    at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="since the drives were enabled")
+    mass_kg: float = setting(unit="kg", low=0.0, high=20.0, meaning="payload from then on, at the tip; 0: none")
+    center_m: tuple[float, float] = setting(
+        (0.0, 0.0), unit="m", low=-2.0, high=2.0, meaning="its centre of mass from the tip, along and beside link 2"
+    )
+    inertia_kg_m2: float = setting(0.0, unit="kg m²", low=0.0, high=10.0, meaning="its inertia about that point")
+
+    @property
+    def tick(self) -> int:
+        """First 100 µs tick, since the drives were enabled, with this payload."""
+        return ticks(self.at_s)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that the emulated arm and the person beside it do, resolved."""
+
+    name: str = setting("", meaning="name of the scenario")
+    about: str = setting("", meaning="what happens, in one line")
+    group: str = setting("", meaning="which scenarios it belongs to")
+    lasts_s: float = setting(
+        51.0,
+        unit="s",
+        low=0.1,
+        high=1e6,
+        meaning="how long a run of it is meant to take, since the drives were enabled",
+    )
+    acknowledge_faults: int = setting(
+        0, low=0, high=1000, meaning="how many faults the person acknowledges, each 1 s after it"
+    )
+    profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
+    seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the sensor noise")
+    noise: bool = setting(True, meaning="noise of torque sensors and encoders; quantisation stays")
+    start_deg: tuple[float, float] = setting(
+        (0.0, 0.0), unit="deg", low=-180.0, high=180.0, meaning="pose at power-on, at rest"
+    )
+    payload_kg: float = setting(0.0, unit="kg", low=0.0, high=20.0, meaning="payload at power-on")
+    torque_offset_Nm: tuple[float, float] = setting(
+        (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="zero error of the torque sensors"
+    )
+    sensors: SensorSettings = setting(SensorSettings, meaning="errors of the torque sensors and the encoders")
+    drives: DriveSettings = setting(DriveSettings, meaning="errors and limits of the drives")
+    payloads: tuple[PayloadSettings, ...] = setting((), meaning="changes of the payload, in order of time")
+    contacts: tuple[ContactSettings, ...] = setting((), meaning="touches, in order of time, one at a time")
+    bodies: tuple[BodySettings, ...] = setting((), meaning="bodies in the arm's way")
+    hands: tuple[HandSettings, ...] = setting((), meaning="hands that grasp and guide")
+    walls: tuple[WallSettings, ...] = setting((), meaning="walls")
+    faults: tuple[FaultSettings, ...] = setting((), meaning="what goes wrong, each row by its own time")
+
+    mechanics: MechanicsSettings = setting(MechanicsSettings, meaning="the arm beyond rigid links")
+    expect: ExpectSettings | None = setting(None, meaning="what a healthy host of configuration `paper` makes of it")
+    expect_certified: ExpectSettings | None = setting(
+        None, meaning="what one of configuration `certified` makes of it, where that is something else"
+    )
+
+    def __post_init__(self) -> None:
+        if len(self.about.splitlines()) > 1:
+            raise ConfigError(f"`about` has {len(self.about.splitlines())} lines, 1 expected")
+        self.mechanics.check(self.arm, self.start_deg, self.payload_bodies)
+        self._check_points("contacts", self.contacts)
+        self._check_points("hands", self.hands)
+        self._check_room("bodies", self.bodies)
+        self._check_room("walls", self.walls)
+        for index, (first, second) in enumerate(zip(self.contacts, self.contacts[1:], strict=False), start=1):
+            if second.onset_tick < first.end_tick:
+                raise ConfigError(
+                    f"`contacts[{index}].at_s` = {second.at_s} s is before the end of the contact before it at "
+                    f"{first.at_s + first.duration_s} s"
+                )
+        for index, change in enumerate(self.payloads):
+            if change.mass_kg == 0.0 and (change.center_m != (0.0, 0.0) or change.inertia_kg_m2 != 0.0):
+                raise ConfigError(f"`payloads[{index}].mass_kg` = 0 kg has neither `center_m` nor `inertia_kg_m2`")
+        for index, (before, after) in enumerate(zip(self.payloads, self.payloads[1:], strict=False), start=1):
+            if after.tick <= before.tick:
+                raise ConfigError(
+                    f"`payloads[{index}].at_s` = {after.at_s} s is not after the change before it at {before.at_s} s"
+                )
+        check_rows(self.faults)
+
+    def _check_points(self, key: str, touches: Sequence[ContactSettings | HandSettings]) -> None:
+        for index, one in enumerate(touches):
+            length_m = self.arm.link_length_m[one.link - 1]
+            if one.point_m > length_m:
+                raise ConfigError(
+                    f"`{key}[{index}].point_m` = {one.point_m} m is beyond the end of link {one.link} at {length_m} m"
+                )
+
+    def _check_room(self, key: str, things: Sequence[BodySettings | WallSettings]) -> None:
+        pose_rad = math.radians(self.start_deg[0]), math.radians(self.start_deg[1])
+        for index, thing in enumerate(things):
+            overlap_m = thing.overlap_m(self.arm.link_length_m, pose_rad)
+            if thing.onset_tick == 0 and overlap_m > 0.0:
+                raise ConfigError(
+                    f"`{key}[{index}]`: at at_s = 0 s the arm in its start pose {self.start_deg} deg "
+                    f"is {overlap_m:.4g} m inside it"
+                )
+
+    def expected_of(self, scheme: str) -> ExpectSettings | None:
+        """Return what a healthy host of a scheme, `paper` or `certified`, makes of it; None: the file doesn't say."""
+        own = self.expect_certified if scheme == "certified" else None
+        return own or self.expect
+
+    @property
+    def arm(self) -> Arm:
+        """The arm of this profile."""
+        return ARMS[self.profile]
+
+    @property
+    def payload_bodies(self) -> tuple[PayloadBody, ...]:
+        """Every payload of this scenario, and none."""
+        changes = ((change.mass_kg, change.center_m, change.inertia_kg_m2) for change in self.payloads)
+        return (0.0, (0.0, 0.0), 0.0), (self.payload_kg, (0.0, 0.0), 0.0), *changes
+
+    @property
+    def start_rad(self) -> Vector:
+        """Pose at power-on, rad (2,)."""
+        return np.array([math.radians(angle_deg) for angle_deg in self.start_deg])
+
+
+def builtin_scenarios() -> list[str]:
+    """Name the scenarios that come with the package."""
+    return toml_names(_builtin_folder())
+
+
+def _builtin_folder() -> Traversable:
+    return resources.files("firmware_sim") / "scenarios"
+
+
+def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
+    """Read a scenario: a built-in name or a TOML file. `profile` and `seed` outweigh the file's. Raises ConfigError."""
+    table = read_table(name_or_file)
+    if profile is not None:
+        table["profile"] = profile
+    if seed is not None:
+        table["seed"] = seed
+    try:
+        return parse(Scenario, table)
+    except ConfigError as error:
+        raise ConfigError(f"scenario {name_or_file}: {error}") from None
+
+
+def read_table(name_or_file: str) -> dict[str, Any]:
+    """Read a scenario's TOML, unchecked but for its syntax. Raises ConfigError."""
+    path = find_toml("scenario", name_or_file, _builtin_folder())
+    table = read_toml(path, "scenario")
+    table.setdefault("name", path.stem)
+    return table
+
+
+def named_profile(name_or_file: str) -> str | None:
+    """Give the profile that a scenario's file names, unchecked; None where it leaves that open. Raises ConfigError."""
+    profile = read_table(name_or_file).get("profile")
+    return None if profile is None else str(profile)
