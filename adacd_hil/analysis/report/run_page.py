@@ -15,6 +15,7 @@ from adacd_hil.analysis.report.packed_traces import SCRIPTS, STYLES, traces_of
 from adacd_hil.analysis.report.page import Heading, render_page
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.tables import (
+    counted_sentence,
     data_table,
     further_table,
     margins_table,
@@ -28,7 +29,6 @@ from adacd_hil.analysis.report.timeline import state_key, timeline_of
 from adacd_hil.analysis.report.timing_tables import timing_tables
 from adacd_hil.analysis.report.words import NONE, has_paper, left_out_text, number_text, stretch_text
 from adacd_hil.analysis.run import Run
-from adacd_hil.analysis.score.score_words import rate_sentence
 from adacd_hil.analysis.verdict import LISTED
 
 
@@ -57,7 +57,7 @@ def report_page(
         sections=sections_table(metrics, run),
         margins=margins_table(metrics.evidence),
         push=push_table(metrics.evidence),
-        counted=_counted(metrics),
+        counted=counted_sentence(metrics),
         close_ups=figures.get("contacts"),
         contacts=contacts_table(metrics),
         left_out=left_out_text(metrics, bounds.CONTACTS),
@@ -136,8 +136,3 @@ def _beside_times(evidence: Evidence | None) -> str:
 def _listed(times: list[str]) -> list[str]:
     """Leave out all but the first of many."""
     return times if len(times) <= LISTED else [*times[:LISTED], "…"]
-
-
-def _counted(metrics: Metrics) -> str:
-    bound = metrics.false_alarm_bound_per_h
-    return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)

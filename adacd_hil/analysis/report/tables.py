@@ -21,6 +21,7 @@ from adacd_hil.analysis.report.words import (
     stretch_text,
 )
 from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.score.score_words import rate_sentence
 from adacd_hil.analysis.untouched import Residual
 from adacd_hil.records import PARAMETER_UNITS
 
@@ -63,6 +64,12 @@ def push_table(evidence: Evidence | None) -> Table | None:
         )
     ]
     return make_table(("joint 1 / joint 2, Nm", *names.values()), rows)
+
+
+def counted_sentence(metrics: Metrics) -> str:
+    """Say what false alarms there were, and which rate that leaves possible; empty where nobody knows."""
+    bound = metrics.false_alarm_bound_per_h
+    return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
 
 
 def _first_and_worst(evidence: Evidence) -> dict[str, tuple[ChannelMargin, ...]]:
