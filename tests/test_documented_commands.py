@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from documents import PAGES, ROOT, Document, Piece, read_document
 
-from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.config import load_settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import FRAME_DTYPE

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from long_cases import long_but
 
-from adacd_hil.cli.demo import resolve, run_embedded
-from adacd_hil.cli.outcome import outcome_of
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+from adacd_hil.cli.run_outcome import outcome_of
 from adacd_hil.config import parse, to_short_toml, to_toml
 from adacd_hil.log.reader import read_log
 from firmware_sim.scenario.expectation import deviations

@@ -18,7 +18,7 @@ from experiment_runs import BIN, PAPER
 from hang import HANG_S
 from long_cases import long_but
 
-from adacd_hil.cli.monitor import Screen
+from adacd_hil.cli.commands.monitor_command import Screen
 from adacd_hil.cli.progress import Progress
 from adacd_hil.log.reader import read_log
 from adacd_hil.terminal import fit_table, in_line, one_line, plain, terminal_columns

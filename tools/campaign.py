@@ -53,8 +53,8 @@ class Row:
 
 def play(name_or_file: str, config: str, seed: int | None, keep: Path | None) -> Row:
     """Play one scenario with one configuration, its logs in a folder of `keep` or nowhere."""
-    from adacd_hil.cli.demo import resolve, run_embedded
-    from adacd_hil.cli.outcome import outcome_of
+    from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+    from adacd_hil.cli.run_outcome import outcome_of
 
     scenario = load_scenario(name_or_file)
     expect = scenario.expected_of(load_settings(config).scheme)

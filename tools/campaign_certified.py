@@ -7,7 +7,7 @@ from campaign_schemes import ADAPTING, ARMED, TESTING, Outcome
 from lab import PERIOD_S, Motion, Recording, paper_motion
 
 from adacd_hil.config import Settings
-from adacd_hil.control.excitation import Excitation
+from adacd_hil.control.motion.excitation import Excitation
 from adacd_hil.records import JOINTS, SchemeState
 from adacd_hil.scheme.kernel import certified_memory, loop
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT

@@ -10,9 +10,9 @@ import numpy as np
 
 from adacd_hil.config import Settings, load_settings, merge, parse
 from adacd_hil.control.controller import Controller
-from adacd_hil.control.floating import Floating
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.reference import Reference
+from adacd_hil.control.motion.floating import Floating
+from adacd_hil.control.motion.reference import Reference
 from adacd_hil.records import (
     TRUTH_LAYOUT,
     ArmState,

@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 
 from adacd_hil.cli.table import format_table
 from adacd_hil.config import Settings, load_settings
-from adacd_hil.control.quintic import evaluate, to_rest
+from adacd_hil.control.motion.quintic import evaluate, to_rest
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import bank
 

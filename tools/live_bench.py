@@ -22,7 +22,7 @@ from live_client import watch
 from numpy.typing import NDArray
 from side_by_side import patient_config
 
-from adacd_hil.cli.demo import Cast, resolve, run_embedded
+from adacd_hil.cli.commands.demo_command import Cast, resolve, run_embedded
 from adacd_hil.config import RequestSettings
 from adacd_hil.control.session import LiveAddress
 from adacd_hil.log.reader import Series, read_log

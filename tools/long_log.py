@@ -26,7 +26,7 @@ from adacd_hil.log.channels import Channel
 from adacd_hil.log.editing.intact import IntactLog
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.chunk_contents import Contents
-from adacd_hil.log.mcap.records import MESSAGE_HEAD
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, FIELDS_KEY, PART_KEY, RUN_METADATA, McapFile
 from adacd_hil.log.parts import part_path
 from adacd_hil.log.sink import Sink

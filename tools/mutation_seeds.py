@@ -7,7 +7,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.config import load_settings, to_toml
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.control.history_file import FORMAT, CertificateRecord, History, devices_digest

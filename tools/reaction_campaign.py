@@ -22,7 +22,7 @@ from contact_rig import Rig, Sample, rig_settings
 from adacd_hil.analysis import drawing
 from adacd_hil.cli.table import format_table
 from adacd_hil.config import ConfigError, Settings
-from adacd_hil.control.quintic import corner_to_corner
+from adacd_hil.control.motion.quintic import corner_to_corner
 from adacd_hil.records import Reaction, SchemeState, Vector
 from firmware_sim.arm.body_regions import BODY_REGIONS
 from firmware_sim.arm.touch_settings import BodySettings

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from adacd_hil.analysis.replay.replay import Replay, replay
-from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.config import ConfigError
 from firmware_sim.scenario.scenario import builtin_scenarios
 

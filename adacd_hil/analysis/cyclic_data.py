@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import CheckCounts, Mask, Run
+from adacd_hil.analysis.logged_run import CheckCounts, Mask, Run
 from adacd_hil.analysis.timing import CycleColumns, Cycles
 from adacd_hil.config import DataSettings, Settings
 from adacd_hil.device.data_watch import SHORTEST_SHARE, WINDOW_S

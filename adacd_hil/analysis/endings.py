@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.terminal import one_line
 

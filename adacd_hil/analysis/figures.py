@@ -25,9 +25,9 @@ from adacd_hil.analysis.drawing import (
     plot,
     style,
 )
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import ADAPTATIONS
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.score.score_words import why_not_found
 from adacd_hil.analysis.score.touches import filtered, row_at

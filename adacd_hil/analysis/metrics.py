@@ -18,8 +18,8 @@ to F_c: those cycles don't count.
 detections are false alarms: `adacd_hil.analysis.score.judge`; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
-those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.evidence`; the paper's scheme that ran
-beside it on the same stream: `adacd_hil.analysis.score.paper_beside`.
+those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.margin_evidence`; the paper's
+scheme that ran beside it on the same stream: `adacd_hil.analysis.score.paper_beside`.
 """
 
 from dataclasses import dataclass
@@ -27,9 +27,9 @@ from typing import NamedTuple
 
 from adacd_hil.analysis.cyclic_data import CyclicData, gather_data
 from adacd_hil.analysis.endings import find_causes, find_faults
-from adacd_hil.analysis.evidence import Evidence, evaluate_certified, last_row
+from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.margin_evidence import Evidence, evaluate_certified, last_row
 from adacd_hil.analysis.paper_comparison import PaperRow, compare_with_paper
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.alarms import find_detections
 from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h
 from adacd_hil.analysis.score.contacts import Contact, list_contacts

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.evidence import Evidence
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.margin_evidence import Evidence
 from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.score.paper_beside import Beside
 from adacd_hil.analysis.score.score_words import found_text

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.logged_run import Mask, Run
 from adacd_hil.records import SchemeState, Vector
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.analysis.evidence import ChannelMargin, MarginGatherer
-from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.logged_run import Mask, Run
+from adacd_hil.analysis.margin_evidence import ChannelMargin, MarginGatherer
 from adacd_hil.analysis.score.alarms import Detection, find_detections
 from adacd_hil.analysis.score.paper_beside import SETTLING_TIME_CONSTANTS, Beside, BesideGatherer, larger
 from adacd_hil.analysis.score.touches import Touch, true_contacts

@@ -5,8 +5,8 @@ from typing import Final, TypeGuard
 
 from adacd_hil.analysis.cyclic_data import CyclicData, data_text
 from adacd_hil.analysis.endings import Fault
-from adacd_hil.analysis.evidence import Evidence
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.margin_evidence import Evidence
 from adacd_hil.analysis.score.judge import Score
 from adacd_hil.analysis.score.score_words import number_of, score_sentence
 from adacd_hil.analysis.sections import Section

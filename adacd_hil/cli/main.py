@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, NoReturn
 import click
 
 from adacd_hil import __version__
-from adacd_hil.cli.compare_command import compare
+from adacd_hil.cli.commands.compare_command import compare
+from adacd_hil.cli.commands.history_command import history
+from adacd_hil.cli.commands.identify_command import identify
+from adacd_hil.cli.commands.log_command import log
+from adacd_hil.cli.commands.play_command import play
+from adacd_hil.cli.commands.replay_command import replay
+from adacd_hil.cli.commands.sweep_command import sweep
+from adacd_hil.cli.commands.tune_command import tune
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
-from adacd_hil.cli.history_command import history
-from adacd_hil.cli.identify_command import identify
 from adacd_hil.cli.live_options import live_options, require_extra
-from adacd_hil.cli.log_command import log
 from adacd_hil.cli.options import (
     clock_option,
     complain,
@@ -26,11 +30,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.play_command import play
-from adacd_hil.cli.replay_command import replay
 from adacd_hil.cli.result_file import tell, tried
-from adacd_hil.cli.sweep_command import sweep
-from adacd_hil.cli.tune_command import tune
 from adacd_hil.config import to_toml
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import is_interrupted, open_terminals
@@ -78,7 +78,7 @@ def demo(
     The configuration's script plays the user of the paper's experiment. In any other scenario the user acknowledges
     stops as the configuration says, and asks to finish at the scenario's `lasts_s`.
     """
-    from adacd_hil.cli.demo import play
+    from adacd_hil.cli.commands.demo_command import play
 
     report, code = play(config, scenario, profile, seed, clock, out, live)
     print(json.dumps(report.as_json(), indent=2) if as_json else report.as_text())
@@ -113,7 +113,7 @@ def run(
     and `finish` to end. Ctrl-C parks the arm and ends; a second Ctrl-C
     stops at once.
     """
-    from adacd_hil.cli.run import as_text, run_on_bus
+    from adacd_hil.cli.commands.run_command import as_text, run_on_bus
 
     result, code = run_on_bus(connection, clock, out, tare, live, history)
     print(json.dumps(result, indent=2) if as_json else as_text(result))
@@ -142,7 +142,7 @@ def tare(
     With more than one pose, the arm is moved by hand in between. Exit status 1: refused, for the reason given; the
     file is as it was. `adacd-hil run --tare FILE` uses the offsets.
     """
-    from adacd_hil.cli.tare import tare_on_bus
+    from adacd_hil.cli.commands.tare_command import tare_on_bus
 
     result = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
     print(json.dumps(result.as_json(), indent=2) if as_json else result.as_text())
@@ -163,8 +163,8 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "St
 
     A stretch from --from until --until is widened so that it cuts no contact and no adaptation.
     """
-    from adacd_hil.cli.report import as_json as in_json
-    from adacd_hil.cli.report import report_logs
+    from adacd_hil.cli.commands.report_command import as_json as in_json
+    from adacd_hil.cli.commands.report_command import report_logs
 
     reports, code = report_logs(logs, out, stretch)
     if as_json:
@@ -206,7 +206,7 @@ def thresholds(
     --until choose a stretch of each log.
     """
     from adacd_hil.analysis.detector_comparison import write_comparison
-    from adacd_hil.cli import thresholds as command
+    from adacd_hil.cli.commands import thresholds_command as command
 
     with tried(out):
         found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
@@ -238,7 +238,7 @@ def excitation(
 
     Prints what the configuration's excitation shows and needs, and what the one found does.
     """
-    from adacd_hil.cli import excitation as command
+    from adacd_hil.cli.commands import excitation_command as command
 
     with tried(out):
         outcome = command.search(config, profile, seconds, seed, out)
@@ -275,7 +275,7 @@ def budget(
     as_json: bool,
 ) -> ExitCode:
     """Say whether the frames of a contract get through in time: bits, response times, what is left for the host."""
-    from adacd_hil.cli import budget as budgets
+    from adacd_hil.cli.commands import budget_command as budgets
 
     found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
     print(json.dumps(budgets.as_json(found), indent=2) if as_json else budgets.as_text(found))
@@ -293,7 +293,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 
     Sends SDO uploads only and changes no node's state. Exit status 5 when a node is missing or not the expected one.
     """
-    from adacd_hil.cli.scan import as_text, scan_bus
+    from adacd_hil.cli.commands.scan_command import as_text, scan_bus
 
     result, code = scan_bus(connection, seconds)
     print(json.dumps(result, indent=2) if as_json else as_text(result))
@@ -316,7 +316,7 @@ def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: P
     Below 0.90 the connection is not sufficient (exit status 1), below 0.95 there is a warning. The drives are not
     enabled unless asked for.
     """
-    from adacd_hil.cli.commtest import as_text, run_commtest
+    from adacd_hil.cli.commands.commtest_command import as_text, run_commtest
 
     result, code = run_commtest(connection, seconds, is_enabling, out)
     print(json.dumps(result, indent=2) if as_json else as_text(result))
@@ -333,7 +333,7 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
     Exit status 1 when a check failed. Resets the nodes' communication and leaves them pre-operational; does neither
     when it hears another master.
     """
-    from adacd_hil.cli import doctor as command
+    from adacd_hil.cli.commands import doctor_command as command
 
     findings, code = command.examine(connection, is_moving)
     print(json.dumps(command.as_json(findings), indent=2) if as_json else command.as_text(findings))
@@ -354,13 +354,13 @@ def monitor(
     With --url: watch a run that was started with --live: state, residuals against their thresholds, parameters,
     contacts, events. Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
     """
-    from adacd_hil.cli.monitor import PLAIN_S, watch
+    from adacd_hil.cli.commands.monitor_command import PLAIN_S, watch
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     if not isinstance(place, str):
         return watch(place, node_id, listened_s, listened_s is None, as_json)
     require_extra("--url", "websockets")
-    from adacd_hil.cli.live_monitor import watch_live
+    from adacd_hil.cli.commands.live_monitor import watch_live
 
     return watch_live(place, listened_s, listened_s is None, as_json)
 

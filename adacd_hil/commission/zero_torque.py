@@ -7,7 +7,7 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
-from adacd_hil.control.evidence import Evidence
+from adacd_hil.control.cycle_evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
 from adacd_hil.control.realtime import make_pacer

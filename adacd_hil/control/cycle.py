@@ -13,14 +13,14 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
-from adacd_hil.control.evidence import Evidence
+from adacd_hil.control.cycle_evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_report import FaultReport
-from adacd_hil.control.floating import Floating
 from adacd_hil.control.gate import Gate, GateFlag
+from adacd_hil.control.motion.floating import Floating
+from adacd_hil.control.motion.reference import Reference
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.realtime import Pacer, Tick
-from adacd_hil.control.reference import Reference
 from adacd_hil.control.self_checks import SelfChecks
 from adacd_hil.control.stop_escalation import StopEscalation
 from adacd_hil.device.arm import Arm

@@ -35,7 +35,7 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from adacd_hil.log.mcap.records import MAGIC
+from adacd_hil.log.mcap.mcap_records import MAGIC
 
 CHUNK_BYTES = 256 * 1024
 _CHUNK_MARGIN = 16 * 1024

@@ -17,7 +17,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.blocks import Block, Item, read_blocks
-from adacd_hil.log.mcap.records import HEAD, RawRecord, attachment_crc_fits, parse, walk
+from adacd_hil.log.mcap.mcap_records import HEAD, RawRecord, attachment_crc_fits, parse, walk
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.piece_builder import UNKNOWN, UNWANTED, PieceBuilder, RawPiece

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from adacd_hil.log.cdr import ENCAPSULATION
 from adacd_hil.log.channels import SCHEME_BLOCK, ChannelId, MessageLike
 from adacd_hil.log.decoding import Decoder
-from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.mcap_file import McapFile
 from adacd_hil.log.packet import (
     EVENT,

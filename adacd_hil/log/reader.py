@@ -17,7 +17,7 @@ from adacd_hil.log.cdr import MessageType
 from adacd_hil.log.channels import DECODED, run_channels, truth_channels
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.log_walk import LogWalk
-from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.mcap_file import FIELDS_KEY
 from adacd_hil.log.piece_builder import RawPiece
 from adacd_hil.log.ros_types import (

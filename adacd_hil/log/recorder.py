@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import NamedTuple
 
 from adacd_hil.config import LogSettings
-from adacd_hil.log import packet, words
+from adacd_hil.log import log_words, packet
 from adacd_hil.log.channels import MessageLike
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
@@ -164,7 +164,7 @@ class Recorder:
         """Wake the writer for what waits in the ring."""
         self._unannounced = 0
         with contextlib.suppress(OSError):  # words that it hasn't heard yet will do, and the dead hear nothing
-            self._socket.send(words.WAKE, socket.MSG_DONTWAIT)
+            self._socket.send(log_words.WAKE, socket.MSG_DONTWAIT)
 
     def _put(self, data: bytes) -> None:
         if not self._ring.put(data) and not (self._is_blocking and self._put_patiently(data)):
@@ -180,8 +180,8 @@ class Recorder:
         is_put = False
         with contextlib.suppress(OSError):  # nobody there
             while not is_put and room_of(len(data)) <= self._ring.capacity:
-                self._socket.send(words.ROOM)
-                if self._socket.recv(words.MOST_BYTES) == words.NOTHING:
+                self._socket.send(log_words.ROOM)
+                if self._socket.recv(log_words.MOST_BYTES) == log_words.NOTHING:
                     break
                 is_put = self._ring.put(data)
         return is_put
@@ -191,7 +191,7 @@ class Recorder:
         if self._summary is None:
             self._socket.settimeout(END_TIMEOUT_S)
             with contextlib.suppress(OSError):
-                self._socket.send(words.END)
+                self._socket.send(log_words.END)
             self._summary = self._summarise(self._hear(END_TIMEOUT_S))
             self._release()
         return self._summary
@@ -227,7 +227,7 @@ class Recorder:
         """Receive the writer's word; None when it died or stays silent."""
         self._socket.settimeout(timeout_s)
         try:
-            received = self._socket.recv(words.MOST_BYTES)
+            received = self._socket.recv(log_words.MOST_BYTES)
         except OSError:
             return None
         word: dict[str, str] = json.loads(received) if received else {}

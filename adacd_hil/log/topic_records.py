@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Channel, Schema
 
-from adacd_hil.log.mcap.records import MESSAGE_HEAD
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 
 
 class Payload(NamedTuple):

@@ -23,7 +23,7 @@ import sys
 import numpy as np
 
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.log import packet, words
+from adacd_hil.log import log_words, packet
 from adacd_hil.log.channels import run_channels, truth_channels
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.live.feed import LiveFeed
@@ -88,14 +88,14 @@ class WriterProcess:
         """Write until the end, then answer with the last word."""
         while True:
             word = self._hear()
-            if word == words.ROOM:
+            if word == log_words.ROOM:
                 self._take_some()
-                _send(self._connection, words.ROOM)  # before the rest, so that both sides work at once
+                _send(self._connection, log_words.ROOM)  # before the rest, so that both sides work at once
             self._take()
-            if word in (words.END, words.NOTHING):
+            if word in (log_words.END, log_words.NOTHING):
                 break
         self._write()
-        self._end(self._finish("closed" if word == words.END else "control process died"))
+        self._end(self._finish("closed" if word == log_words.END else "control process died"))
 
     def _end(self, summary: dict[str, str]) -> None:
         """Close the last file and say how it went."""
@@ -113,11 +113,11 @@ class WriterProcess:
     def _hear(self) -> bytes | None:
         """Receive a word, NOTHING when the control process is dead; None when there is none for a while."""
         try:
-            return self._connection.recv(words.MOST_BYTES)
+            return self._connection.recv(log_words.MOST_BYTES)
         except BlockingIOError:
             return None
         except ConnectionResetError:
-            return words.NOTHING
+            return log_words.NOTHING
 
     def _take(self) -> None:
         """Take all that waits in the ring; in real time, flush by the clock."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import CertifiedStream, PaperStream, Run, Truth
+from adacd_hil.analysis.logged_run import CertifiedStream, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import CycleColumns
 from adacd_hil.config import Settings, parse
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth

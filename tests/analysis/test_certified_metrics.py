@@ -22,7 +22,7 @@ from hand_made_run import (
 
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.report.report import Report
+from adacd_hil.analysis.report.report_files import Report
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.score.touches import Channel, two_pole_delay_s
 from adacd_hil.analysis.sections import split_sections

@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 from scipy.signal import lsim
 
-from adacd_hil.analysis.excitation import TOLERANCE, NoExcitationError, Search
+from adacd_hil.analysis.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError, ExcitationSettings, Settings, TrajectorySettings, load_settings
-from adacd_hil.control.excitation import Excitation
+from adacd_hil.control.motion.excitation import Excitation
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.regressor import regressor
 

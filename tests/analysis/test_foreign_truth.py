@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from hand_made_run import record, record_truth, touched_run
 
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.reading import read_run
-from adacd_hil.analysis.report.report import write_report
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.report.report_files import write_report
 from adacd_hil.analysis.score import truth_reading
 from adacd_hil.analysis.score.foreign_truth import config_digest, foreign_truth
 from adacd_hil.analysis.score.truth_contacts import contacts_beside
 from adacd_hil.analysis.score.truth_reading import TruthRows
-from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.config import to_toml
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY

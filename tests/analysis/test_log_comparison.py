@@ -11,7 +11,7 @@ from adacd_hil.analysis.replay.log_comparison import MATCH_S, compare_logs, matc
 from adacd_hil.analysis.replay.run_digest import Detection
 from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.analysis.report.reading import read_run
-from adacd_hil.cli.compare_command import _contact as in_words
+from adacd_hil.cli.commands.compare_command import _contact as in_words
 from adacd_hil.config import load_settings, to_toml
 from adacd_hil.log.errors import LogError
 

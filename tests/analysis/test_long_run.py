@@ -15,7 +15,7 @@ from adacd_hil.analysis.report import long_run
 from adacd_hil.analysis.report.json_form import report_json
 from adacd_hil.analysis.report.outline import Facts, TruthClock
 from adacd_hil.analysis.report.reading import read_run
-from adacd_hil.analysis.report.report import write_run_report
+from adacd_hil.analysis.report.report_files import write_run_report
 from adacd_hil.analysis.report.timeline import timeline_of
 from adacd_hil.analysis.report.words import left_out_text, shown_contacts
 from adacd_hil.analysis.score import truth_reading

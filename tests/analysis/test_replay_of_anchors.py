@@ -6,7 +6,7 @@ import pytest
 
 from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.analysis.replay.source import LogSource
-from adacd_hil.cli.demo import resolve, run_embedded
+from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.config import to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log

@@ -19,7 +19,7 @@ from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.json_form import report_json
 from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.report.report import write_report, write_run_report
+from adacd_hil.analysis.report.report_files import write_report, write_run_report
 from adacd_hil.analysis.report.timing_tables import timing_tables
 from adacd_hil.config import to_toml
 from adacd_hil.log.errors import LogError

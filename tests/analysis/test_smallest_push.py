@@ -11,7 +11,7 @@ from adacd_hil.analysis.host_cycles import Span
 from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report import bounds
 from adacd_hil.analysis.report.page import render
-from adacd_hil.analysis.report.tables import counted_sentence, push_table
+from adacd_hil.analysis.report.report_tables import counted_sentence, push_table
 from adacd_hil.scheme.detect.sensitivity import AGREES
 
 SLOWEST = 0.612758  # what 10 and then 200 rad/s show of a step after 0.1 s: 1 - (200 e^-1 - 10 e^-20) / 190

@@ -20,7 +20,7 @@ from adacd_hil.analysis.detector_comparison import (
     write_comparison,
 )
 from adacd_hil.analysis.motion import read_motion, sample_of
-from adacd_hil.analysis.thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
+from adacd_hil.analysis.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
 from adacd_hil.cli.main import cli
 from adacd_hil.config import parse, read_toml
 from adacd_hil.log.errors import LogError

@@ -25,7 +25,7 @@ from adacd_hil.analysis.sweep.tune_figures import write_tuning
 from adacd_hil.analysis.sweep.tune_logs import Window, read_logs
 from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, choose, delay_ms, rising
 from adacd_hil.analysis.sweep.tune_scheme import _Shown, candidates, observe_candidates, thresholds_as_changes
-from adacd_hil.cli.demo import Cast, run_embedded
+from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, load_settings, to_toml
 from adacd_hil.log.errors import LogError

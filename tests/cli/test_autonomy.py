@@ -12,11 +12,11 @@ import can
 import pytest
 from click.testing import CliRunner
 
+from adacd_hil.cli.commands.demo_command import USER, resolve
+from adacd_hil.cli.commands.play import may_move_an_arm
 from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
-from adacd_hil.cli.demo import USER, resolve
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.main import cli
-from adacd_hil.cli.play import may_move_an_arm
 from adacd_hil.config import OperatorSettings, Settings, builtin_names, load_settings
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
 from adacd_hil.wire.bus import is_virtual

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from bench_bus import CODEC, BenchBus
 
-from adacd_hil.cli.doctor import as_json, as_text
+from adacd_hil.cli.commands.doctor_command import as_json, as_text
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
 from adacd_hil.commission.diagnosis import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.config import load_settings

@@ -9,8 +9,8 @@ import pytest
 from bus_lab import BUS_MISSING, SHORT_RUN, USAGE, Lab, complaints
 from click.testing import CliRunner
 
+from adacd_hil.cli.commands.run_command import ask_first_run
 from adacd_hil.cli.main import cli
-from adacd_hil.cli.run import ask_first_run
 from adacd_hil.clock import date_ns, wall_ns
 from adacd_hil.config import ConfigError, load_settings, parse_toml, to_toml
 from adacd_hil.control.history_file import (

@@ -6,9 +6,9 @@ import pytest
 from bench_bus import CODEC, BenchBus
 from click.testing import CliRunner
 
+from adacd_hil.cli.commands.monitor_command import Monitor, Screen, as_text
 from adacd_hil.cli.connection import Connection
 from adacd_hil.cli.main import cli
-from adacd_hil.cli.monitor import Monitor, Screen, as_text
 from adacd_hil.wire.bus import Frame
 
 

@@ -4,7 +4,7 @@ import json
 
 from bench_bus import CODEC, BenchBus
 
-from adacd_hil.cli.scan import as_text, describe
+from adacd_hil.cli.commands.scan_command import as_text, describe
 from adacd_hil.device.survey import compare, expected_nodes, survey
 from adacd_hil.wire.codec import Codec, parse_codec
 

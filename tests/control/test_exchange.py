@@ -3,7 +3,7 @@
 import pytest
 from bench_bus import CODEC, PERIOD_NS, BenchBus
 
-from adacd_hil.control.evidence import Evidence
+from adacd_hil.control.cycle_evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.realtime import Tick
 from adacd_hil.records import ArmState

@@ -3,7 +3,7 @@
 import numpy as np
 
 from adacd_hil.config import Settings, load_settings, parse
-from adacd_hil.control.excitation import Excitation
+from adacd_hil.control.motion.excitation import Excitation
 
 SETTINGS = load_settings("certified", "P")
 PERIOD_S = SETTINGS.excitation.period_s

@@ -13,7 +13,7 @@ from mcap.records import SummaryOffset as GroupOffset
 
 from adacd_hil.log.cdr import ENCAPSULATION, Member, number_type
 from adacd_hil.log.chunked_file import ChunkedFile, encode
-from adacd_hil.log.mcap.records import MAGIC
+from adacd_hil.log.mcap.mcap_records import MAGIC
 from adacd_hil.log.mcap_file import LIBRARY
 
 HEAD = struct.Struct("<BQ")

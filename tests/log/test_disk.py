@@ -10,8 +10,8 @@ import threading
 import pytest
 from recorded_run import CODEC, make_run
 
+from adacd_hil.log import log_words
 from adacd_hil.log import sink as sink_module
-from adacd_hil.log import words
 from adacd_hil.log.packet import pack_cycle, pack_event
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import read_log
@@ -84,9 +84,9 @@ class Writer:
         self.wait(lambda: self.clock.now > seen + STEP_NS)
 
     def end(self):
-        self._socket.send(words.END)
+        self._socket.send(log_words.END)
         self._thread.join()
-        word = json.loads(self._socket.recv(words.MOST_BYTES))
+        word = json.loads(self._socket.recv(log_words.MOST_BYTES))
         self._reader.close()
         self.ring.close()
         self._socket.close()

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from recorded_run import CODEC, make_run, record
 from test_can_io import all_kinds, content, write
 
-from adacd_hil.cli.log_export import export
+from adacd_hil.cli.commands.log_export import export
 from adacd_hil.log.chunked_file import MAGIC
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.can_messages import TimedMessage, to_messages

@@ -15,7 +15,7 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.export import export_tables
 from adacd_hil.log.formats.frame_log import read_frames
-from adacd_hil.log.formats.tables import Tables
+from adacd_hil.log.formats.signal_tables import Tables
 from adacd_hil.log.mcap.opening import MOST_BYTES
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import read_log

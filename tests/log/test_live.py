@@ -31,7 +31,7 @@ from recorded_run import CODEC, feed, make_run, start
 from websockets.sync.client import connect
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.log import words
+from adacd_hil.log import log_words
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.live.client import LiveClient, live_client
@@ -340,7 +340,7 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobo
         ring.put(pack_event(run.cycles[0].t_ns, 0, LAST))
         clock.sleep_until_ns(clock.now_ns() + SHOW_PERIOD_NS)
         assert "/scheme" in by_topic(receive_until_last(client))
-        ours.send(words.END)
+        ours.send(log_words.END)
         thread.join()
     process.live.process.wait(HANG_S)
     assert clock.now_ns() == 3_000_000_000 + SHOW_PERIOD_NS

@@ -21,7 +21,7 @@ from recorded_run import CODEC, feed, make_run, start
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from adacd_hil.log import words
+from adacd_hil.log import log_words
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.live import server as server_module
 from adacd_hil.log.live.admission import FULL, NOTICES, Admission
@@ -502,7 +502,7 @@ def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch, unstar
     with socket.create_connection(address) as deaf:  # for whose goodbye the server waits
         deaf.sendall(raw_request("127.0.0.1"))
         assert deaf.recv(12) == b"HTTP/1.1 101"
-        writer.send(words.END)
+        writer.send(log_words.END)
         with contextlib.suppress(ConnectionRefusedError):
             while True:
                 socket.create_connection(address).close()
@@ -521,7 +521,7 @@ def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarte
         refused = await asyncio.open_connection(*address)
         refused[1].write(raw_request("elsewhere.example"))
         assert (await refused[0].read()).startswith(b"HTTP/1.1 403")
-        writer.send(words.END)
+        writer.send(log_words.END)
         for _ in range(steps):
             await asyncio.sleep(0)
         with contextlib.suppress(ConnectionRefusedError), socket.create_connection(address):

@@ -17,7 +17,7 @@ from judged_log import judged_log
 from run_rules import Violation
 from vcan_kills import VcanKill
 
-from adacd_hil.cli.demo import Cast, run_embedded
+from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.config import OperatorSettings, RequestSettings, load_settings, parse
 from adacd_hil.log.reader import Series
 from adacd_hil.records import TRUTH_LAYOUT

@@ -16,7 +16,7 @@ import timing_hour
 import witness
 import yardstick
 
-from adacd_hil.cli.run import check_budget_of
+from adacd_hil.cli.commands.run_command import check_budget_of
 from adacd_hil.config import ConfigError, load_settings
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.scenario.scenario import load_scenario

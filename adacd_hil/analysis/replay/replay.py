@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
 from adacd_hil.analysis.replay.attempts import Stretch
-from adacd_hil.analysis.replay.outcome import Adaptation, OutcomeGatherer, Transition
+from adacd_hil.analysis.replay.replayed_outcome import Adaptation, OutcomeGatherer, Transition
 from adacd_hil.analysis.replay.scheme_comparison import (
     SHOWN,
     TOLERANCE,

@@ -2,6 +2,7 @@
 
 from typing import Final, NamedTuple
 
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.arm_drawing import ArmDrawing, Push, draw_arm
 from adacd_hil.analysis.report.bounds import CONTACTS
@@ -15,7 +16,6 @@ from adacd_hil.analysis.report.words import (
     signs_text,
     uncertain_text,
 )
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.score.touches import row_at
 from adacd_hil.records import Location, Vector

@@ -6,9 +6,9 @@ import io
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.timeline import stays_of
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.sections import section_at
 from adacd_hil.records import PARAMETER_UNITS

@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.outline import BUSY
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.paper_beside import SETTLING_TIME_CONSTANTS
 from adacd_hil.analysis.score.touches import true_contacts
 

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 from urllib.parse import quote
 
 from adacd_hil.analysis.report.page import Heading, render_page
-from adacd_hil.analysis.report.report import Report
+from adacd_hil.analysis.report.report_files import Report
 from adacd_hil.analysis.report.words import NONE
 
 INDEX_NAME: Final = "index.html"

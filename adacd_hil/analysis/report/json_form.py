@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from adacd_hil.analysis.evidence import Evidence
+from adacd_hil.analysis.logged_run import StretchOfRun
+from adacd_hil.analysis.margin_evidence import Evidence
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.run import StretchOfRun
 
 SCHEMA: Final = 3
 """Version of report.json; goes up when a key changes its meaning or disappears."""
@@ -75,7 +75,7 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
 
 
 def _evidence_json(evidence: Evidence) -> dict[str, Any]:
-    """Give what only the certified scheme has; the keys are described in `adacd_hil.analysis.evidence`."""
+    """Give what only the certified scheme has; the keys are described in `adacd_hil.analysis.margin_evidence`."""
     return {**dataclasses.asdict(evidence), "smallest_margin": evidence.smallest_margin}
 
 

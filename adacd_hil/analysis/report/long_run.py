@@ -19,11 +19,11 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.analysis.cyclic_data import CyclicDataGatherer
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.metrics import Gathered, is_realtime
 from adacd_hil.analysis.report.bounds import ADAPTATIONS
 from adacd_hil.analysis.report.scheme_rows import SchemeRows, run_of_piece
 from adacd_hil.analysis.report.traces import panels_of
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.alarms import find_detections
 from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.analysis.sections import split_sections

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.host_cycles import AttemptBegins, host_cycles
+from adacd_hil.analysis.logged_run import CheckCounts, Run
 from adacd_hil.analysis.report.scheme_rows import SchemeRows
-from adacd_hil.analysis.run import CheckCounts, Run
 from adacd_hil.analysis.score.truth_reading import TruthRows, host_truth
 from adacd_hil.analysis.timing import Cycles
 from adacd_hil.log.reader import LoggedEvent, Series, contacts_of

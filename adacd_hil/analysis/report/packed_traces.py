@@ -4,11 +4,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.timeline import STATE_COLOURS, notices_of, stays_of
 from adacd_hil.analysis.report.trace_encoding import Packed, pack, step_of
 from adacd_hil.analysis.report.traces import Panel, panels_of
-from adacd_hil.analysis.run import Run
 
 STYLES: Final = ("uplot-1.6.32.min.css",)
 SCRIPTS: Final = ("uplot-1.6.32.iife.min.js", "traces.js")

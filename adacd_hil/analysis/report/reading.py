@@ -14,13 +14,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from adacd_hil.analysis.logged_run import Run, StretchOfRun, Truth
 from adacd_hil.analysis.metrics import Gathered
 from adacd_hil.analysis.replay.source import settings_of
 from adacd_hil.analysis.report.cut_points import settling_s, widen
 from adacd_hil.analysis.report.long_run import LongRun
 from adacd_hil.analysis.report.outline import Facts, Outline
 from adacd_hil.analysis.report.scheme_rows import SchemeRows, run_of_piece
-from adacd_hil.analysis.run import Run, StretchOfRun, Truth
 from adacd_hil.analysis.score.alarms import find_detections
 from adacd_hil.analysis.score.foreign_truth import foreign_truth
 from adacd_hil.analysis.score.score_words import unjudged_sentence

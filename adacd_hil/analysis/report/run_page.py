@@ -6,7 +6,8 @@ import numpy as np
 
 from adacd_hil.analysis.cyclic_data import percent_text
 from adacd_hil.analysis.drawing import Drawing
-from adacd_hil.analysis.evidence import Evidence
+from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.margin_evidence import Evidence
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report import bounds
 from adacd_hil.analysis.report.contact_cards import contact_cards, contacts_table
@@ -14,7 +15,7 @@ from adacd_hil.analysis.report.long_run import CONTACTS as TRACED_CONTACTS
 from adacd_hil.analysis.report.packed_traces import SCRIPTS, STYLES, traces_of
 from adacd_hil.analysis.report.page import Heading, render_page
 from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.report.tables import (
+from adacd_hil.analysis.report.report_tables import (
     counted_sentence,
     data_table,
     further_table,
@@ -28,7 +29,6 @@ from adacd_hil.analysis.report.tables import (
 from adacd_hil.analysis.report.timeline import state_key, timeline_of
 from adacd_hil.analysis.report.timing_tables import timing_tables
 from adacd_hil.analysis.report.words import NONE, has_paper, left_out_text, number_text, stretch_text
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.verdict import LISTED
 
 

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import CertifiedStream, Motion, PaperStream, Run
+from adacd_hil.analysis.logged_run import CertifiedStream, Motion, PaperStream, Run
 from adacd_hil.config import Settings
 from adacd_hil.log.reader import Series
 from adacd_hil.records import JOINTS

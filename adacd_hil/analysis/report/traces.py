@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.run import CertifiedStream, Run
+from adacd_hil.analysis.logged_run import CertifiedStream, Run
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
 from adacd_hil.scheme.model.bank import channels_of
 

@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from adacd_hil.analysis.logged_run import StretchOfRun
 from adacd_hil.analysis.metrics import Metrics
-from adacd_hil.analysis.run import StretchOfRun
 from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.score.score_words import why_not_found
 

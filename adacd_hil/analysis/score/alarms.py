@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.logged_run import Mask, Run
 from adacd_hil.analysis.sections import is_interrupted
 from adacd_hil.records import ContactReport, SchemeState
 

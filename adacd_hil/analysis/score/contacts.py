@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.analysis.run import Run
+from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.score.alarms import Detection
 from adacd_hil.analysis.score.judge import JudgedContact, Score
 from adacd_hil.analysis.score.touches import Touch, channels_at, ideal_response, row_at

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.logged_run import Mask, Run
 from adacd_hil.analysis.score.judge import StreamJudge
 from adacd_hil.analysis.score.touches import Touch, touch_window
 from adacd_hil.analysis.sections import Section, rows_of

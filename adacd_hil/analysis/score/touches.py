@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.run import Mask, Run
+from adacd_hil.analysis.logged_run import Mask, Run
 from adacd_hil.analysis.score.alarms import Detection
 from adacd_hil.analysis.score.judge import Score, TouchWindow, judge
 from adacd_hil.analysis.timing import Cycles

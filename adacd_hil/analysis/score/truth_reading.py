@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.host_cycles import EmulatorSpan, host_cycles, host_span
-from adacd_hil.analysis.run import Truth
+from adacd_hil.analysis.logged_run import Truth
 from adacd_hil.analysis.thinning import extreme_rows
 from adacd_hil.analysis.timing import Cycles
 from adacd_hil.log.reader import Series

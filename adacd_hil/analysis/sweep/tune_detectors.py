@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.analysis.motion import Progress, TorqueStream
+from adacd_hil.analysis.recorded_thresholds import Statistics, run_detectors
 from adacd_hil.analysis.sweep.tune_logs import TunedLog
 from adacd_hil.analysis.sweep.tune_roc import Observed, Touched, rising
-from adacd_hil.analysis.thresholds import Statistics, run_detectors
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import detectors
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.host_cycles import AttemptBegins, host_span
 from adacd_hil.analysis.motion import APART_S, LoggedMotion, Progress, read_motion, schemes
+from adacd_hil.analysis.recorded_thresholds import BLOCK_S
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
 from adacd_hil.analysis.score.judge import Times, TouchWindow, explained_until
 from adacd_hil.analysis.score.truth_contacts import HostCycles, TrueContact, contacts_beside, windows_of
-from adacd_hil.analysis.thresholds import BLOCK_S
 from adacd_hil.config import Settings, load_settings
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError

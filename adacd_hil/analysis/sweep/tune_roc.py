@@ -19,9 +19,9 @@ from adacd_hil.analysis.false_alarms import (
     counted_hours,
     largest_ratio,
 )
+from adacd_hil.analysis.recorded_thresholds import BLOCK_S
 from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h, share_bounds
 from adacd_hil.analysis.score.score_words import delay_figures
-from adacd_hil.analysis.thresholds import BLOCK_S
 from adacd_hil.records import Vector
 
 FACTORS: Final = tuple(10.0 ** (k / 12.0) for k in range(-9, 19))

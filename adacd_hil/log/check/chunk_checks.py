@@ -15,8 +15,8 @@ from adacd_hil.log.check.definition_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings
 from adacd_hil.log.chunked_file import INDEX_ENTRY
 from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
+from adacd_hil.log.mcap.mcap_records import HEAD, RawRecord, name_of, parse
 from adacd_hil.log.mcap.opening import ChunkError, Opening
-from adacd_hil.log.mcap.records import HEAD, RawRecord, name_of, parse
 
 _CHANNEL_NUMBERS = 2**16
 

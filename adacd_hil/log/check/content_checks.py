@@ -11,7 +11,7 @@ from adacd_hil.log.check.findings import Findings
 from adacd_hil.log.check.ros_text import text_problem
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.chunk_contents import Contents
-from adacd_hil.log.mcap.records import MESSAGE_HEAD
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.ros_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,

@@ -13,7 +13,17 @@ from adacd_hil.log.check.definition_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings
 from adacd_hil.log.check.summary_checks import SummaryCheck
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.records import HEAD, MAGIC, Gap, RawRecord, Trailer, attachment_crc_fits, name_of, parse, scan
+from adacd_hil.log.mcap.mcap_records import (
+    HEAD,
+    MAGIC,
+    Gap,
+    RawRecord,
+    Trailer,
+    attachment_crc_fits,
+    name_of,
+    parse,
+    scan,
+)
 from adacd_hil.log.summary import count_frames
 
 _DATA = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA}

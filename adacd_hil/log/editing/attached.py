@@ -8,7 +8,7 @@ from mcap.records import Attachment, Metadata
 
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
+from adacd_hil.log.mcap.mcap_records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.mcap_file import RUN_METADATA
 
 

@@ -22,8 +22,8 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.chunk_contents import Contents, read_contents
 from adacd_hil.log.mcap.definitions import Definitions
 from adacd_hil.log.mcap.file_end import FileEnd, read_end, read_record
+from adacd_hil.log.mcap.mcap_records import MAGIC, MESSAGE_HEAD, RawRecord, parse
 from adacd_hil.log.mcap.opening import ChunkError, Opening
-from adacd_hil.log.mcap.records import MAGIC, MESSAGE_HEAD, RawRecord, parse
 from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, FIELDS_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.ros_types import LOG, unpack_log

@@ -13,8 +13,8 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
 from adacd_hil.log.mcap.definitions import Definitions
 from adacd_hil.log.mcap.file_end import crc_of, read_end
+from adacd_hil.log.mcap.mcap_records import MAGIC, Gap, RawRecord, attachment_crc_fits, parse, scan
 from adacd_hil.log.mcap.opening import ChunkError, Opening
-from adacd_hil.log.mcap.records import MAGIC, Gap, RawRecord, attachment_crc_fits, parse, scan
 from adacd_hil.log.mcap_file import PART_KEY, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.parts import find_parts, part_path
 from adacd_hil.log.summary import DROPPED_KEY, number

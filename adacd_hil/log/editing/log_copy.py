@@ -20,7 +20,7 @@ from adacd_hil.log.editing.info import read_info
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.chunk_contents import Contents
 from adacd_hil.log.mcap.file_end import read_end
-from adacd_hil.log.mcap.records import read_header
+from adacd_hil.log.mcap.mcap_records import read_header
 from adacd_hil.log.mcap_file import LIBRARY, PRODUCT, ROS_PROFILE, SUMMARY_METADATA
 from adacd_hil.log.parts import is_part_name
 from adacd_hil.log.summary import COPY_ENDINGS

@@ -21,14 +21,14 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
 from adacd_hil.log.mcap.definitions import Definitions
 from adacd_hil.log.mcap.file_end import crc_of, read_end
-from adacd_hil.log.mcap.opening import ChunkError, Opening
-from adacd_hil.log.mcap.records import (
+from adacd_hil.log.mcap.mcap_records import (
     Gap,
     RawRecord,
     attachment_crc_fits,
     parse,
     scan,
 )
+from adacd_hil.log.mcap.opening import ChunkError, Opening
 
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _NOTES = 20

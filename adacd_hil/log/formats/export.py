@@ -12,10 +12,10 @@ from adacd_hil.input_files import open_input
 from adacd_hil.log.channels import DECODED
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.frame_log import open_frames
-from adacd_hil.log.formats.tables import Tables, event_columns, frame_columns, series_columns
+from adacd_hil.log.formats.signal_tables import Tables, event_columns, frame_columns, series_columns
 from adacd_hil.log.mcap.chunk_contents import read_contents
+from adacd_hil.log.mcap.mcap_records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.mcap.opening import ChunkError, Opening
-from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.stream import LogStream
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.wire.codec import Codec

@@ -26,7 +26,7 @@ from adacd_hil.log.formats.recorded_frames import RECORDED_FRAME_DTYPE
 from adacd_hil.log.mcap.blocks import Block, read_blocks
 from adacd_hil.log.mcap.chunk_contents import Contents
 from adacd_hil.log.mcap.file_end import summary_of
-from adacd_hil.log.mcap.records import HEAD, MAGIC, MESSAGE_HEAD, Problem, RawRecord, parse
+from adacd_hil.log.mcap.mcap_records import HEAD, MAGIC, MESSAGE_HEAD, Problem, RawRecord, parse
 from adacd_hil.log.mcap_file import RUN_METADATA
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import EPOCH_KEY

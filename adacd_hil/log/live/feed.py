@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log import words
+from adacd_hil.log import log_words
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.live.told import Batch, Told, pack_batch
 from adacd_hil.log.own_process import start_module
@@ -68,7 +68,7 @@ class LiveFeed:
     def _hear(self) -> dict[str, str]:
         self._socket.settimeout(START_TIMEOUT_S)
         try:
-            received = self._socket.recv(words.MOST_BYTES)
+            received = self._socket.recv(log_words.MOST_BYTES)
         except OSError:
             received = b""
         word: dict[str, str] = json.loads(received) if received else {"error": "it did not start"}
@@ -78,8 +78,8 @@ class LiveFeed:
     def is_watched(self) -> bool:
         """Whether somebody is there to see what is shown."""
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
-            while word := self._socket.recv(words.MOST_BYTES):
-                self._is_watched = word == words.WATCHED
+            while word := self._socket.recv(log_words.MOST_BYTES):
+                self._is_watched = word == log_words.WATCHED
             self._is_watched = False  # nobody is left
         return self._is_watched
 
@@ -101,7 +101,7 @@ class LiveFeed:
         if not self._ring.put(pack_batch(Batch(records, channels, log_ns, ends))):
             self.hidden += 1
             return
-        self._say(words.WAKE)
+        self._say(log_words.WAKE)
 
     def _say(self, word: bytes) -> None:
         with contextlib.suppress(OSError):  # it has words that it hasn't heard yet, or is dead
@@ -109,7 +109,7 @@ class LiveFeed:
 
     def close(self) -> None:
         """Let it send what it has, and end, in its own time."""
-        self._say(words.END)
+        self._say(log_words.END)
         self._release()
 
     def _release(self) -> None:

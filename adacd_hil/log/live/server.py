@@ -30,7 +30,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from adacd_hil.log import words
+from adacd_hil.log import log_words
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.live.admission import FULL, SUBPROTOCOLS, Admission, Refusal
 from adacd_hil.log.live.told import Told, unpack_batch
@@ -163,10 +163,10 @@ class LiveServer:
         with contextlib.suppress(BlockingIOError):
             while True:
                 try:
-                    word = self._writer.recv(words.MOST_BYTES)
+                    word = self._writer.recv(log_words.MOST_BYTES)
                 except ConnectionResetError:
-                    word = words.NOTHING
-                if word in (words.END, words.NOTHING):
+                    word = log_words.NOTHING
+                if word in (log_words.END, log_words.NOTHING):
                     self._is_over.set()
                     break
         self._show_some()
@@ -199,7 +199,7 @@ class LiveServer:
         if is_watched != self._is_watched:
             self._is_watched = is_watched
             with contextlib.suppress(OSError):  # it is gone, which _hear will notice
-                self._writer.send(words.WATCHED if is_watched else words.ALONE)
+                self._writer.send(log_words.WATCHED if is_watched else log_words.ALONE)
 
     # -- viewers --------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from adacd_hil.log.live.rates import DESCRIPTION_TOPIC, SCENE_TOPIC, TRANSFORMS_
 from adacd_hil.log.live.scene import Shape, draw_contact, draw_joints, transforms_of
 from adacd_hil.log.live.scene_types import SCENE, STRING, TRANSFORMS, Entity, pack_scene, pack_string, pack_transforms
 from adacd_hil.log.live.told import Batch
-from adacd_hil.log.mcap.records import MESSAGE_HEAD
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.ros_types import JOINT_STATE_DTYPE
 from adacd_hil.log.setup import LiveSetup
 from adacd_hil.records import SchemeState

@@ -14,8 +14,8 @@ from mcap.records import Chunk
 
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.mcap.chunk_contents import Contents, read_chunks
+from adacd_hil.log.mcap.mcap_records import HEAD, MAGIC, IndexRun, Problem, RawRecord, crc32, parse, walk
 from adacd_hil.log.mcap.opening import ChunkError, Opening, open_as_claimed
-from adacd_hil.log.mcap.records import HEAD, MAGIC, IndexRun, Problem, RawRecord, crc32, parse, walk
 
 BLOCK_BYTES = 1 << 21
 THREADS = 2

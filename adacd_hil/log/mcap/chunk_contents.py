@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from adacd_hil.log.chunked_file import INDEX_ENTRY
-from adacd_hil.log.mcap.records import HEAD, MESSAGE_HEAD, RawRecord
+from adacd_hil.log.mcap.mcap_records import HEAD, MESSAGE_HEAD, RawRecord
 
 _DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _START = struct.Struct("<BQ")

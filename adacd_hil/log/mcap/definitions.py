@@ -6,7 +6,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.records import RawRecord, parse
+from adacd_hil.log.mcap.mcap_records import RawRecord, parse
 
 
 class Definitions:

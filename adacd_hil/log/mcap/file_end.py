@@ -8,7 +8,7 @@ from mcap.opcode import Opcode
 from mcap.records import Footer
 
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.records import HEAD, MAGIC, MOST_RECORD_BYTES, RawRecord, parse
+from adacd_hil.log.mcap.mcap_records import HEAD, MAGIC, MOST_RECORD_BYTES, RawRecord, parse
 
 _BLOCK = 1 << 20
 _FOOTER = HEAD.size + 20

@@ -8,7 +8,7 @@ import lz4.frame
 import zstandard
 from mcap.records import Chunk
 
-from adacd_hil.log.mcap.records import crc32
+from adacd_hil.log.mcap.mcap_records import crc32
 
 MOST_BYTES = 32 << 20
 """Of a chunk, before compression."""

@@ -74,7 +74,7 @@ def sweep(
     if logs:
         work = replay_task
     else:
-        from adacd_hil.cli.sweep_simulation import simulate_task
+        from adacd_hil.cli.commands.sweep_simulation import simulate_task
 
         work = simulate_task
     store = SweepStore(out)

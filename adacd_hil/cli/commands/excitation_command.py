@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.analysis.excitation import Figures, Limits, NoExcitationError, Search
+from adacd_hil.analysis.excitation_search import Figures, Limits, NoExcitationError, Search
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table

@@ -6,7 +6,8 @@ from string import ascii_letters
 from typing import Final
 
 from adacd_hil.analysis.cyclic_data import CyclicData, percent_text
-from adacd_hil.analysis.evidence import ChannelMargin, Evidence
+from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.margin_evidence import ChannelMargin, Evidence
 from adacd_hil.analysis.metrics import Metrics
 from adacd_hil.analysis.report.bounds import ADAPTATIONS, SECTIONS
 from adacd_hil.analysis.report.page import Cell, Table, make_table
@@ -20,7 +21,6 @@ from adacd_hil.analysis.report.words import (
     signed_text,
     stretch_text,
 )
-from adacd_hil.analysis.run import Run
 from adacd_hil.analysis.score.score_words import rate_sentence
 from adacd_hil.analysis.untouched import Residual
 from adacd_hil.records import PARAMETER_UNITS

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from adacd_hil.cli.commands.log_export import export
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.log_export import export
 from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
@@ -38,7 +38,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 
     A folder stands for the logs in it.
     """
-    from adacd_hil.cli import log_text
+    from adacd_hil.cli.commands import log_text
     from adacd_hil.log.check.check import find_logs
     from adacd_hil.log.editing.info import read_info
 
@@ -59,7 +59,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 
     A folder stands for the logs in it. docs/log-tools.md lists the rules.
     """
-    from adacd_hil.cli import log_text
+    from adacd_hil.cli.commands import log_text
     from adacd_hil.log.check.check import check_log, find_logs
 
     checked = [check_log(path, _tell) for path in find_logs(logs)]
@@ -84,7 +84,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 
     --out: default NAME.recovered.mcap. The log itself stays as it is. No message is saved that no CRC vouches for.
     """
-    from adacd_hil.cli import log_text
+    from adacd_hil.cli.commands import log_text
     from adacd_hil.log.editing.recover import recover as recover_log
 
     recovery = recover_log(log, out, _tell)

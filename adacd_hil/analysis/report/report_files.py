@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from adacd_hil.analysis.figures import draw
+from adacd_hil.analysis.logged_run import Run, StretchOfRun
 from adacd_hil.analysis.metrics import Gathered, Metrics, evaluate
 from adacd_hil.analysis.report.bounds import PRINTED_CONTACTS
 from adacd_hil.analysis.report.csv_tables import report_tables
@@ -26,7 +27,6 @@ from adacd_hil.analysis.report.words import (
     paper_head,
     shown_contacts,
 )
-from adacd_hil.analysis.run import Run, StretchOfRun
 from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import WHOLE, Stretch

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from adacd_hil.cli.commands.monitor_command import Screen
 from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.cli.monitor import Screen
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.errors import LogError

@@ -6,8 +6,8 @@ from typing import Any
 
 import click
 
+from adacd_hil.cli.commands.log_export import contract_of, dbc_option, id_option, only_option
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
-from adacd_hil.cli.log_export import contract_of, dbc_option, id_option, only_option
 from adacd_hil.cli.options import explained, json_option
 from adacd_hil.given_path import GivenPath
 
@@ -55,7 +55,7 @@ def play(
     Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. On a real bus only frames that the contract says the devices
     send are sent, unless --commands asks for the others: NMT, SDO and torque commands can move an arm.
     """
-    from adacd_hil.cli.play import Playback, as_text, may_move_an_arm, run_playback
+    from adacd_hil.cli.commands.play import Playback, as_text, may_move_an_arm, run_playback
     from adacd_hil.log.formats.frame_choice import FrameChoice, sides
 
     codec = contract_of(log, dbc)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from adacd_hil.analysis.score.foreign_truth import config_digest
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
+from adacd_hil.cli.new_run_folder import run_folder
 from adacd_hil.cli.progress import Progress
-from adacd_hil.cli.run_folder import run_folder
 from adacd_hil.clock import VirtualClock
 from adacd_hil.config import RequestSettings, Settings, load_settings, to_toml
 from adacd_hil.control.operator import ScriptedOperator
@@ -28,7 +28,7 @@ from firmware_sim.canopen.contracts import playable_contract
 from firmware_sim.scenario.scenario import Scenario, load_scenario, named_profile
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.report.report import Report
+    from adacd_hil.analysis.report.report_files import Report
 
 SCENARIO = "paper"
 """Whose requests to the host are in a script; the user of another one only asks to finish."""
@@ -142,7 +142,7 @@ def play(
             pace = played_s / summary.elapsed_s
             progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
         progress("drawing the report")
-        from adacd_hil.analysis.report.report import write_report  # what draws takes longest to import
+        from adacd_hil.analysis.report.report_files import write_report  # what draws takes longest to import
 
         try:
             report = write_report(summary.log.path, truth_path, folder.path)

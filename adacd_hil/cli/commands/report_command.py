@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adacd_hil.analysis.report.index_page import INDEX_NAME, Entry, count_text, index_page
-from adacd_hil.analysis.report.report import Report, write_report
+from adacd_hil.analysis.report.report_files import Report, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.config import ConfigError

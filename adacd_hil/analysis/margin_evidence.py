@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adacd_hil.analysis.distribution import Distribution
-from adacd_hil.analysis.run import CertifiedStream, Run
+from adacd_hil.analysis.logged_run import CertifiedStream, Run
 from adacd_hil.analysis.score.paper_beside import Beside, larger
 from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.analysis.smallest_push import SmallestPush

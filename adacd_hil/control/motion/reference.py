@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 
 from adacd_hil.config import Settings
-from adacd_hil.control.admittance import Admittance
-from adacd_hil.control.excitation import Excitation
-from adacd_hil.control.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
+from adacd_hil.control.motion.admittance import Admittance
+from adacd_hil.control.motion.excitation import Excitation
+from adacd_hil.control.motion.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
 from adacd_hil.records import JOINTS, ArmState, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
 

@@ -1,0 +1,1 @@
+"""The desired motion of each state."""
