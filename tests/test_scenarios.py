@@ -14,7 +14,7 @@ from firmware_sim.scenario.faults import KINDS
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario
 
 NAMES = builtin_scenarios()
-GROUPS = {"experiment", "people", "mechanics", "measurement", "faults"}
+GROUPS = {"experiment", "people", "mechanics", "measurement", "faults", "minutes"}
 PLAYED = (
     "clamped-lower-arm-link1",
     "blow-chest",
