@@ -293,14 +293,14 @@ def run_block(
 ) -> Block:
     """Run one block and read what it says. Raises TimingError."""
     with running(run, folder, preload) as begun:
-        time.sleep(SETTLE_S)
+        time.sleep(SETTLE_S)  # what is measured begins once it cycles
         pids = {run.name: begun.process.pid, "emulator": emulator_pid}
         if begun.logger_pid is not None:
             pids["logger"] = begun.logger_pid
         windows = [take_window(pids)]
         begin_s = time.monotonic()
         while time.monotonic() - begin_s < seconds and begun.process.poll() is None:
-            time.sleep(WINDOW_S)
+            time.sleep(WINDOW_S)  # as long as a window lasts
             windows.append(take_window(pids))
         status = begun.end()
         if status not in ENDED_WELL:

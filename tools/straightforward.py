@@ -250,7 +250,7 @@ class Loop:
         """Reset the nodes and put them into operation."""
         for command in (0x82, 0x01):
             self.send("Nmt", {"command": command, "node": 0})
-            time.sleep(0.3)
+            time.sleep(0.3)  # as one writes it in an afternoon: long enough for any device to boot
 
     def receive(self, values: dict[str, dict[str, Any]]) -> float | None:
         """Receive, check, decode and log until all four answers are in; return the kernel's stamp of the last, s."""

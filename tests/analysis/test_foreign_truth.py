@@ -80,16 +80,17 @@ def with_truth_of(run: Run, rows: slice) -> Run:
 @pytest.mark.slow
 @pytest.mark.parametrize("full_cycles", [500_000, 100], ids=["short", "long"])
 @pytest.mark.parametrize(
-    ("rows", "false_alarms", "unjudged"), [(slice(None), 1, 0), (slice(3000), 0, 2), (slice(3000, None), 1, 1)]
+    ("rows", "false_alarms", "unjudged"),
+    [(slice(None), 1, ""), (slice(3000), 0, "2 detections"), (slice(3000, None), 1, "1 detection")],
 )
 def test_what_comes_before_or_after_the_truth_is_not_judged(
-    rows: slice, false_alarms: int, unjudged: int, full_cycles: int, tmp_path: Path
+    rows: slice, false_alarms: int, unjudged: str, full_cycles: int, tmp_path: Path
 ) -> None:
     run, gathered, source = read_run(*recorded(tmp_path, with_truth_of(touched_run(), rows)), full_cycles=full_cycles)
     from adacd_hil.analysis.metrics import evaluate
 
     assert evaluate(run, gathered).false_alarms == false_alarms
-    said = f"the truth doesn't cover {unjudged} detections, which are not judged" if unjudged else ""
+    said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else ""
     assert (source.problem, source.is_complete) == (said, not unjudged)
 
 

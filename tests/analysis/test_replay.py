@@ -258,7 +258,7 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(log: Path, whole: Re
         found = replay_source(LogSource(log), [source.settings], untouched)[0]
         return len(found.score.false_alarms), found.is_whole, found.notes
 
-    said = "the truth doesn't cover 1 detections, which are not judged"
+    said = "the truth doesn't cover 1 detection, not judged"
     assert judged(first, last) == (1, True, ())
     assert judged(first, (attempt, onset - 1)) == (0, False, (said,))
     assert judged(last, last) == (0, False, (said,))

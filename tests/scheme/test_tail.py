@@ -200,6 +200,6 @@ def test_a_certificate_says_what_counting_and_what_a_gaussian_tail_let_expect_of
     memory["peak"][1] = 0.4 * MODEL_NM, 0.5 * MODEL_NM
     memory["tail_Nm"][1, 1] = 1.25 * MODEL_NM  # where the floor is the threshold in force, it is what counts
     expected = 2.0 * tail.rate_per_h(NU_HZ[1], 0.5, 0.4)
-    said = "false alarms per hour: at most 21600 by counting the 0.50 s of the test alone, at 95 %, "
+    said = "false alarms per hour: at most 21569 by counting the 0.50 s of the test alone, at 95 %, "
     assert nothing_seen == said + "0 if residuals have the tail of a Gaussian"
     assert tail.describe(K, memory) == said + f"{expected:.1g} if residuals have the tail of a Gaussian"

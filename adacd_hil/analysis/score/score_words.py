@@ -45,7 +45,7 @@ def score_sentence(score: Score) -> str:
 
 def unjudged_sentence(count: int) -> str:
     """Say in one line how many alarms the truth does not cover; "" if none."""
-    return f"the truth doesn't cover {count} detections, which are not judged" if count else ""
+    return f"the truth doesn't cover {number_of(count, 'detection')}, not judged" if count else ""
 
 
 def rate_sentence(false_alarms: int, bound_per_h: float) -> str:

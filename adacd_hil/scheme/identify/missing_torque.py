@@ -211,15 +211,7 @@ def is_found(k: Any, m: Any) -> bool:
     """Tell whether the model lacks a torque, by all samples there are; fill `missing_rms_Nm` (n,), `is_elastic`."""
     _clear_found(m)
     rigid = _weigh_rigid(k, m)
-    b, count, first, full = m["evidence_b"], m["belief"].shape[0], _first_elastic(m), m["evidence_full"]
-    by_place = _log_evidence(m, b, _scale_of(k, m, count, first), full)
-    both = _log_evidence(m, b, _scale_of(k, m, count, full.shape[0]), full)
-    elastic = _log_evidence(m, b, _scale_of(k, m, first, full.shape[0]), full)
-    if min(elastic - rigid, both - by_place) > ELASTIC_GAIN:
-        _fill_missing(m)
-        m["is_elastic"] = 1.0
-        return True
-    return _is_by_place(k, m, rigid)
+    return _is_elastic(k, m, rigid) or _is_by_place(k, m, rigid)
 
 
 @compiled
@@ -236,6 +228,21 @@ def _scale_of(k: Any, m: Any, first: int, last: int) -> Vector:
     scale[:count] = k["evidence_std"][:count]
     scale[first:last] = k["evidence_std"][first:last]
     return scale  # type: ignore[no-any-return]
+
+
+@compiled
+def _is_elastic(k: Any, m: Any, rigid: float) -> bool:
+    """Tell whether an elastic joint explains what the model, of this log evidence, leaves; fill `missing_rms_Nm`."""
+    b, count, first, full = m["evidence_b"], m["belief"].shape[0], _first_elastic(m), m["evidence_full"]
+    if not _log_evidence(m, b, _scale_of(k, m, first, full.shape[0]), full) - rigid > ELASTIC_GAIN:
+        return False
+    by_place = _log_evidence(m, b, _scale_of(k, m, count, first), m["evidence_row"])
+    both = _log_evidence(m, b, _scale_of(k, m, count, full.shape[0]), m["evidence_row"])
+    if not both - by_place > ELASTIC_GAIN:
+        return False
+    _fill_missing(m)
+    m["is_elastic"] = 1.0
+    return True
 
 
 @compiled

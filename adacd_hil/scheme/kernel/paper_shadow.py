@@ -43,7 +43,7 @@ def step(
     return mode
 
 
-class Beside:
+class PaperShadow:
     """The paper's scheme on the same stream."""
 
     def __init__(self, settings: Settings) -> None:

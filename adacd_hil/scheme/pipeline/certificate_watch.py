@@ -100,9 +100,9 @@ class CertificateWatch:
             return None
         self._refusal = None
         known_by, self._vouched_against = self._known_by(), ""
-        level = "info" if anchor.is_anchored(self._constants, self._memory) else "warning"
-        by_place = position.describe(self._constants, self._memory)
         k, m = self._constants, self._memory
+        level = "info" if anchor.is_anchored(k, m) else "warning"
+        by_place = position.describe(k, m)
         text = f"{anchor.describe(k, m)}; {sight.describe(m)}; {tail.describe(k, m)}; {known_by}{by_place}"
         self._is_standing = True
         self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))

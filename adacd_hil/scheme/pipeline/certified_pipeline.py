@@ -25,7 +25,7 @@ from adacd_hil.scheme.identify.doubt import Doubt
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.kernel.loop import Numbers, Recorded, Samples, run_certified
-from adacd_hil.scheme.kernel.paper_shadow import Beside
+from adacd_hil.scheme.kernel.paper_shadow import PaperShadow
 from adacd_hil.scheme.model import bank
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.batch import RunsBatches
@@ -74,7 +74,7 @@ class CertifiedPipeline(RunsBatches):
         self._tau_ext_wide_hat = self._values[places["tau_ext_wide_hat"]]
         self._sigma = self._memory[0]["wide_sigma"]
         self._threshold = self._memory[0]["wide_threshold"]
-        self._paper = Beside(settings)
+        self._paper = PaperShadow(settings)
         self._supervisor = Supervisor(settings)
         self._touch = Touch(settings)
         self._theta_ff = np.zeros(base)

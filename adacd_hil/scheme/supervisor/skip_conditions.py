@@ -1,4 +1,4 @@
-"""Calm: what leaves a state as it is, cycle after cycle, so that recorded cycles may pass without a look at each.
+"""Conditions under which the supervisor's state cannot change; replay uses them to skip cycles.
 
 A cycle's findings are the kernel's bits of `Observation` and those of the arm, `ArmFinding`, in one number.
 """
@@ -27,7 +27,7 @@ class ArmFinding(IntFlag):
 
 
 class Calm(NamedTuple):
-    """Bounds within which a cycle changes nothing but counts; all of them have to be kept.
+    """Bounds within which a cycle only counts; a cycle outside one of them has to be looked at.
 
     watched, expected: findings & watched is expected. cycles: so many may pass. periods: fewer than these may pass.
     due: the cycle's number is below.
