@@ -1,6 +1,5 @@
 """The check of one file: every record is read once, in order, and handed to the rules it concerns."""
 
-import zlib
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -20,6 +19,7 @@ from adacd_hil.log.mcap.mcap_records import (
     RawRecord,
     Trailer,
     attachment_crc_fits,
+    crc32,
     name_of,
     parse,
     scan,
@@ -76,7 +76,7 @@ class _FileCheck:
         is_right = magic == MAGIC
         if not is_right:
             self._findings.add("magic", "the file doesn't begin with MCAP's magic", 0)
-        self._crc = zlib.crc32(magic) if is_right else 0
+        self._crc = crc32(magic) if is_right else 0
         end = len(magic) if is_right else 0
         for item in scan(self._file):
             if isinstance(item, Trailer):
@@ -103,7 +103,7 @@ class _FileCheck:
         self._file.seek(gap.offset)
         left = gap.size
         while left > 0 and (block := self._file.read(min(_BLOCK, left))):
-            self._crc = zlib.crc32(block, self._crc)
+            self._crc = crc32(block, self._crc)
             left -= len(block)
         self._file.seek(position)
 
@@ -116,10 +116,10 @@ class _FileCheck:
             return
         if record.opcode == Opcode.FOOTER:
             self._count(record)
-            crc = zlib.crc32(record.body[:-_FOOTER_CRC], zlib.crc32(head, self._crc))
+            crc = crc32(record.body[:-_FOOTER_CRC], crc32(head, self._crc))
             self._summary.footer(record, crc)
             return
-        self._crc = zlib.crc32(record.body, zlib.crc32(head, self._crc))
+        self._crc = crc32(record.body, crc32(head, self._crc))
         try:
             self._judge(record)
         except LogError as error:

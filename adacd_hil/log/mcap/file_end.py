@@ -1,14 +1,13 @@
 """The end of an MCAP file: its footer, and the summary where its CRC fits."""
 
 import os
-import zlib
 from typing import IO, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Footer
 
 from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.mcap_records import HEAD, MAGIC, MOST_RECORD_BYTES, RawRecord, parse
+from adacd_hil.log.mcap.mcap_records import HEAD, MAGIC, MOST_RECORD_BYTES, RawRecord, crc32, parse
 
 _BLOCK = 1 << 20
 _FOOTER = HEAD.size + 20
@@ -92,7 +91,7 @@ def crc_of(file: IO[bytes], start: int, end: int) -> int:
     crc = 0
     file.seek(start)
     while start < end and (block := file.read(min(_BLOCK, end - start))):
-        crc = zlib.crc32(block, crc)
+        crc = crc32(block, crc)
         start += len(block)
     return crc
 
