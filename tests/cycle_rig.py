@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import OperatorSettings, RequestSettings, load_settings
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.realtime import GridPacer
@@ -13,6 +12,8 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.recorder import Recorder
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.tap import Tap

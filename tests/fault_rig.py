@@ -9,7 +9,6 @@ from fault_table import Case, Expected, Wire, rows_of
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import OperatorSettings, RequestSettings, Settings, load_settings, parse
 from adacd_hil.control.cycle import Cycle
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.realtime import GridPacer
@@ -20,6 +19,9 @@ from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.tap import Tap

@@ -5,10 +5,12 @@ from pathlib import Path
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import BusSettings, LockstepSettings, OperatorSettings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import OperatorSettings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.bench.bench import Bench

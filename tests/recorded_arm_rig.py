@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import OperatorSettings, RequestSettings, Settings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.device.arm_watch import ArmWatch
@@ -20,6 +19,8 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import ArmBatch, ArmState
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench.bench import Bench

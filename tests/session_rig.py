@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import OperatorSettings, RequestSettings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.bench.bench import Bench

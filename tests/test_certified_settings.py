@@ -5,9 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from adacd_hil.config import FRICTION_TERMS, ConfigError, Settings, load_settings, merge, parse, renewed, to_toml
 from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.settings.certified_settings import FRICTION_TERMS
+from adacd_hil.settings.configuration import Settings, load_settings, merge, renewed
+from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.toml_files import to_toml
 
 SEVEN = [0.1] * 7
 AT_REST = {"period_s": 2.0, "cosine": [[0.1], [0.2]], "sine": [[0.0], [0.0]]}

@@ -18,11 +18,11 @@ import pytest
 from documents import PAGES, ROOT, Document, Piece, read_document
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.config import load_settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import FRAME_DTYPE
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.cli.emulator_main import main as emulator_main
 

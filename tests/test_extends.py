@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
 
 
 def test_a_path_is_taken_from_the_file_that_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

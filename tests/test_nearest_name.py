@@ -5,8 +5,9 @@ import tomllib
 import pytest
 
 from adacd_hil.analysis.replay.what_if import apply_settings
-from adacd_hil.config import SUCCESSORS, ConfigError, Settings, load_settings, parse
 from adacd_hil.nearest_name import nearest_name
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
 
 KEYS = ("a_rad_s", "b_rad_s", "threshold_Nm", "torque_limit_Nm", "torque_rate_limit_Nm_s", "Kp", "Kd", "condition")
 DOTTED = ("filter.a_rad_s", "detector.threshold_Nm", "certified.condition", "certified.noise_sigmas")

@@ -10,8 +10,9 @@ import lockstep_rig
 import numpy as np
 import pytest
 
-from adacd_hil.config import BusSettings, LockstepSettings, OperatorSettings, RequestSettings
 from adacd_hil.log.reader import RunLog
+from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 
 
 def play(folder: Path, schedule: str = "same_cycle", **lockstep: Any) -> tuple[RunLog, list[int]]:

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from lockstep_rig import play
 
-from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings, parse
 from adacd_hil.log.reader import RunLog
+from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame
 from firmware_sim.scenario.scenario import Scenario
 

@@ -11,8 +11,9 @@ from experiment_runs import BIN, run_on_vcan
 from hang import HANG_S
 from lockstep_rig import play
 
-from adacd_hil.config import LockstepSettings, OperatorSettings, RequestSettings
 from adacd_hil.log.reader import topic_bytes
+from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]
 

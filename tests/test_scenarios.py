@@ -7,8 +7,9 @@ from long_cases import long_but
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.cli.run_outcome import outcome_of
-from adacd_hil.config import parse, to_short_toml, to_toml
 from adacd_hil.log.reader import read_log
+from adacd_hil.settings.schema import parse
+from adacd_hil.settings.toml_files import to_short_toml, to_toml
 from firmware_sim.scenario.expectation import deviations
 from firmware_sim.scenario.faults import KINDS
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario

@@ -10,8 +10,9 @@ from typing import NoReturn
 import pytest
 
 from adacd_hil import scheduling
-from adacd_hil.config import ConfigError, Settings, parse
 from adacd_hil.scheduling import RealtimeRequest, isolated_cpus, request_realtime
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError, parse
 
 ASKING = """
 import json, os, subprocess, sys

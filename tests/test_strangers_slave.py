@@ -15,12 +15,13 @@ import canopen
 import numpy as np
 import pytest
 
-from adacd_hil.config import DevicesSettings, Settings, load_settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, ArmState, FaultReason
+from adacd_hil.settings.arm_settings import DevicesSettings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import contract_folder
 

@@ -12,7 +12,6 @@ from click.testing import CliRunner
 from adacd_hil.cli.connection import received_ids
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, Settings, load_settings, parse
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.operator import ScriptedOperator
@@ -24,6 +23,9 @@ from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import ArmCommand, FaultReason, SchemeState
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.bus import Bus, BusError, EmbeddedBus, Frame
 from adacd_hil.wire.tap import Tap
 from firmware_sim.bench.bench import Bench

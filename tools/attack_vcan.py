@@ -21,8 +21,8 @@ from attacked_run import ATTACK_S, STOPS, Finding, expected_lines, finding, firs
 from attacks import ATTACKS, MS, AttackCase, Forger, Repeated, find_attack
 from side_by_side import BIN, ROOT, TimingError, emulator
 
-from adacd_hil.config import to_toml
 from adacd_hil.log.reader import read_log
+from adacd_hil.settings.toml_files import to_toml
 
 START_S = 600.0
 """Longest until the arm moves: everything is compiled before, the first time for minutes on a busy machine."""

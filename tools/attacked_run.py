@@ -17,12 +17,14 @@ import numpy as np
 from attacks import MS, Attack, AttackCase, Forged, Forger
 from numpy.typing import NDArray
 
-from adacd_hil.config import OperatorSettings, RequestSettings, Settings, load_settings, parse
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario

@@ -30,7 +30,6 @@ from side_by_side import BIN, CHANNEL, ENVIRONMENT, ROOT, TimingError, as_text, 
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.realtime import GridPacer, Tick
 from adacd_hil.control.session import Session
@@ -39,6 +38,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import ArmState, FaultReason, Request
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.arm.mechanics_settings import MechanicsSettings

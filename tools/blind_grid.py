@@ -36,8 +36,10 @@ from run_rules import Case, judge  # noqa: E402
 from witnessed_run import Played, play_witnessed  # noqa: E402
 
 from adacd_hil.cli.table import format_table  # noqa: E402
-from adacd_hil.config import OperatorSettings, RequestSettings, Settings, load_settings, parse  # noqa: E402
 from adacd_hil.records import SchemeState  # noqa: E402
+from adacd_hil.settings.configuration import Settings, load_settings  # noqa: E402
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings  # noqa: E402
+from adacd_hil.settings.schema import parse  # noqa: E402
 from firmware_sim.scenario.scenario import Scenario  # noqa: E402
 
 PLACES = (

@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil.cli.table import format_table
-from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.scenario.expectation import deviations
 from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 

@@ -6,11 +6,11 @@ import numpy as np
 from campaign_schemes import ADAPTING, ARMED, TESTING, Outcome
 from lab import PERIOD_S, Motion, Recording, paper_motion
 
-from adacd_hil.config import Settings
 from adacd_hil.control.motion.excitation import Excitation
 from adacd_hil.records import JOINTS, SchemeState
 from adacd_hil.scheme.kernel import certified_memory, loop
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
+from adacd_hil.settings.configuration import Settings
 
 WIDE_FILTER = 1
 """Filter of the bank that is undone for the external torque, as in contact reports."""

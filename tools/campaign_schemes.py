@@ -12,9 +12,9 @@ from lab import PERIOD_S, Motion, Recording, paper_motion
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings, load_settings
 from adacd_hil.records import Vector
 from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.settings.configuration import Settings, load_settings
 
 ADAPTING, TESTING, ARMED = 0, 1, 2
 _LEARN = int(paper_kernel.LEARN)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adacd_hil.config import Settings, load_settings, merge, parse
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.gate import Gate
 from adacd_hil.control.motion.floating import Floating
@@ -27,6 +26,8 @@ from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.pipeline.contact_course import Touch
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.settings.configuration import Settings, load_settings, merge
+from adacd_hil.settings.schema import parse
 from firmware_sim.body.body import Body, DriveMode
 from firmware_sim.scenario.scenario import Scenario
 

@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.score.alarms import begins_of
 from adacd_hil.cli.table import format_table
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings, load_settings
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.kernel import certified_memory, loop
 from adacd_hil.scheme.model.bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.settings.configuration import Settings, load_settings
 from firmware_sim.arm.arms import Arm
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.sensor_settings import SensorSettings

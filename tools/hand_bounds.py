@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from adacd_hil.cli.table import format_table
-from adacd_hil.config import Settings, load_settings
 from adacd_hil.control.motion.quintic import evaluate, to_rest
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import bank
+from adacd_hil.settings.configuration import Settings, load_settings
 
 Array = NDArray[np.float64]
 SIGMAS = 5.0

@@ -9,8 +9,8 @@ import numpy as np
 from wire_record import Passed, WireRecord
 from witnessed_run import Played, Truth
 
-from adacd_hil.config import Settings
 from adacd_hil.log.reader import read_log
+from adacd_hil.settings.configuration import Settings
 from firmware_sim.scenario.scenario import Scenario
 
 

@@ -20,9 +20,9 @@ from lab_motion import PERIOD_S, Motion, cut, join, multisine, paper_motion, ran
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import ArmSettings
 from adacd_hil.control.controller import HANDOVER_S, _torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.settings.arm_settings import ArmSettings
 from firmware_sim.arm.arms import ARMS, Arm
 from firmware_sim.arm.plant import COULOMB, DQ, JOINT_TORQUE, TAU, TORQUE_LIMIT, VISCOUS, Q, external_torque
 from firmware_sim.arm.scripted_contact import ONSET_TICK, TICK_S, ContactSettings, ticks

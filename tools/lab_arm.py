@@ -7,7 +7,7 @@ import numpy as np
 from lab_motion import PERIOD_S
 from numpy.typing import NDArray
 
-from adacd_hil.config import load_settings
+from adacd_hil.settings.configuration import load_settings
 from firmware_sim.arm.arms import ARMS, Arm, Link
 from firmware_sim.arm.drive_settings import DriveSettings
 from firmware_sim.arm.mechanics_settings import MechanicsSettings

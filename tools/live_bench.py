@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from side_by_side import patient_config
 
 from adacd_hil.cli.commands.demo_command import Cast, resolve, run_embedded
-from adacd_hil.config import RequestSettings
 from adacd_hil.control.session import LiveAddress
 from adacd_hil.log.reader import Series, read_log
+from adacd_hil.settings.run_settings import RequestSettings
 
 FIELDS = ("lateness_ns", "compute_ns")
 PERCENTILES = (50.0, 99.0, 99.9)

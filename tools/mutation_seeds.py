@@ -8,13 +8,14 @@ import can
 import numpy as np
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.config import load_settings, to_toml
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.control.history_file import FORMAT, CertificateRecord, History, devices_digest
 from adacd_hil.log.editing.cut import Stretch, cut
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import contract_folder
 from firmware_sim.scenario.scenario import builtin_scenarios
 

@@ -12,8 +12,10 @@ from typing import Any
 
 from witnessed_run import User
 
-from adacd_hil.config import ConfigError, Settings, load_settings, parse, to_toml
 from adacd_hil.records import Request
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import Codec, load_codec
 from firmware_sim.arm.body_regions import BODY_REGIONS
 from firmware_sim.bench.fault_plan import FaultPlan

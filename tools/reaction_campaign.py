@@ -21,9 +21,10 @@ from contact_rig import Rig, Sample, rig_settings
 
 from adacd_hil.analysis import drawing
 from adacd_hil.cli.table import format_table
-from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.motion.quintic import corner_to_corner
 from adacd_hil.records import Reaction, SchemeState, Vector
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.body_regions import BODY_REGIONS
 from firmware_sim.arm.touch_settings import BodySettings
 from firmware_sim.scenario.scenario import Scenario

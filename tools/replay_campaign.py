@@ -16,7 +16,7 @@ from pathlib import Path
 
 from adacd_hil.analysis.replay.replay import Replay, replay
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.config import ConfigError
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.scenario.scenario import builtin_scenarios
 
 _SHOWN = 3

@@ -18,13 +18,13 @@ from wire_record import OverdueError, WireRecord, WitnessBus
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import Settings
 from adacd_hil.control.operator import FaultAnswer, Operator, ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.records import TRUTH_LAYOUT, Request, SchemeState
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario

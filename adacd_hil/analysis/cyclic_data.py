@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import CheckCounts, Mask, Run
 from adacd_hil.analysis.timing import CycleColumns, Cycles
-from adacd_hil.config import DataSettings, Settings
 from adacd_hil.device.data_watch import SHORTEST_SHARE, WINDOW_S
 from adacd_hil.scheme.supervisor.supervisor import POWERED
+from adacd_hil.settings.bus_settings import DataSettings
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.e2e import E2eStatus
 
 _POWERED: Final = tuple(int(state) for state in POWERED)

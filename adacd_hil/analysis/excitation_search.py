@@ -25,11 +25,13 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import ConfigError, ExcitationSettings, Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.filters import first_order_hold
 from adacd_hil.scheme.model.regressor import F_C1, F_C2, regressor
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.control_settings import ExcitationSettings
+from adacd_hil.settings.schema import ConfigError
 
 PERIOD_S = 2.4
 """Of an excitation for a configuration that has none: a fit of 1.4 s sees more than half of it."""

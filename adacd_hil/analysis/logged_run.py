@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.host_cycles import Span
 from adacd_hil.analysis.timing import CycleColumns, Cycles
-from adacd_hil.config import Settings
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.stretch import Stretch
 from adacd_hil.records import ContactReport, SchemeState, Vector
+from adacd_hil.settings.configuration import Settings
 
 Mask = NDArray[np.bool_]
 

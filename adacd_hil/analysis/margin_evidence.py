@@ -14,9 +14,9 @@ from adacd_hil.analysis.logged_run import CertifiedStream, Run
 from adacd_hil.analysis.score.paper_beside import Beside, larger
 from adacd_hil.analysis.sections import Section, rows_of
 from adacd_hil.analysis.smallest_push import SmallestPush
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.bank import channels_of
+from adacd_hil.settings.configuration import Settings
 
 
 @dataclass(frozen=True)

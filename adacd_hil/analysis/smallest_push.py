@@ -11,9 +11,9 @@ import numpy as np
 
 from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sight, tail
+from adacd_hil.settings.configuration import Settings
 
 
 @dataclass(frozen=True)

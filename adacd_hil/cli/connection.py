@@ -11,9 +11,9 @@ from typing import NoReturn
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
-from adacd_hil.config import Settings, load_settings
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, can_interfaces, is_virtual, open_bus
 from adacd_hil.wire.codec import Codec

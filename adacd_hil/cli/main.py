@@ -31,8 +31,8 @@ from adacd_hil.cli.options import (
     stretch_options,
 )
 from adacd_hil.cli.result_file import tell, tried
-from adacd_hil.config import to_toml
 from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.terminal import is_interrupted, open_terminals
 
 if TYPE_CHECKING:

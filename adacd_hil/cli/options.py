@@ -10,10 +10,11 @@ from typing import Any
 import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.config import ConfigError, builtin_names
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.output_files import in_words, is_disk_full
+from adacd_hil.settings.configuration import builtin_names
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError

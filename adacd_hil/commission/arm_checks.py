@@ -15,7 +15,6 @@ from adacd_hil.commission.communication_test import CommunicationReport, Communi
 from adacd_hil.commission.diagnosis import Check, Outcome, failed, ok, skipped, warning
 from adacd_hil.commission.hand_motion import HandMotion
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.network import Master
@@ -24,6 +23,7 @@ from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.records import JOINTS
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.link import Link

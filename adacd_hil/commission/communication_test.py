@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.timing import CycleColumns, columns_of_records
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.drive import Drive
 from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.records import JOINTS, CycleRecord
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.load import LoadMeter
 
 SUFFICIENT_SHARE = 0.90

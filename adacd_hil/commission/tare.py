@@ -18,9 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.config import ConfigError, Settings
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINT_NAMES, JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import A4, A5, regressor
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 
 GRAVITY_POSES = 3
 """Fewest poses that estimate a4, a5 and two offsets and leave residuals to judge them by: 6 equations, 4 unknowns."""

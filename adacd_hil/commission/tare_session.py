@@ -23,13 +23,14 @@ from adacd_hil.commission.tare import (
     measure_pose,
     solve_tare,
 )
-from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.session import git_commit
 from adacd_hil.control.tare_file import FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master
 from adacd_hil.records import JOINT_NAMES, ArmState, Vector
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.tap import Tap

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.clock import Clock
-from adacd_hil.config import Settings
 from adacd_hil.control.cycle_evidence import Evidence
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
@@ -15,6 +14,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.tap import Tap
 

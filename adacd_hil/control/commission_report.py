@@ -3,9 +3,9 @@
 from collections import Counter
 from typing import NamedTuple
 
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import JOINTS, ArmState, FaultReason, SchemeState
+from adacd_hil.settings.configuration import Settings
 
 _STATES = (SchemeState.INIT, SchemeState.COMMISSION)
 

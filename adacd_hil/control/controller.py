@@ -7,9 +7,9 @@ torque jerks the arm, and what the velocity's lag makes of that looks like a con
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.settings.configuration import Settings
 
 HANDOVER_S = 0.5
 """From the old parameters to the new. Switched at once, profile M's residual peaks at 0.071 Nm 7 ms later; led over

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from adacd_hil.clock import Clock
-from adacd_hil.config import Settings
 from adacd_hil.control.controller import Controller
 from adacd_hil.control.cycle_evidence import Evidence
 from adacd_hil.control.exchange import Exchange
@@ -45,6 +44,7 @@ from adacd_hil.records import (
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.scheme.pipeline.selection import pipeline_of
 from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, POWERED
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.tap import Tap
 
 FAULT_LINGER_S = 0.5

@@ -1,11 +1,11 @@
 """How each cycle went, for the log: lateness, ages, what the work took, what was left of the period, what waits."""
 
 from adacd_hil.clock import Clock
-from adacd_hil.config import Settings
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.realtime import Tick
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import ArmState, CycleRecord, Event
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.tap import Tap
 
 _REPEAT_NS = 1_000_000_000

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from adacd_hil.config import setting
 from adacd_hil.device.network import Identity
+from adacd_hil.settings.schema import setting
 
 
 @dataclass(frozen=True)

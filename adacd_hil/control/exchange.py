@@ -4,7 +4,6 @@ SYNC comes in, too, where another host sends it.
 """
 
 from adacd_hil.clock import Clock
-from adacd_hil.config import Settings
 from adacd_hil.control.late_commands import LateCommands
 from adacd_hil.control.realtime import Tick
 from adacd_hil.control.trouble_report import TroubleReport
@@ -12,6 +11,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.records import ArmState
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError
 from adacd_hil.wire.tap import Tap
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from adacd_hil.config import Settings
 from adacd_hil.control.commission_report import CommissionReport
 from adacd_hil.control.self_checks import SelfChecks
 from adacd_hil.device.arm import Arm
@@ -11,6 +10,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.records import ArmState, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.settings.configuration import Settings
 
 
 class FaultReport:

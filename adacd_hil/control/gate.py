@@ -3,8 +3,8 @@
 import math
 from enum import IntFlag
 
-from adacd_hil.config import ArmSettings
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.settings.arm_settings import ArmSettings
 
 
 class GateFlag(IntFlag):

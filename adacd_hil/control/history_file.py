@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.clock import date_ns
-from adacd_hil.config import ConfigError, HistorySettings, Settings, parse, parse_toml, setting, to_toml
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
@@ -23,6 +22,10 @@ from adacd_hil.input_files import read_input
 from adacd_hil.output_files import dangling_link, replacing
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.last_certificate import Certificate
+from adacd_hil.settings.commission_settings import HistorySettings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 HISTORY_NAME = "history.toml"
 FORMAT = 1

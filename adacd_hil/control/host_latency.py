@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.config import LockstepSettings
+from adacd_hil.settings.bus_settings import LockstepSettings
 
 _BLOCK: Final = 1024
 _TAIL: Final = 3.090232306167813

@@ -8,8 +8,8 @@ from collections import deque
 from enum import Enum
 from typing import Protocol, TextIO
 
-from adacd_hil.config import OperatorSettings
 from adacd_hil.records import Request, SchemeState
+from adacd_hil.settings.run_settings import OperatorSettings
 
 CONSOLE_WORDS = {
     "ack": Request.ACKNOWLEDGE,

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock, VirtualClock
-from adacd_hil.config import Settings
 from adacd_hil.control.host_latency import HostLatency
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.scheduling import RealtimeGrant
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import BusError, Frame
 from adacd_hil.wire.tap import Tap
 

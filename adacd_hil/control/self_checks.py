@@ -5,11 +5,11 @@ The scheme knows none of it. What fails goes to it as a request for FAULT, so th
 
 import math
 
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.drive import Drive
 from adacd_hil.device.parameter_watch import ParameterWatch
 from adacd_hil.records import JOINTS, ArmState, FaultReason, Request, SchemeState, Vector
+from adacd_hil.settings.configuration import Settings
 
 TORQUE_STATUSES = 2
 """Statuses in a row that have to show a wrong torque. One may be of the moment in which a command was late."""

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
-from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
@@ -30,6 +29,8 @@ from adacd_hil.output_files import place_file
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.scheme.identify.last_certificate import Certificate
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.tap import Tap

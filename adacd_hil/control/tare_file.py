@@ -12,13 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adacd_hil.clock import date_ns
-from adacd_hil.config import ConfigError, Settings, TareSettings, parse, read_toml, setting, to_toml
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.input_files import read_input
 from adacd_hil.output_files import replacing
 from adacd_hil.records import JOINTS, Event
+from adacd_hil.settings.commission_settings import TareSettings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.toml_files import read_toml, to_toml
 
 TARE_NAME = "tare.toml"
 FORMAT = 1

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.device.answer_clock import AnswerClock
 from adacd_hil.device.drive import Cia402State, Drive, option_codes, torque_limit_permille
 from adacd_hil.device.emergency import name_error
@@ -20,6 +19,7 @@ from adacd_hil.device.sample_alignment import KEPT, SampleAlignment
 from adacd_hil.device.strangers import Strangers
 from adacd_hil.device.torque_sensor import USABLE, SensorStatus, TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.e2e import E2eStatus

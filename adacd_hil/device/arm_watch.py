@@ -2,10 +2,10 @@
 
 from collections.abc import Callable
 
-from adacd_hil.config import Settings
 from adacd_hil.device.deadline import DeadlineWatch
 from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.records import ArmState, FaultReason
+from adacd_hil.settings.configuration import Settings
 
 _LOOKS = 0.1
 """How often heartbeats are looked at, in their periods."""

@@ -18,8 +18,8 @@ import canopen
 from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
-from adacd_hil.config import ConfigError
 from adacd_hil.input_files import read_input
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, BusError, Frame
 
 ANSWER_TIMEOUT_S = 0.5

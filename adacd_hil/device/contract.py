@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.placement import Device, place_devices
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.output_files import place_file
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
 from adacd_hil.wire.node_offset import NODE_MASK, move_contract
 

@@ -7,9 +7,9 @@ Counted while the drives are enabled: what a device does before and after is no 
 
 from dataclasses import dataclass
 
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import ArmState, Event
+from adacd_hil.settings.configuration import Settings
 
 WINDOW_S = 1.0
 MOST_IN_A_ROW = 2

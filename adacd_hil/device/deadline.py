@@ -10,8 +10,8 @@ or the arm brakes to rest and holds its place until the user acknowledges, where
 
 from collections import deque
 
-from adacd_hil.config import Settings
 from adacd_hil.records import ArmState, FaultReason
+from adacd_hil.settings.configuration import Settings
 
 
 class DeadlineWatch:

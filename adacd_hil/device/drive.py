@@ -8,8 +8,8 @@ from collections import deque
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
-from adacd_hil.config import Settings
 from adacd_hil.device.profile import ProfileSettings
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 
 MODE_CYCLIC_SYNCHRONOUS_TORQUE = 10

@@ -2,9 +2,9 @@
 
 import math
 
-from adacd_hil.config import Settings
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, torque_limit_permille
 from adacd_hil.device.slave import Slave
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 
 _CST_SUPPORTED = 1 << 9  # of 0x6502

@@ -7,7 +7,6 @@ Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects); Ci
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError
 from adacd_hil.device.drive_setup import command_deadline_ms, set_up_drive
@@ -20,6 +19,7 @@ from adacd_hil.device.profile import EMCY_INHIBIT_100US
 from adacd_hil.device.sensor_setup import set_up_sensor
 from adacd_hil.device.slave import Slave
 from adacd_hil.records import Event
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 

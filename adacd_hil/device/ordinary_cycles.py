@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_batch import (
     CONSTANTS,
@@ -27,6 +26,7 @@ from adacd_hil.device.drive import Drive
 from adacd_hil.device.heartbeat import HEARTBEAT_ID, HeartbeatWatch
 from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.records import JOINTS, ArmBatch, ArmState, FaultReason
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import MessageCodec, SignalCodec
 from adacd_hil.wire.e2e_batch import PROFILE_NUMBERS
 

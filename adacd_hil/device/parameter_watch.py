@@ -9,11 +9,11 @@ Expedited SDO uploads: a request of 8 bytes, and in some later cycle its answer.
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from adacd_hil.config import Settings
 from adacd_hil.device.notices import Notices
 from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.device.slave import Slave
 from adacd_hil.records import Event
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 
 _UPLOAD = 0x40

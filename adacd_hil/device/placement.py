@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.canopen_bus import Variable, find_variable, read_eds
 from adacd_hil.device.profile import ObjectName, PdoSettings, Profile, ProfileSettings, SignalSettings, load_profile
 from adacd_hil.records import JOINTS
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 
 
 @dataclass(frozen=True)

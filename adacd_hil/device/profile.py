@@ -12,7 +12,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, toml_names
+from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from adacd_hil.wire.codec import contract_folder
 
 FEATURES = (

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_batch import FrameColumns, columns_of
 from adacd_hil.device.arm_watch import ArmWatch
@@ -32,6 +31,7 @@ from adacd_hil.device.network import RESET_COMMUNICATION, START
 from adacd_hil.device.ordinary_cycles import NotOrdinaryError, OrdinaryCycles
 from adacd_hil.device.placement import place_devices
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import Codec
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
-from adacd_hil.config import LogSettings
 from adacd_hil.log import log_words, packet
 from adacd_hil.log.channels import MessageLike
 from adacd_hil.log.errors import LogError, LogExistsError
@@ -28,6 +27,7 @@ from adacd_hil.log.run_folder import check_free, make_room
 from adacd_hil.log.setup import LiveSetup, Setup, tell_messages
 from adacd_hil.output_files import create_file
 from adacd_hil.records import PARAMETER_NAMES, Event
+from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
 
 START_TIMEOUT_S = 60.0

@@ -6,7 +6,7 @@ The defaults are a drive that gives its rated torque for ever, with a torque loo
 
 from dataclasses import dataclass
 
-from adacd_hil.config import ConfigError, setting
+from adacd_hil.settings.schema import ConfigError, setting
 
 Pair = tuple[float, float]
 CURRENT_LOOP_HZ = 1000.0

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.config import ConfigError, setting
 from adacd_hil.records import Vector
+from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, Arm
 from firmware_sim.arm.mechanics import (
     DOWNHILL,

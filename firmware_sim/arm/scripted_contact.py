@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import ConfigError, setting
 from adacd_hil.records import Vector
+from adacd_hil.settings.schema import ConfigError, setting
 
 TICK_S: Final = 1e-4
 """The drives' inner period, and the grid of everything that happens to the arm."""

@@ -6,7 +6,7 @@ encoder. The equations are in `firmware_sim.body.torque_transducer` and `firmwar
 
 from dataclasses import dataclass
 
-from adacd_hil.config import ConfigError, setting
+from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.sensing import TORQUE_NOISE_NM, TORQUE_RANGE_NM
 
 _STEEPEST_LOOP = 0.5

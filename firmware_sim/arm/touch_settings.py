@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from adacd_hil.config import ConfigError, setting
+from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.body_regions import BODY_REGIONS
 from firmware_sim.arm.scripted_contact import TICK_S, ticks
 

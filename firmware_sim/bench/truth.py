@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
-from adacd_hil.config import to_toml
 from adacd_hil.log.channels import ChannelId, pack_truth
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.recorder import LogSummary, Recorder
 from adacd_hil.records import Event, Vector
+from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.scenario.scenario import Scenario
 
 SCENARIO_NAME = "scenario.toml"

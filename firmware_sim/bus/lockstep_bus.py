@@ -21,7 +21,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import Settings
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.budget import read_contract
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
 from adacd_hil.wire.codec import Codec

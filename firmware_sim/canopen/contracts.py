@@ -4,7 +4,7 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from adacd_hil.config import ConfigError
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
 from adacd_hil.wire.node_offset import move_contract
 from firmware_sim.canopen.mapping_objects import CLASSIC_BYTES, FD_BYTES

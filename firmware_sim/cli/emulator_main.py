@@ -12,13 +12,13 @@ from typing import Any, NoReturn
 import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
-from adacd_hil.config import ConfigError
 from adacd_hil.given_path import WrittenPath
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.run_folder import TRUTH_NAME, check_free
 from adacd_hil.output_files import in_words, tidied
 from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line, open_terminals
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import CodecError, load_codec

@@ -5,7 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from adacd_hil.config import ConfigError, find_problems, to_short_toml, to_toml
+from adacd_hil.settings.schema import ConfigError, find_problems
+from adacd_hil.settings.toml_files import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench.fault_plan import FaultPlan
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table

@@ -15,8 +15,8 @@ Ends of a run:
 from dataclasses import dataclass, fields
 from typing import Final, NamedTuple
 
-from adacd_hil.config import ConfigError, setting
 from adacd_hil.records import FaultReason
+from adacd_hil.settings.schema import ConfigError, setting
 
 ENDS: Final = ("finished", "fault", "refused", "lost")
 REASONS: Final = tuple(reason.name for reason in FaultReason if reason is not FaultReason.NONE)

@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple, TypeVar
 
-from adacd_hil.config import ConfigError, setting
 from adacd_hil.nearest_name import nearest_name
+from adacd_hil.settings.schema import ConfigError, setting
 
 DRIVES = ("drive1", "drive2")
 SENSORS = ("sensor1", "sensor2")

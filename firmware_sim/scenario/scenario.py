@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.config import ConfigError, find_toml, parse, read_toml, setting, toml_names
 from adacd_hil.records import Vector
+from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from firmware_sim.arm.arms import ARMS, Arm
 from firmware_sim.arm.drive_settings import DriveSettings
 from firmware_sim.arm.mechanics_settings import MechanicsSettings, PayloadBody

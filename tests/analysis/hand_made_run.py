@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import CertifiedStream, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import CycleColumns
-from adacd_hil.config import Settings, parse
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import (
@@ -22,6 +21,8 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import parse
 
 CAD_THETA = (0.18, 0.036, 0.019, 0.0, 0.0, 0.0, 0.0)
 THETA = (0.2, 0.04, 0.02, 0.03, 0.015, 0.0375, 0.025)

@@ -13,11 +13,11 @@ from adacd_hil.analysis.foreign.recording_identification import identify
 from adacd_hil.analysis.foreign.recording_import import read_recording
 from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
-from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import WHOLE, Stretch
 from adacd_hil.scheme.identify.offline import model_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.settings.schema import ConfigError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "foreign"
 THETA = np.array([0.19205, 0.034125, 0.020175, 0.03, 0.015, 0.0375, 0.02])

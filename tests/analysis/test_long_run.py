@@ -22,7 +22,6 @@ from adacd_hil.analysis.score import truth_reading
 from adacd_hil.analysis.score.truth_reading import TruthRows, read_truth
 from adacd_hil.analysis.verdict import identified_text
 from adacd_hil.cli.main import cli
-from adacd_hil.config import to_toml
 from adacd_hil.log import stream
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme
 from adacd_hil.log.errors import LogError
@@ -31,6 +30,7 @@ from adacd_hil.log.recorder import Recorder
 from adacd_hil.log.stretch import Stretch, start_of_log
 from adacd_hil.records import CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.settings.toml_files import to_toml
 
 PIECE = 333
 

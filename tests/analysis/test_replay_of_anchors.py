@@ -7,12 +7,12 @@ import pytest
 from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.config import to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import CERTIFICATE_EVENTS
 from adacd_hil.scheme.identify import anchor
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
+from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

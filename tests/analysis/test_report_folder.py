@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from hand_made_run import A, M, make_run, record
 
 from adacd_hil.cli.main import cli
-from adacd_hil.config import to_toml
+from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = pytest.mark.slow
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from adacd_hil.analysis.replay.scheme_comparison import SchemeComparison, different_arithmetic
-from adacd_hil.config import load_settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.provenance import arithmetic
@@ -12,6 +11,7 @@ from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.topic_records import record_dtype
 from adacd_hil.records import Event, scheme_layout
 from adacd_hil.scheme.pipeline.batch import SchemeBatch
+from adacd_hil.settings.configuration import load_settings
 
 SETTINGS = load_settings("paper")
 LAYOUT = scheme_layout(7)

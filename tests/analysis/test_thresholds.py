@@ -22,10 +22,11 @@ from adacd_hil.analysis.detector_comparison import (
 from adacd_hil.analysis.motion import read_motion, sample_of
 from adacd_hil.analysis.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
 from adacd_hil.cli.main import cli
-from adacd_hil.config import parse, read_toml
 from adacd_hil.log.errors import LogError
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.detectors import DetectorSettings
+from adacd_hil.settings.schema import parse
+from adacd_hil.settings.toml_files import read_toml
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 compiled_only = pytest.mark.skipif(INTERPRETED, reason="minutes of recording take minutes when interpreted")

@@ -27,12 +27,15 @@ from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, choose
 from adacd_hil.analysis.sweep.tune_scheme import _Shown, candidates, observe_candidates, thresholds_as_changes
 from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.cli.main import cli
-from adacd_hil.config import ConfigError, OperatorSettings, RequestSettings, load_settings, to_toml
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.stretch import Stretch, begin_of_log
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.scenario.scenario import load_scenario
 
 M, A = SchemeState.MONITOR, SchemeState.ADAPT

@@ -12,7 +12,8 @@ from adacd_hil.analysis.replay.what_if import (
     parse_variations,
     split_list,
 )
-from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
 
 PAPER = load_settings("paper")
 

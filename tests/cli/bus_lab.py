@@ -8,8 +8,8 @@ from click.testing import CliRunner, Result
 
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import Clock
-from adacd_hil.config import parse
 from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.bench.bench import Bench

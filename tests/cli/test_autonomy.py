@@ -17,8 +17,9 @@ from adacd_hil.cli.commands.play import may_move_an_arm
 from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.main import cli
-from adacd_hil.config import OperatorSettings, Settings, builtin_names, load_settings
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
+from adacd_hil.settings.configuration import Settings, builtin_names, load_settings
+from adacd_hil.settings.run_settings import OperatorSettings
 from adacd_hil.wire.bus import is_virtual
 
 

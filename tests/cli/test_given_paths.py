@@ -7,10 +7,10 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli as host_cli
-from adacd_hil.config import ConfigError
 from adacd_hil.control.history_file import use_history
 from adacd_hil.given_path import GivenPath
 from adacd_hil.output_files import dangling_link
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.cli.emulator_main import cli as emulator_cli
 
 USAGE = 2

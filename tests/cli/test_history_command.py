@@ -12,7 +12,6 @@ from click.testing import CliRunner
 from adacd_hil.cli.commands.run_command import ask_first_run
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import date_ns, wall_ns
-from adacd_hil.config import ConfigError, load_settings, parse_toml, to_toml
 from adacd_hil.control.history_file import (
     FORMAT,
     CertificateRecord,
@@ -24,6 +23,9 @@ from adacd_hil.control.history_file import (
     use_history,
 )
 from adacd_hil.device.network import Identity
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 pytestmark = pytest.mark.slow
 

@@ -10,8 +10,10 @@ from click.testing import CliRunner
 from adacd_hil.cli.exit_codes import CommandError
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.result_file import tell, tried
-from adacd_hil.config import ExcitationSettings, parse, parse_toml
 from adacd_hil.output_files import is_disk_full
+from adacd_hil.settings.control_settings import ExcitationSettings
+from adacd_hil.settings.schema import parse
+from adacd_hil.settings.toml_files import parse_toml
 
 PARTIAL, FAILURE = 3, 1
 SMALL = """extends = 'certified'

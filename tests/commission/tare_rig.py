@@ -8,7 +8,7 @@ import numpy as np
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.commission.tare_session import TareSession
-from adacd_hil.config import Settings, load_settings
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.bench.bench import Bench

@@ -9,8 +9,8 @@ from tare_rig import CODEC, SETTLED_CYCLE, WINDOW_S, Hand, TareRig, tare_setting
 
 from adacd_hil.commission.tare import Pose, TareRefusedError, measure_pose, solve_tare
 from adacd_hil.commission.tare_session import TareInterruptedError
-from adacd_hil.config import ConfigError
 from adacd_hil.device.canopen_bus import DeviceError
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Frame
 
 OFFSET = (0.3, -0.2)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from session_rig import Rig
 
-from adacd_hil.config import RealtimeSettings, load_settings
 from adacd_hil.device.deadline import DeadlineWatch
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import ArmState, FaultReason, SchemeState
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import RealtimeSettings
 
 STALL_CYCLE = 600
 ON_TIME = ArmState(

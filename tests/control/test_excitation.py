@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from adacd_hil.config import Settings, load_settings, parse
 from adacd_hil.control.motion.excitation import Excitation
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.schema import parse
 
 SETTINGS = load_settings("certified", "P")
 PERIOD_S = SETTINGS.excitation.period_s

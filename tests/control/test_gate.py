@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.config import ArmSettings
 from adacd_hil.control.gate import Gate, GateFlag
+from adacd_hil.settings.arm_settings import ArmSettings
 
 PERIOD_S = 0.001
 LIMIT_NM = (12.0, 6.0)

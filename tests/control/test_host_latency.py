@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from adacd_hil.config import ConfigError, LockstepSettings
 from adacd_hil.control.host_latency import HostLatency
+from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.schema import ConfigError
 
 
 def draws_us(count: int, **settings: object) -> np.ndarray:

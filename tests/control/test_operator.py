@@ -5,9 +5,9 @@ import os
 
 import pytest
 
-from adacd_hil.config import OperatorSettings, RequestSettings
 from adacd_hil.control.operator import ConsoleOperator, FaultAnswer, ScriptedOperator
 from adacd_hil.records import Request, SchemeState
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 
 
 def script(*entries: tuple[float, str], acknowledge_after_s: float = 0.0) -> ScriptedOperator:

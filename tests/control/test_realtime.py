@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 
 from adacd_hil.clock import MonotonicClock, VirtualClock
-from adacd_hil.config import LockstepSettings, load_settings
 from adacd_hil.control.realtime import GridPacer, Pacer, Tick, calibrate, make_pacer, prepare_spin
 from adacd_hil.scheduling import RealtimeGrant
+from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.tap import Tap
 

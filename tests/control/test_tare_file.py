@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from adacd_hil.clock import format_date
-from adacd_hil.config import ConfigError, load_settings
 from adacd_hil.control.tare_file import (
     PoseRecord,
     SensorRecord,
@@ -18,6 +17,8 @@ from adacd_hil.control.tare_file import (
 )
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
 
 DATE_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
 HOUR_NS = 3_600_000_000_000

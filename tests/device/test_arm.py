@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import Settings, parse
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import ArmCommand, FaultReason
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import E2eSender

@@ -8,9 +8,10 @@ import cantools
 import pytest
 
 import adacd_hil
-from adacd_hil.config import ConfigError, Settings, load_settings, parse
 from adacd_hil.device.contract import compose, load_contract, write_contract
 from adacd_hil.device.placement import place_devices
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import contract_folder, load_codec
 
 DRIVE_PROFILE = Path(adacd_hil.__file__).parent / "device_profiles" / "adacd-drive.toml"

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from adacd_hil.config import Settings
 from adacd_hil.device.data_watch import DataWatch
+from adacd_hil.settings.configuration import Settings
 
 ROW = "no sample for the model in 2 cycles in a row: so much later a contact is found"
 AGAIN = "a sample for the model at least every 2 cycles again, for 1000 cycles"

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 import adacd_hil
-from adacd_hil.config import Settings, load_settings, parse
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.drive import (
     IMPLAUSIBLE_JUMP_RAD,
@@ -20,6 +19,8 @@ from adacd_hil.device.drive import (
     torque_limit_permille,
 )
 from adacd_hil.device.profile import load_profile
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
 
 CODEC = load_codec()

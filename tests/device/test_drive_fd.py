@@ -4,7 +4,6 @@ import dataclasses
 
 import pytest
 
-from adacd_hil.config import load_settings
 from adacd_hil.device.drive import (
     IMPLAUSIBLE_JUMP_RAD,
     TRANSITIONS,
@@ -15,6 +14,7 @@ from adacd_hil.device.drive import (
     find_signal,
     torque_limit_permille,
 )
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec, parse_codec
 from adacd_hil.wire.e2e import E2eStatus
 

@@ -5,10 +5,10 @@ import pytest
 from long_cases import long_but
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import Settings, load_settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.contract import load_contract
 from adacd_hil.records import FaultReason
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.e2e import E2eSender

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import Settings, load_settings, parse
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, FaultReason
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.bench.bench import Bench

@@ -8,9 +8,10 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
-from adacd_hil.config import ConfigError, load_settings, parse
 from adacd_hil.device.canopen_bus import read_eds
 from adacd_hil.device.profile import ObjectName, ProfileSettings, load_profile, parse_object, profile_names
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import contract_folder
 
 SENSOR = """

@@ -7,8 +7,8 @@ from typing import Any
 import canopen
 import numpy as np
 
-from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.bench.bench import Bench

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.settings.schema import parse
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.scripted_contact import ContactSettings
 from firmware_sim.arm.sensing import TORQUE_LSB_NM

@@ -10,8 +10,9 @@ import cantools
 import pytest
 from bench_host import ENABLE, SHUTDOWN, START, SWITCH_ON, BenchHost, quiet_scenario
 
-from adacd_hil.config import ConfigError, load_settings
 from adacd_hil.device.contract import load_contract
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
 from firmware_sim.arm.sensing import TORQUE_LSB_NM
 from firmware_sim.canopen.contracts import CONTRACTS, contract_of, playable_contract

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.settings.schema import parse
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, to_counts
 from firmware_sim.arm.sensor_settings import SensorSettings
 from firmware_sim.body.body import Body, DriveMode

@@ -2,7 +2,7 @@
 
 import pytest
 
-from adacd_hil.config import ConfigError, parse
+from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.scenario.expectation import ExpectSettings, Outcome, deviations
 from firmware_sim.scenario.scenario import Scenario
 

@@ -7,7 +7,7 @@ import pytest
 from bench_host import CODEC
 from test_faults import EXAMPLES, UNTIMED, example
 
-from adacd_hil.config import ConfigError, parse
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import E2eStatus
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S

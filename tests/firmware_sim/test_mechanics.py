@@ -13,8 +13,8 @@ import pytest
 from general_arm import LOCKED_NM, NOBODY, GeneralArm, one_joint, without_friction
 from long_cases import long_but
 
-from adacd_hil.config import ConfigError, parse
 from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.mechanics_settings import LARGEST_SUBSTEPS, MechanicsSettings
 from firmware_sim.arm.plant import DQ, DSHAFT, MECHANICAL_STATE, Q, accelerate, fit_payload, integrate

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from bench_host import ENABLE, FAULT_RESET, BenchHost, quiet_scenario
 
-from adacd_hil.config import parse
 from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.settings.schema import parse
 from firmware_sim.arm.drive_settings import DriveSettings
 from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.bench.bench import Bench

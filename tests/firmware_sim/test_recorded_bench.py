@@ -9,11 +9,13 @@ from lockstep_rig import play
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import BusSettings, LockstepSettings, OperatorSettings, RequestSettings, load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.log.formats.mcap_frame_writer import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import topic_bytes
+from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from firmware_sim.bench.recorded_bench import RecordedBench
 from firmware_sim.bench.recorded_cycles import RecordedCycles

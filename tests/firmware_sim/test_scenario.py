@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from adacd_hil.config import ConfigError
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.scripted_contact import contact_force, contact_torque
 from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adacd_hil.config import ConfigError, parse, to_toml
 from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.arm.drive_settings import DriveSettings
 from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import (

@@ -9,7 +9,7 @@ from bench_host import START, BenchHost, quiet_scenario
 from scipy import signal
 
 import firmware_sim.bench.bench
-from adacd_hil.config import parse
+from adacd_hil.settings.schema import parse
 from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, TorqueNoise, torque_counts
 from firmware_sim.arm.sensor_settings import SensorSettings

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from adacd_hil.config import ConfigError, parse
+from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_force, contact_torque
 
 L1_M, L2_M = 0.35, 0.30

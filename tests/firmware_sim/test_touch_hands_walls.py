@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from touched_arm import TouchedArm
 
-from adacd_hil.config import ConfigError
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.plant import DQ, MECHANICAL_STATE, Q, fit_payload, integrate, mass_matrix
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_torque

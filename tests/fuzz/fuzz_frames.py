@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.bench.bench import Bench

@@ -20,11 +20,11 @@ from cantools.autosar.end_to_end import compute_profile2_crc
 from fuzz_frames import CanFrame
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import load_settings
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, Request, SchemeState
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import CodecError, MessageCodec, load_codec
 from adacd_hil.wire.e2e import E2eStatus

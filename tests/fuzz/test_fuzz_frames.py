@@ -25,9 +25,9 @@ from fuzz_receivers import (
 )
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import load_settings
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import topic_bytes
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from firmware_sim.nodes.drive_states import DriveState
 

@@ -17,13 +17,13 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
-from adacd_hil.config import LogSettings
 from adacd_hil.log import recorder as recorder_module
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.log.setup import ToldMessage
 from adacd_hil.records import Event
+from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
 
 CONTROL_PROCESS = """

@@ -9,13 +9,13 @@ import pytest
 from hang import HANG_S
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
-from adacd_hil.config import LogSettings
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.parts import part_path
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.log.run_folder import check_free, log_in
 from adacd_hil.records import Event
+from adacd_hil.settings.run_settings import LogSettings
 
 pytestmark = pytest.mark.slow  # each log starts a process
 

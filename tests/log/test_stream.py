@@ -17,7 +17,6 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from recorded_run import make_run, record
 
-from adacd_hil.config import LogSettings
 from adacd_hil.log import log_walk
 from adacd_hil.log.channels import run_channels
 from adacd_hil.log.errors import LogError
@@ -28,6 +27,7 @@ from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, read_log
 from adacd_hil.log.ros_types import LOG, pack_log, unpack_log
 from adacd_hil.log.stream import LogStream
 from adacd_hil.records import Event
+from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.codec import load_codec
 
 COUNT = 900

@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import load_settings
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import Request, SchemeState
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario

@@ -20,8 +20,8 @@ from reference_runs import (
     play,
 )
 
-from adacd_hil.config import load_settings
 from adacd_hil.records import SchemeState
+from adacd_hil.settings.configuration import load_settings
 
 RENEW = "if this is meant: python tests/reference/renew.py"
 UNCOMPILED = {"certified-quick": 1000, "paper-quick": 750}

@@ -3,11 +3,11 @@
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.contact.reaction import Withdrawal
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.settings.configuration import Settings
 
 THETA = {
     "P": np.array([0.19205, 0.034125, 0.020175, 0.03, 0.015, 0.0375, 0.02]),

@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from adacd_hil.config import Settings, load_settings, merge, parse
 from adacd_hil.records import scheme_layout
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.settings.configuration import Settings, load_settings, merge
+from adacd_hil.settings.schema import parse
 
 PLACES = scheme_layout(7).slices
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from adacd_hil.config import ConfigError
 from adacd_hil.scheme.detect.detectors import (
     DetectorSettings,
     autocovariance,
@@ -18,6 +17,7 @@ from adacd_hil.scheme.detect.detectors import (
     record,
 )
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.settings.schema import ConfigError
 
 T = 1e-3
 SETTINGS = DetectorSettings(onset_samples=(4, 16))

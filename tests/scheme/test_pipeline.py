@@ -12,12 +12,12 @@ from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA, ClosedLoop
 from smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 
-from adacd_hil.config import load_settings
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, scheme_layout
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.model.regressor import is_positive_definite
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
 from adacd_hil.scheme.supervisor.observation import Observation
+from adacd_hil.settings.configuration import load_settings
 
 NEVER_ALARM = {"detector": {"threshold_Nm": [50.0, 50.0]}}
 
@@ -458,7 +458,7 @@ SHORT_RECORD = """
 import sys
 import numpy as np
 from planar_arm import THETA, ClosedLoop
-from adacd_hil.config import load_settings
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.scheme.kernel import paper_kernel
 from smooth_motion import run_kernel, settings_with, smooth_motion, torque_of
 

@@ -8,11 +8,11 @@ import pytest
 from excited_arm import SETTINGS, TouchedLoop, play, record
 from planar_arm import THETA
 
-from adacd_hil.config import load_settings
 from adacd_hil.records import CERTIFICATE_EVENTS, POSITION_TERMS, Request, SchemeState
 from adacd_hil.scheme.identify import missing_torque, position
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import bank
+from adacd_hil.settings.configuration import load_settings
 
 FREE = replace(SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)))
 TOLD = replace(FREE, arm=replace(FREE.arm, position_torque_Nm=0.15))

@@ -11,9 +11,9 @@ from crccheck.crc import Crc8Autosar
 from wire_record import Passed, WireRecord, data_ids
 from witnessed_run import Played, Truth
 
-from adacd_hil.config import Settings, load_settings
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import TRUTH_LAYOUT, Event, FaultReason, Request, SchemeState
+from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.wire.codec import contract_folder
 from firmware_sim.scenario.scenario import Scenario
 

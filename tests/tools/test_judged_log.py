@@ -18,9 +18,11 @@ from run_rules import Violation
 from vcan_kills import VcanKill
 
 from adacd_hil.cli.commands.demo_command import Cast, run_embedded
-from adacd_hil.config import OperatorSettings, RequestSettings, load_settings, parse
 from adacd_hil.log.reader import Series
 from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.schema import parse
 from firmware_sim.scenario.scenario import Scenario
 
 

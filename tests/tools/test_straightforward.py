@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scheme.smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 
-from adacd_hil.config import Settings
 from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.settings.configuration import Settings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from straightforward import NumpyScheme

@@ -17,7 +17,8 @@ import witness
 import yardstick
 
 from adacd_hil.cli.commands.run_command import check_budget_of
-from adacd_hil.config import ConfigError, load_settings
+from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.scenario.scenario import load_scenario
 

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
-from adacd_hil.config import ConfigError
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import Stretch as Span
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify.offline import Record
+from adacd_hil.settings.schema import ConfigError
 
 MOST_ROWS: Final = 4_000_000
 """Rows of a file that are kept, and samples that they become: an hour at 1 kHz, with a little to spare."""

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.config import ConfigError, parse, read_toml, setting
 from adacd_hil.input_files import read_input
 from adacd_hil.scheme.identify.offline import OfflineSettings
 from adacd_hil.scheme.model.urdf import SerialArm, UrdfError, read_urdf
+from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.toml_files import read_toml
 
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ANGLE = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}

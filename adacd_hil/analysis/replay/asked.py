@@ -10,10 +10,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.config import OperatorSettings, Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme.pipeline.batch import SchemeBatch
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.run_settings import OperatorSettings
 
 
 class Script(Protocol):

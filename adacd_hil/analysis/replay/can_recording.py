@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.replay.attempts import NMT_ID, RESET_COMMUNICATION, Places, Stretch
 from adacd_hil.analysis.replay.source import FRAME_TOPICS, LogSource, Part
-from adacd_hil.config import Settings
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.errors import LogError
@@ -28,6 +27,7 @@ from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.log.formats.recorded_frames import as_logged
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import LogStream, Piece
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 
 FEEDBACK_SHARE: Final = 0.7

@@ -30,7 +30,6 @@ from adacd_hil.analysis.replay.source import LogSource, Part, Source
 from adacd_hil.analysis.score.judge import Score
 from adacd_hil.analysis.score.score_words import unjudged_sentence
 from adacd_hil.analysis.score.truth_contacts import TrueContacts, contacts_beside
-from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedContact
@@ -41,6 +40,7 @@ from adacd_hil.scheme.pipeline.batch import SchemeBatch, arm_at
 from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
 from adacd_hil.scheme.pipeline.selection import pipeline_of
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 
 SCRIPTED: Final = "script"

@@ -12,12 +12,12 @@ from adacd_hil.analysis.host_cycles import host_span
 from adacd_hil.analysis.score.alarms import Alarm, enters_react
 from adacd_hil.analysis.score.judge import Score, TouchWindow, judge
 from adacd_hil.analysis.score.truth_contacts import HostCycles, TrueContact, TrueContacts, windows_of
-from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.records import FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.batch import SchemeBatch
 from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.settings.configuration import Settings
 
 _LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 

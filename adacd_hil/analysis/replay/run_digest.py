@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.analysis.replay.source import settings_of
-from adacd_hil.config import Settings
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stream import LogStream
 from adacd_hil.records import SchemeState
+from adacd_hil.settings.configuration import Settings
 
 _TOPICS: Final = ("/scheme", "/cycle", "/contact")
 _TIMES: Final = ("lateness_ns", "feedback_ns", "command_ns", "compute_ns", "slack_ns")

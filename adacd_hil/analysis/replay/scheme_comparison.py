@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.config import Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.provenance import arithmetic
@@ -23,6 +22,7 @@ from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Vector
 from adacd_hil.scheme.pipeline.batch import SchemeBatch
 from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.settings.configuration import Settings
 
 TOLERANCE: Final = 1e-9
 """Least squares over a minute amplify a rounding error of 1e-16 by the condition number, up to 1e6."""

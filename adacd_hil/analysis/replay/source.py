@@ -9,12 +9,14 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from adacd_hil.analysis.replay.attempts import AttemptSplitter, Stretch
 from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
-from adacd_hil.config import Settings, parse, parse_toml, renewed
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.stream import LogStream, Piece
 from adacd_hil.log.stretch import begin_of_log
 from adacd_hil.records import CERTIFICATE_EVENTS
+from adacd_hil.settings.configuration import Settings, renewed
+from adacd_hil.settings.schema import parse
+from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
 
 FRAME_TOPICS: Final = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")

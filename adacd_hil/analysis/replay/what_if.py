@@ -15,9 +15,11 @@ from typing import Any, Final
 
 from adacd_hil.analysis.replay.replay import Replay
 from adacd_hil.analysis.score.score_words import found_text, why_not_found
-from adacd_hil.config import SUCCESSORS, ConfigError, Settings, parse, parse_toml, to_toml
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
+from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", "rated_torque_Nm")
 """Settings of the arm that made the numbers of a log."""

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import CertifiedStream, Motion, PaperStream, Run
-from adacd_hil.config import Settings
 from adacd_hil.log.reader import Series
 from adacd_hil.records import JOINTS
+from adacd_hil.settings.configuration import Settings
 
 Rows = NDArray[np.int64]
 

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.config import ConfigError
 from adacd_hil.extras import install_command
 from adacd_hil.log.errors import LogError
+from adacd_hil.settings.schema import ConfigError
 
 TLS = "tls://"
 _TIMEOUT_S = 10

@@ -12,7 +12,9 @@ from adacd_hil.analysis.score.score_words import delays_phrase, rate_phrase, sha
 from adacd_hil.analysis.sweep.tune import Candidate, Tuning, free_hours
 from adacd_hil.analysis.sweep.tune_roc import Found
 from adacd_hil.clock import wall_ns
-from adacd_hil.config import ConfigError, Settings, builtin_names, load_settings, to_toml
+from adacd_hil.settings.configuration import Settings, builtin_names, load_settings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import to_toml
 
 
 def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:

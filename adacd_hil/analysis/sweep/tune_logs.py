@@ -22,12 +22,12 @@ from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
 from adacd_hil.analysis.score.judge import Times, TouchWindow, explained_until
 from adacd_hil.analysis.score.truth_contacts import HostCycles, TrueContact, contacts_beside, windows_of
-from adacd_hil.config import Settings, load_settings
 from adacd_hil.input_files import open_input
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import Series
 from adacd_hil.log.stretch import EVER_NS, WHOLE, Stretch
 from adacd_hil.records import JOINTS
+from adacd_hil.settings.configuration import Settings, load_settings
 
 _TENTHS = 10
 

@@ -17,11 +17,12 @@ from adacd_hil.analysis.replay.replay import Watch, replay_many
 from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.analysis.sweep.tune_logs import TunedLog, Window
 from adacd_hil.analysis.sweep.tune_roc import Observed, Touched, rising
-from adacd_hil.config import ConfigError, Settings
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.pipeline.batch import SchemeBatch
 from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 
 _FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)
 _GAIN_FACTORS: Final = (1.0, 0.3, 3.0)

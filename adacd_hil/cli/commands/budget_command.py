@@ -4,8 +4,8 @@ import textwrap
 from typing import Any, NamedTuple
 
 from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.config import load_settings
 from adacd_hil.device.contract import find_contract, load_contract
+from adacd_hil.settings.configuration import load_settings
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, share_bus, us
 from adacd_hil.wire.codec import load_codec

@@ -12,7 +12,6 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
-from adacd_hil.config import Settings, to_toml
 from adacd_hil.control.realtime import prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
@@ -25,6 +24,8 @@ from adacd_hil.log.run_folder import check_free
 from adacd_hil.output_files import replace_file
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import BusError

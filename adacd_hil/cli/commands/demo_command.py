@@ -13,7 +13,6 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.new_run_folder import run_folder
 from adacd_hil.cli.progress import Progress
 from adacd_hil.clock import VirtualClock
-from adacd_hil.config import RequestSettings, Settings, load_settings, to_toml
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
@@ -21,6 +20,9 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME
 from adacd_hil.output_files import in_words
 from adacd_hil.records import SchemeState
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.run_settings import RequestSettings
+from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.truth import TruthLog

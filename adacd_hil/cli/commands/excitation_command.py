@@ -10,7 +10,9 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.config import ExcitationSettings, builtin_names, load_settings, to_toml
+from adacd_hil.settings.configuration import builtin_names, load_settings
+from adacd_hil.settings.control_settings import ExcitationSettings
+from adacd_hil.settings.toml_files import to_toml
 
 _LABELS = (
     ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),

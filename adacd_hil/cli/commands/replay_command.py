@@ -15,8 +15,8 @@ from adacd_hil.terminal import in_line
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.replay import Replay
     from adacd_hil.analysis.replay.source import Source
-    from adacd_hil.config import Settings
     from adacd_hil.log.stretch import Stretch
+    from adacd_hil.settings.configuration import Settings
 
 _EPILOG = (
     "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
@@ -108,8 +108,8 @@ def _replay_one(
         refuse_facts,
     )
     from adacd_hil.analysis.score.truth_contacts import contacts_beside
-    from adacd_hil.config import load_settings
     from adacd_hil.control.operator import ScriptedOperator
+    from adacd_hil.settings.configuration import load_settings
 
     source, is_alone = _open(given, configured, against)
     own = source.settings
@@ -136,8 +136,8 @@ def _open(
     """Open a log or a recording; also say whether it is a recording alone."""
     from adacd_hil.analysis.replay.can_recording import RecordingAgainstLog, RecordingAlone
     from adacd_hil.analysis.replay.source import LogSource
-    from adacd_hil.config import load_settings
     from adacd_hil.device.contract import load_contract
+    from adacd_hil.settings.configuration import load_settings
     from adacd_hil.wire.codec import load_codec
 
     path = log_in(given)

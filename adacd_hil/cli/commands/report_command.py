@@ -9,11 +9,11 @@ from adacd_hil.analysis.report.index_page import INDEX_NAME, Entry, count_text, 
 from adacd_hil.analysis.report.report_files import Report, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
-from adacd_hil.config import ConfigError
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME, log_in
 from adacd_hil.log.stretch import Stretch
 from adacd_hil.output_files import replace_file
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 
 DEEPEST = 4

@@ -24,13 +24,14 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
 from adacd_hil.cli.new_run_folder import run_folder
 from adacd_hil.cli.progress import Progress
 from adacd_hil.clock import format_date, wall_ns
-from adacd_hil.config import ConfigError, Settings
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.run_folder import LOG_NAME
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line
 from adacd_hil.wire.budget import check_budget
 from adacd_hil.wire.bus import Bus

@@ -111,7 +111,7 @@ def _plan(
     from adacd_hil.analysis.replay.what_if import apply_settings, parse_variations
     from adacd_hil.analysis.sweep.plan import plan_logs, plan_scenarios
     from adacd_hil.compiled import program_digest
-    from adacd_hil.config import load_settings
+    from adacd_hil.settings.configuration import load_settings
 
     variants = parse_variations(vary)
     base = load_settings(config or "certified", profile or None)

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.settings.configuration import Settings
 
 
 class Admittance:

@@ -8,8 +8,8 @@ Units: rad, rad/s, rad/s², s. Joint vectors (2,).
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import Vector
+from adacd_hil.settings.configuration import Settings
 
 
 class Excitation:

@@ -11,9 +11,9 @@ Shapes: vectors (2,); theta (p,). Units: rad, rad/s, Nm.
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.model import regressor
+from adacd_hil.settings.configuration import Settings
 
 TURNED_rad_s = 0.05
 """Slower than this a joint counts as standing, and Coulomb friction is compensated in proportion."""

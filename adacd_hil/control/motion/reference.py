@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.control.motion.admittance import Admittance
 from adacd_hil.control.motion.excitation import Excitation
 from adacd_hil.control.motion.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
 from adacd_hil.records import JOINTS, ArmState, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
+from adacd_hil.settings.configuration import Settings
 
 SHORTEST_APPROACH_S = 0.6
 """Shortest way to the corner when it must also be stopped: from 100 °/s this stays below 400 °/s²."""

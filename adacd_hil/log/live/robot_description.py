@@ -14,9 +14,9 @@ from xml.etree.ElementTree import Comment, Element, SubElement
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.log.live.link_bodies import LinkBody, ModelError, find_bodies
 from adacd_hil.records import JOINT_NAMES, PARAMETER_NAMES
+from adacd_hil.settings.configuration import Settings
 
 ROBOT_NAME = "robot.urdf"
 WORLD, BASE, TIP = "world", "base", "tip"

@@ -13,12 +13,12 @@ Per cycle it only writes one row; everything else happens three times in a conta
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, Reaction, Vector
 from adacd_hil.scheme.contact import classification, localisation
 from adacd_hil.scheme.contact.contact_estimate import ONSET_FRACTION
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
 from adacd_hil.scheme.supervisor.skip_conditions import Calm
+from adacd_hil.settings.configuration import Settings
 
 LINK_S = 0.01
 """From detection until the link is decided."""

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.settings.configuration import Settings
 
 
 class Profile(NamedTuple):

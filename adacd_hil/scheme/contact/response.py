@@ -9,10 +9,10 @@ Shapes: tau_ext_hat (2,), Nm.
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import ContactLevel, Reaction, Vector
 from adacd_hil.scheme.supervisor.observation import Observation
 from adacd_hil.scheme.supervisor.skip_conditions import Calm
+from adacd_hil.settings.configuration import Settings
 
 TURNED_CYCLES = 5
 """How many samples in a row the torque must be turned: what a blow leaves in the estimate is shorter."""

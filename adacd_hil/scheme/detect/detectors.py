@@ -39,9 +39,9 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import ConfigError, setting
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model import regressor
+from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.structured import Structured, packed, zeroed
 
 VELOCITY_LAG_S: Final = 1.25e-3

@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import CertifiedSettings
 from adacd_hil.records import Vector
 from adacd_hil.scheme.contact import contact_estimate
 from adacd_hil.scheme.model import bank, friction
+from adacd_hil.settings.certified_settings import CertifiedSettings
 
 SECOND_DIFFERENCE = 0.36
 """Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect.sensitivity import AGREES, MOVING
 from adacd_hil.scheme.model import bank
+from adacd_hil.settings.configuration import Settings
 
 WITHIN_S = 0.1
 """The slowest filter is at 0.63 of a step by then, without its smoothing."""

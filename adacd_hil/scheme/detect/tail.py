@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.model import bank
+from adacd_hil.settings.configuration import Settings
 
 HOUR_S = 3600.0
 RATE_HZ = 1.0 / HOUR_S

@@ -43,10 +43,10 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect.sensitivity import LARGEST_UNIT
 from adacd_hil.scheme.identify import anchor, fit_samples, later_samples
+from adacd_hil.settings.configuration import Settings
 
 STEADY = 400.0
 """Squared distance over u at which a fit has changed. Fits of 400 untouched arms, wide ones included, came to 0.06 of

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import earlier
+from adacd_hil.settings.configuration import Settings
 
 SIGMAS = 4.0
 FLOOR_NM, FLOOR_KGM2 = 0.02, 0.006

@@ -36,11 +36,11 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.identify.position import TERMS, fill
 from adacd_hil.scheme.model import bank
+from adacd_hil.settings.configuration import Settings
 
 EXPECTED_NM = 0.06
 """Standard deviation of a coefficient, of an arm that has a cable."""

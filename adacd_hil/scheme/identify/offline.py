@@ -37,12 +37,12 @@ import numpy as np
 import scipy.linalg
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import setting
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import detector
 from adacd_hil.scheme.identify import estimator
 from adacd_hil.scheme.model import chain, filters
 from adacd_hil.scheme.model.chain import BaseParameters, Chain, Indices, Scratch
+from adacd_hil.settings.schema import setting
 
 _UNKNOWN_LINK = (
     10.0,

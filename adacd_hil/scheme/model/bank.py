@@ -21,9 +21,9 @@ tau_f (C, n); S, W_f, input_old (C, n, p); W_learnt (n, p), tau_learnt (n,). Uni
 import math
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import Settings
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model import filters
+from adacd_hil.settings.configuration import Settings
 
 SLOW = 0
 """Filter by which a model is tested and reported: the slow one, whose noise is least."""

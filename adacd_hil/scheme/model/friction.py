@@ -21,8 +21,8 @@ import math
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.config import FRICTION_TERMS
 from adacd_hil.records import Vector
+from adacd_hil.settings.certified_settings import FRICTION_TERMS
 
 STRIBECK, LOAD, ASYMMETRIC, WIDTH, DAHL_SHORT, DAHL_LONG = range(len(FRICTION_TERMS))
 

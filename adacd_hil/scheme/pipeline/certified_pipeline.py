@@ -7,7 +7,6 @@ this one does, ends by eq. (15), and its would-be alarms are in the block; it de
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import (
     PARAMETER_UNITS,
     ArmState,
@@ -36,6 +35,7 @@ from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.supervisor.skip_conditions import Calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import SchemeEvent
+from adacd_hil.settings.configuration import Settings
 
 _WATCH = certified_kernel.WATCH
 _MODES = {

@@ -3,7 +3,6 @@
 Per cycle, after the kernel and the supervisor: `step`. It looks at the state reached, so it must see every cycle.
 """
 
-from adacd_hil.config import Settings
 from adacd_hil.records import ContactLevel, ContactReport, Reaction, SchemeState, Vector
 from adacd_hil.scheme.contact.contact_report import ContactReporter
 from adacd_hil.scheme.contact.response import Response
@@ -11,6 +10,7 @@ from adacd_hil.scheme.kernel.loop import TouchWatch
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.supervisor.skip_conditions import Calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.settings.configuration import Settings
 
 _COLLISION = int(Observation.COLLISION)
 _REACTING = (SchemeState.REACT, SchemeState.STOPPED)

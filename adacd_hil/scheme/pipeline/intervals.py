@@ -5,8 +5,8 @@ Between the SYNCs on which they were taken: a sample that comes late was still t
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import ArmBatch, ArmState, Vector
+from adacd_hil.settings.configuration import Settings
 
 
 class Intervals:

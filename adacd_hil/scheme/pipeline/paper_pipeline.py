@@ -10,7 +10,6 @@ adaptation has finished and its mass matrix is positive definite everywhere. It 
 
 import numpy as np
 
-from adacd_hil.config import Settings
 from adacd_hil.records import (
     ArmState,
     ContactReport,
@@ -32,6 +31,7 @@ from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
 from adacd_hil.scheme.supervisor.skip_conditions import Calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import SchemeEvent
+from adacd_hil.settings.configuration import Settings
 
 _MODES = {
     state: (paper_kernel.LEARN if state is SchemeState.ADAPT else 0)

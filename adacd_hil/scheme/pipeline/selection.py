@@ -1,9 +1,9 @@
 """The choice of the scheme: which pipeline the settings ask for, and how its blocks are laid out."""
 
-from adacd_hil.config import Settings
 from adacd_hil.records import Layout, certified_layout, scheme_layout
 from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.settings.configuration import Settings
 
 
 def pipeline_of(settings: Settings) -> Pipeline | CertifiedPipeline:

@@ -19,11 +19,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.config import Settings
 from adacd_hil.records import ArmBatch, ArmState, FaultReason, Request, SchemeState
 from adacd_hil.scheme.supervisor.observation import Observation
 from adacd_hil.scheme.supervisor.skip_conditions import NEVER, ArmFinding, Calm, findings_of
 from adacd_hil.scheme.supervisor.transitions import TRANSITIONS, SchemeEvent, next_state
+from adacd_hil.settings.configuration import Settings
 
 REST_HOLD_S = 0.05
 """How long |dq| stays below the rest velocity until the arm counts as at rest. At the reversal of a withdrawal with

@@ -1,0 +1,114 @@
+"""Settings of the certified scheme: section `certified`."""
+
+from dataclasses import dataclass
+
+from adacd_hil.settings.schema import ConfigError, setting
+
+FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
+"""Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.friction`."""
+CROSS_TALK = "cross_talk"
+"""What each torque sensor shows of the other joint's torque, Nm/Nm."""
+
+_KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
+
+
+@dataclass(frozen=True)
+class CertifiedSettings:
+    """The scheme that goes beyond the paper: what is believed, when it is enough, and what stands out from it.
+
+    Seven numbers are by kind of parameter: inertia, viscous friction, Coulomb friction, gravity, torque offset, lag,
+    further friction.
+    """
+
+    cutoffs_rad_s: tuple[float, ...] = setting(
+        (10.0, 50.0, 200.0), unit="rad/s", low=1.0, high=1000.0, meaning="filters of the bank, from slow to fast"
+    )
+    smoothing_rad_s: float = setting(
+        200.0, unit="rad/s", low=10.0, high=3000.0, meaning="second low-pass behind each filter, against velocity noise"
+    )
+    noise_sigmas: float = setting(6.5, low=1.0, high=50.0, meaning="threshold in deviations of the torque's noise")
+    model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold in deviations of the model")
+    friction_terms: tuple[str, ...] = setting(
+        ("stribeck", "load", "dahl_short", "dahl_long"),
+        choices=FRICTION_TERMS,
+        meaning="friction beyond viscous and Coulomb",
+    )
+    dahl_rad: tuple[float, float] = setting(
+        (0.001, 0.004), unit="rad", low=1e-6, high=1.0, meaning="bristle lengths of dahl_short and dahl_long"
+    )
+    cross_talk_std: float = setting(
+        0.01,
+        low=0.0,
+        high=0.5,
+        meaning="part of the other joint's torque that a torque sensor shows, a deviation; 0: not identified",
+    )
+    still_rad_s: float = setting(
+        0.002,
+        unit="rad/s",
+        low=0.0,
+        high=1.0,
+        meaning="|dq| below which a joint may stand still; above the noise of dq",
+    )
+    coulomb_width_rad_s: float = setting(
+        0.0, unit="rad/s", low=0.0, high=1.0, meaning="Coulomb friction is F_c tanh(dq / width); 0: F_c sgn(dq)"
+    )
+    stribeck_rad_s: float = setting(
+        0.05, unit="rad/s", low=1e-3, high=10.0, meaning="speed over which static friction falls off"
+    )
+    prior_std: tuple[float, ...] = setting(
+        (1.0, 0.5, 0.5, 10.0, 0.3, 0.001, 0.2), low=0.0, high=1e6, meaning=f"what an arm may be: {_KINDS}"
+    )
+    enough_std: tuple[float, ...] = setting(
+        (0.02, 0.04, 0.04, 0.2, 0.04, 0.004, 0.2), low=0.0, high=1e6, meaning=f"how well it must be known: {_KINDS}"
+    )
+    drift_std: tuple[float, ...] = setting(
+        (0.0, 0.0015, 0.0015, 0.0, 0.0005, 0.0, 0.0015),
+        low=0.0,
+        high=1e3,
+        meaning=f"how far it may wander in a second of monitoring: {_KINDS}",
+    )
+    model_error: tuple[float, ...] = setting(
+        (0.003, 0.01, 0.01, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
+    )
+    payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="what a payload at the tip may weigh")
+    payload_inertia_std: float = setting(
+        0.02, unit="kg m²", low=0.0, high=100.0, meaning="what it may add to each inertia beside a point mass"
+    )
+    residual_Nm: float = setting(0.02, unit="Nm", low=1e-4, high=10.0, meaning="residual of one filtered sample")
+    learn_every: int = setting(4, low=1, high=100, meaning="samples between two that are learnt")
+    hold_back_s: float = setting(
+        0.06, unit="s", low=0.0, high=1.0, meaning="how long a sample waits until it is learnt; a contact discards it"
+    )
+    recover_s: float = setting(0.5, unit="s", low=0.0, high=60.0, meaning="after a contact, nothing is learnt so long")
+    fit_s: tuple[float, float] = setting(
+        (1.4, 0.45), unit="s", low=0.05, high=600.0, meaning="shortest fit: of the arm, of a payload"
+    )
+    test_s: tuple[float, float] = setting(
+        (0.6, 0.35), unit="s", low=0.05, high=600.0, meaning="test of the frozen model: of the arm, with a payload"
+    )
+    beta_Nm: float = setting(
+        0.1, unit="Nm", low=1e-3, high=100.0, meaning="test: largest |tau_ext_hat| of the slowest filter"
+    )
+    excitation_Nm2s: float = setting(
+        5e-5, unit="Nm² s", low=0.0, high=1e6, meaning="smallest eigenvalue of the scaled information matrix"
+    )
+    condition: float = setting(1e5, low=1.0, high=1e12, meaning="largest condition number of the same matrix")
+    refine_s: float = setting(4.0, unit="s", low=0.1, high=3600.0, meaning="test of a refined model before it is used")
+    torque_noise_Nm: float = setting(0.02, unit="Nm", low=0.0, high=10.0, meaning="torque sensor, rms of one sample")
+    velocity_noise_rad_s: float = setting(
+        3.3e-3, unit="rad/s", low=0.0, high=1.0, meaning="velocity, largest error of one sample"
+    )
+    lag_s: float = setting(
+        0.00125, unit="s", low=0.0, high=0.1, meaning="expected age of the velocity when the torque is new; identified"
+    )
+    standstill_share: float = setting(1.0, low=0.0, high=10.0, meaning="part of F_c that is uncertain at rest")
+
+    def __post_init__(self) -> None:
+        if len(self.cutoffs_rad_s) < 2:
+            raise ConfigError(f"`certified.cutoffs_rad_s` has {len(self.cutoffs_rad_s)} values, at least 2 expected")
+        if list(self.cutoffs_rad_s) != sorted(self.cutoffs_rad_s):
+            raise ConfigError(f"`certified.cutoffs_rad_s` = {self.cutoffs_rad_s} must go from slow to fast")
+        for name in ("prior_std", "enough_std", "drift_std", "model_error"):
+            count = len(getattr(self, name))
+            if count != 7:
+                raise ConfigError(f"`certified.{name}` has {count} values, 7 expected: {_KINDS}")

@@ -1,0 +1,197 @@
+"""A configuration: all sections as one value, from a built-in name or a TOML file and what that extends."""
+
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adacd_hil.records import JOINTS, POSITION_TERMS, Vector
+from adacd_hil.scheduling import RealtimeRequest
+from adacd_hil.settings.arm_settings import ArmSettings, DevicesSettings
+from adacd_hil.settings.bus_settings import BusSettings, DataSettings, LockstepSettings
+from adacd_hil.settings.certified_settings import CROSS_TALK, CertifiedSettings
+from adacd_hil.settings.commission_settings import HistorySettings, SafetySettings, TareSettings
+from adacd_hil.settings.control_settings import (
+    ControllerSettings,
+    ExcitationSettings,
+    ReactionSettings,
+    TrajectorySettings,
+)
+from adacd_hil.settings.paper_settings import DetectorSettings, EstimatorSettings, FilterSettings, TerminationSettings
+from adacd_hil.settings.run_settings import LogSettings, OperatorSettings, RealtimeSettings
+from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
+
+_LONGEST_CHAIN = 8
+"""Configurations that extend each other."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything a run depends on, resolved. Attached to every log."""
+
+    name: str = setting("", meaning="name of the configuration")
+    scheme: str = setting("paper", choices=("paper", "certified"), meaning="the paper's scheme, or the one beyond it")
+    arm: ArmSettings = setting(ArmSettings, meaning="the arm")
+    bus: BusSettings = setting(BusSettings, meaning="timing on the bus")
+    data: DataSettings = setting(DataSettings, meaning="how much of the cyclic data may be missing")
+    devices: DevicesSettings = setting(DevicesSettings, meaning="drives and sensors")
+    filter: FilterSettings = setting(FilterSettings, meaning="torque filter")
+    estimator: EstimatorSettings = setting(EstimatorSettings, meaning="adaptation law")
+    termination: TerminationSettings = setting(TerminationSettings, meaning="end of adaptation")
+    detector: DetectorSettings = setting(DetectorSettings, meaning="collision detection")
+    certified: CertifiedSettings = setting(CertifiedSettings, meaning="the scheme beyond the paper")
+    reaction: ReactionSettings = setting(ReactionSettings, meaning="what is done about a contact")
+    trajectory: TrajectorySettings = setting(TrajectorySettings, meaning="the motion")
+    excitation: ExcitationSettings = setting(ExcitationSettings, meaning="the motion of the certified adaptation")
+    controller: ControllerSettings = setting(ControllerSettings, meaning="joint controller")
+    operator: OperatorSettings = setting(OperatorSettings, meaning="scripted user")
+    lockstep: LockstepSettings = setting(LockstepSettings, meaning="modelled time of the host")
+    realtime: RealtimeSettings = setting(RealtimeSettings, meaning="being on time")
+    safety: SafetySettings = setting(SafetySettings, meaning="checks before torque")
+    tare: TareSettings = setting(TareSettings, meaning="tare of the torque sensors")
+    history: HistorySettings = setting(HistorySettings, meaning="the arm's last certificate")
+    log: LogSettings = setting(LogSettings, meaning="the log")
+
+    @property
+    def blind_cycles(self) -> int:
+        """Cycles in a row without a fresh sample that fault the run: not fewer than a value may be old."""
+        return max(self.data.blind_cycles, self.bus.max_age_cycles)
+
+    @property
+    def commission_cycles(self) -> int:
+        """Good cycles in a row before the drives are enabled: those of `safety.commission_s`, at least one."""
+        return max(1, round(self.safety.commission_s / self.bus.period_s))
+
+    @property
+    def further_names(self) -> tuple[str, ...]:
+        """Names of what the certified scheme estimates beside the dynamic parameters, in order; none of the paper's."""
+        if self.scheme == "paper":
+            return ()
+        by_place = POSITION_TERMS if self.arm.position_torque_Nm > 0.0 else ()
+        between = (CROSS_TALK,) if self.certified.cross_talk_std > 0.0 else ()
+        kinds = ("offset", "lag", *self.certified.friction_terms, *between, *by_place)
+        return tuple(f"{kind}{joint + 1}" for kind in kinds for joint in range(JOINTS))
+
+    @property
+    def further_count(self) -> int:
+        """Number of `further_names`."""
+        return len(self.further_names)
+
+    @property
+    def filter_count(self) -> int:
+        """Filters in the certified scheme's bank; 0 of the paper's."""
+        return len(self.certified.cutoffs_rad_s) if self.scheme == "certified" else 0
+
+    @property
+    def channel_count(self) -> int:
+        """Residuals per joint that have a threshold: each filter's smoothed, and all but the slowest one's bare."""
+        return max(2 * self.filter_count - 1, 0)
+
+    @property
+    def cad_theta(self) -> Vector:
+        """The CAD model's parameters (p,)."""
+        return np.array(self.arm.cad_theta, dtype=np.float64)
+
+    @property
+    def realtime_request(self) -> RealtimeRequest:
+        """What the control process asks of the operating system."""
+        wish = self.realtime
+        return RealtimeRequest(wish.scheduler, wish.priority, wish.cpu, wish.lock_memory, self.bus.period_ns)
+
+    def __post_init__(self) -> None:
+        names = self.estimator.parameter_names
+        if len(self.arm.cad_theta) not in (0, len(names)):
+            gravity = " (`estimator.gravity` adds a4 and a5, Nm)" if self.estimator.gravity else ""
+            raise ConfigError(
+                f"`arm.cad_theta` has {len(self.arm.cad_theta)} values, {len(names)} expected: "
+                f"{', '.join(names)}{gravity}; [] without CAD model"
+            )
+        if self.bus.host_node in (*self.devices.drive_node, *self.devices.sensor_node):
+            raise ConfigError(f"`bus.host_node` = {self.bus.host_node} is the node id of a device")
+
+
+def renewed(table: dict[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a log with today's keys in place of those that older versions had.
+
+    A log has every key that there was when it was written, so one that is missing was not in the model.
+    """
+    certified = table.get("certified")
+    if isinstance(certified, dict) and "cross_talk_std" not in certified:
+        table = table | {"certified": certified | {"cross_talk_std": 0.0}}
+    safety = table.get("safety")
+    if not isinstance(safety, dict) or "commission_cycles" not in safety:
+        return table
+    bus = table.get("bus")
+    period_us = bus.get("period_us", 1000) if isinstance(bus, dict) else 1000
+    cycles = safety["commission_cycles"]
+    if not (isinstance(cycles, int) and isinstance(period_us, int)):
+        return table
+    kept = {key: value for key, value in safety.items() if key != "commission_cycles"}
+    return table | {"safety": kept | {"commission_s": cycles * period_us * 1e-6}}
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Lay one TOML table over another, section by section."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict):
+            merged[key] = merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _builtin_folder() -> Traversable:
+    return resources.files("adacd_hil") / "configs"
+
+
+def builtin_names() -> list[str]:
+    """Name the configurations that come with the package."""
+    return toml_names(_builtin_folder())
+
+
+def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Settings:
+    """Resolve a configuration: a built-in name, or a TOML file laid over the one it `extends` (default `paper`).
+
+    `profile` picks the `[profiles.X]` table that is laid over the rest. Raises ConfigError.
+    """
+    table = _load_table(name_or_file)
+    profiles = _table_in(table, "profiles", "`profiles`")
+    table.pop("profiles", None)
+    chosen = profile or _table_in(table, "arm", "`arm`").get("profile", "P")
+    if not isinstance(chosen, str) or chosen not in profiles:
+        raise ConfigError(f"profile {chosen!r} is not in configuration {name_or_file}; known: {', '.join(profiles)}")
+    _table_in(profiles, chosen, f"`profiles.{chosen}`")
+    # What the file says of the arm outweighs the profile's own values, not the other way round.
+    return parse(Settings, merge(merge(profiles[chosen], table), {"arm": {"profile": chosen}}))
+
+
+def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
+    """Return a table within a table, empty where it isn't there. Raises ConfigError when it is no table."""
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise ConfigError(f"{name} = {value!r} must be a table")
+    return value
+
+
+def _load_table(name_or_file: str, seen: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Read a configuration and all that it extends; a relative path is taken from the file that names it."""
+    if name_or_file in seen:
+        raise ConfigError(f"configuration {name_or_file} extends itself")
+    if len(seen) > _LONGEST_CHAIN:
+        raise ConfigError(f"configuration {seen[0]} extends more than {_LONGEST_CHAIN} others, one by one")
+    path = find_toml("configuration", name_or_file, _builtin_folder())
+    table = read_toml(path)
+    table.setdefault("name", path.stem)
+    if "extends" not in table and name_or_file in builtin_names():
+        return table
+    extended = table.pop("extends", "paper")
+    if not isinstance(extended, str):
+        raise ConfigError(f"`extends` = {extended!r} must be the name of a configuration or a file")
+    if extended not in builtin_names() and Path(extended).suffix:
+        extended = str(path.parent / extended)
+    return merge(_load_table(extended, (*seen, name_or_file)), table)

@@ -1,0 +1,155 @@
+"""TOML files: found by name, read within limits, and written so that `parse` reads the same settings back."""
+
+import dataclasses
+import re
+import tomllib
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+from adacd_hil.input_files import exists, read_input
+from adacd_hil.nearest_name import nearest_name
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.terminal import one_line
+
+_MOST_TOML_BYTES = 1 << 20
+_DEEPEST = 16
+_LONGEST_KEY = 80
+_TOO_DEEP = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){64}""")
+_MOST_NAMES = 12
+"""More built-in names than this make no line that anybody reads."""
+
+
+def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
+    """Read one TOML file; `kind` says what it is in errors.
+
+    Raises ConfigError when it is missing, no regular file, too large or not TOML.
+    """
+    try:
+        return parse_toml(read_input(path, _MOST_TOML_BYTES))
+    except FileNotFoundError:
+        raise ConfigError(f"{kind} {path} does not exist") from None
+    except (OSError, ConfigError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"{kind} {path}: {reason}") from None
+
+
+def parse_toml(text: bytes | str) -> dict[str, Any]:
+    """Read TOML, tables at most 16 deep and integers of 64 bits. Raises ConfigError with what is wrong.
+
+    A byte order mark at the beginning, which editors on Windows write, is left out.
+    """
+    try:
+        text = (text if isinstance(text, str) else text.decode("utf-8")).removeprefix("\ufeff")
+        if _TOO_DEEP.search(text):  # such a key takes its reader a time that goes by the square
+            raise RecursionError
+        table = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"more than {_DEEPEST} tables or lists within each other") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"byte {error.start} is not UTF-8") from None
+    except ValueError as error:  # of TOML, and of integers that are too long to be read
+        raise ConfigError(one_line(error)) from None
+    _check_extent(table)
+    return table
+
+
+def _check_extent(table: dict[str, Any]) -> None:
+    """Refuse what would not end well further on: very deep tables, integers that no float can hold."""
+    waiting: list[tuple[str, Any, int]] = [("", table, 0)]
+    while waiting:
+        key, value, depth = waiting.pop()
+        if depth > _DEEPEST:
+            raise ConfigError(f"`{key}`: more than {_DEEPEST} tables or lists within each other")
+        if isinstance(value, dict):
+            waiting += [(f"{key}.{name}".lstrip(".")[:_LONGEST_KEY], item, depth + 1) for name, item in value.items()]
+        elif isinstance(value, list):
+            waiting += [(key, item, depth + 1) for item in value]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise ConfigError(f"`{key}` is an integer of more than 64 bits")
+
+
+def toml_names(folder: Traversable) -> list[str]:
+    """Name the TOML files of a package's folder, without their ending."""
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
+    """Find the file that a built-in name or a path stands for. Raises ConfigError with the nearest built-in name."""
+    names = toml_names(folder)
+    if name_or_file in names:
+        return Path(str(folder / f"{name_or_file}.toml"))
+    path = Path(name_or_file)
+    if not name_or_file or (not path.suffix and not exists(path)):
+        nearest = nearest_name(name_or_file, names)
+        some = ", ".join(names) if len(names) <= _MOST_NAMES else f"{len(names)}, such as {', '.join(names[:3])}"
+        hint = f"; did you mean {nearest!r}?" if nearest else f"; built in: {some}"
+        raise ConfigError(f"{kind} {name_or_file!r} is neither built in nor a file{hint}")
+    return path
+
+
+def to_toml(settings: Any) -> str:
+    """Write settings as TOML that `parse` reads back to the same value."""
+    lines: list[str] = []
+    _write_section(settings, "", lines)
+    return "\n".join(lines).strip() + "\n"
+
+
+def to_short_toml(settings: Any) -> str:
+    """Write what differs from the defaults, a row per line, as TOML that `parse` reads back to the same value."""
+    lines: list[str] = []
+    _write_section(settings, "", lines, is_short=True)
+    return "\n".join(lines).strip() + "\n"
+
+
+def is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
+    """Tell whether a setting has the value that it has when it is absent."""
+    if field.default_factory is not dataclasses.MISSING:
+        return bool(value == field.default_factory())
+    return field.default is not dataclasses.MISSING and bool(value == field.default)
+
+
+def _write_section(section: Any, prefix: str, lines: list[str], is_short: bool = False) -> None:
+    nested = []
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if is_short and is_default(field, value):
+            continue
+        if dataclasses.is_dataclass(value):
+            nested.append((field.name, value))
+        elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+            rows = ["{" + _inline(item, is_short) + "}" for item in value]
+            if is_short:
+                lines.extend((f"{field.name} = [", *(f"    {row}," for row in rows), "]"))
+            else:
+                lines.append(f"{field.name} = [{', '.join(rows)}]")
+        elif value is not None:
+            lines.append(f"{field.name} = {_toml_value(value)}")
+    for name, value in nested:
+        lines.extend(("", f"[{prefix}{name}]"))
+        _write_section(value, f"{prefix}{name}.", lines, is_short)
+
+
+def _inline(section: Any, is_short: bool) -> str:
+    values = [
+        (field.name, value)
+        for field in dataclasses.fields(section)
+        if (value := getattr(section, field.name)) is not None and not (is_short and is_default(field, value))
+    ]
+    return ", ".join(f"{name} = {_toml_value(value)}" for name, value in values)
+
+
+_TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
+    ord('"'): '\\"',
+    ord("\\"): "\\\\",
+}
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.translate(_TOML_ESCAPES) + '"'
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    return repr(value)
