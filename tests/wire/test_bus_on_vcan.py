@@ -281,8 +281,10 @@ def test_what_was_lost_is_known_with_the_first_frame_after_it(raw: socket.socket
 
     def read(count: int) -> None:
         for _ in range(count):
-            if (frame := bus.receive(0.1)) is not None:
-                seen.append((int.from_bytes(frame.data, "big"), bus.frames_lost))
+            frame = bus.receive(0.1)
+            if frame is None:
+                return
+            seen.append((int.from_bytes(frame.data, "big"), bus.frames_lost))
 
     send(2000)
     for _ in range(3):  # some room, a few frames, and again none: losses in the middle of what one system call takes
