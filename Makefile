@@ -4,8 +4,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
+# Hundreds of programs are started here, and each would read all sources again without their bytecode on the disk.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-realtime check compiled-certified compiled-paper bench clean
+.PHONY: help demo test test-all test-realtime check compiled-certified compiled-paper vcan bench clean
 
 help:
 	@echo "make demo   the paper's experiment with an emulated arm, certified scheme and paper's side by side; report in runs/demo/report.html (the last demo's)"
@@ -49,13 +52,17 @@ compiled-certified compiled-paper: compiled-%: $(VENV)/.run
 			>"$$folder/said" 2>&1 || { cat "$$folder/said" >&2; exit 1; }; }
 compiled-paper: | check
 
+# Installs user-mode Linux where it is needed and missing, beside what keeps the processors busy.
+vcan:
+	@tools/with-vcan -- true || true
+
 PYTEST := $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 # test leaves the longest tests out, test-all nothing.
 test: left_out := and not long
 test-all: all := --all
 test test-all: $(VENV)/.dev
-	$(MAKE) --no-print-directory -j2 compiled-certified compiled-paper
+	$(MAKE) --no-print-directory -j3 vcan compiled-certified compiled-paper
 	$(PYTEST) -m "not vcan $(left_out)"
 	tools/test-on-vcan $(all)
 
