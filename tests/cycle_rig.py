@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+from queued_bus import QueuedBus
+
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import ScriptedOperator
@@ -18,7 +20,6 @@ from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.tap import Tap
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bus.bus_model import QueuedBus
 from firmware_sim.scenario.scenario import load_scenario
 
 CODEC = load_codec()

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from fault_table import Case, Expected, Wire, rows_of
+from queued_bus import QueuedBus
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
@@ -26,7 +27,6 @@ from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.tap import Tap
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bus.bus_model import QueuedBus
 from firmware_sim.scenario.scenario import Scenario
 
 CODEC = load_codec()

@@ -26,7 +26,7 @@ from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import crc8
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.truth import TruthLog
+from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]

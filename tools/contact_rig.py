@@ -28,7 +28,8 @@ from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.settings.configuration import Settings, load_settings, merge
 from adacd_hil.settings.schema import parse
-from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 
 SIGMA_NM = np.array([0.03, 0.015])

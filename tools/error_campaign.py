@@ -34,9 +34,9 @@ from adacd_hil.scheme.kernel import certified_memory, loop
 from adacd_hil.scheme.model.bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings, load_settings
-from firmware_sim.arm.arms import Arm
+from firmware_sim.arm.arms import ArmProfile
+from firmware_sim.arm.device_settings import SensorSettings
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
-from firmware_sim.arm.sensor_settings import SensorSettings
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ CABLE_NM = 0.1
 ELASTIC_DAMPING, ROTOR_KG_M2 = 0.02, (0.05, 0.01)
 
 
-def mechanics_of(error: str, arm: Arm) -> MechanicsSettings:
+def mechanics_of(error: str, arm: ArmProfile) -> MechanicsSettings:
     """Return what the error named does to the arm; the rigid plant where it is another's."""
     coulomb_Nm, inertia = np.array(arm.coulomb_Nm), arm.theta()[[0, 2]]
 

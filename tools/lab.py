@@ -23,7 +23,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.control.controller import HANDOVER_S, _torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
-from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import COULOMB, DQ, JOINT_TORQUE, TAU, TORQUE_LIMIT, VISCOUS, Q, external_torque
 from firmware_sim.arm.scripted_contact import ONSET_TICK, TICK_S, ContactSettings, ticks
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
@@ -76,10 +76,10 @@ class Recording:
 class _Experiment(Scenario):
     """A scenario whose arm need not be one of the profiles."""
 
-    own_arm: Arm = ARMS["P"]
+    own_arm: ArmProfile = ARMS["P"]
 
     @property
-    def arm(self) -> Arm:
+    def arm(self) -> ArmProfile:
         return self.own_arm
 
 

@@ -8,10 +8,9 @@ from lab_motion import PERIOD_S
 from numpy.typing import NDArray
 
 from adacd_hil.settings.configuration import load_settings
-from firmware_sim.arm.arms import ARMS, Arm, Link
-from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.arms import ARMS, ArmProfile, RigidLink
+from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
-from firmware_sim.arm.sensor_settings import SensorSettings
 
 Pair = tuple[float, float]
 
@@ -31,7 +30,7 @@ _REFERENCE = "S"  # whose gains are scaled with the inertia
 class LabArm:
     """An arm to be recorded. torque_offset_Nm: zero error of the torque sensors; pairs are (joint 1, joint 2)."""
 
-    arm: Arm
+    arm: ArmProfile
     Kp: Pair
     Kd: Pair
     payload_kg: float = 0.0
@@ -97,7 +96,7 @@ def random_arm(seed: int, payload_kg: float = 0.0, friction: str = "plain", **ch
         mass_kg = np.exp(generator.uniform(np.log(0.7 * light.mass_kg), np.log(1.5 * heavy.mass_kg)))
         center_m = length_m * generator.uniform(0.35, 0.65)
         inertia_kg_m2 = mass_kg * length_m**2 * generator.uniform(0.07, 0.14)
-        links.append(Link(float(length_m), float(mass_kg), float(center_m), float(inertia_kg_m2)))
+        links.append(RigidLink(float(length_m), float(mass_kg), float(center_m), float(inertia_kg_m2)))
     low, high = ARMS[_REFERENCE], ARMS["M"]
     share = generator.uniform(0.0, 1.0, (2, 2))
     viscous, coulomb = (

@@ -53,7 +53,7 @@ TARGETS: dict[str, tuple[str, ...]] = {  # module: its quick tests as globs, qui
     "adacd_hil/wire/e2e.py": ("tests/wire/test_e2e*.py",),
     "adacd_hil/device/drive.py": ("tests/device/test_drive*.py",),
     "adacd_hil/scheme/supervisor/supervisor.py": ("tests/scheme/test_supervisor.py",),
-    "firmware_sim/nodes/drive_states.py": (
+    "firmware_sim/nodes/drive_profile.py": (
         "tests/firmware_sim/test_drive_states_table.py",
         "tests/firmware_sim/test_drive_node.py",
     ),

@@ -25,8 +25,7 @@ from adacd_hil.control.motion.quintic import corner_to_corner
 from adacd_hil.records import Reaction, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
-from firmware_sim.arm.body_regions import BODY_REGIONS
-from firmware_sim.arm.touch_settings import BodySettings
+from firmware_sim.arm.touch_settings import BODY_REGIONS, BodySettings
 from firmware_sim.scenario.scenario import Scenario
 
 AFTER_S = 1.0

@@ -79,7 +79,7 @@ def check_shared(name: str, settings: Settings) -> None:
 def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
     """Give a bus without time of its own the modelled one of lockstep. Raises CodecError."""
     # The emulator's part of the host; real time does without.
-    from firmware_sim.bus.lockstep_bus import make_lockstep_bus
+    from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 
     return make_lockstep_bus(bus, clock, codec, settings)
 

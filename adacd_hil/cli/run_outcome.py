@@ -6,17 +6,17 @@ from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import FaultReason
-from firmware_sim.scenario.expectation import Outcome
+from firmware_sim.scenario.expectation import ScenarioOutcome
 
 
-def outcome_of(summary: SessionSummary, truth_path: Path) -> Outcome:
+def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
     """Read the logs of a run that has ended. Raises LogError."""
     run, gathered, _ = read_run(summary.log.path, truth_path)
     metrics = evaluate(run, gathered)
     force_N = None if run.truth is None else run.truth.force_N
     took_s = list(metrics.adaptation_s.values())
     found = [contact for contact in metrics.contacts if contact.delay_ms is not None]
-    return Outcome(
+    return ScenarioOutcome(
         end=_end(summary),
         fault=metrics.fault,
         fault_s=metrics.fault_s,

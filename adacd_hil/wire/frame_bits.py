@@ -18,8 +18,8 @@ from typing import NamedTuple
 CLASSIC_BYTES = 8
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Bytes that CAN FD can carry, by data length code."""
-_CRC15 = 0x4599
-_TAIL_BITS = 3 + 7 + 3  # CRC delimiter, acknowledgement, its delimiter; end of frame; intermission
+CRC15 = 0x4599
+TAIL_BITS = 3 + 7 + 3  # CRC delimiter, acknowledgement, its delimiter; end of frame; intermission
 _FD_TAIL_BITS = 2 + 7 + 3  # the CRC delimiter is a data bit
 _LONG_CRC_BYTES = 16  # CRC-17 up to here, CRC-21 above
 
@@ -51,13 +51,13 @@ class FrameBits(NamedTuple):
 
 def unstuffed_bits(length: int, is_extended: bool = False) -> int:
     """Bits of a classic frame with `length` bytes, stuff bits left out. Raises ValueError over 8 bytes."""
-    return _stuffable_bits(length, is_extended) + _TAIL_BITS
+    return _stuffable_bits(length, is_extended) + TAIL_BITS
 
 
 def worst_case_bits(length: int, is_extended: bool = False) -> int:
     """Most bits that a classic frame with `length` bytes can have. Raises ValueError over 8 bytes."""
     stuffable = _stuffable_bits(length, is_extended)
-    return stuffable + _TAIL_BITS + (stuffable - 1) // 4
+    return stuffable + TAIL_BITS + (stuffable - 1) // 4
 
 
 def exact_bits(can_id: int, data: bytes, is_extended: bool = False) -> int:
@@ -70,7 +70,7 @@ def exact_bits(can_id: int, data: bytes, is_extended: bool = False) -> int:
     count = _stuffable_bits(len(data), is_extended)
     # Leading zeros don't change a CRC that starts at zero, so the bits may be taken as whole bytes.
     crc = _crc15(content.to_bytes((count - 15 + 7) // 8))
-    return count + _TAIL_BITS + _count_stuff_bits(f"{content << 15 | crc:0{count}b}")
+    return count + TAIL_BITS + _count_stuff_bits(f"{content << 15 | crc:0{count}b}")
 
 
 def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
@@ -164,7 +164,7 @@ def _crc15_table() -> tuple[int, ...]:
     for byte in range(256):
         crc = byte << 7
         for _ in range(8):
-            crc = crc << 1 ^ (_CRC15 if crc & 0x4000 else 0)
+            crc = crc << 1 ^ (CRC15 if crc & 0x4000 else 0)
         table.append(crc & 0x7FFF)
     return tuple(table)
 

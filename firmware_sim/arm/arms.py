@@ -46,7 +46,7 @@ STOP_DAMPING_NM_S: Final = (10.0, 2.0)
 
 
 @dataclass(frozen=True)
-class Link:
+class RigidLink:
     """One rigid link: its length and where its mass is, seen from the joint that carries it."""
 
     length_m: float
@@ -56,11 +56,11 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Arm:
+class ArmProfile:
     """A profile: links, joint friction, and the drives' ratings. Pairs are (joint 1, joint 2)."""
 
     name: str
-    links: tuple[Link, Link]
+    links: tuple[RigidLink, RigidLink]
     viscous_Nm_s: tuple[float, float]  # per rad/s of the joint
     coulomb_Nm: tuple[float, float]
     rated_torque_Nm: tuple[float, float]  # 0x6076, also the most that the drive gives
@@ -105,8 +105,8 @@ class Arm:
         return numbers
 
 
-_LINKS: Final = (Link(0.35, 3.0, 0.20, 0.040), Link(0.30, 1.5, 0.13, 0.015))
-_LIGHT_LINKS: Final = (Link(0.35, 1.5, 0.20, 0.020), Link(0.30, 0.75, 0.13, 0.0075))
+_LINKS: Final = (RigidLink(0.35, 3.0, 0.20, 0.040), RigidLink(0.30, 1.5, 0.13, 0.015))
+_LIGHT_LINKS: Final = (RigidLink(0.35, 1.5, 0.20, 0.020), RigidLink(0.30, 0.75, 0.13, 0.0075))
 _RATED_TORQUE_NM: Final = (12.0, 6.0)
 
 # Braking slows the unloaded arm with time constants of 10 to 30 ms, long enough that the 1.6 ms lag of the drive's
@@ -116,10 +116,10 @@ _LIGHT_BRAKE_DAMPING_NM_S: Final = (12.5, 1.5)
 
 ARMS: Final = {
     # Reproduces the paper's two adaptation times.
-    "P": Arm("P", _LIGHT_LINKS, (0.03, 0.015), (0.0375, 0.02), _RATED_TORQUE_NM, _LIGHT_BRAKE_DAMPING_NM_S),
+    "P": ArmProfile("P", _LIGHT_LINKS, (0.03, 0.015), (0.0375, 0.02), _RATED_TORQUE_NM, _LIGHT_BRAKE_DAMPING_NM_S),
     # Twice the inertia, little friction.
-    "S": Arm("S", _LINKS, (0.024, 0.012), (0.03, 0.016), _RATED_TORQUE_NM, _BRAKE_DAMPING_NM_S),
+    "S": ArmProfile("S", _LINKS, (0.024, 0.012), (0.03, 0.016), _RATED_TORQUE_NM, _BRAKE_DAMPING_NM_S),
     # The torque sensor sees the gear's friction.
-    "M": Arm("M", _LINKS, (0.12, 0.06), (0.15, 0.08), _RATED_TORQUE_NM, _BRAKE_DAMPING_NM_S),
+    "M": ArmProfile("M", _LINKS, (0.12, 0.06), (0.15, 0.08), _RATED_TORQUE_NM, _BRAKE_DAMPING_NM_S),
 }
 """Profiles by name."""

@@ -2,10 +2,10 @@
 
 Link side, with the mass matrix and centrifugal terms of `firmware_sim.arm.plant`:
 
-    M(q) q̈ + centrifugal = τ_J + τ_ext − τ_gravity − friction          friction: `firmware_sim.arm.plant_friction`
+    M(q) q̈ + centrifugal = τ_J + τ_ext − τ_gravity − friction          friction: `firmware_sim.arm.joint_mechanics`
 
-An elastic joint has τ_J = τ_s and a motor side of its own (`firmware_sim.arm.transmission`). A stiff joint turns with
-its rotor: M gets the rotor's inertia R, motor-side friction adds to the joint's, and what the sensor sees follows:
+An elastic joint has τ_J = τ_s and a motor side of its own (`firmware_sim.arm.joint_mechanics`). A stiff joint turns
+with its rotor: M gets the rotor's inertia R, motor-side friction adds to the joint's, and what the sensor sees follows:
 τ_J = τ_m + ripple − R q̈ − motor-side friction. While a stiff joint sticks, motor-side and joint friction share the load
 in the ratio of their levels; rigid bodies leave it open.
 
@@ -33,6 +33,28 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
+from firmware_sim.arm.joint_mechanics import (
+    CAPACITY,
+    COULOMB_DROP,
+    ENCODER_ON_LINK,
+    FREE,
+    MOTOR_COULOMB,
+    MOTOR_VISCOUS,
+    ROTOR_INERTIA,
+    SIGMA0,
+    SIGMA1,
+    SIGMA2,
+    STIFFNESS,
+    TRANSMISSION_NUMBERS,
+    VISCOUS_DROP,
+    advance_bristle,
+    bristle_rate,
+    drift_factor,
+    dry_level,
+    ripple_torque,
+    spring_torque,
+    warm,
+)
 from firmware_sim.arm.plant import (
     ARM_NUMBERS,
     BRAKE,
@@ -59,33 +81,9 @@ from firmware_sim.arm.plant import (
     external_torque,
     follow_target,
 )
-from firmware_sim.arm.plant_friction import (
-    CAPACITY,
-    COULOMB_DROP,
-    FREE,
-    SIGMA0,
-    SIGMA1,
-    SIGMA2,
-    VISCOUS_DROP,
-    advance_bristle,
-    bristle_rate,
-    drift_factor,
-    dry_level,
-    warm,
-)
 from firmware_sim.arm.touch_forces import touch
-from firmware_sim.arm.transmission import (
-    ENCODER_ON_LINK,
-    MOTOR_COULOMB,
-    MOTOR_VISCOUS,
-    ROTOR_INERTIA,
-    STIFFNESS,
-    TRANSMISSION_NUMBERS,
-    ripple_torque,
-    spring_torque,
-)
 
-GRAVITY_M_S2: Final = 9.80665
+STANDARD_GRAVITY_M_S2: Final = 9.80665
 """Standard gravity, CGPM 1901."""
 
 # Places in the vector that stands for the mechanics, after those of friction and transmission.

@@ -1,7 +1,7 @@
 """Section `[mechanics]` of a scenario: what the arm does beyond rigid links with viscous and Coulomb friction.
 
 Everything is off by default, and a scenario without this section runs the rigid plant. Pairs are (joint 1, joint 2).
-Equations: `firmware_sim.arm.plant_friction`, `firmware_sim.arm.transmission`, `firmware_sim.arm.mechanics`.
+Equations: `firmware_sim.arm.joint_mechanics`, `firmware_sim.arm.mechanics`.
 """
 
 import math
@@ -13,13 +13,39 @@ import numpy as np
 
 from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError, setting
-from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, Arm
+from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, ArmProfile
+from firmware_sim.arm.joint_mechanics import (
+    AMBIENT,
+    BACKLASH,
+    CAPACITY,
+    COOLING,
+    COULOMB_DROP,
+    DAMPING,
+    ENCODER_ON_LINK,
+    FREE,
+    LOAD,
+    MOTOR_COULOMB,
+    MOTOR_VISCOUS,
+    REFERENCE_C,
+    RIPPLE,
+    RIPPLE_PERIODS,
+    RIPPLE_PHASE,
+    RIPPLE_SHARE,
+    ROTOR_INERTIA,
+    SIGMA0,
+    SIGMA1,
+    SIGMA2,
+    STIFFNESS,
+    STRIBECK,
+    SURPLUS,
+    VISCOUS_DROP,
+)
 from firmware_sim.arm.mechanics import (
     DOWNHILL,
     GRAVITY,
-    GRAVITY_M_S2,
     HOLDING_BRAKE,
     MECHANICS_NUMBERS,
+    STANDARD_GRAVITY_M_S2,
 )
 from firmware_sim.arm.plant import (
     MECHANICAL_STATE,
@@ -31,35 +57,7 @@ from firmware_sim.arm.plant import (
     fit_payload,
     mass_matrix,
 )
-from firmware_sim.arm.plant_friction import (
-    AMBIENT,
-    CAPACITY,
-    COOLING,
-    COULOMB_DROP,
-    FREE,
-    LOAD,
-    REFERENCE_C,
-    SIGMA0,
-    SIGMA1,
-    SIGMA2,
-    STRIBECK,
-    SURPLUS,
-    VISCOUS_DROP,
-)
 from firmware_sim.arm.scripted_contact import TICK_S
-from firmware_sim.arm.transmission import (
-    BACKLASH,
-    DAMPING,
-    ENCODER_ON_LINK,
-    MOTOR_COULOMB,
-    MOTOR_VISCOUS,
-    RIPPLE,
-    RIPPLE_PERIODS,
-    RIPPLE_PHASE,
-    RIPPLE_SHARE,
-    ROTOR_INERTIA,
-    STIFFNESS,
-)
 
 ENCODER_SIDES: Final = ("motor", "link")
 
@@ -182,7 +180,7 @@ class MechanicsSettings:
         first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
         return sum(first), sum(second)
 
-    def check(self, arm: Arm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
+    def check(self, arm: ArmProfile, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
         """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads."""
         for joint in range(2):
             static_Nm, coulomb_Nm = self.static_Nm[joint], arm.coulomb_Nm[joint]
@@ -207,7 +205,7 @@ class MechanicsSettings:
                 "less stiffness or damping, or more inertia"
             )
 
-    def arm_numbers(self, arm: Arm) -> Vector:
+    def arm_numbers(self, arm: ArmProfile) -> Vector:
         """Pack the arm with its stops for compiled functions (ARM_NUMBERS,)."""
         numbers = arm.numbers()
         low_deg, high_deg = self._stops_deg(arm)
@@ -220,12 +218,12 @@ class MechanicsSettings:
             numbers[place : place + 2] = pair
         return numbers
 
-    def _stops_deg(self, arm: Arm) -> tuple[Pair, Pair]:
+    def _stops_deg(self, arm: ArmProfile) -> tuple[Pair, Pair]:
         if self.stop_low_deg is None or self.stop_high_deg is None:
             return (-arm.stop_deg[0], -arm.stop_deg[1]), arm.stop_deg
         return self.stop_low_deg, self.stop_high_deg
 
-    def numbers(self, arm: Arm) -> Vector:
+    def numbers(self, arm: ArmProfile) -> Vector:
         """Pack for compiled functions (MECHANICS_NUMBERS,), by the places of friction, transmission and mechanics."""
         numbers = np.zeros(MECHANICS_NUMBERS)
 
@@ -256,7 +254,7 @@ class MechanicsSettings:
         put(MOTOR_COULOMB, self.motor_coulomb_Nm)
         put(HOLDING_BRAKE, self.holding_brake_Nm)
         numbers[ENCODER_ON_LINK : ENCODER_ON_LINK + 2] = self.encoder_side == "link"
-        numbers[GRAVITY] = GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
+        numbers[GRAVITY] = STANDARD_GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
         numbers[DOWNHILL] = math.radians(self.tilt_direction_deg)
         for joint in range(2):
             is_dry = arm.coulomb_Nm[joint] + surplus[joint] + self.load_friction[joint] > 0.0
@@ -266,10 +264,10 @@ class MechanicsSettings:
             numbers[FREE + joint] = not (on_link or on_motor)
         return numbers
 
-    def _sigma2(self, arm: Arm) -> Pair:
+    def _sigma2(self, arm: ArmProfile) -> Pair:
         return arm.viscous_Nm_s if self.sigma2_Nm_s is None else self.sigma2_Nm_s
 
-    def eigenvalues(self, arm: Arm, payloads: Sequence[PayloadBody]) -> tuple[float, float]:
+    def eigenvalues(self, arm: ArmProfile, payloads: Sequence[PayloadBody]) -> tuple[float, float]:
         """Give the largest |Im λ| and |λ| in rad/s of the arm linearised about rest, bristles stuck and stops touched.
 
         The largest of elbow angles from 0 to 180 degrees in steps of 45, with each of the payloads.
@@ -311,7 +309,7 @@ class MechanicsSettings:
                 largest = max(largest, float(np.abs(eigenvalues).max()))
         return oscillation, largest
 
-    def substeps(self, arm: Arm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
+    def substeps(self, arm: ArmProfile, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
         """Choose the substeps of a 100 µs tick; touch_rad_s: fastest eigenfrequency of what touches the arm."""
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)

@@ -35,8 +35,8 @@ from firmware_sim.arm.scripted_contact import contact_force, contact_torque
 CURRENT_LOOP_RAD_S: Final = 2.0 * math.pi * 1000.0
 """Bandwidth of the drive's torque loop; 1 kHz is usual for servo drives."""
 
-# Places in the vector that stands for an arm, see `firmware_sim.arm.arms.Arm.numbers`. They are here and not there
-# because compiled code contains them, and the cache of compiled code is keyed by the modules that compile.
+# Places in the vector that stands for an arm, see `firmware_sim.arm.arms.ArmProfile.numbers`. They are here and not
+# there because compiled code contains them, and the cache of compiled code is keyed by the modules that compile.
 ALPHA: Final = 0  # kg m², without payload, as BETA and GAMMA
 BETA: Final = 1
 GAMMA: Final = 2

@@ -9,6 +9,7 @@ These are the defaults. What a scenario changes of them is in `torque_transducer
 """
 
 import math
+from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -31,7 +32,17 @@ TORQUE_COUNTS: Final = (-(1 << 15), (1 << 15) - 1)
 _LOWEST_COUNT: Final = TORQUE_COUNTS[0]
 _HIGHEST_COUNT: Final = TORQUE_COUNTS[1]
 # Samples drawn at once: large enough to cost nothing per sample, small enough to draw within 10 µs.
-_BLOCK: Final = 256
+_SAMPLES_AT_ONCE: Final = 256
+
+
+class DriveMode(IntEnum):
+    """What a drive does with its motor. The drive node chooses; every mode can follow every other."""
+
+    OFF = 0  # no torque, the arm coasts: Switched on and below, until the node enables
+    TORQUE = 1  # follows the set-point: Operation enabled, until the node disables, stops or faults
+    BRAKE = 2  # torque against the velocity: Quick stop and Fault reaction active, until the node sees standstill
+    BRAKE_SLOWLY = 3  # as BRAKE, on the slow-down ramp: half the damping
+    BRAKE_HARD = 4  # as BRAKE, up to the current limit: one and a half times the damping, the most that stays damped
 
 
 @compiled
@@ -83,12 +94,12 @@ class TorqueNoise:
         self._generator = np.random.default_rng(seed)
         self._rms_Nm = np.broadcast_to(np.asarray(rms_Nm, dtype=np.float64), (2,))
         self._is_on = bool(self._rms_Nm.any())
-        self._block: NDArray[np.float64] = np.zeros((_BLOCK, 2))
-        self._next = _BLOCK
+        self._block: NDArray[np.float64] = np.zeros((_SAMPLES_AT_ONCE, 2))
+        self._next = _SAMPLES_AT_ONCE
 
     def draw(self) -> NDArray[np.float64]:
         """Give the next sample (2,), Nm; valid until the next call."""
-        if self._next == _BLOCK:
+        if self._next == _SAMPLES_AT_ONCE:
             self._next = 0
             if self._is_on:
                 self._generator.standard_normal(out=self._block)

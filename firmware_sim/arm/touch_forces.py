@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from firmware_sim.arm.arms import Arm
+from firmware_sim.arm.arms import ArmProfile
 from firmware_sim.arm.scripted_contact import LINK as CONTACT_LINK
 from firmware_sim.arm.scripted_contact import TICK_S, contact_force, contact_torque, ticks
 
@@ -104,7 +104,7 @@ _FASTEST_BLOW_M_S: Final = 2.0
 """Fastest blow that `largest_rate_rad_s` covers: the tip of both links, straight, at 180 deg/s."""
 
 
-def _largest_mobility(arm: Arm, link: int, points_m: Vector) -> float:
+def _largest_mobility(arm: ArmProfile, link: int, points_m: Vector) -> float:
     """Give the largest 1/mass, 1/kg, that the unloaded arm shows a force at these points of a link, in any pose."""
     alpha, beta, gamma = arm.inertia()
     length1_m = arm.link_length_m[0]
@@ -123,7 +123,7 @@ def _largest_mobility(arm: Arm, link: int, points_m: Vector) -> float:
     return float(largest.max())
 
 
-def _row(kind: int, arm: Arm, thing: "BodySettings | HandSettings | WallSettings") -> Vector:
+def _row(kind: int, arm: ArmProfile, thing: "BodySettings | HandSettings | WallSettings") -> Vector:
     """Fill the columns that all things have."""
     row = np.full(TOUCH_COLUMNS, np.nan)
     row[KIND] = kind
@@ -133,7 +133,7 @@ def _row(kind: int, arm: Arm, thing: "BodySettings | HandSettings | WallSettings
     return row
 
 
-def _body_row(arm: Arm, body: "BodySettings") -> Vector:
+def _body_row(arm: ArmProfile, body: "BodySettings") -> Vector:
     row = _row(BODY, arm, body)
     row[LINK], row[X_M], row[Y_M] = body.link, body.x_m, body.y_m
     row[STIFFNESS], row[DAMPING], row[MASS] = body.stiffness, body.damping_N_s_m, body.mass
@@ -145,7 +145,7 @@ def _body_row(arm: Arm, body: "BodySettings") -> Vector:
     return row
 
 
-def _hand_row(arm: Arm, hand: "HandSettings") -> Vector:
+def _hand_row(arm: ArmProfile, hand: "HandSettings") -> Vector:
     row = _row(HAND, arm, hand)
     row[LINK], row[POINT_M], row[FORCE_LIMIT], row[SPEED] = hand.link, hand.point_m, hand.force_limit_N, hand.speed_m_s
     row[STIFFNESS], row[DAMPING] = hand.stiffness_N_m, hand.damping_N_s_m
@@ -158,7 +158,7 @@ def _hand_row(arm: Arm, hand: "HandSettings") -> Vector:
     return row
 
 
-def _wall_row(arm: Arm, wall: "WallSettings") -> Vector:
+def _wall_row(arm: ArmProfile, wall: "WallSettings") -> Vector:
     row = _row(WALL, arm, wall)
     row[X_M], row[Y_M], row[ANGLE_RAD] = wall.x_m, wall.y_m, math.radians(wall.normal_deg)
     row[STIFFNESS], row[DAMPING] = wall.stiffness_N_m, wall.damping_s_m

@@ -12,7 +12,7 @@ Two clocks:
            SYNC keeps coming.
 
 By SYNC, heartbeats and deadlines go by the given clock while no SYNC comes, and so does the braking that they cause. A
-host in lockstep says itself how much time passes (`firmware_sim.canopen.time_marks`), and hears from the bench what
+host in lockstep says itself how much time passes (`adacd_hil.wire.time_marks`), and hears from the bench what
 doesn't come at once. Once a host has died, `outlive_host` lets pass what time it takes the arm to come to rest. The
 truth is told on the way, a row per period, numbered and stamped on from the last SYNC.
 
@@ -27,20 +27,20 @@ from typing import Literal, Protocol
 from adacd_hil.records import JOINTS, TRUTH_LAYOUT, Vector
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec, contract_folder
+from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS, MarkKind, answers_to_sync, unpack_mark
 from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS
 from firmware_sim.bench.injector import Handler, Injector, OnEvent
-from firmware_sim.bench.truth_channels import OnTruth, TruthRows
+from firmware_sim.bench.outbox import Outbox
+from firmware_sim.bench.truth_log import OnTruth, TruthFeed
 from firmware_sim.body.body import Body, Measurement
-from firmware_sim.body.torque_transducer import converter_ends
-from firmware_sim.canopen.contracts import Contract, answers_to_sync, contract_of, longest_pdo
-from firmware_sim.canopen.object_dictionary import NEVER_NS, Abort, refuse
-from firmware_sim.canopen.outbox import Outbox
+from firmware_sim.body.sensors import converter_ends
+from firmware_sim.canopen.contracts import EmulatedContract, contract_of, longest_pdo
+from firmware_sim.canopen.object_dictionary import Abort, refuse
 from firmware_sim.canopen.sync_order import SyncKind, SyncOrder
-from firmware_sim.canopen.time_marks import HOST_MARK, MarkKind, unpack_mark
-from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE, Device
+from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE, EmulatedDevice, SyncListeners
 from firmware_sim.nodes.drive_node import DriveNode, Motor
 from firmware_sim.nodes.sensor_node import SensorNode
-from firmware_sim.nodes.sync_listeners import SyncListeners
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario
 
@@ -48,8 +48,6 @@ ClockMode = Literal["sync", "wall"]
 _TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
-_PLANNED_PERIOD_NS = 1_000_000
-"""How long a fault without length, such as a reboot, is active."""
 
 LONGEST_ORPHANAGE_NS = 5_000_000_000
 """How long an arm is watched whose host has died; braking takes 1 s at most, what coasts with friction a few more."""
@@ -111,7 +109,7 @@ class Bench:
         clock_mode: ClockMode = "sync",
         seed: int | None = None,
         on_truth: OnTruth | None = None,
-        contract: Contract | None = None,
+        contract: EmulatedContract | None = None,
         on_event: OnEvent | None = None,
         on_answer: Callable[[], None] = lambda: None,
     ) -> None:
@@ -138,7 +136,7 @@ class Bench:
         self._scenario = scenario
         self._seed = seed
         self._is_wall = clock_mode == "wall"
-        self._rows = TruthRows(self._fill_truth, on_truth)
+        self._rows = TruthFeed(self._fill_truth, on_truth)
         self._on_answer = on_answer
         self._order = SyncOrder(is_timed=self._is_wall)
         self._lost_syncs = 0  # before the last one
@@ -156,9 +154,9 @@ class Bench:
         ids = device_ids(scenario.faults, right_ids)
         longest = longest_pdo(codec)
         plan_seed = scenario.seed if seed is None else seed
-        self._injector = Injector(scenario, plan_seed, _PLANNED_PERIOD_NS, codec, self._outbox, on_event)
+        self._injector = Injector(scenario, plan_seed, PLANNED_PERIOD_NS, codec, self._outbox, on_event)
         self.devices = tuple(
-            Device(
+            EmulatedDevice(
                 ids[i],
                 folder / files[i],
                 self._injector.sender(i),

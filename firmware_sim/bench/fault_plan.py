@@ -16,14 +16,16 @@ from typing import NamedTuple
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 from adacd_hil.wire.e2e import Protection, crc8, crc16
+from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
-from firmware_sim.canopen.object_dictionary import NEVER_NS
 from firmware_sim.scenario.faults import NODES, FaultSettings
 
 EVERYBODY = -1
 """For `receive`: a frame that comes to all devices at once."""
 
-_ANY = -1  # in place of an identifier
+PLANNED_PERIOD_NS = 1_000_000
+"""How long a fault without length, such as a reboot, is active."""
+_ANY_FRAME = -1  # in place of an identifier
 _BEFORE_NS = -1  # scenario time before the drives are enabled
 _NOT_VALID = 0x01  # of 0x6150
 _DBC_NAMES = {
@@ -204,7 +206,7 @@ class FaultPlan:
         """Return what becomes of a frame that a node sends: delay in ns, identifier, data of each."""
         if node in self._silent:
             return []
-        rows = self._sending.get((node, can_id)) or self._sending.get((node, _ANY))
+        rows = self._sending.get((node, can_id)) or self._sending.get((node, _ANY_FRAME))
         if not rows:
             return [(0, can_id, data)]
         return [(delay_ns, can_id, changed) for delay_ns, changed in self._change(rows, can_id, data)]
@@ -298,8 +300,8 @@ class FaultPlan:
         self._receiving = _by_place(received, self._places)
         self._sending = _by_place(sent, self._places)
         for node, can_id in self._sending:
-            rows_of_any = self._sending.get((node, _ANY), ())
-            if can_id != _ANY and rows_of_any:
+            rows_of_any = self._sending.get((node, _ANY_FRAME), ())
+            if can_id != _ANY_FRAME and rows_of_any:
                 both = {*self._sending[node, can_id], *rows_of_any}
                 self._sending[node, can_id] = tuple(sorted(both, key=lambda row: row.index))
 
@@ -508,7 +510,7 @@ def _find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Plac
     if row.frame is None:
         return frozenset()
     if row.frame == "any":
-        return frozenset((node, _ANY) for node in row.nodes)
+        return frozenset((node, _ANY_FRAME) for node in row.nodes)
     try:
         if row.is_broadcast:
             return frozenset([(EVERYBODY, codec.message(_broadcast_name(row)).can_id)])

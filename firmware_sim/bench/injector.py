@@ -8,12 +8,12 @@ from collections.abc import Callable, Sequence
 
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.time_marks import NEVER_NS, MarkKind
 from firmware_sim.bench.fault_plan import EVERYBODY, ActionKind, FaultPlan, NodeAction
+from firmware_sim.bench.outbox import Outbox
 from firmware_sim.body.body import Measurement
-from firmware_sim.canopen.object_dictionary import NEVER_NS, Send
-from firmware_sim.canopen.outbox import Outbox
-from firmware_sim.canopen.time_marks import MarkKind
-from firmware_sim.nodes.device import Device
+from firmware_sim.canopen.object_dictionary import Send
+from firmware_sim.nodes.device import EmulatedDevice
 from firmware_sim.nodes.drive_node import DriveNode
 from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.scenario import Scenario
@@ -39,11 +39,13 @@ class Injector:
         self._power_on_ns = 0
         self._started_ns: int | None = None
         self._flooded_ns = 0  # up to here babbling nodes have sent
-        self._devices: Sequence[Device] = ()
+        self._devices: Sequence[EmulatedDevice] = ()
         self._drives: Sequence[DriveNode] = ()
         self._sensors: Sequence[SensorNode] = ()
 
-    def attach(self, devices: Sequence[Device], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]) -> None:
+    def attach(
+        self, devices: Sequence[EmulatedDevice], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]
+    ) -> None:
         """Connect the nodes."""
         self._devices, self._drives, self._sensors = devices, drives, sensors
 

@@ -10,7 +10,6 @@ the set-point that was latched at SYNC k. All state lies in one vector, so a bod
 
 import math
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import TRUTH_LAYOUT, Vector
+from firmware_sim.arm.joint_mechanics import REFERENCE_C
 from firmware_sim.arm.mechanics import HOLDING_BRAKE, integrate_mechanics, observe, work_space
 from firmware_sim.arm.plant import (
     BRAKE,
@@ -43,7 +43,6 @@ from firmware_sim.arm.plant import (
     integrate,
     mirror_stiff_joints,
 )
-from firmware_sim.arm.plant_friction import REFERENCE_C
 from firmware_sim.arm.scripted_contact import (
     END_TICK,
     ONSET_TICK,
@@ -55,6 +54,7 @@ from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     TORQUE_LSB_NM,
     VELOCITY_LSB_RAD_S,
+    DriveMode,
     TorqueNoise,
     to_counts,
     track,
@@ -73,7 +73,6 @@ from firmware_sim.arm.touch_forces import (
     largest_rate_rad_s,
     touch_table,
 )
-from firmware_sim.body.encoder import NOISE_TICKS, EncoderNoise, encoder_numbers, read_angle
 from firmware_sim.body.motor import (
     HAS_LIMITS,
     IS_LIMITED,
@@ -88,10 +87,14 @@ from firmware_sim.body.motor import (
     motor_state,
     winding_temperature,
 )
-from firmware_sim.body.torque_transducer import (
+from firmware_sim.body.sensors import (
     HAS_MEMORY,
+    NOISE_TICKS,
     TRANSDUCER_STATE,
+    EncoderNoise,
     converter_ends,
+    encoder_numbers,
+    read_angle,
     sample_torque,
     sense_torque,
     settle_transducer,
@@ -99,17 +102,6 @@ from firmware_sim.body.torque_transducer import (
     walk_offset,
 )
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
-
-
-class DriveMode(IntEnum):
-    """What a drive does with its motor. The drive node chooses; every mode can follow every other."""
-
-    OFF = 0  # no torque, the arm coasts: Switched on and below, until the node enables
-    TORQUE = 1  # follows the set-point: Operation enabled, until the node disables, stops or faults
-    BRAKE = 2  # torque against the velocity: Quick stop and Fault reaction active, until the node sees standstill
-    BRAKE_SLOWLY = 3  # as BRAKE, on the slow-down ramp: half the damping
-    BRAKE_HARD = 4  # as BRAKE, up to the current limit: one and a half times the damping, the most that stays damped
-
 
 SUBSTEPS: Final = 1
 """Integration steps per tick: RK4 at 10 kHz. Halving the step changes a period's velocity by less than 2e-10 rad/s, and
@@ -124,7 +116,7 @@ _ENCODER: Final = _TICK + 4  # 2: encoder position, rad
 _ESTIMATE: Final = _TICK + 6  # 2: position of the tracking loop, rad
 _VELOCITY: Final = _TICK + 8  # 2: velocity of the tracking loop, rad/s
 _MOTOR: Final = _TICK + 10  # places of `firmware_sim.body.motor`
-_TRANSDUCER: Final = _MOTOR + MOTOR_STATE  # places of `firmware_sim.body.torque_transducer`
+_TRANSDUCER: Final = _MOTOR + MOTOR_STATE  # places of `firmware_sim.body.sensors`
 _STATE: Final = _TRANSDUCER + TRANSDUCER_STATE
 
 _OFF: Final = int(DriveMode.OFF)

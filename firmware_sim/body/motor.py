@@ -27,7 +27,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from firmware_sim.arm.drive_settings import CURRENT_LOOP_HZ, DriveSettings
+from firmware_sim.arm.device_settings import CURRENT_LOOP_HZ, DriveSettings
 from firmware_sim.arm.scripted_contact import TICK_S
 
 CONTINUOUS_OVER_CURRENT: Final = 0x2310

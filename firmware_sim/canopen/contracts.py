@@ -7,11 +7,11 @@ from pathlib import Path
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
 from adacd_hil.wire.node_offset import move_contract
-from firmware_sim.canopen.mapping_objects import CLASSIC_BYTES, FD_BYTES
+from firmware_sim.canopen.pdo_record import CLASSIC_BYTES, FD_BYTES
 
 
 @dataclass(frozen=True)
-class Contract:
+class EmulatedContract:
     """File names within `contract_folder`."""
 
     dbc: str
@@ -25,20 +25,20 @@ class Contract:
 
 
 CONTRACTS = {
-    "arm": Contract("arm.dbc", "drive.eds", "torque_sensor.eds"),
-    "arm_fd": Contract("arm_fd.dbc", "drive_fd.eds", "torque_sensor_fd.eds"),
-    "arm_fd_500us": Contract("arm_fd_500us.dbc", "drive_fd.eds", "torque_sensor_fd.eds"),
-    "arm_stock": Contract("arm_stock.dbc", "stock_drive.eds", "int32_sensor.eds"),
+    "arm": EmulatedContract("arm.dbc", "drive.eds", "torque_sensor.eds"),
+    "arm_fd": EmulatedContract("arm_fd.dbc", "drive_fd.eds", "torque_sensor_fd.eds"),
+    "arm_fd_500us": EmulatedContract("arm_fd_500us.dbc", "drive_fd.eds", "torque_sensor_fd.eds"),
+    "arm_stock": EmulatedContract("arm_stock.dbc", "stock_drive.eds", "int32_sensor.eds"),
 }
 """By the name of the DBC file."""
 
 
-def contract_of(codec: Codec) -> Contract:
+def contract_of(codec: Codec) -> EmulatedContract:
     """Find the contract of a DBC by its file name; any other DBC is played by our own devices."""
     return CONTRACTS.get(codec.path.stem, CONTRACTS["arm_fd" if is_fd(codec) else "arm"])
 
 
-def playable_contract(codec: Codec) -> Contract:
+def playable_contract(codec: Codec) -> EmulatedContract:
     """Find the contract with the layout of a DBC, wherever its nodes are. Raises ConfigError when there is none."""
     for contract in CONTRACTS.values():
         if codec.path == contract.path:
@@ -63,9 +63,3 @@ def is_fd(codec: Codec) -> bool:
 def longest_pdo(codec: Codec) -> int:
     """Return how many bytes a PDO may have on this contract's bus."""
     return FD_BYTES if is_fd(codec) else CLASSIC_BYTES
-
-
-def answers_to_sync(codec: Codec) -> frozenset[int]:
-    """Name the identifiers that the devices of a contract send on every SYNC. Raises CodecError."""
-    names = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
-    return frozenset(codec.message(name).can_id for name in names)

@@ -18,9 +18,8 @@ from canopen.sdo.server import SdoServer
 
 Send = Callable[[int, bytes], None]
 
-NEVER_NS = 1 << 62
-"""Later than any time: nothing is due."""
-
+NOT_VALID = 1 << 31
+"""Bit of a COB-ID entry: the object is off."""
 _FIRST_INDEX = 0x1000  # below are data types: dummy mapping entries, no objects
 _FORMATS = {
     datatypes.BOOLEAN: "B",
@@ -75,7 +74,7 @@ def one_of(*allowed: int) -> Callable[[int], None]:
     return check
 
 
-class Variable(NamedTuple):
+class DictionaryVariable(NamedTuple):
     """What mapping and access rules say of one numeric object. `format`: of `struct`, empty when it isn't a number."""
 
     bits: int
@@ -85,7 +84,7 @@ class Variable(NamedTuple):
     is_writable: bool
 
 
-class _Network(canopen.Network):
+class _SilentNetwork(canopen.Network):
     """A network without bus and threads: what a node sends goes to a function."""
 
     def __init__(self, send: Send) -> None:
@@ -108,7 +107,7 @@ class _Network(canopen.Network):
 class _Server(SdoServer):
     """canopen's SDO server, one transfer at a time: a segment that belongs to none is refused, lengths are held to."""
 
-    def __init__(self, node: "_Node") -> None:
+    def __init__(self, node: "_DictionaryNode") -> None:
         node_id = int(node.id or 0)
         super().__init__(0x600 + node_id, 0x580 + node_id, node)  # type: ignore[no-untyped-call]
         self._local = node
@@ -196,7 +195,7 @@ def _read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
     return canopen.import_od(str(path), node_id)
 
 
-class _Node(canopen.LocalNode):
+class _DictionaryNode(canopen.LocalNode):
     """canopen's local node with strict sub-indices and without its own heartbeat."""
 
     def __init__(self, node_id: int, eds_path: Path) -> None:
@@ -228,8 +227,8 @@ class ObjectDictionary:
         self.is_locked: Callable[[int, int], bool] = lambda _index, _subindex: False
         """Whether the state of the device forbids SDO to write an object now."""
         self._is_requested = False  # an SDO request is in progress
-        self._node = _Node(node_id, eds_path)
-        self._node.associate_network(_Network(send))
+        self._node = _DictionaryNode(node_id, eds_path)
+        self._node.associate_network(_SilentNetwork(send))
         self._node.add_read_callback(self._read)  # type: ignore[no-untyped-call]
         self._node.add_write_callback(self._write)  # type: ignore[no-untyped-call]
 
@@ -252,11 +251,11 @@ class ObjectDictionary:
             return 0
         return len(self.objects[index])
 
-    def find(self, index: int, subindex: int) -> Variable:
+    def find(self, index: int, subindex: int) -> DictionaryVariable:
         """Describe an object; an absent one refuses the SDO request in progress."""
         found = self._node._find_object(index, subindex)
         access = found.access_type
-        return Variable(
+        return DictionaryVariable(
             bits=len(found),
             format=_FORMATS.get(found.data_type or 0, ""),
             is_mappable=bool(found.pdo_mappable),

@@ -16,7 +16,8 @@ from typing import Protocol
 
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.e2e import E2eStatus
-from firmware_sim.canopen.object_dictionary import NEVER_NS, ObjectDictionary, Send
+from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.canopen.object_dictionary import ObjectDictionary, Send
 from firmware_sim.canopen.pdo_record import EVENT_DRIVEN, PdoRecord
 
 RECEIVE, TRANSMIT = 0x1400, 0x1800

@@ -1,21 +1,22 @@
-"""Communication and mapping record of one PDO: what a master may write when.
+"""Communication and mapping record of one PDO: what a master may write when, and where objects lie in the frame.
 
 A PDO is written while it is invalid (bit 31 of its COB-ID): number of entries to 0, entries, number of entries, valid.
-Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38, and table 34 (restricted identifiers).
+A mapping that begins with the end-to-end header's objects makes protected frames. Dummy entries (data types instead of
+objects) leave gaps in frames that are received. Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38, and table 34 (restricted
+identifiers).
 """
 
+import struct
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
 from adacd_hil.wire.codec import MessageCodec
-from firmware_sim.canopen.mapping_objects import NOTHING, check_entry, lay_out
-from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, refuse
+from firmware_sim.canopen.object_dictionary import NOT_VALID, Abort, ObjectDictionary, refuse
 
 EVENT_DRIVEN = (254, 255)
 """Transmission types."""
 _TYPES = (*range(241), *EVENT_DRIVEN)
-_NOT_VALID = 1 << 31  # of a COB-ID
 _IS_EXTENDED = 1 << 29
 _MAPPING = 0x200  # from a communication record to its mapping record
 
@@ -53,7 +54,7 @@ class PdoRecord(ABC):
         self._owner = owner
         self.message = message
         self.can_id = dictionary.value(index, 1) & 0x7FF
-        self._is_valid = not dictionary.value(index, 1) & _NOT_VALID
+        self._is_valid = not dictionary.value(index, 1) & NOT_VALID
         self.type = dictionary.value(index, 2)
         self.inhibit_ns = dictionary.value_or(0, index, 3) * 100_000
         self.timer_ns = dictionary.value_or(0, index, 5) * 1_000_000
@@ -96,12 +97,12 @@ class PdoRecord(ABC):
             refuse(Abort.VALUE_RANGE)
         if self.is_received and can_id not in LISTENED_IDS:
             refuse(Abort.VALUE_RANGE)
-        if self._is_valid and not value & _NOT_VALID and can_id != self.can_id:
+        if self._is_valid and not value & NOT_VALID and can_id != self.can_id:
             refuse(Abort.DEVICE_STATE)
 
     def _identify(self, value: int) -> None:
         self.can_id = value & 0x7FF
-        self._is_valid = not value & _NOT_VALID
+        self._is_valid = not value & NOT_VALID
         self._owner.refresh()
 
     def _set_type(self, value: int) -> None:
@@ -172,3 +173,74 @@ def _header_bytes(message: MessageCodec) -> int:
 def _check_type(value: int) -> None:
     if value not in _TYPES:
         refuse(Abort.VALUE_RANGE)
+
+
+CLASSIC_BYTES, FD_BYTES = 8, 64
+_FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
+
+_HEADERS = {
+    2: ((0x2100, 1), (0x2100, 2)),  # AUTOSAR Profile 2: CRC; counter and status
+    4: ((0x2101, 1), (0x2101, 2), (0x2101, 3)),  # Profile 5: CRC, counter, status
+}
+_HEADER_OBJECTS = {key for keys in _HEADERS.values() for key in keys}
+
+
+class MappingEntry(NamedTuple):
+    """One mapping entry: index << 16 | sub-index << 8 | bits."""
+
+    key: tuple[int, int]
+    bits: int
+
+
+class PdoLayout(NamedTuple):
+    """What a frame holds: header_bytes, then `packing` with the values of `keys`, then padding up to `length`."""
+
+    keys: tuple[tuple[int, int], ...]
+    packing: struct.Struct
+    header_bytes: int
+    length: int
+
+
+NOTHING = PdoLayout((), struct.Struct("<"), 0, 0)
+
+
+def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> str:
+    """Refuse what can't be mapped in this direction; return the entry's `struct` format."""
+    (index, subindex), bits = decode_entry(value)
+    dummy_bits = dictionary.dummy_bits(index)
+    if dummy_bits:
+        if not is_received or subindex != 0 or bits != dummy_bits:
+            refuse(Abort.NOT_MAPPABLE)
+        return f"{bits // 8}x"
+    variable = dictionary.find(index, subindex)
+    is_reachable = variable.is_writable if is_received else variable.is_readable
+    is_number = variable.format != "" and variable.bits % 8 == 0
+    if not (variable.is_mappable and is_reachable and is_number) or bits != variable.bits:
+        refuse(Abort.NOT_MAPPABLE)
+    return variable.format
+
+
+def decode_entry(value: int) -> MappingEntry:
+    """Take an entry apart."""
+    return MappingEntry((value >> 16, value >> 8 & 0xFF), value & 0xFF)
+
+
+def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bool, longest: int) -> PdoLayout:
+    """Place the mapped objects in a frame of at most `longest` bytes; refuse a mapping that can't be.
+
+    A header must lead and be whole. Frames of more than 8 bytes have one of CAN FD's lengths.
+    """
+    formats = [check_entry(dictionary, value, is_received) for value in values]
+    entries = [decode_entry(value) for value in values]
+    size = sum(entry.bits for entry in entries) // 8
+    if size > longest:
+        refuse(Abort.PDO_TOO_LONG)
+    keys = [entry.key for entry in entries]
+    header_bytes = next((n for n, header in _HEADERS.items() if tuple(keys[: len(header)]) == header), 0)
+    skipped = len(_HEADERS[header_bytes]) if header_bytes else 0
+    if any(key in _HEADER_OBJECTS for key in keys[skipped:]):
+        refuse(Abort.INCOMPATIBLE)
+    length = size if size <= CLASSIC_BYTES else next(n for n in _FD_LENGTHS if n >= size)
+    packing = struct.Struct("<" + "".join(formats[skipped:]) + f"{length - size}x")
+    mapped = tuple(key for key in keys[skipped:] if not dictionary.dummy_bits(key[0]))
+    return PdoLayout(mapped, packing, header_bytes, length)

@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
-from adacd_hil.given_path import WrittenPath
+from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.log.editing.attached import run_metadata
 from adacd_hil.log.errors import LogError, LogExistsError
 from adacd_hil.log.run_folder import TRUTH_NAME, check_free
 from adacd_hil.output_files import in_words, tidied
@@ -21,22 +22,22 @@ from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line, open_terminals
 from adacd_hil.wire.bus import BusError, BusMissingError
-from adacd_hil.wire.codec import CodecError, load_codec
-from adacd_hil.wire.node_offset import move_contract
+from adacd_hil.wire.codec import Codec, CodecError, load_codec
+from adacd_hil.wire.node_offset import HOST_NODE, move_contract
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.injector import OnEvent
-from firmware_sim.bench.truth import TruthLog
+from firmware_sim.bench.outbox import Departure
+from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
+from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.canopen.contracts import CONTRACTS
-from firmware_sim.cli.departure import Departure
-from firmware_sim.cli.emulator_options import on_bus
-from firmware_sim.cli.emulator_play import play
+from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.scenario_list import as_text, check, describe_all, show, show_as_table
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 
-class ExitCode(IntEnum):
+class EmulatorExit(IntEnum):
     """What the exit statuses mean."""
 
     OK = 0
@@ -50,19 +51,62 @@ EPILOG = (
     "2 wrong usage or configuration; 5 bus missing."
 )
 
-_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
-    (click.ClickException, ExitCode.USAGE),
-    (ConfigError, ExitCode.USAGE),
-    (CodecError, ExitCode.USAGE),
-    (BusMissingError, ExitCode.BUS_MISSING),
-    (BusError, ExitCode.FAILURE),
-    (LogExistsError, ExitCode.USAGE),
-    (LogError, ExitCode.FAILURE),
-    (OSError, ExitCode.FAILURE),
+_CODES: tuple[tuple[type[Exception], EmulatorExit], ...] = (
+    (click.ClickException, EmulatorExit.USAGE),
+    (ConfigError, EmulatorExit.USAGE),
+    (CodecError, EmulatorExit.USAGE),
+    (BusMissingError, EmulatorExit.BUS_MISSING),
+    (BusError, EmulatorExit.FAILURE),
+    (LogExistsError, EmulatorExit.USAGE),
+    (LogError, EmulatorExit.FAILURE),
+    (OSError, EmulatorExit.FAILURE),
 )
 
 
 _CONTEXT = {"auto_envvar_prefix": "FIRMWARE_SIM", "help_option_names": ["-h", "--help"]}
+
+
+_DEVICES = 4
+_OPTIONS = (  # last first: click lists them the other way round
+    click.option(
+        "--clock",
+        "clock_mode",
+        type=click.Choice(get_args(ClockMode)),
+        default="sync",
+        show_default=True,
+        help="sync: the arm's time goes by SYNC. wall: by the clock, and the drives watch for SYNC.",
+    ),
+    click.option(
+        "--host-node",
+        type=click.IntRange(1, 127),
+        default=HOST_NODE,
+        show_default=True,
+        help="Node id of the arm's host: bus.host_node of its configuration.",
+    ),
+    click.option(
+        "--node-offset",
+        type=click.IntRange(0, LAST_NODE - _DEVICES),
+        default=0,
+        show_default=True,
+        help="Added to the devices' node ids: another arm on the bus.",
+    ),
+    click.option(
+        "--contract",
+        type=click.Choice(list(CONTRACTS)),
+        default="arm",
+        show_default=True,
+        help="Which devices: DBC and EDS files of this name.",
+    ),
+    click.option("-c", "--channel", required=True, help="Channel of the interface, such as vcan0."),
+    click.option("-i", "--interface", required=True, help="python-can interface, such as socketcan."),
+)
+
+
+def on_bus(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of the bus and of the devices on it."""
+    for option in _OPTIONS:
+        command = option(command)
+    return command
 
 
 @click.group(epilog=EPILOG, context_settings=_CONTEXT)
@@ -133,6 +177,64 @@ def run(
         return _report(bench, resolved, clock_mode, truth, as_json)
 
 
+@cli.command(
+    "play",
+    epilog="Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus failed, the recording is "
+    "damaged or of another contract); 2 wrong usage; 5 bus missing.",
+)
+@click.argument("log", type=GivenPath(dir_okay=False))
+@on_bus
+@click.option(
+    "--answers-only", is_flag=True, help="Leave the answers to SYNC to somebody else on the bus, such as canplayer."
+)
+@click.option("--once", "is_once", is_flag=True, help="End with the first host that starts the nodes and goes.")
+@click.option("--json", "as_json", is_flag=True, help="Print how it went as JSON on stdout.")
+def play(
+    log: Path,
+    interface: str,
+    channel: str,
+    contract: str,
+    node_offset: int,
+    host_node: int,
+    clock_mode: ClockMode,
+    answers_only: bool,
+    is_once: bool,
+    as_json: bool,
+) -> int:
+    """Play the devices of a recording: on each SYNC the frames that answered it then; all else is answered live.
+
+    Reads MCAP, candump .log, BLF, ASC, MF4, TRC and CSV. What the host commands moves nothing. After the recording's
+    last cycle SYNC is no longer answered. Prints "ready" on stderr once the nodes have announced themselves.
+    """
+    chosen = CONTRACTS[contract]
+    codec = move_contract(load_codec(chosen.path), node_offset, host_node)
+    _check_contract(log, codec)
+    cycles = None if answers_only else RecordedCycles(log, codec)
+    clock = MonotonicClock()
+    with ExitStack() as stack:
+        bus = open_devices_end(interface, channel, clock, codec)
+        stack.callback(bus.close)
+        stop = stack.enter_context(stop_by_signal())
+        departure = Departure(bus)
+        bench = RecordedBench(
+            load_scenario("idle"),
+            codec,
+            departure.send,
+            cycles,
+            clock_mode=clock_mode,
+            contract=chosen,
+            on_answer=departure.go,
+        )
+        service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
+        for line in request_realtime().missing:
+            _complain(f"not granted: {line}")
+        freeze_garbage()
+        service.boot()
+        print("ready", file=sys.stderr, flush=True)
+        service.run()
+        return _report_played(bench, cycles, as_json)
+
+
 @cli.command("list", epilog=EPILOG)
 @click.option("--json", "as_json", is_flag=True, help="Print the list as JSON.")
 def list_scenarios(as_json: bool) -> int:
@@ -142,7 +244,7 @@ def list_scenarios(as_json: bool) -> int:
         print(json.dumps(described, indent=2, ensure_ascii=False))
     else:
         print(as_text([("name", "group", "about"), *((row["name"], row["group"], row["about"]) for row in described)]))
-    return ExitCode.OK
+    return EmulatorExit.OK
 
 
 @cli.command("show", epilog=EPILOG)
@@ -158,7 +260,7 @@ def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int 
         print(json.dumps(show_as_table(resolved, is_whole), indent=2, ensure_ascii=False))
     else:
         print(show(resolved, is_whole), end="")
-    return ExitCode.OK
+    return EmulatorExit.OK
 
 
 @cli.command("check", epilog="Exit status: 0 every file can be played; 2 one can't.")
@@ -175,10 +277,7 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
         print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
     else:
         print("\n".join(in_line(line) for finding in findings for line in finding.lines))
-    return ExitCode.USAGE if any(finding.problems for finding in findings) else ExitCode.OK
-
-
-cli.add_command(play)
+    return EmulatorExit.USAGE if any(finding.problems for finding in findings) else EmulatorExit.OK
 
 
 def _stamp_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> Callable[[int, int, Vector], None]:
@@ -206,7 +305,9 @@ def _make_folder(path: Path) -> None:
         raise ConfigError(f"--out {path} can't be made a folder: {error.strerror}") from None
 
 
-def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool) -> ExitCode:
+def _report(
+    bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool
+) -> EmulatorExit:
     """Print how it went, having closed the truth log."""
     described: dict[str, Any] = {
         "scenario": scenario.name,
@@ -218,7 +319,7 @@ def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: Trut
         "drive_states": [drive.state.value for drive in bench.drives],
         "error_codes": [drive.error_code for drive in bench.drives],
     }
-    code = ExitCode.OK
+    code = EmulatorExit.OK
     if truth is not None:
         summary = truth.close()
         is_empty = not summary.messages and summary.is_complete  # no host came
@@ -231,10 +332,38 @@ def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: Trut
         }
         if not summary.is_complete:
             _complain(summary.error or f"{summary.path} lacks {summary.dropped} cycles: the disk was too slow")
-            code = ExitCode.FAILURE
+            code = EmulatorExit.FAILURE
     if as_json:
         print(json.dumps(described))
     return code
+
+
+def _check_contract(log: Path, codec: Codec) -> None:
+    """Raise LogError when a log of ours says that it was recorded with another contract."""
+    digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
+    own = f"0x{codec.layout_digest:08X}"
+    if digest and digest.casefold() != own.casefold():
+        raise LogError(
+            f"{log} was recorded with another contract: layout digest {digest}, here {own}; "
+            "see --contract, --node-offset and --host-node"
+        )
+
+
+def _report_played(bench: RecordedBench, cycles: RecordedCycles | None, as_json: bool) -> int:
+    problem = "" if cycles is None else cycles.problem
+    if problem:
+        _complain(problem)
+    if as_json:
+        described = {
+            "cycles": bench.cycle + 1,
+            "answered": 0 if cycles is None else cycles.answered,
+            "is_over": cycles is not None and cycles.is_over,
+            "drive_states": [drive.state.value for drive in bench.drives],
+            "rejected_commands": [drive.rejected_commands for drive in bench.drives],
+            "problem": problem,
+        }
+        print(json.dumps(described))
+    return EmulatorExit.FAILURE if problem else EmulatorExit.OK
 
 
 def _complain(line: str) -> None:
@@ -250,9 +379,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         code = cli.main(arguments, prog_name="firmware-sim", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
-        code = ExitCode.USAGE
+        code = EmulatorExit.USAGE
     except (click.Abort, KeyboardInterrupt):
-        code = ExitCode.OK
+        code = EmulatorExit.OK
     except tuple(kind for kind, _ in _CODES) as error:
         _complain(error.format_message() if isinstance(error, click.ClickException) else in_words(error))
         code = next(code for kind, code in _CODES if isinstance(error, kind))

@@ -8,14 +8,12 @@ from typing import Any
 from adacd_hil.settings.schema import ConfigError, find_problems
 from adacd_hil.settings.toml_files import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
-from firmware_sim.bench.fault_plan import FaultPlan
+from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS, FaultPlan
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table
-
-_PLANNED_PERIOD_NS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Finding:
+class ScenarioFinding:
     """What a check of one file came to. `problems`: one line each; `checked`: what was looked at, if all is good."""
 
     file: str
@@ -63,21 +61,21 @@ def show_as_table(scenario: Scenario, is_whole: bool) -> dict[str, Any]:
     return tomllib.loads(show(scenario, is_whole))
 
 
-def check(file: str, codec: Codec) -> Finding:
+def check(file: str, codec: Codec) -> ScenarioFinding:
     """Look for everything that keeps a scenario from being played under a contract."""
     try:
         table = read_table(file)
     except ConfigError as error:
-        return Finding(file, (_in_file(str(error), file),))
+        return ScenarioFinding(file, (_in_file(str(error), file),))
     problems = find_problems(Scenario, table)
     if problems:
-        return Finding(file, tuple(problems))
+        return ScenarioFinding(file, tuple(problems))
     scenario = load_scenario(file)
     try:
-        FaultPlan(scenario.faults, scenario.seed, _PLANNED_PERIOD_NS, codec)
+        FaultPlan(scenario.faults, scenario.seed, PLANNED_PERIOD_NS, codec)
     except ConfigError as error:
-        return Finding(file, (str(error),))
-    return Finding(file, (), _checked(scenario, codec))
+        return ScenarioFinding(file, (str(error),))
+    return ScenarioFinding(file, (), _checked(scenario, codec))
 
 
 def _in_file(problem: str, file: str) -> str:

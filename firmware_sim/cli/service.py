@@ -9,12 +9,11 @@ from adacd_hil.clock import Clock
 from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS
 from firmware_sim.bench.bench import LONGEST_ORPHANAGE_NS, Bench, ClockMode
+from firmware_sim.bench.outbox import Departure
 from firmware_sim.canopen.contracts import is_fd
-from firmware_sim.canopen.object_dictionary import NEVER_NS
 from firmware_sim.canopen.pdo_record import LISTENED_IDS
-from firmware_sim.canopen.time_marks import HOST_MARK
-from firmware_sim.cli.departure import Departure
 
 _IDLE_NS = 10_000_000  # without SYNC for this long, timers go by the clock: heartbeats before and between runs
 _LONGEST_WAIT_NS = 50_000_000  # how soon a signal is noticed on a silent bus

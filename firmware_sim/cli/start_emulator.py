@@ -6,7 +6,7 @@ from typing import NoReturn
 from adacd_hil.start import start_program
 
 INTERRUPTED = 0
-"""`firmware_sim.cli.emulator_main.ExitCode.OK`, which takes numpy to import: the emulator is ended by Ctrl-C."""
+"""`firmware_sim.cli.emulator_main.EmulatorExit.OK`, which takes numpy to import: the emulator is ended by Ctrl-C."""
 
 
 def start_emulator() -> NoReturn:

@@ -5,20 +5,18 @@ the bench's time; what a device and its application tell each other is in the ti
 Source: CiA 301, 7.2 (services), 7.3 (NMT), 7.5.2.32 (0x1029, error behaviour).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from pathlib import Path
 from typing import Protocol
 
 from adacd_hil.wire.codec import MessageCodec
-from firmware_sim.canopen.emergency_objects import ErrorReporter
-from firmware_sim.canopen.heartbeat_objects import HeartbeatConsumer, HeartbeatProducer
-from firmware_sim.canopen.mapping_objects import CLASSIC_BYTES
-from firmware_sim.canopen.node_clock import NodeClock
+from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.canopen.error_control import ErrorReporter, HeartbeatConsumer, HeartbeatProducer, Watchdog, Watchdogs
 from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, refuse
 from firmware_sim.canopen.pdo import Pdos, PdoUser
+from firmware_sim.canopen.pdo_record import CLASSIC_BYTES
 from firmware_sim.canopen.sync_order import SyncCounts, SyncKind
-from firmware_sim.canopen.watchdogs import Watchdog, Watchdogs
 
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
 _RECOVERED_FROM_BUS_OFF = 0x8140
@@ -70,7 +68,7 @@ class Application(PdoUser, Protocol):
         """Begin anew: communication only, or all of the device."""
 
 
-class Device(ObjectDictionary):
+class EmulatedDevice(ObjectDictionary):
     """A CANopen device: everything but what its application does."""
 
     def __init__(
@@ -306,3 +304,102 @@ class Device(ObjectDictionary):
             self.sync_counts.reset()
         if self._application is not None:
             self._application.restart(is_node_reset)
+
+
+_BILLION = 1_000_000_000
+
+
+class NodeClock:
+    """A device's own clock: that of the bench, until it is set to run fast or slow.
+
+    Everything that a device times goes by it: heartbeats, event timers, inhibit times, watchdogs, the time in an EMCY.
+    Both times are integer ns. A clock that drifts no more keeps the lead that it has.
+    """
+
+    def __init__(self) -> None:
+        self.is_true = True
+        """Whether it is the bench's time."""
+        self._since_ns = self._own_since_ns = 0
+        self._rate = _BILLION  # own ns in a second of the bench
+
+    def set_drift(self, drift_ppm: float, t_ns: int) -> None:
+        """Run fast by `drift_ppm` from the bench's `t_ns` on."""
+        self._own_since_ns = self.own_ns(t_ns)
+        self._since_ns = t_ns
+        self._rate = _BILLION + round(drift_ppm * 1000)
+        self.is_true = self._rate == _BILLION and self._own_since_ns == t_ns
+
+    def own_ns(self, t_ns: int) -> int:
+        """Return the device's time."""
+        if self.is_true:
+            return t_ns
+        return self._own_since_ns + (t_ns - self._since_ns) * self._rate // _BILLION
+
+    def bench_ns(self, own_ns: int) -> int:
+        """Return the first time of the bench at which the device's is `own_ns`."""
+        if self.is_true or own_ns >= NEVER_NS:
+            return own_ns
+        return self._since_ns - (own_ns - self._own_since_ns) * _BILLION // -self._rate
+
+
+class SyncListeners:
+    """All devices of a bench. A SYNC in its place costs nothing here."""
+
+    def __init__(self, devices: Sequence[EmulatedDevice]) -> None:
+        self._devices = devices
+        self.everybody = (1,) * len(devices)
+        """Every device, once each."""
+        self._nobody = (0,) * len(devices)
+        self._unheard = [0] * len(devices)
+        self._takers: dict[int, tuple[int, ...]] = {}
+        self.overflow = _LONGEST_OVERFLOW
+        """The last SYNC counter before 1."""
+        self.is_remembering = False
+        """Whether a device remembers a SYNC that was odd or lost, and wants to be told of right ones, too."""
+        for device in devices:
+            device.watch(0x1019, 0, lambda _: self._sort())
+        self._sort()
+
+    def restart(self) -> None:
+        """Take the next SYNC for the first."""
+        self._unheard = [0] * len(self._devices)
+
+    def takers(self, data: bytes) -> tuple[int, ...]:
+        """Give 1 for each device that takes SYNCs of this length, by its 0x1019; else 0."""
+        return self._takers.get(len(data), self._nobody)
+
+    def tell(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
+        """Tell what a SYNC is and how many were lost before it. `heard`: how often each device hears it."""
+        for place, device in enumerate(self._devices):
+            self._unheard[place] += lost
+            if heard[place] == 0:
+                self._unheard[place] += 1
+                continue
+            device.note_sync(kind if takers[place] else SyncKind.WRONG_LENGTH, self._unheard[place], t_ns)
+            self._unheard[place] = 0
+            for _ in range(heard[place] - 1):
+                device.note_sync(SyncKind.REPEATED, 0, t_ns)
+        self._remember()
+
+    def ignore(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, t_ns: int) -> None:
+        """Tell what a SYNC is that nobody answers."""
+        for place, device in enumerate(self._devices):
+            for _ in range(heard[place]):
+                device.note_sync(kind if takers[place] else SyncKind.WRONG_LENGTH, 0, t_ns)
+        self._remember()
+
+    def miss(self, count: int) -> None:
+        """Keep SYNCs from all devices."""
+        self._unheard = [unheard + count for unheard in self._unheard]
+        self._remember()
+
+    def _remember(self) -> None:
+        self.is_remembering = any(self._unheard) or any(device.is_sync_odd for device in self._devices)
+
+    def _sort(self) -> None:
+        overflows = [device.sync_overflow for device in self._devices]
+        self._takers = {
+            0: tuple(int(not overflow) for overflow in overflows),
+            1: tuple(int(overflow != 0) for overflow in overflows),
+        }
+        self.overflow = next((overflow for overflow in overflows if overflow), _LONGEST_OVERFLOW)

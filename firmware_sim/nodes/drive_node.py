@@ -17,14 +17,25 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from adacd_hil.wire.codec import Codec
-from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S
-from firmware_sim.body.body import DriveMode
-from firmware_sim.canopen.object_dictionary import NEVER_NS, Abort, one_of, refuse
-from firmware_sim.canopen.watchdogs import ERROR_CODES, WARNINGS, Watchdog
-from firmware_sim.nodes.device import Device
-from firmware_sim.nodes.drive_states import STATE_BITS, DriveEvent, DriveState, decode_command, find_transition
-from firmware_sim.nodes.drive_stops import DISABLE, FAULT_REACTIONS, QUICK_STOPS, RAMPS, Standstill, Stop
-from firmware_sim.nodes.torque_limits import TorqueLimits
+from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
+from firmware_sim.canopen.error_control import ERROR_CODES, WARNINGS, Watchdog
+from firmware_sim.canopen.object_dictionary import Abort, one_of, refuse
+from firmware_sim.nodes.device import EmulatedDevice
+from firmware_sim.nodes.drive_profile import (
+    DISABLE,
+    FAULT_REACTIONS,
+    QUICK_STOPS,
+    RAMPS,
+    STATE_BITS,
+    DriveEvent,
+    DriveState,
+    Standstill,
+    Stop,
+    TorqueLimits,
+    decode_command,
+    find_transition,
+)
 
 CYCLIC_SYNCHRONOUS_TORQUE = 10
 _NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
@@ -60,7 +71,13 @@ class DriveNode:
     """One drive on the bus. `motor_mode` and `torque_Nm` are what its motor is told until the next SYNC."""
 
     def __init__(
-        self, device: Device, codec: Codec, number: int, motor: Motor, rated_torque_Nm: float, is_free_running: bool
+        self,
+        device: EmulatedDevice,
+        codec: Codec,
+        number: int,
+        motor: Motor,
+        rated_torque_Nm: float,
+        is_free_running: bool,
     ) -> None:
         """Connect the node to its device.
 

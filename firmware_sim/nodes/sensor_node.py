@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 from adacd_hil.wire.codec import Codec
 from firmware_sim.arm.sensing import TORQUE_COUNTS, TORQUE_LSB_NM
+from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, refuse
-from firmware_sim.canopen.watchdogs import Watchdog
-from firmware_sim.nodes.device import Device
+from firmware_sim.nodes.device import EmulatedDevice
 
 STATUS_NOT_VALID = 0x01
 STATUS_POSITIVE_OVERLOAD = 0x02
@@ -35,7 +35,7 @@ class SensorNode:
 
     def __init__(
         self,
-        device: Device,
+        device: EmulatedDevice,
         codec: Codec,
         number: int,
         converter_ends: tuple[int, int] = TORQUE_COUNTS,

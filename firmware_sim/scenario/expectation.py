@@ -82,7 +82,7 @@ _COUNTS: Final = ("contacts", "false_alarms", "missed")
 _TROUBLES: Final = (("false_alarms", "false"), ("missed", "missed"))
 
 
-class Outcome(NamedTuple):
+class ScenarioOutcome(NamedTuple):
     """What a run came to, named as in `ExpectSettings`. Times since motion start; None: there is none."""
 
     end: str
@@ -109,7 +109,7 @@ class Outcome(NamedTuple):
         ).text
 
 
-def deviations(expect: ExpectSettings, outcome: Outcome) -> tuple[str, ...]:
+def deviations(expect: ExpectSettings, outcome: ScenarioOutcome) -> tuple[str, ...]:
     """Say, a line each, where a run differs from what was expected; nothing where it doesn't."""
     found = []
     for key in ("end", "fault", "adaptations"):

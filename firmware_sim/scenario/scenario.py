@@ -17,11 +17,10 @@ import numpy as np
 from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
-from firmware_sim.arm.arms import ARMS, Arm
-from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.arms import ARMS, ArmProfile
+from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.mechanics_settings import MechanicsSettings, PayloadBody
 from firmware_sim.arm.scripted_contact import ContactSettings, ticks
-from firmware_sim.arm.sensor_settings import SensorSettings
 from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
 from firmware_sim.scenario.expectation import ExpectSettings
 from firmware_sim.scenario.faults import FaultSettings, check_rows
@@ -134,7 +133,7 @@ class Scenario:
         return own or self.expect
 
     @property
-    def arm(self) -> Arm:
+    def arm(self) -> ArmProfile:
         """The arm of this profile."""
         return ARMS[self.profile]
 

@@ -19,7 +19,7 @@ from adacd_hil.log.errors import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.stretch import Stretch, begin_of_log
 from adacd_hil.records import FaultReason, SchemeState
-from firmware_sim.bench.truth import TruthLog
+from firmware_sim.bench.truth_log import TruthLog
 
 pytestmark = pytest.mark.slow
 

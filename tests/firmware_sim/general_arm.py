@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.mechanics import gravity_torque, integrate_mechanics, observe, work_space
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import (
@@ -47,12 +47,12 @@ def run_arm(
             history[index, place] = state[place]
 
 
-def without_friction(name: str = "S") -> Arm:
+def without_friction(name: str = "S") -> ArmProfile:
     """Nor any stops in its way."""
     return dataclasses.replace(ARMS[name], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0), stop_deg=(1e6, 1e6))
 
 
-def one_joint(coulomb_Nm: float = 0.0, viscous_Nm_s: float = 0.0) -> tuple[Arm, float]:
+def one_joint(coulomb_Nm: float = 0.0, viscous_Nm_s: float = 0.0) -> tuple[ArmProfile, float]:
     """An arm whose elbow is locked by friction, and the inertia about its shoulder with the elbow stretched.
 
     It turns as far as it is driven.
@@ -73,7 +73,7 @@ class GeneralArm:
 
     def __init__(
         self,
-        arm: Arm,
+        arm: ArmProfile,
         settings: MechanicsSettings,
         q=(0.0, 0.0),
         dq=(0.0, 0.0),

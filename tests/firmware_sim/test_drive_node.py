@@ -23,7 +23,7 @@ from bench_host import (
     set_mode,
 )
 
-from firmware_sim.nodes.drive_states import TRANSITIONS, DriveEvent, DriveState, decode_command, find_transition
+from firmware_sim.nodes.drive_profile import TRANSITIONS, DriveEvent, DriveState, decode_command, find_transition
 
 S, E = DriveState, DriveEvent
 NEGATIVE_RATED_TORQUE = -1000

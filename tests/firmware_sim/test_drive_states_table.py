@@ -2,7 +2,7 @@
 
 import pytest
 
-from firmware_sim.nodes.drive_states import STATE_BITS, DriveEvent, DriveState, decode_command
+from firmware_sim.nodes.drive_profile import STATE_BITS, DriveEvent, DriveState, decode_command
 
 S, E = DriveState, DriveEvent
 

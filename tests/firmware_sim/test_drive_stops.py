@@ -3,7 +3,7 @@
 import pytest
 from bench_host import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, BenchHost, remap_mode, set_mode
 
-from firmware_sim.body.body import DriveMode
+from firmware_sim.arm.sensing import DriveMode
 
 DISABLED, READY, SWITCHED_ON, ENABLED, STOPPING, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 SLOWLY, RAMP, HARD = DriveMode.BRAKE_SLOWLY, DriveMode.BRAKE, DriveMode.BRAKE_HARD

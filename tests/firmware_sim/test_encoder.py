@@ -7,10 +7,10 @@ import pytest
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
-from firmware_sim.arm.sensing import POSITION_LSB_RAD, to_counts
-from firmware_sim.arm.sensor_settings import SensorSettings
-from firmware_sim.body.body import Body, DriveMode
-from firmware_sim.body.encoder import NOISE_TICKS, encoder_numbers, read_angle
+from firmware_sim.arm.device_settings import SensorSettings
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, DriveMode, to_counts
+from firmware_sim.body.body import Body
+from firmware_sim.body.sensors import NOISE_TICKS, encoder_numbers, read_angle
 from firmware_sim.scenario.scenario import Scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)

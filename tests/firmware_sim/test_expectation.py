@@ -3,13 +3,13 @@
 import pytest
 
 from adacd_hil.settings.schema import ConfigError, parse
-from firmware_sim.scenario.expectation import ExpectSettings, Outcome, deviations
+from firmware_sim.scenario.expectation import ExpectSettings, ScenarioOutcome, deviations
 from firmware_sim.scenario.scenario import Scenario
 
 EXPECTED = ExpectSettings(
     adaptations=1, contacts=2, false_alarms=1, false_alarms_most=3, adaptation_s=(5.0, 6.0), delay_ms=30.0, force_N=80.0
 )
-AS_EXPECTED = Outcome("finished", None, None, 1, 5.2, 2, 2, 0, 12.0, 60.0)
+AS_EXPECTED = ScenarioOutcome("finished", None, None, 1, 5.2, 2, 2, 0, 12.0, 60.0)
 FEW = {"adaptations": 1, "contacts": 1}
 
 
@@ -46,7 +46,7 @@ def test_bounds_are_inclusive_and_a_delay_needs_a_contact(changes):
 
 def test_a_fault_is_expected_with_its_time():
     expected = ExpectSettings(adaptations=0, contacts=0, end="fault", fault="DRIVE", fault_s=(1.0, 1.2))
-    faulted = Outcome("fault", "DRIVE", 1.1, 0, None, 0, 0, 0, None, 0.0)
+    faulted = ScenarioOutcome("fault", "DRIVE", 1.1, 0, None, 0, 0, 0, None, 0.0)
     assert deviations(expected, faulted) == ()
     assert deviations(expected, faulted._replace(fault_s=1.3)) == ("fault_s: 1.3 s, expected 1 to 1.2 s",)
 

@@ -3,7 +3,7 @@
 import pytest
 from bench_host import ENABLE, PERIOD_NS, BenchHost, quiet_scenario
 
-from firmware_sim.canopen.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 
 ANSWERS = [0x181, 0x182, 0x183, 0x184]
 

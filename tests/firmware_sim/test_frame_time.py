@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adacd_hil.wire.frame_bits import FD_LENGTHS, exact_frame, worst_case_frame
-from firmware_sim.bus.frame_time import exact_time, worst_time
+from adacd_hil.wire.frame_time import exact_time, worst_time
 
 RATE, DATA_RATE = 1_000_000, 5_000_000
 CLASSIC = exact_time(RATE)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from general_arm import GeneralArm, one_joint
 
+from firmware_sim.arm.joint_mechanics import advance_bristle, bristle_rate
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import BRISTLE, DQ, DSHAFT, SHAFT, WARMTH, Q
-from firmware_sim.arm.plant_friction import advance_bristle, bristle_rate
 from firmware_sim.arm.scripted_contact import TICK_S
 
 COULOMB_NM, STATIC_NM, STRIBECK_RAD_S = 0.5, 0.8, 0.1

@@ -7,8 +7,8 @@ import pytest
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
-from firmware_sim.bus.lockstep_bus import LockstepBus
-from firmware_sim.canopen.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from adacd_hil.wire.lockstep_bus import LockstepBus
+from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 
 SYNC, PERIOD_NS = 0x080, 1_000_000
 FRAME_NS = 100_000  # every frame of these tests takes so long

@@ -19,7 +19,8 @@ from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.mechanics_settings import LARGEST_SUBSTEPS, MechanicsSettings
 from firmware_sim.arm.plant import DQ, DSHAFT, MECHANICAL_STATE, Q, accelerate, fit_payload, integrate
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
-from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")

@@ -10,10 +10,11 @@ from bench_host import ENABLE, FAULT_RESET, BenchHost, quiet_scenario
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
-from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.device_settings import DriveSettings
 from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.bench.bench import Bench
-from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.body.body import Body
 from firmware_sim.body.motor import (
     EFFORT,
     available_torque,

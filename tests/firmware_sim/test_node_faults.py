@@ -5,10 +5,9 @@ import struct
 import pytest
 from bench_host import ENABLE, FAULT_RESET, PERIOD_NS, RESET_NODE, START, BenchHost
 
-from firmware_sim.body.body import DriveMode
-from firmware_sim.canopen.node_clock import NodeClock
-from firmware_sim.canopen.object_dictionary import NEVER_NS
-from firmware_sim.nodes.device import NmtState
+from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.nodes.device import NmtState, NodeClock
 
 MS = 1_000_000
 FAULT_BITS, DISABLED_BITS, REACTION_BITS, ENABLED_BITS = 0x08, 0x40, 0x0F, 0x27

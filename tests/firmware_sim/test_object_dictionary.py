@@ -18,7 +18,7 @@ from bench_host import (
 )
 
 from adacd_hil.wire.codec import contract_folder
-from firmware_sim.canopen.watchdogs import Watchdog
+from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.nodes.device import NmtState
 
 NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRITE_ONLY = 0x06020000, 0x06090011, 0x06010002, 0x06010001

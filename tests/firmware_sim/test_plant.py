@@ -9,7 +9,7 @@ import pinocchio
 import pytest
 
 from adacd_hil.compiled import compiled
-from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import (
     DQ,
     MECHANICAL_STATE,
@@ -29,14 +29,14 @@ NOBODY = np.zeros(0)
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 
-def state_of(arm: Arm, q=(0.0, 0.0), dq=(0.0, 0.0), payload_kg=0.0, tau=(0.0, 0.0)) -> np.ndarray:
+def state_of(arm: ArmProfile, q=(0.0, 0.0), dq=(0.0, 0.0), payload_kg=0.0, tau=(0.0, 0.0)) -> np.ndarray:
     state = np.zeros(MECHANICAL_STATE)
     fit_payload(state, arm.numbers(), payload_kg)
     state[Q : Q + 2], state[DQ : DQ + 2], state[TAU : TAU + 2] = q, dq, tau
     return state
 
 
-def without_friction(arm: Arm) -> Arm:
+def without_friction(arm: ArmProfile) -> ArmProfile:
     """Nor any stops in its way."""
     return dataclasses.replace(arm, viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0), stop_deg=(1e6, 1e6))
 
@@ -54,7 +54,7 @@ def kinetic_energy_J(state: np.ndarray) -> float:
     return 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
 
 
-def pinocchio_arm(arm: Arm, payload_kg: float) -> pinocchio.Model:
+def pinocchio_arm(arm: ArmProfile, payload_kg: float) -> pinocchio.Model:
     """Build the arm in an engine that is not ours, in the horizontal plane."""
     model = pinocchio.Model()
     model.gravity = pinocchio.Motion.Zero()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from bench_host import CODEC, DISABLE_VOLTAGE, ENABLE, QUICK_STOP, SHUTDOWN, SWITCH_ON, BenchHost, quiet_scenario
 
-from firmware_sim.canopen.watchdogs import ERROR_CODES, WARNINGS, Watchdog
+from firmware_sim.canopen.error_control import ERROR_CODES, WARNINGS, Watchdog
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
 READY, SWITCHED_ON, ENABLED = 0x21, 0x23, 0x27

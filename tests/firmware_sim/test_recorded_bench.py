@@ -17,9 +17,8 @@ from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
-from firmware_sim.bench.recorded_bench import RecordedBench
-from firmware_sim.bench.recorded_cycles import RecordedCycles
-from firmware_sim.canopen.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
 from firmware_sim.scenario.scenario import load_scenario
 
 SYNC, NMT = 0x080, 0x000

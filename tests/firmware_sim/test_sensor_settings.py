@@ -11,18 +11,18 @@ import pytest
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
-from firmware_sim.arm.drive_settings import DriveSettings
+from firmware_sim.arm.device_settings import DriveSettings, SensorSettings
 from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,
+    DriveMode,
     TorqueNoise,
     to_counts,
     torque_counts,
     track,
 )
-from firmware_sim.arm.sensor_settings import SensorSettings
-from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)

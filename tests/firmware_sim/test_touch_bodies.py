@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from touched_arm import TouchedArm
 
-from firmware_sim.arm.body_regions import BODY_REGIONS
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_torque
 from firmware_sim.arm.touch_forces import (
     ENERGY,
@@ -20,7 +19,7 @@ from firmware_sim.arm.touch_forces import (
     touch_substeps,
     touch_table,
 )
-from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.arm.touch_settings import BODY_REGIONS, BodySettings, HandSettings, WallSettings
 
 POSE = (0.3, 0.7)
 SOFT = {"mass_kg": 1.5, "stiffness_N_m": 2000.0}

@@ -8,12 +8,12 @@ import pytest
 from general_arm import GeneralArm, one_joint, without_friction
 
 from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.joint_mechanics import spring_torque
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.plant import DQ, DSHAFT, JOINT_TORQUE, SHAFT, Q, mass_matrix
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
-from firmware_sim.arm.sensing import POSITION_LSB_RAD
-from firmware_sim.arm.transmission import spring_torque
-from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, DriveMode
+from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from firmware_sim.arm.arms import ARMS, Arm
+from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import COULOMB, DQ, MECHANICAL_STATE, VISCOUS, Q, accelerate, fit_payload, mass_matrix
 from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.touch_forces import (
@@ -63,7 +63,7 @@ class TouchedArm:
     def __init__(self, q=(0.0, 0.0), dq=(0.0, 0.0), motor=(0.0, 0.0), substeps=1, damping=0.0, **scenario) -> None:
         start_deg = tuple(math.degrees(angle) for angle in q)
         self.scenario = Scenario(start_deg=start_deg, **scenario)
-        self.arm: Arm = ARMS[self.scenario.profile]
+        self.arm: ArmProfile = ARMS[self.scenario.profile]
         self.numbers = self.arm.numbers()
         self.numbers[[VISCOUS, VISCOUS + 1, COULOMB, COULOMB + 1]] = damping, damping, 0.0, 0.0
         self.things = touch_table(self.scenario)

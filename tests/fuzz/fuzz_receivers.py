@@ -28,9 +28,9 @@ from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import CodecError, MessageCodec, load_codec
 from adacd_hil.wire.e2e import E2eStatus
+from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.bench.bench import Bench
-from firmware_sim.body.body import DriveMode
-from firmware_sim.nodes.drive_states import DriveState
+from firmware_sim.nodes.drive_profile import DriveState
 from firmware_sim.scenario.scenario import load_scenario
 
 CODEC = load_codec()

@@ -29,7 +29,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.log.reader import topic_bytes
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
-from firmware_sim.nodes.drive_states import DriveState
+from firmware_sim.nodes.drive_profile import DriveState
 
 pytestmark = pytest.mark.slow
 

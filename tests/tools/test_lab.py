@@ -8,7 +8,8 @@ import pytest
 
 from adacd_hil.control.controller import _torque
 from firmware_sim.arm.scripted_contact import ContactSettings
-from firmware_sim.body.body import Body, DriveMode
+from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))

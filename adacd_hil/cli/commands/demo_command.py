@@ -25,7 +25,7 @@ from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.truth import TruthLog
+from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.canopen.contracts import playable_contract
 from firmware_sim.scenario.scenario import Scenario, load_scenario, named_profile
 

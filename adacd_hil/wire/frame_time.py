@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.wire.frame_bits import CLASSIC_BYTES, FD_LENGTHS, unstuffed_fd_bits, worst_case_frame
+from adacd_hil.wire.bus import MAX_STANDARD_ID
+from adacd_hil.wire.frame_bits import CLASSIC_BYTES, CRC15, FD_LENGTHS, TAIL_BITS, unstuffed_fd_bits, worst_case_frame
 
-_CRC15: Final = 0x4599
-_TAIL_BITS: Final = 3 + 7 + 3  # CRC delimiter, acknowledgement, its delimiter; end of frame; intermission
 _HEAD_BITS: Final = 19  # start of frame, identifier, RTR, IDE, r0, DLC
 _EXTENDED_HEAD_BITS: Final = 39  # and SRR, 18 bits more of the identifier, r1
 _FD_HEAD_BITS: Final = 17  # start of frame, identifier, RRS, IDE, FDF, res, BRS
 _FD_CONTROL_BITS: Final = 5  # ESI, DLC
-_MAX_STANDARD_ID: Final = 0x7FF
 
 FrameTime = Callable[[int, bytes], int]
 """Gives the time of a frame on the bus, ns, by identifier and data."""
@@ -41,7 +39,7 @@ def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
         else:
             bit = (crc >> (total + 14 - place)) & 1
         if place < total:
-            crc = ((crc << 1) ^ _CRC15) & 0x7FFF if ((crc >> 14) ^ bit) & 1 else (crc << 1) & 0x7FFF
+            crc = ((crc << 1) ^ CRC15) & 0x7FFF if ((crc >> 14) ^ bit) & 1 else (crc << 1) & 0x7FFF
         count += 1
         if bit == last:
             run += 1
@@ -101,10 +99,10 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
         length = len(data)
         if length <= CLASSIC_BYTES:
             value = int.from_bytes(data, "big", signed=True)
-            if can_id <= _MAX_STANDARD_ID:
-                return bits_to_ns(stuffed(can_id << 7 | length, _HEAD_BITS, value, length) + _TAIL_BITS)
+            if can_id <= MAX_STANDARD_ID:
+                return bits_to_ns(stuffed(can_id << 7 | length, _HEAD_BITS, value, length) + TAIL_BITS)
             head = ((can_id >> 18) << 2 | 3) << 25 | (can_id & 0x3FFFF) << 7 | length
-            return bits_to_ns(stuffed(head, _EXTENDED_HEAD_BITS, value, length) + _TAIL_BITS)
+            return bits_to_ns(stuffed(head, _EXTENDED_HEAD_BITS, value, length) + TAIL_BITS)
         plain = unstuffed_fd_bits(length)
         body = np.frombuffer(data, dtype=np.uint8)
         before, after = _fd_stuff_bits(can_id << 5 | 0b00101, body, FD_LENGTHS.index(length))
@@ -112,10 +110,10 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
 
     def classic(can_id: int, data: bytes, from_bytes: Callable[..., int] = int.from_bytes) -> int:
         length = len(data)
-        if length > CLASSIC_BYTES or can_id > _MAX_STANDARD_ID:
+        if length > CLASSIC_BYTES or can_id > MAX_STANDARD_ID:
             return other(can_id, data)
         bits = stuffed(can_id << 7 | length, _HEAD_BITS, from_bytes(data, "big", signed=True), length)
-        return (bits + _TAIL_BITS) * whole_ns
+        return (bits + TAIL_BITS) * whole_ns
 
     return classic if whole_ns else other
 
@@ -129,7 +127,7 @@ def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     by_length: dict[tuple[int, bool], int] = {}
 
     def time_ns(can_id: int, data: bytes) -> int:
-        key = (len(data), can_id > _MAX_STANDARD_ID)
+        key = (len(data), can_id > MAX_STANDARD_ID)
         found = by_length.get(key)
         if found is None:
             found = by_length[key] = worst_case_frame(*key).duration_ns(bitrate, data_bitrate)

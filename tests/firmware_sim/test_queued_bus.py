@@ -1,10 +1,10 @@
 """The bounded transmit queue: an adapter with nobody to acknowledge."""
 
 import pytest
+from queued_bus import QueuedBus
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.wire.bus import EmbeddedBus, Frame, InterfaceDownError, TransmitQueueError
-from firmware_sim.bus.bus_model import QueuedBus
 
 
 class Rig:

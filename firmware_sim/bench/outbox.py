@@ -2,15 +2,16 @@
 
 By SYNC, time stands still while the bench answers one, so what is released within the period that follows goes out
 together, in the order of release. A host in lockstep is told by marks when each frame is released
-(`firmware_sim.canopen.time_marks`); an undisturbed answer needs none.
+(`adacd_hil.wire.time_marks`); an undisturbed answer needs none.
 """
 
 import heapq
 from collections.abc import Callable
 from typing import NamedTuple
 
-from firmware_sim.canopen.object_dictionary import NEVER_NS, Send
-from firmware_sim.canopen.time_marks import DEVICE_MARK, MarkKind, pack_mark
+from adacd_hil.wire.bus import Bus
+from adacd_hil.wire.time_marks import DEVICE_MARK, NEVER_NS, MarkKind, pack_mark
+from firmware_sim.canopen.object_dictionary import Send
 
 
 class Held(NamedTuple):
@@ -88,3 +89,21 @@ class Outbox:
     def mark(self, kind: MarkKind, t_ns: int = 0) -> None:
         """Send a mark."""
         self._send(DEVICE_MARK, pack_mark(kind, t_ns))
+
+
+class Departure:
+    """Gathers frames until they are let go."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._frames: list[tuple[int, bytes]] = []
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Let a frame wait for the others."""
+        self._frames.append((can_id, data))
+
+    def go(self) -> None:
+        """Send what waits. Raises BusError; what could not be sent is dropped, as by a controller that is reset."""
+        if self._frames:
+            frames, self._frames = self._frames, []
+            self._bus.send_all(frames)

@@ -21,8 +21,12 @@ import struct
 from enum import IntEnum
 from typing import Final
 
+from adacd_hil.wire.codec import Codec
+
 HOST_MARK: Final = 0x1ADACD00
 DEVICE_MARK: Final = 0x1ADACD01
+NEVER_NS: Final = 1 << 62
+"""Later than any time: nothing is due."""
 _PACKING: Final = struct.Struct("<Q")
 
 
@@ -51,3 +55,9 @@ def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
         return MarkKind(packed & 0xFF), packed >> 8
     except ValueError:
         return None
+
+
+def answers_to_sync(codec: Codec) -> frozenset[int]:
+    """Name the identifiers that the devices of a contract send on every SYNC. Raises CodecError."""
+    names = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
+    return frozenset(codec.message(name).can_id for name in names)

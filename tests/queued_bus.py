@@ -8,16 +8,15 @@ as long as the interface is up and go out, in order, when the bus returns, howev
 from collections import deque
 
 from adacd_hil.wire.bus import Bus, Frame, InterfaceDownError, TransmitQueueError
+from adacd_hil.wire.lockstep_bus import DEFAULT_QUEUE_LENGTH
 
-DEFAULT_LENGTH = 10
-"""Linux's default `txqueuelen` of a CAN interface (CAN_DEFAULT_TX_QUEUE_LEN, drivers/net/can/dev)."""
 MAX_LENGTH = 512
 
 
 class QueuedBus(Bus):
     """Wraps one end of a bus. Nothing waits: a queue that is full fails at once, where SocketCAN fails after 50 ms."""
 
-    def __init__(self, bus: Bus, length: int = DEFAULT_LENGTH) -> None:
+    def __init__(self, bus: Bus, length: int = DEFAULT_QUEUE_LENGTH) -> None:
         """Hold up to `length` frames, 1…512. Raises ValueError."""
         if not 1 <= length <= MAX_LENGTH:
             raise ValueError(f"length of the transmit queue = {length} frames is not within 1…{MAX_LENGTH}")

@@ -12,7 +12,7 @@ its transmit queue:
 
 What the host sends reaches the devices in the order in which it is through.
 
-How devices let time pass: `firmware_sim.canopen.time_marks`. Devices that send no marks are waited for, by the wall
+How devices let time pass: `adacd_hil.wire.time_marks`. Devices that send no marks are waited for, by the wall
 clock.
 """
 
@@ -22,16 +22,23 @@ from typing import Final
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.bitrate import DEFAULT_BITRATE
 from adacd_hil.wire.budget import read_contract
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
 from adacd_hil.wire.codec import Codec
-from firmware_sim.bus.bus_model import DEFAULT_LENGTH
-from firmware_sim.bus.frame_time import FrameTime, exact_time, worst_time
-from firmware_sim.canopen.contracts import answers_to_sync
-from firmware_sim.canopen.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
+from adacd_hil.wire.frame_time import FrameTime, exact_time, worst_time
+from adacd_hil.wire.time_marks import (
+    DEVICE_MARK,
+    HOST_MARK,
+    NEVER_NS,
+    MarkKind,
+    answers_to_sync,
+    pack_mark,
+    unpack_mark,
+)
 
-NEVER_NS: Final = 1 << 62
-DEFAULT_BITRATE: Final = 1_000_000
+DEFAULT_QUEUE_LENGTH: Final = 10
+"""Linux's default `txqueuelen` of a CAN interface (CAN_DEFAULT_TX_QUEUE_LEN, drivers/net/can/dev)."""
 DEFAULT_DATA_BITRATE: Final = 5_000_000
 _CYCLIC_PERIODS: Final = 2
 """For so many periods after a SYNC devices live by SYNC; after that the host lets time pass by ADVANCE."""
@@ -54,7 +61,7 @@ class LockstepBus(Bus):
         sync_id: int = 0x080,
         answers: Iterable[int] = (),
         patience_s: float = 2.0,
-        queue_length: int = DEFAULT_LENGTH,
+        queue_length: int = DEFAULT_QUEUE_LENGTH,
         is_fifo: bool = False,
     ) -> None:
         """Take over a bus.

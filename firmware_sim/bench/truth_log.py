@@ -1,19 +1,60 @@
-"""The emulator's own log: what was true at every SYNC, as one MCAP file with the topics /truth and /events.
+"""What was true at every SYNC: its rows, and the emulator's own log of them with the topics /truth and /events.
 
-With the scenario it explains itself: the resolved scenario is attached, and each of its faults has a line in the
-metadata, `fault_0` for bit 0 of the truth's field `faults`, and so on.
+Where no SYNC comes, rows go on from the last one, one per period. The log explains itself: the resolved scenario is
+attached, and each of its faults has a line in the metadata, `fault_0` for bit 0 of the truth's field `faults`, and so
+on.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
+
+import numpy as np
 
 from adacd_hil.log.channels import ChannelId, pack_truth
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.recorder import LogSummary, Recorder
-from adacd_hil.records import Event, Vector
+from adacd_hil.records import TRUTH_LAYOUT, Event, Vector
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.scenario.scenario import Scenario
+
+OnTruth = Callable[[int, int, Vector], None]
+"""Called with cycle, t_ns of the SYNC frame, and a block by TRUTH_LAYOUT that is valid until the next call."""
+
+
+class TruthFeed:
+    """Numbers and stamps the rows of one bench."""
+
+    def __init__(self, fill: Callable[[Vector], None], on_truth: OnTruth | None) -> None:
+        """`fill`: fills a block with what is true now."""
+        self.on_truth = on_truth
+        self.cycle = -1
+        """Of the last row, -1 before the first."""
+        self.sync_ns = 0
+        """The bench's time at the last SYNC."""
+        self._fill = fill
+        self._block = np.zeros(TRUTH_LAYOUT.size)
+        self._stamp_ns = self._sync_stamp_ns = self._sync_cycle = 0
+
+    def tell_sync(self, cycle: int, stamp_ns: int, now_ns: int) -> None:
+        """Tell the row of a SYNC at the bench's `now_ns`."""
+        self.sync_ns, self._sync_stamp_ns, self._sync_cycle = now_ns, stamp_ns, cycle
+        self._tell(cycle, stamp_ns)
+
+    def tell_next(self, period_ns: int) -> None:
+        """Tell a row a period after the last one."""
+        self._tell(self.cycle + 1, self._stamp_ns + period_ns)
+
+    def tell_overdue(self, periods: int, period_ns: int) -> None:
+        """Tell a row so many periods after the last SYNC."""
+        self._tell(self._sync_cycle + periods, self._sync_stamp_ns + periods * period_ns)
+
+    def _tell(self, cycle: int, stamp_ns: int) -> None:
+        self.cycle, self._stamp_ns = cycle, stamp_ns
+        if self.on_truth is not None:
+            self._fill(self._block)
+            self.on_truth(cycle, stamp_ns, self._block)
+
 
 SCENARIO_NAME = "scenario.toml"
 """The attachment."""

@@ -1,1 +1,0 @@
-"""A modelled CAN bus, and two processes in lockstep."""

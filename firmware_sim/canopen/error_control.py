@@ -1,0 +1,253 @@
+"""Error control of one emulated device: EMCY and its history, heartbeats both ways, watchdogs.
+
+Each watchdog trips once, says so by EMCY, and clears by itself when its cause has gone. An EMCY's byte 3 is the number
+of the watchdog, its bytes 4 to 7 the device's time in ms at which that happened. 0x2210 keeps the last one and counts
+them. A fault that a watchdog caused is the drive's business and stays latched. Source: CiA 301 (4.2), 7.2.7 (EMCY:
+objects 0x1001, 0x1003, 0x1014, 0x1015), 7.2.8.3.2 (heartbeats: 0x1016, 0x1017), table 27 (0x8100 … 0x8250); CiA 402-1,
+error codes 0x6320 "parameter error" and 0x8700 "sync controller".
+"""
+
+import struct
+from collections import deque
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Protocol
+
+from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.canopen.object_dictionary import NOT_VALID, Abort, ObjectDictionary, Send, refuse
+
+HISTORY_LENGTH = 4
+"""Entries of 0x1003 in the EDS files."""
+
+_EMERGENCY = struct.Struct("<HBBI")
+
+
+class ErrorReporter:
+    """Sends EMCY messages with inhibit time and remembers their codes, newest first."""
+
+    def __init__(
+        self, dictionary: ObjectDictionary, send: Send, register: Callable[[], int], is_allowed: Callable[[], bool]
+    ) -> None:
+        """`register`: present 0x1001. `is_allowed`: whether the NMT state lets EMCY be sent."""
+        self._send = send
+        self._register = register
+        self._is_allowed = is_allowed
+        self._waiting: deque[bytes] = deque()
+        self._inhibit_ns = 0
+        self._allowed_ns = 0
+        self._is_valid = True
+        self._cob_id = 0x80 + dictionary.node_id
+        self._history: deque[int] = deque(maxlen=HISTORY_LENGTH)
+        dictionary.serve(0x1001, 0, register)
+        dictionary.serve(0x1003, 0, lambda: len(self._history))
+        for sub in range(1, HISTORY_LENGTH + 1):
+            dictionary.serve(0x1003, sub, lambda sub=sub: self._past_error(sub))  # type: ignore[misc]
+        dictionary.watch(0x1003, 0, self._clear_history, _check_zero)
+        dictionary.watch(0x1014, 0, self._validate, self._check_cob_id)
+        dictionary.watch(0x1015, 0, self._set_inhibit)
+
+    def report(self, code: int, t_ns: int, number: int = 0, time_ms: int = 0) -> None:
+        """Send an EMCY. `number`, `time_ms`: the manufacturer's part, which watchdog and when on the device's clock."""
+        if code != 0:
+            self._history.appendleft(code)
+        if self._is_valid and self._is_allowed():
+            self._waiting.append(_EMERGENCY.pack(code, self._register(), number, time_ms & 0xFFFFFFFF))
+            self.poll(t_ns)
+
+    def report_at_once(self, code: int, t_ns: int) -> None:
+        """Send an EMCY without regard to the inhibit time and to those that wait."""
+        self._history.appendleft(code)
+        if self._is_valid and self._is_allowed():
+            self._allowed_ns = t_ns + self._inhibit_ns
+            self._send(self._cob_id, _EMERGENCY.pack(code, self._register(), 0, 0))
+
+    def reset(self) -> None:
+        """Forget everything, as at power-on."""
+        self._waiting.clear()
+        self._history.clear()
+        self._allowed_ns = 0
+
+    def poll(self, t_ns: int) -> int:
+        """Send what the inhibit time held back; return when to look again."""
+        while self._waiting and t_ns >= self._allowed_ns:
+            self._allowed_ns = t_ns + self._inhibit_ns
+            self._send(self._cob_id, self._waiting.popleft())
+        return self._allowed_ns if self._waiting else NEVER_NS
+
+    def _past_error(self, sub: int) -> int:
+        if sub > len(self._history):
+            refuse(Abort.NO_DATA)
+        return self._history[sub - 1]
+
+    def _clear_history(self, _value: int) -> None:
+        self._history.clear()
+
+    def _check_cob_id(self, value: int) -> None:
+        if value & ~NOT_VALID != self._cob_id:
+            refuse(Abort.VALUE_RANGE)
+
+    def _validate(self, value: int) -> None:
+        self._is_valid = not value & NOT_VALID
+
+    def _set_inhibit(self, tenths_ms: int) -> None:
+        self._inhibit_ns = tenths_ms * 100_000
+
+
+def _check_zero(value: int) -> None:
+    if value != 0:
+        refuse(Abort.VALUE_RANGE)
+
+
+class HeartbeatProducer:
+    """0x1017: sends the NMT state every so many ms; the boot-up message is the first heartbeat."""
+
+    def __init__(
+        self, dictionary: ObjectDictionary, send: Send, state: Callable[[], int], now_ns: Callable[[], int]
+    ) -> None:
+        self._can_id = 0x700 + dictionary.node_id
+        self._send = send
+        self._state = state
+        self._now_ns = now_ns
+        self._period_ns = 0
+        self._due_ns = NEVER_NS
+        dictionary.watch(0x1017, 0, self._set_period)
+
+    def restart(self, t_ns: int) -> None:
+        """Begin a period."""
+        self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
+
+    def poll(self, t_ns: int) -> int:
+        """Send what is due; return when the next one is."""
+        if t_ns >= self._due_ns:
+            self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
+            self._send(self._can_id, bytes([self._state()]))
+        return self._due_ns
+
+    def _set_period(self, period_ms: int) -> None:
+        self._period_ns = period_ms * 1_000_000
+        self.restart(self._now_ns())
+
+
+class HeartbeatListener(Protocol):
+    """Who is told of the master's heartbeat."""
+
+    now_ns: int
+
+    def lose_heartbeat(self, t_ns: int) -> None:
+        """React to silence."""
+
+    def find_heartbeat(self, t_ns: int) -> None:
+        """React to the end of the silence."""
+
+
+class HeartbeatConsumer:
+    """0x1016:1: monitors one node from its first heartbeat on. A lost heartbeat is found again when one arrives."""
+
+    def __init__(self, dictionary: ObjectDictionary, listener: HeartbeatListener) -> None:
+        self.is_lost = False
+        """Whether the heartbeat is monitored and missing."""
+        self._listener = listener
+        self._node_id = 0
+        self._timeout_ns = 0
+        self._due_ns = NEVER_NS
+        dictionary.watch(0x1016, 1, self._configure, _check_node)
+
+    def on_heartbeat(self, node_id: int, t_ns: int) -> None:
+        """Take note of a heartbeat."""
+        if self._timeout_ns == 0 or node_id != self._node_id:
+            return
+        self._due_ns = t_ns + self._timeout_ns
+        self._find(t_ns)
+
+    def poll(self, t_ns: int) -> int:
+        """Notice a silence; return when to look again."""
+        if t_ns >= self._due_ns:
+            self._due_ns = NEVER_NS
+            self.is_lost = True
+            self._listener.lose_heartbeat(t_ns)
+        return self._due_ns
+
+    def _configure(self, value: int) -> None:
+        self._node_id = (value >> 16) & 0x7F
+        self._timeout_ns = (value & 0xFFFF) * 1_000_000
+        self._due_ns = NEVER_NS
+        self._find(self._listener.now_ns)  # what isn't monitored any more isn't missing
+
+    def _find(self, t_ns: int) -> None:
+        if self.is_lost:
+            self.is_lost = False
+            self._listener.find_heartbeat(t_ns)
+
+
+def _check_node(value: int) -> None:
+    """Accept a node that can exist, or a time of 0: off."""
+    if value & 0xFFFF and not 1 <= value >> 16 <= 127:
+        refuse(Abort.VALUE_RANGE)
+
+
+_COUNT_SUB = 2  # 0x2210: counts are at sub-index 2 + number
+
+
+class Watchdog(IntEnum):
+    """Numbers of the watchdogs. Each says how it clears."""
+
+    SYNC = 1  # a SYNC comes
+    COMMAND = 2  # a valid command acts
+    HEARTBEAT = 3  # the master's heartbeat comes, or is no longer monitored
+    OPERATIONAL = 4  # NMT start
+    LENGTH = 5  # a command frame of the right length comes
+    SYNC_ORDER = 6  # 100 SYNCs in a row are right
+    SYNC_LENGTH = 7  # a SYNC of the right length comes
+    COMMAND_PDO = 8  # Enable operation is no longer asked for, or can be obeyed
+
+
+ERROR_CODES = {
+    # CiA 301 has no code for a missing SYNC (0x8140 is recovery from bus-off, 0x8240 a SYNC of the wrong length).
+    Watchdog.SYNC: 0x8700,
+    Watchdog.COMMAND: 0x8250,
+    Watchdog.HEARTBEAT: 0x8130,
+    Watchdog.OPERATIONAL: 0x8100,
+    Watchdog.LENGTH: 0x8210,
+    Watchdog.SYNC_ORDER: 0x8200,
+    Watchdog.SYNC_LENGTH: 0x8240,
+    Watchdog.COMMAND_PDO: 0x6320,
+}
+"""EMCY error code and 0x603F by watchdog."""
+
+WARNINGS = frozenset({Watchdog.LENGTH, Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH, Watchdog.COMMAND_PDO})
+"""Those that never cause a fault."""
+
+
+class Watchdogs:
+    """Which watchdogs are tripped now, and what was."""
+
+    def __init__(self, dictionary: ObjectDictionary) -> None:
+        self.tripped: set[Watchdog] = set()
+        self._last = 0
+        self._last_ms = 0
+        self._counts = dict.fromkeys(Watchdog, 0)
+        dictionary.serve(0x2210, 1, lambda: self._last)
+        dictionary.serve(0x2210, 2, lambda: self._last_ms & 0xFFFFFFFF)
+        for watchdog in Watchdog:
+            dictionary.serve(0x2210, _COUNT_SUB + watchdog, lambda w=watchdog: self._counts[w] & 0xFFFF)  # type: ignore[misc]
+
+    def trip(self, watchdog: Watchdog, reporter: ErrorReporter, t_ns: int, time_ms: int) -> None:
+        """Note and report a watchdog that isn't tripped yet. `time_ms`: on the device's clock."""
+        if watchdog in self.tripped:
+            return
+        self.tripped.add(watchdog)
+        self._last, self._last_ms = watchdog, time_ms
+        self._counts[watchdog] += 1
+        reporter.report(ERROR_CODES[watchdog], t_ns, watchdog, time_ms)
+
+    def clear(self, watchdog: Watchdog, reporter: ErrorReporter, t_ns: int, time_ms: int) -> None:
+        """Report that the cause of a tripped watchdog has gone."""
+        if watchdog in self.tripped:
+            self.tripped.remove(watchdog)
+            reporter.report(0, t_ns, watchdog, time_ms)
+
+    def reset(self) -> None:
+        """Forget everything, as at power-on."""
+        self.tripped.clear()
+        self._last = self._last_ms = 0
+        self._counts = dict.fromkeys(Watchdog, 0)

@@ -1,0 +1,239 @@
+"""The CiA 402 profile of a torque drive: its state machine as one table, how it stops, what limits its torque.
+
+The table has the standard's transition numbers. In cyclic synchronous torque the drive leaves the set-point and brakes
+by itself: on the slow-down ramp, on the quick-stop ramp, or up to its current limit. Ramps by voltage limit don't exist
+here: codes 4 and 8 are refused.
+
+Torque in cyclic synchronous torque, per mille of rated torque:
+
+    demand 0x6074 = target 0x6071 + offset 0x60B2, within −min(0x6072, 0x60E1) … +min(0x6072, 0x60E0)
+
+Source: CiA 402-2 (IEC 61800-7-201): power drive system finite state automaton, controlword 0x6040, statusword 0x6041,
+objects 0x605A to 0x605E, cyclic synchronous torque mode.
+"""
+
+from enum import Enum
+from typing import NamedTuple
+
+from firmware_sim.arm.sensing import DriveMode
+from firmware_sim.canopen.object_dictionary import ObjectDictionary
+from firmware_sim.canopen.pdo import Pdos
+
+_FAULT_RESET = 0x80  # bit 7 of the controlword
+_VOLTAGE_ENABLED = 1 << 4  # of the statusword: the power stage has its supply
+
+
+class DriveState(Enum):
+    """States of CiA 402. Each says how to get out of it."""
+
+    START = "start"  # by itself, at power-on or reset
+    NOT_READY_TO_SWITCH_ON = "not ready to switch on"  # by itself, when initialised
+    SWITCH_ON_DISABLED = "switch on disabled"  # shutdown
+    READY_TO_SWITCH_ON = "ready to switch on"  # switch on; back: disable voltage, quick stop
+    SWITCHED_ON = "switched on"  # enable operation; back: shutdown, disable voltage, quick stop
+    OPERATION_ENABLED = "operation enabled"  # disable operation, shutdown, disable voltage, quick stop
+    QUICK_STOP_ACTIVE = "quick stop active"  # by itself at standstill; disable voltage
+    FAULT_REACTION_ACTIVE = "fault reaction active"  # by itself at standstill
+    FAULT = "fault"  # fault reset, once the cause is gone
+
+
+class DriveEvent(Enum):
+    """What moves the state machine: the controlword's commands and the drive's own findings."""
+
+    SHUTDOWN = "shutdown"
+    SWITCH_ON = "switch on, disable operation"  # one bit pattern; its meaning depends on the state
+    ENABLE_OPERATION = "enable operation"
+    DISABLE_VOLTAGE = "disable voltage"
+    QUICK_STOP = "quick stop"
+    FAULT_RESET = "fault reset"
+    POWER_ON = "power on or reset"
+    INITIALISED = "initialised"
+    QUICK_STOP_DONE = "quick stop completed"
+    FAULT_DETECTED = "fault detected"
+    FAULT_REACTION_DONE = "fault reaction completed"
+
+
+class StateTransition(NamedTuple):
+    """One arrow of the state machine with the standard's number."""
+
+    number: int
+    source: DriveState
+    event: DriveEvent
+    target: DriveState
+
+
+_S, _E = DriveState, DriveEvent
+TRANSITIONS = (
+    StateTransition(0, _S.START, _E.POWER_ON, _S.NOT_READY_TO_SWITCH_ON),
+    StateTransition(1, _S.NOT_READY_TO_SWITCH_ON, _E.INITIALISED, _S.SWITCH_ON_DISABLED),
+    StateTransition(2, _S.SWITCH_ON_DISABLED, _E.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    StateTransition(3, _S.READY_TO_SWITCH_ON, _E.SWITCH_ON, _S.SWITCHED_ON),
+    # "Switch on and enable operation" in one word: 3 now, 4 with the next command.
+    StateTransition(3, _S.READY_TO_SWITCH_ON, _E.ENABLE_OPERATION, _S.SWITCHED_ON),
+    StateTransition(4, _S.SWITCHED_ON, _E.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+    StateTransition(5, _S.OPERATION_ENABLED, _E.SWITCH_ON, _S.SWITCHED_ON),
+    StateTransition(6, _S.SWITCHED_ON, _E.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    StateTransition(7, _S.READY_TO_SWITCH_ON, _E.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    StateTransition(7, _S.READY_TO_SWITCH_ON, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    StateTransition(8, _S.OPERATION_ENABLED, _E.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    StateTransition(9, _S.OPERATION_ENABLED, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    StateTransition(10, _S.SWITCHED_ON, _E.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    StateTransition(10, _S.SWITCHED_ON, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    StateTransition(11, _S.OPERATION_ENABLED, _E.QUICK_STOP, _S.QUICK_STOP_ACTIVE),
+    StateTransition(12, _S.QUICK_STOP_ACTIVE, _E.QUICK_STOP_DONE, _S.SWITCH_ON_DISABLED),
+    StateTransition(12, _S.QUICK_STOP_ACTIVE, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    *(
+        StateTransition(13, state, _E.FAULT_DETECTED, _S.FAULT_REACTION_ACTIVE)
+        for state in DriveState
+        if state not in (_S.START, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
+    ),
+    StateTransition(14, _S.FAULT_REACTION_ACTIVE, _E.FAULT_REACTION_DONE, _S.FAULT),
+    StateTransition(15, _S.FAULT, _E.FAULT_RESET, _S.SWITCH_ON_DISABLED),
+    # Only where 0x605A lets the drive stay in Quick stop active.
+    StateTransition(16, _S.QUICK_STOP_ACTIVE, _E.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+)
+"""CiA 402-2, figure "power drive system finite state automaton" and its table of transitions."""
+
+_BY_SOURCE = {(row.source, row.event): row for row in TRANSITIONS}
+
+STATE_BITS = {
+    DriveState.START: 0x00,
+    DriveState.NOT_READY_TO_SWITCH_ON: 0x00,
+    DriveState.SWITCH_ON_DISABLED: 0x40 | _VOLTAGE_ENABLED,
+    DriveState.READY_TO_SWITCH_ON: 0x21 | _VOLTAGE_ENABLED,
+    DriveState.SWITCHED_ON: 0x23 | _VOLTAGE_ENABLED,
+    DriveState.OPERATION_ENABLED: 0x27 | _VOLTAGE_ENABLED,
+    DriveState.QUICK_STOP_ACTIVE: 0x07 | _VOLTAGE_ENABLED,
+    DriveState.FAULT_REACTION_ACTIVE: 0x0F | _VOLTAGE_ENABLED,
+    DriveState.FAULT: 0x08 | _VOLTAGE_ENABLED,
+}
+"""Bits 0 to 6 of the statusword; quick stop (bit 5) is 0 where the standard leaves it open."""
+
+
+def find_transition(state: DriveState, event: DriveEvent) -> StateTransition | None:
+    """Return the transition that `event` causes in `state`, None when it causes none."""
+    return _BY_SOURCE.get((state, event))
+
+
+def decode_command(controlword: int, previous: int) -> DriveEvent | None:
+    """Name the command of a controlword, None when it carries none (CiA 402-2, command coding).
+
+    Fault reset is the rising edge of bit 7; while bit 7 stays set there is no command.
+    """
+    if controlword & _FAULT_RESET:
+        return None if previous & _FAULT_RESET else DriveEvent.FAULT_RESET
+    if not controlword & 0x02:
+        return DriveEvent.DISABLE_VOLTAGE
+    if not controlword & 0x04:
+        return DriveEvent.QUICK_STOP
+    if not controlword & 0x01:
+        return DriveEvent.SHUTDOWN
+    return DriveEvent.ENABLE_OPERATION if controlword & 0x08 else DriveEvent.SWITCH_ON
+
+
+_REST_RAD_S = 0.02  # standstill: a hundredth of the slowest motion that the arm makes
+_REST_NS = 10_000_000  # standstill lasts; passing through zero does not
+_LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never stands still
+
+
+class Stop(NamedTuple):
+    """One option code. `mode` OFF: the drive function is disabled at once, without braking."""
+
+    mode: DriveMode
+    stays: bool = False  # in Quick stop active
+
+
+DISABLE = Stop(DriveMode.OFF)
+QUICK_STOPS = {
+    0: DISABLE,
+    1: Stop(DriveMode.BRAKE_SLOWLY),
+    2: Stop(DriveMode.BRAKE),
+    3: Stop(DriveMode.BRAKE_HARD),
+    5: Stop(DriveMode.BRAKE_SLOWLY, stays=True),
+    6: Stop(DriveMode.BRAKE, stays=True),
+    7: Stop(DriveMode.BRAKE_HARD, stays=True),
+}
+"""0x605A."""
+RAMPS = {0: DISABLE, 1: Stop(DriveMode.BRAKE_SLOWLY)}
+"""0x605B shutdown, 0x605C disable operation."""
+FAULT_REACTIONS = {code: QUICK_STOPS[code] for code in (0, 1, 2, 3)}
+"""0x605E."""
+
+
+class Standstill:
+    """Watches a braking motor."""
+
+    def __init__(self) -> None:
+        self._since_ns = self._moving_ns = 0
+
+    def begin(self, t_ns: int) -> None:
+        """Braking begins."""
+        self._since_ns = self._moving_ns = t_ns
+
+    def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
+        """Whether the motor stands still, or has braked for the longest time."""
+        if abs(velocity_rad_s) > _REST_RAD_S:
+            self._moving_ns = t_ns
+        return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
+
+
+_UNLIMITED = 0xFFFF  # where the EDS lacks a limit
+
+
+class TorqueLimits:
+    """Target, offset and limits, as written by SDO or PDO."""
+
+    def __init__(self, dictionary: ObjectDictionary, pdos: Pdos) -> None:
+        self.target = 0
+        self._offset = self._max = self._positive = self._negative = 0
+        self._low = self._high = 0
+        dictionary.serve(0x6071, 0, lambda: self.target)
+        dictionary.serve(0x60B2, 0, lambda: self._offset)
+        dictionary.serve(0x6072, 0, lambda: self._max)
+        dictionary.serve(0x60E0, 0, lambda: self._positive)
+        dictionary.serve(0x60E1, 0, lambda: self._negative)
+        for index, take, default in (
+            (0x6071, self._set_target, 0),
+            (0x60B2, self._set_offset, 0),
+            (0x6072, self._set_max, _UNLIMITED),
+            (0x60E0, self._set_positive, _UNLIMITED),
+            (0x60E1, self._set_negative, _UNLIMITED),
+        ):
+            pdos.accept(index, 0, take)
+            dictionary.watch(index, 0, take)
+            take(dictionary.default_or(default, index))
+
+    def demand(self) -> int:
+        """Return 0x6074 of an enabled drive."""
+        wanted = self.target + self._offset
+        if self._low <= wanted <= self._high:
+            return wanted
+        return self._high if wanted > self._high else self._low
+
+    @property
+    def is_limiting(self) -> bool:
+        """Whether a limit is in force, statusword bit 11."""
+        return not self._low <= self.target + self._offset <= self._high
+
+    def _set_target(self, permille: int) -> None:
+        self.target = permille
+
+    def _set_offset(self, permille: int) -> None:
+        self._offset = permille
+
+    def _set_max(self, permille: int) -> None:
+        self._max = permille
+        self._combine()
+
+    def _set_positive(self, permille: int) -> None:
+        self._positive = permille
+        self._combine()
+
+    def _set_negative(self, permille: int) -> None:
+        self._negative = permille
+        self._combine()
+
+    def _combine(self) -> None:
+        """Of several limits the smallest counts."""
+        self._high = min(self._max, self._positive)
+        self._low = -min(self._max, self._negative)
