@@ -1,0 +1,97 @@
+"""What a user installs: the wheel holds every file that the code reads, the licences, and the types."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+BUILD = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
+DATA = sorted(
+    path.relative_to(ROOT).as_posix()
+    for room in ("adacd_hil", "firmware_sim")
+    for path in (ROOT / room).rglob("*")
+    if path.is_file() and path.suffix != ".pyc"
+)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel of this source tree."""
+    folder = tmp_path_factory.mktemp("wheel")
+    built = subprocess.run(
+        [sys.executable, "-c", BUILD, str(folder)], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return folder / built.stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which an installer would lay the wheel's packages."""
+    folder = tmp_path_factory.mktemp("installed")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def _run(installed: Path, code: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=installed, env=environment, capture_output=True, text=True, check=True
+    )
+    return ran.stdout
+
+
+def test_the_wheel_holds_every_file_of_the_packages(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        assert set(DATA) - set(archive.namelist()) == set()
+
+
+def test_the_wheel_holds_the_contracts_and_electronic_data_sheets(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        held = {name.removeprefix("adacd_hil/dbc/") for name in archive.namelist() if name.startswith("adacd_hil/dbc/")}
+    assert held == {path.name for path in (ROOT / "dbc").iterdir()}
+
+
+@pytest.mark.parametrize("name", ["LICENSE", "NOTICE", "adacd_hil/analysis/report/assets/uplot-1.6.32.LICENSE"])
+def test_the_wheel_holds_the_licence(wheel: Path, name: str) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        [held] = [each for each in archive.namelist() if each.endswith(f".dist-info/licenses/{name}")]
+        assert archive.read(held) == (ROOT / name).read_bytes()
+
+
+def test_whatever_is_shipped_of_others_stands_in_the_notice() -> None:
+    shipped = {path.name for path in (ROOT / "adacd_hil").rglob("*") if path.suffix == ".LICENSE"}
+    assert {name for name in shipped if name not in (ROOT / "NOTICE").read_text()} == set()
+
+
+def test_the_installed_package_is_the_one_that_runs(installed: Path) -> None:
+    assert Path(_run(installed, "import adacd_hil; print(adacd_hil.__file__)").strip()).is_relative_to(installed)
+
+
+@pytest.mark.parametrize("name", [path.stem for path in sorted((ROOT / "adacd_hil" / "configs").iterdir())])
+def test_every_configuration_and_its_contract_load_where_the_wheel_is_installed(installed: Path, name: str) -> None:
+    code = (
+        "import sys; from importlib.metadata import distribution\n"
+        "[command] = [each for each in distribution('adacd-hil').entry_points if each.name == 'adacd-hil']\n"
+        f"sys.argv = ['adacd-hil', 'budget', '--config', '{name}']\n"
+        "command.load()()"
+    )
+    assert "%" in _run(installed, code)
+
+
+def test_both_commands_are_entry_points(installed: Path) -> None:
+    code = (
+        "from importlib.metadata import distribution\n"
+        "print(*sorted(each.name for each in distribution('adacd-hil').entry_points"
+        " if each.group == 'console_scripts' and callable(each.load())))"
+    )
+    assert _run(installed, code).split() == ["adacd-hil", "firmware-sim"]
+
+
+@pytest.mark.parametrize("package", ["adacd_hil", "firmware_sim"])
+def test_the_packages_say_that_they_are_typed(installed: Path, package: str) -> None:
+    assert (installed / package / "py.typed").is_file()
