@@ -13,12 +13,14 @@ import re
 import stat
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core.caching import FunctionCache
+from numpy.typing import ArrayLike
 
 _ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("adacd_hil", "firmware_sim")
@@ -150,3 +152,19 @@ def _compiled(function: Function, **options: bool) -> Function:
     if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
         dispatcher._cache = _SharedCache(function)  # type: ignore[no-untyped-call]
     return cast(Function, dispatcher)
+
+
+Structured = np.ndarray[Any, np.dtype[np.void]]
+
+
+def packed(values: Mapping[str, ArrayLike]) -> Structured:
+    """Put values of any shape into one element (1,), as float64."""
+    element = zeroed({name: np.shape(value) for name, value in values.items()})
+    for name, value in values.items():
+        element[name] = value
+    return element
+
+
+def zeroed(shapes: Mapping[str, tuple[int, ...]]) -> Structured:
+    """Return one element (1,) of zeros, float64, with a field of each shape."""
+    return np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))

@@ -6,9 +6,8 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.bus import EmbeddedBus, Frame, Tap
 from adacd_hil.wire.codec import load_codec
-from adacd_hil.wire.tap import Tap
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario
 

@@ -16,9 +16,8 @@ from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.bus import EmbeddedBus, Frame, Tap
 from adacd_hil.wire.codec import load_codec
-from adacd_hil.wire.tap import Tap
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario
 

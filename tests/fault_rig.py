@@ -23,9 +23,8 @@ from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import parse
-from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame
+from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame, Tap
 from adacd_hil.wire.codec import load_codec
-from adacd_hil.wire.tap import Tap
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario
 

@@ -17,7 +17,7 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from hang import HANG_S
 
-from adacd_hil.wire.bus import can_interfaces
+from adacd_hil.wire.can_interface import can_interfaces
 from adacd_hil.wire.codec import contract_folder
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.wallclock]

@@ -26,9 +26,8 @@ from adacd_hil.records import ArmCommand, FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError, parse
-from adacd_hil.wire.bus import Bus, BusError, EmbeddedBus, Frame
+from adacd_hil.wire.bus import Bus, BusError, EmbeddedBus, Frame, Tap
 from adacd_hil.wire.lockstep_bus import make_lockstep_bus
-from adacd_hil.wire.tap import Tap
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario
 

@@ -18,12 +18,12 @@ from lab_motion import paper_motion
 from mujoco_arm import MujocoArm
 from planar_arm import THETA
 
+from adacd_hil.compiled import Structured
 from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.identify import earlier, fit_samples
 from adacd_hil.scheme.identify.belief import payload_direction
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
-from adacd_hil.structured import Structured
 
 FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.2)

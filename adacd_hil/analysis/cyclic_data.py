@@ -1,7 +1,7 @@
 """How much of the cyclic data came in time, by the log: what stands in the verdict beside what was detected.
 
 Counted while the drives are to have torque. *Incomplete*: a cyclic frame was missing, late or wrong. *Aged*: the oldest
-value used was older than the cycle. Windows are the host's own, of one second (`device.data_watch`), and the limits
+value used was older than the cycle. Windows are the host's own, of one second (`device.arm_report`), and the limits
 those of the configuration's `[data]`. By device, the checks' running counts tell how many cycles had no new frame or a
 repeated one; they are logged once a second, so that of the last second, which a fault may have ended, nothing is told.
 """
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import CheckCounts, Mask, Run
 from adacd_hil.analysis.timing import CycleColumns, Cycles
-from adacd_hil.device.data_watch import SHORTEST_SHARE, WINDOW_S
+from adacd_hil.device.arm_report import SHORTEST_SHARE, WINDOW_S
 from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.settings.bus_settings import DataSettings
 from adacd_hil.settings.configuration import Settings

@@ -38,13 +38,13 @@ from adacd_hil.analysis.motion import (
     read_motion,
     sample_of,
 )
+from adacd_hil.compiled import Structured
 from adacd_hil.log.errors import LogError
 from adacd_hil.log.stretch import WHOLE, Stretch
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.model.regressor import mass_matrix
 from adacd_hil.settings.schema import setting
-from adacd_hil.structured import Structured
 
 BLOCK_S: Final = 0.1
 _PROGRESS_SAMPLES: Final = 1_000_000

@@ -15,7 +15,8 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.terminal import hurry
-from adacd_hil.wire.bus import Bus, BusError, BusMissingError, can_interfaces, is_virtual, open_bus
+from adacd_hil.wire.bus import Bus, BusError, BusMissingError, open_bus
+from adacd_hil.wire.can_interface import can_interfaces, is_virtual
 from adacd_hil.wire.codec import Codec
 
 MOST_BLIND_CYCLES = 5

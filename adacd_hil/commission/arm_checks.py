@@ -16,18 +16,18 @@ from adacd_hil.commission.diagnosis import Check, Outcome, failed, ok, skipped, 
 from adacd_hil.commission.hand_motion import HandMotion
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.network import Master
-from adacd_hil.device.pdo_map import contract_differences, read_pdos
+from adacd_hil.device.pdo_mapping import contract_differences, read_pdos
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.survey import NMT_STATES, compare, expected_nodes, survey
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import Bus, BusError
+from adacd_hil.wire.bus import Bus, BusError, Tap
+from adacd_hil.wire.can_interface import InterfaceState
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.link import Link
-from adacd_hil.wire.tap import Tap
 from adacd_hil.wire.traffic import Traffic, listen
 
 LISTEN_S = 0.5
@@ -50,7 +50,7 @@ class ArmExamination:
     codec: Codec
     clock: Clock
     open_bus: Callable[[], Bus]
-    read_link: Callable[[], Link | None]
+    read_link: Callable[[], InterfaceState | None]
     bitrate: int = 1_000_000
     data_bitrate: int = 0
     ask: Callable[[str], None] | None = None
@@ -273,7 +273,7 @@ def check_heartbeats(patient: ArmExamination) -> Outcome:
 
 def check_devices(patient: ArmExamination) -> Outcome:
     """Check that no drive is in fault, no device reports an error."""
-    lines = [line for line in patient.arm.describe_faults() if ": status" not in line]
+    lines = [line for line in ArmReport(patient.arm).describe_faults() if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     if lines or events:
         return warning("; ".join([*lines, *events]), "a run resets the fault if its cause has gone")

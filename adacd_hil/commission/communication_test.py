@@ -19,7 +19,7 @@ from adacd_hil.device.drive import Drive
 from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.records import JOINTS, CycleRecord
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.load import LoadMeter
+from adacd_hil.wire.traffic import LoadMeter
 
 SUFFICIENT_SHARE = 0.90
 GOOD_SHARE = 0.95

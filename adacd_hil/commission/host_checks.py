@@ -8,8 +8,7 @@ from pathlib import Path
 
 from adacd_hil.commission.diagnosis import Check, Outcome, failed, ok, skipped, warning
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeGrant, isolated_cpus
-from adacd_hil.wire.bus import can_interfaces
-from adacd_hil.wire.link import MTU_FD, Link
+from adacd_hil.wire.can_interface import CANFD_MTU, InterfaceState, can_interfaces
 
 QUEUE_FRAMES = 10
 """txqueuelen to have: the kernel's default, three cycles' worth of a cycle's three frames."""
@@ -31,7 +30,7 @@ class Host:
 
     interface: str
     channel: str
-    link: Link | None
+    link: InterfaceState | None
     bitrate: int
     data_bitrate: int
     request_realtime: Callable[[], RealtimeGrant]
@@ -74,7 +73,7 @@ def check_interface(host: Host) -> Outcome:
     return ok(f"{name} is up, hardware" + (f" ({link.kind})" if link.kind else ""))
 
 
-def _with_hardware(check: Callable[[Host, Link], Outcome]) -> Callable[[Host], Outcome]:
+def _with_hardware(check: Callable[[Host, InterfaceState], Outcome]) -> Callable[[Host], Outcome]:
     """Skip a check that says nothing of a virtual bus."""
 
     def run(host: Host) -> Outcome:
@@ -87,7 +86,7 @@ def _with_hardware(check: Callable[[Host, Link], Outcome]) -> Callable[[Host], O
     return run
 
 
-def check_bitrate(host: Host, link: Link) -> Outcome:
+def check_bitrate(host: Host, link: InterfaceState) -> Outcome:
     """Check that the bit rates are the contract's."""
     if link.bitrate is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -101,7 +100,7 @@ def check_bitrate(host: Host, link: Link) -> Outcome:
     return ok(f"{link.bitrate} bit/s" + (f", data phase {link.data_bitrate}" if host.data_bitrate else ""))
 
 
-def check_sample_point(_host: Host, link: Link) -> Outcome:
+def check_sample_point(_host: Host, link: InterfaceState) -> Outcome:
     """Check that the sample point suits the devices'."""
     if link.sample_point is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -112,7 +111,7 @@ def check_sample_point(_host: Host, link: Link) -> Outcome:
     return ok(text)
 
 
-def check_restart(_host: Host, link: Link) -> Outcome:
+def check_restart(_host: Host, link: InterfaceState) -> Outcome:
     """Check what happens after bus-off."""
     if link.restart_ms is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -124,7 +123,7 @@ def check_restart(_host: Host, link: Link) -> Outcome:
     return ok(f"{link.restart_ms} ms after bus-off")
 
 
-def check_controller(_host: Host, link: Link) -> Outcome:
+def check_controller(_host: Host, link: InterfaceState) -> Outcome:
     """Check that the controller takes part in the bus."""
     if link.state is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -157,8 +156,8 @@ def check_mtu(host: Host) -> Outcome:
         return skipped("no SocketCAN interface")
     if not host.data_bitrate:
         return ok(f"{host.link.mtu}, classic frames fit")
-    if host.link.mtu < MTU_FD:
-        return failed(f"{host.link.mtu}: no CAN FD frames", f"ip link set {host.link.name} mtu {MTU_FD}, or `fd on`")
+    if host.link.mtu < CANFD_MTU:
+        return failed(f"{host.link.mtu}: no CAN FD frames", f"ip link set {host.link.name} mtu {CANFD_MTU}, or `fd on`")
     return ok(f"{host.link.mtu}, CAN FD frames fit")
 
 

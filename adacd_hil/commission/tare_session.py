@@ -31,9 +31,8 @@ from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Mas
 from adacd_hil.records import JOINT_NAMES, ArmState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.wire.bus import Bus, BusError
+from adacd_hil.wire.bus import Bus, BusError, Tap
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.tap import Tap
 
 AUTO_ZERO = (0x6125, 1)
 AUTO_ZERO_SIGNATURE = b"zero"

@@ -11,12 +11,11 @@ from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.gate import Gate
 from adacd_hil.control.realtime import make_pacer
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_watch import Recurrence
 from adacd_hil.device.network import Master
-from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import Frame, Tap
 
 DISABLE_CYCLES = 20
 """Cycles of disabling at the end; drives need two."""

@@ -23,10 +23,9 @@ from adacd_hil.control.realtime import Pacer, Tick
 from adacd_hil.control.self_checks import SelfChecks
 from adacd_hil.control.stop_escalation import StopEscalation
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_watch import ArmWatch
-from adacd_hil.device.data_watch import DataShares, DataWatch
+from adacd_hil.device.arm_report import DataShares, DataWatch
+from adacd_hil.device.arm_watch import ArmWatch, Recurrence
 from adacd_hil.device.network import Master
-from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import (
@@ -45,7 +44,7 @@ from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.scheme.pipeline.selection import pipeline_of
 from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, POWERED
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import Tap
 
 FAULT_LINGER_S = 0.5
 """How long a faulted run goes on, so that the drives' quick stop is in the log."""

@@ -6,7 +6,7 @@ from adacd_hil.control.realtime import Tick
 from adacd_hil.device.arm import Arm
 from adacd_hil.records import ArmState, CycleRecord, Event
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import Tap
 
 _REPEAT_NS = 1_000_000_000
 

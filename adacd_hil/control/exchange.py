@@ -8,12 +8,11 @@ from adacd_hil.control.late_commands import LateCommands
 from adacd_hil.control.realtime import Tick
 from adacd_hil.control.trouble_report import TroubleReport
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_watch import Recurrence
 from adacd_hil.device.network import Master
-from adacd_hil.device.recurrence import Recurrence
 from adacd_hil.records import ArmState
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError, Tap
 
 FEEDBACK_SHARE = 0.7
 """Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at

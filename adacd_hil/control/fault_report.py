@@ -5,6 +5,7 @@ from collections.abc import Callable
 from adacd_hil.control.commission_report import CommissionReport
 from adacd_hil.control.self_checks import SelfChecks
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.arm_watch import ArmWatch
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmState, FaultReason, SchemeState
@@ -26,18 +27,19 @@ class FaultReport:
         master: Master,
     ) -> None:
         self._commission = CommissionReport(settings, arm)
-        self._arm, self._watch, self._checks, self._master = arm, watch, checks, master
+        report = ArmReport(arm)
+        self._report, self._watch, self._checks, self._master = report, watch, checks, master
         self._causes: dict[FaultReason, tuple[Callable[[], list[str]], ...]] = {
-            FaultReason.DATA_AGE: (arm.describe_gaps,),
-            FaultReason.BLIND: (arm.describe_gaps,),
-            FaultReason.LIMIT: (arm.describe_excess,),
+            FaultReason.DATA_AGE: (report.describe_gaps,),
+            FaultReason.BLIND: (report.describe_gaps,),
+            FaultReason.LIMIT: (report.describe_excess,),
             FaultReason.DEADLINE: (lambda: [watch.deadline.describe()],),
             FaultReason.COMMISSION_TIMEOUT: (
                 pipeline.describe_withheld,
                 self._commission.describe,
-                arm.describe_excess,
+                report.describe_excess,
             ),
-            FaultReason.ENABLE_TIMEOUT: (arm.describe_disabled,),
+            FaultReason.ENABLE_TIMEOUT: (report.describe_disabled,),
             FaultReason.ADAPT_TIMEOUT: (pipeline.describe_missing,),
         }
 
@@ -50,7 +52,7 @@ class FaultReport:
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
             *(line for describe in self._causes.get(fault, ()) for line in describe()),
-            *self._arm.describe_faults(),
+            *self._report.describe_faults(),
             *self._watch.lost,
             *self._master.describe_emergencies(),
         ]

@@ -4,7 +4,7 @@ The commands of cycle k act at SYNC k + 1, pipelined ones at k + 2. Those that a
 out act one later.
 """
 
-from adacd_hil.device.notices import Notices
+from adacd_hil.device.arm_watch import Notices
 from adacd_hil.records import Event
 
 

@@ -12,8 +12,7 @@ from adacd_hil.control.host_latency import HostLatency
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import BusError, Frame
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import BusError, Frame, Tap
 
 _MOST_FRAMES = 1000
 """Frames taken at once, so that a bus that somebody floods can't hold up the cycle."""

@@ -11,8 +11,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.operator import FaultAnswer, Operator
 from adacd_hil.log.recorder import Recorder
 from adacd_hil.records import Event
-from adacd_hil.wire.bus import BusError
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import BusError, Tap
 
 _LOOK_NS = 10_000_000
 """How often the user is asked and the bus is read while a fault is latched."""

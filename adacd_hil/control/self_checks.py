@@ -6,8 +6,8 @@ The scheme knows none of it. What fails goes to it as a request for FAULT, so th
 import math
 
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.device_setup import ParameterWatch
 from adacd_hil.device.drive import Drive
-from adacd_hil.device.parameter_watch import ParameterWatch
 from adacd_hil.records import JOINTS, ArmState, FaultReason, Request, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 

@@ -15,6 +15,7 @@ from adacd_hil.control.realtime import Pacer, make_pacer, prepare_spin
 from adacd_hil.control.recovery import Recovery
 from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
@@ -31,9 +32,8 @@ from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
-from adacd_hil.wire.bus import Bus, BusError
+from adacd_hil.wire.bus import Bus, BusError, Tap
 from adacd_hil.wire.codec import Codec, contract_folder
-from adacd_hil.wire.tap import Tap
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ class Session:
             recorder.cycle(self.clock.now_ns(), [], tap.take())
             recorder.event(self.clock.now_ns(), Event("error", "run", ending.error))
             self.progress(ending.error)
-        for line in (*arm.describe_checks(), *master.describe_checks()):
+        for line in (*ArmReport(arm).describe_checks(), *master.describe_checks()):
             recorder.event(self.clock.now_ns(), Event("info", "frame checks", line))
         return ending
 

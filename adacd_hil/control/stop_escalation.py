@@ -5,9 +5,9 @@ is not enough: in Pre-operational it takes no command from anybody, and by its o
 """
 
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_watch import Notices
 from adacd_hil.device.drive import Cia402State
 from adacd_hil.device.network import Master
-from adacd_hil.device.notices import Notices
 from adacd_hil.records import Event, FaultReason
 
 PATIENCE_CYCLES = 10

@@ -3,7 +3,7 @@
 A controller that nobody answers reports thousands of times a second; every frame is in the log anyway.
 """
 
-from adacd_hil.device.notices import Notices
+from adacd_hil.device.arm_watch import Notices
 from adacd_hil.records import Event
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.error_frames import TroubleKind, decode_error

@@ -1,4 +1,4 @@
-"""Which SYNC a cyclic frame answers: the ledger of one device.
+"""Which SYNC a cyclic frame answers, device by device, and what all devices sampled on the same SYNC.
 
 A device answers every SYNC with one frame. A frame that comes in time answers the last SYNC. One that comes later than
 the host waits, or behind the next SYNC, answers an earlier one, and its value is as old as that: taken for the last
@@ -20,6 +20,7 @@ the arm moves. It counts as the latter; a second frame on the same SYNC shows th
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 USUAL_ANSWERS = 100
 """Answers from which the usual time is taken, at the beginning of an attempt, while the arm rests: 0.1 s at 1 kHz."""
@@ -126,3 +127,40 @@ class AnswerClock:
         self.answered = ordinal
         self._is_guess = False
         self._unanswered = 0
+
+
+KEPT = 16
+"""SYNCs whose values are kept: more than any device may be late."""
+
+
+class Sample(NamedTuple):
+    """Values of all devices, sampled on one SYNC. `ordinal`: which; `values`: a tuple of each device."""
+
+    ordinal: int
+    values: tuple[tuple[float, ...], ...]
+
+
+class SampleAlignment:
+    """The last values of each device by the SYNC that they answer.
+
+    The model compares torque with motion, so all values of a sample must be of one moment. Where a device answers late,
+    the sample is complete a cycle or more later than it was taken: it is used then, with its age.
+    """
+
+    def __init__(self, devices: int) -> None:
+        self._ordinals = [[-1] * KEPT for _ in range(devices)]
+        self._values: list[list[tuple[float, ...]]] = [[()] * KEPT for _ in range(devices)]
+
+    def put(self, device: int, ordinal: int, values: tuple[float, ...]) -> None:
+        """Keep a device's values of one SYNC."""
+        place = ordinal % KEPT
+        self._ordinals[device][place] = ordinal
+        self._values[device][place] = values
+
+    def newest(self, last: int, after: int) -> Sample | None:
+        """Return the newest complete sample of the SYNCs up to `last` that come behind `after`, or None."""
+        for ordinal in range(last, max(after, last - KEPT), -1):
+            place = ordinal % KEPT
+            if all(ordinals[place] == ordinal for ordinals in self._ordinals):
+                return Sample(ordinal, tuple(values[place] for values in self._values))
+        return None

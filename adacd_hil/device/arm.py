@@ -6,22 +6,20 @@ The only place of sign, zero offset and torque ratio. Every value carries its ag
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.device.answer_clock import AnswerClock
-from adacd_hil.device.drive import Cia402State, Drive, option_codes, torque_limit_permille
-from adacd_hil.device.emergency import name_error
-from adacd_hil.device.heartbeat import PATIENCE_PERIODS
-from adacd_hil.device.placement import Device, place_devices
-from adacd_hil.device.sample_alignment import KEPT, SampleAlignment
+from adacd_hil.device.answer_clock import KEPT, AnswerClock, SampleAlignment
+from adacd_hil.device.arm_watch import PATIENCE_PERIODS
+from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
+from adacd_hil.device.profile import PlacedDevice, place_devices
 from adacd_hil.device.strangers import Strangers
-from adacd_hil.device.torque_sensor import USABLE, SensorStatus, TorqueSensor
+from adacd_hil.device.torque_sensor import USABLE, TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import EMERGENCY_ID
 from adacd_hil.wire.e2e import E2eStatus
 
 SYNC_OVERFLOW = 240
@@ -33,23 +31,9 @@ _Command = tuple[list[float], bool, bool]
 """Commanded torque of each joint, Nm; whether the drives are to be enabled; whether they are to stop quickly."""
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
 _STATUS = -1  # in place of a device's: a status frame, which answers no SYNC
-EMERGENCY_ID = 0x080
 _EMERGENCY_BYTES = 8
-_REMEMBERED = 0xFF  # bits of as many cycles: which of them a device left without a usable frame
-
-
-class SignalAge(NamedTuple):
-    """How old the value of some signals of one device is, in cycles; `limit`: the oldest that is usable."""
-
-    device: str
-    signals: str
-    age: int
-    limit: int
-
-    @property
-    def is_over(self) -> bool:
-        """Whether it is too old."""
-        return self.age > self.limit
+REMEMBERED_GAPS = 0xFF
+"""Bits of as many cycles: which of them a device left without a usable frame."""
 
 
 class Arm:
@@ -70,14 +54,13 @@ class Arm:
         self._is_following = settings.bus.follows
         self._is_pipelined = settings.bus.is_pipelined
         self._pending: _Command | None = None
-        self._sign = settings.arm.sign
+        self.sign = settings.arm.sign
         self._offset_Nm = settings.arm.torque_offset_Nm
-        self._position_limit_deg = settings.arm.position_limit_deg
-        self._velocity_limit_deg_s = settings.arm.velocity_limit_deg_s
+        self.limits = settings.arm
         self._permille_per_Nm = tuple(
             sign * 1000.0 / rated for sign, rated in zip(settings.arm.sign, settings.arm.rated_torque_Nm, strict=True)
         )
-        self._max_age = settings.bus.max_age_cycles
+        self.max_age_cycles = settings.bus.max_age_cycles
         self.status_age_limits = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
         """How old each drive's status may be, in cycles; infinite where nothing is expected."""
         self._handlers = self._build_handlers()
@@ -86,13 +69,13 @@ class Arm:
         self._periods = 1
         self._received = 0
         self._seen = 0
-        self._was_enabled = False
+        self.was_enabled = False
         self._ordinal = -1  # of the last SYNC
         self._sync_cycles, self._sync_ns = [-1] * KEPT, [0] * KEPT  # of the last SYNCs, by ordinal
         self._clocks = tuple(AnswerClock() for _ in self.devices)
         self._alignment = SampleAlignment(len(self.devices))
         self._sampled_ordinal = self._sampled_cycle = -1  # of the last complete sample
-        self._gaps = [0] * len(self.devices)  # bit k: no usable frame k cycles ago
+        self.gaps = [0] * len(self.devices)  # bit k: no usable frame k cycles ago
         self._last_data = [b""] * len(self.devices)
         self.repeats = [0] * len(self.devices)
         """How often each device's frame came again, the same or with the same counter."""
@@ -138,7 +121,7 @@ class Arm:
         )
         if self._pending is not None:
             tau_c, enable, quick_stop = self._pending
-            is_stale = periods > self._max_age
+            is_stale = periods > self.max_age_cycles
             frames += self._encode([0.0] * JOINTS if is_stale else tau_c, enable, quick_stop)
             self._pending = None
         self._bus.send_all(frames)
@@ -157,8 +140,8 @@ class Arm:
                 device.miss()
 
     def _remember_gaps(self) -> None:
-        for place, gaps in enumerate(self._gaps):
-            self._gaps[place] = (gaps << 1 | ~self._received >> place & 1) & _REMEMBERED
+        for place, gaps in enumerate(self.gaps):
+            self.gaps[place] = (gaps << 1 | ~self._received >> place & 1) & REMEMBERED_GAPS
 
     def pass_by(self, cycles: int, cycle: int, t_ns: int) -> None:
         """Take so many cycles, all complete and in time, for read elsewhere; the last one and its SYNC are given."""
@@ -169,7 +152,7 @@ class Arm:
         for clock in self._clocks:
             clock.pass_by(self._ordinal)
         self._sampled_ordinal, self._sampled_cycle = self._ordinal, cycle
-        self._gaps = [0] * len(self.devices)
+        self.gaps = [0] * len(self.devices)
         self._received = self._seen = _COMPLETE
         self.has_all_frames = True
 
@@ -316,7 +299,7 @@ class Arm:
     ) -> ArmState:
         """Make the state of values sampled in given cycles; `ordinal`: of the SYNC of a complete sample."""
         (q1, dq1), (q2, dq2), (tau1,), (tau2,) = values
-        sign1, sign2 = self._sign
+        sign1, sign2 = self.sign
         offset1, offset2 = self._offset_Nm
         cycle = self._cycle
         steps, sampled_ns = 0, self._t_ns
@@ -342,8 +325,8 @@ class Arm:
         )
 
     def _device_fault(self, is_enabled: bool) -> FaultReason:
-        has_dropped_out = self._was_enabled and not is_enabled
-        self._was_enabled |= is_enabled
+        has_dropped_out = self.was_enabled and not is_enabled
+        self.was_enabled |= is_enabled
         if has_dropped_out:
             return FaultReason.DRIVE
         sensor1, sensor2 = self.sensors
@@ -356,18 +339,6 @@ class Arm:
             is_drive = any(drive.name in self._emergencies for drive in self.drives)
             return FaultReason.DRIVE if is_drive else FaultReason.SENSOR
         return FaultReason.FOREIGN_FRAMES if self.strangers.are_heard(self._cycle) else FaultReason.NONE
-
-    def ages(self) -> list[SignalAge]:
-        """Return the age of every signal that the arm is run by, against its limit."""
-        cycle = self._cycle
-        ages = []
-        for drive, status_limit in zip(self.drives, self.status_age_limits, strict=True):
-            ages.append(SignalAge(drive.name, "position, velocity", cycle - drive.sample_cycle, self._max_age))
-            if drive.has_status_frame and not math.isinf(status_limit):
-                ages.append(SignalAge(drive.name, "statusword", cycle - drive.status_cycle, int(status_limit)))
-        for sensor in self.sensors:
-            ages.append(SignalAge(sensor.name, "torque", cycle - sensor.sample_cycle, self._max_age))
-        return ages
 
     def write(self, command: ArmCommand) -> None:
         """Send the commands of this cycle, to act at the next SYNC; pipelined, keep them until then. Raises BusError.
@@ -387,17 +358,6 @@ class Arm:
             (drive2.command_id, drive2.command(round(tau2 * ratio2), enable, quick_stop)),
         )
 
-    def describe_gaps(self) -> list[str]:
-        """Say of which devices no usable frame came in time in how many of the last cycles, one line each."""
-        present = [~self._received >> place & 1 for place in range(len(self.devices))]
-        gaps = [bits << 1 | now for bits, now in zip(self._gaps, present, strict=True)]
-        return [
-            f"{device.name}: no usable frame in time in {bits.bit_count()} of the last {_REMEMBERED.bit_length() + 1} "
-            "cycles"
-            for device, bits in zip(self.devices, gaps, strict=True)
-            if bits
-        ]
-
     def frame_checks(self) -> FrameChecks:
         """Return what the checks have said of all cyclic frames so far."""
         return FrameChecks(
@@ -406,58 +366,8 @@ class Arm:
             tuple(device.implausible_frames for device in self.devices),
         )
 
-    def describe_checks(self) -> list[str]:
-        """Say how many cyclic frames of each device passed and failed their checks, one line each."""
-        return [_describe_checks(device) for device in self.devices]
 
-    def describe_faults(self) -> list[str]:
-        """Say what is wrong with each device, one line each; empty when nothing is.
-
-        A drive's fault with the name of its error, a sensor's status, and signals that are older than their limit.
-        """
-        lines = []
-        for drive in self.drives:
-            if drive.state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE) or drive.error_code:
-                name = f": {name_error(drive.error_code)}" if drive.error_code else ""
-                lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}{name}")
-            elif self._was_enabled:
-                lines += _describe_disabled(drive)
-        lines += self.strangers.describe(self._cycle)
-        for sensor in self.sensors:
-            if sensor.status:
-                lines.append(f"{sensor.name}: status 0x{int(sensor.status):02X}: {_describe_status(sensor.status)}")
-        lines.extend(
-            f"{age.device}: {age.signals} {age.age} cycles old, {age.limit} allowed"
-            for age in self.ages()
-            if age.is_over
-        )
-        return lines
-
-    def describe_disabled(self) -> list[str]:
-        """Say which drive is not enabled, one line each; empty when both are."""
-        return [line for drive in self.drives for line in _describe_disabled(drive)]
-
-    def describe_excess(self) -> list[str]:
-        """Say which joint is beyond which of the arm's limits, one line each; empty when none is."""
-        lines = []
-        for joint, (drive, sign) in enumerate(zip(self.drives, self._sign, strict=True)):
-            for quantity, value, bound, unit in (
-                ("position", drive.position_rad, self._position_limit_deg[joint], "deg"),
-                ("velocity", drive.velocity_rad_s, self._velocity_limit_deg_s[joint], "deg/s"),
-            ):
-                value_deg = math.degrees(sign * value)
-                if abs(value_deg) > bound:
-                    lines.append(f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed")
-        return lines
-
-
-def _describe_disabled(drive: Drive) -> list[str]:
-    if drive.is_enabled:
-        return []
-    return [f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"]
-
-
-def _make_drive(settings: Settings, codec: Codec, device: Device) -> Drive:
+def _make_drive(settings: Settings, codec: Codec, device: PlacedDevice) -> Drive:
     quick_stop_option, _ = option_codes(settings, device.settings)
     return Drive(
         codec,
@@ -469,33 +379,14 @@ def _make_drive(settings: Settings, codec: Codec, device: Device) -> Drive:
     )
 
 
-def _make_sensor(codec: Codec, device: Device, period_s: float) -> TorqueSensor:
+def _make_sensor(codec: Codec, device: PlacedDevice, period_s: float) -> TorqueSensor:
     bounds = device.settings.plausibility
     return TorqueSensor(codec, device.joint + 1, period_s, bounds.torque_rate_Nm_s, bounds.torque_range_Nm)
 
 
-def _status_age_limit(device: Device, period_s: float) -> float:
+def _status_age_limit(device: PlacedDevice, period_s: float) -> float:
     """Return how many cycles old a drive's status may be: 2.5 of its periods; infinite where it has no period."""
     status = device.pdo("Status")
     if status is None or not status.event_timer_ms:
         return math.inf
     return math.ceil(PATIENCE_PERIODS * status.event_timer_ms * 1e-3 / period_s)
-
-
-def _describe_checks(device: Drive | TorqueSensor) -> str:
-    tally = device.end_to_end.tally()
-    if device.is_protected:
-        return f"{device.name}: " + ", ".join(f"{count} {status.name}" for status, count in tally)
-    missing = dict(tally)[E2eStatus.NO_NEW_DATA]
-    return (
-        f"{device.name}: unprotected, {device.implausible_frames} implausible, {missing} {E2eStatus.NO_NEW_DATA.name}"
-    )
-
-
-def _describe_status(status: SensorStatus) -> str:
-    words = (
-        (SensorStatus.POSITIVE_OVERLOAD, "positive overload"),
-        (SensorStatus.NEGATIVE_OVERLOAD, "negative overload"),
-        (SensorStatus.NOT_VALID, "not valid"),
-    )
-    return ", ".join(text for bit, text in words if status & bit)

@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import compiled, released
-from adacd_hil.device.heartbeat import OPERATIONAL
+from adacd_hil.compiled import Structured, compiled, released
+from adacd_hil.device.arm_watch import OPERATIONAL
 from adacd_hil.records import JOINTS
-from adacd_hil.structured import Structured
 from adacd_hil.wire.e2e_batch import MOST_DATA_IDS, counter_of, is_next
 
 DEVICES = 2 * JOINTS

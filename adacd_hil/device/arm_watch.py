@@ -1,11 +1,26 @@
-"""The second look at an ArmState: what the devices' heartbeats and the host's own lateness make of it."""
+"""The second look at an ArmState: what the devices' heartbeats and the host's own lateness make of it.
 
-from collections.abc import Callable
+Also what such watches are made of: things done every so many cycles, and events that come again and again.
 
-from adacd_hil.device.deadline import DeadlineWatch
-from adacd_hil.device.recurrence import Recurrence
-from adacd_hil.records import ArmState, FaultReason
+The heartbeat consumer finds nodes that are silent, or not in the state that they should be in. Source: CiA 301 (4.2),
+clause 7.2.8.2.2 (heartbeat protocol); t_ns is the host's time, the frames' stamps included.
+
+The deadline policy says what is done when the host misses too many periods. A miss is a period that was skipped whole:
+its SYNC was never sent. A SYNC that is late by less than a period is none; the devices sample late, and the scheme
+counts with the interval that was measured. Pauses that are meant, as between two attempts, are no misses.
+`realtime.misses` of them within `realtime.misses_window_s` are too many. By `realtime.on_misses` the run then faults,
+or the arm brakes to rest and holds its place until the user acknowledges, where the scheme knows such a state.
+"""
+
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+
+from adacd_hil.device.profile import PlacedDevice
+from adacd_hil.records import ArmState, Event, FaultReason
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 
 _LOOKS = 0.1
 """How often heartbeats are looked at, in their periods."""
@@ -31,3 +46,197 @@ class ArmWatch:
         if self.lost and arm.fault is FaultReason.NONE:
             arm = arm._replace(fault=FaultReason.HEARTBEAT)
         return self.deadline.judge(arm)
+
+
+class Recurrence:
+    """Something that is done every so many cycles, and after skipped ones as soon as there is a cycle again."""
+
+    def __init__(self, interval_s: float, period_s: float) -> None:
+        self._cycles = max(1, round(interval_s / period_s))
+        self._due_cycle = 0
+
+    def is_due(self, cycle: int) -> bool:
+        """Whether it is to be done in this cycle; asked once per cycle."""
+        if cycle < self._due_cycle:
+            return False
+        self._due_cycle = cycle - cycle % self._cycles + self._cycles
+        return True
+
+
+REPEAT_NS = 1_000_000_000
+"""Least time between two events of one kind."""
+
+
+class Notices:
+    """Collects events, each kind at once, then at most once a second with the count of those between.
+
+    `take_events` gives those since the last call.
+    """
+
+    def __init__(self) -> None:
+        self._said_ns: dict[Hashable, int] = {}
+        self._unsaid: dict[Hashable, int] = {}
+        self._events: list[Event] = []
+
+    def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
+        """Take an event of a kind at a time. `count`: how many it stands for."""
+        said_ns = self._said_ns.get(kind)
+        if said_ns is not None and t_ns - said_ns < REPEAT_NS:
+            self._unsaid[kind] = self._unsaid.get(kind, 0) + count
+            return
+        more = self._unsaid.pop(kind, 0)
+        self._said_ns[kind] = t_ns
+        self._events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+
+PATIENCE_PERIODS = 2.5
+"""Periods without a heartbeat until a node counts as silent, on the host and in 0x1016 of the devices: one heartbeat
+may be lost and the next one be late by half a period, and yet nobody waits for a third."""
+OPERATIONAL = 5
+_STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
+
+
+@dataclass
+class _WatchedNode:
+    name: str
+    node_id: int
+    state: int | None = None
+    heard_ns: int | None = None
+    has_run: bool = False
+    left_to: int | None = None
+    """The last state other than OPERATIONAL since it was judged last, be it OPERATIONAL again by now."""
+    complaint: str = ""
+
+
+class HeartbeatWatch:
+    """Follows the heartbeats of some nodes, while they should be operational."""
+
+    def __init__(self, nodes: Iterable[tuple[str, int]], period_ms: int, report: Callable[[Event], None]) -> None:
+        """`nodes`: name and node id. `report` gets an event when a node falls out and when it is back."""
+        self._nodes = {HEARTBEAT_ID + node_id: _WatchedNode(name, node_id) for name, node_id in nodes}
+        self.can_ids = tuple(self._nodes)
+        """Identifiers of the heartbeats that are watched."""
+        self.patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
+        """Longest silence of a node that is none."""
+        self._report = report
+        self._is_watching = False
+        self._since_ns: int | None = None
+
+    def start(self) -> None:
+        """Expect OPERATIONAL from now on; what was heard before says nothing."""
+        self._is_watching = True
+        self._since_ns = None
+        for node in self._nodes.values():
+            node.has_run = False
+            node.left_to = None
+            node.complaint = ""
+
+    def stop(self) -> None:
+        """Expect nothing more."""
+        self._is_watching = False
+
+    def accept(self, frame: Frame) -> None:
+        """Take a heartbeat; other frames change nothing."""
+        node = self._nodes.get(frame.can_id)
+        if node is None or frame.is_error or len(frame.data) != 1:
+            return
+        node.state = frame.data[0] & 0x7F
+        node.heard_ns = frame.t_ns
+        if node.state == OPERATIONAL:
+            node.has_run = True
+        elif node.has_run:
+            node.left_to = node.state
+
+    def watch(self, t_ns: int) -> list[str]:
+        """Name what is wrong now, one line per node; empty when nothing is or nothing is expected."""
+        if not self._is_watching:
+            return []
+        if self._since_ns is None:
+            self._since_ns = t_ns
+        lines = []
+        for node in self._nodes.values():
+            line = self._judge(node, t_ns, self._since_ns)
+            if line:
+                lines.append(line)
+        return lines
+
+    def heard_ns(self) -> dict[int, int] | None:
+        """Say by identifier when each node was last heard, or began to be watched; None unless all are OPERATIONAL."""
+        since_ns = self._since_ns
+        nodes = self._nodes.items()
+        if since_ns is None or any(
+            node.state != OPERATIONAL or node.left_to is not None or node.complaint for _, node in nodes
+        ):
+            return None
+        return {can_id: max(node.heard_ns or since_ns, since_ns) for can_id, node in nodes}
+
+    def _judge(self, node: _WatchedNode, t_ns: int, since_ns: int) -> str:
+        heard_ns = since_ns if node.heard_ns is None else max(node.heard_ns, since_ns)
+        silent_ns = t_ns - heard_ns
+        state = node.state if node.left_to is None else node.left_to
+        node.left_to = None
+        if silent_ns > self.patience_ns:
+            complaint = "silent"
+            text = f"no heartbeat for {silent_ns // 1_000_000} ms, {self.patience_ns // 1_000_000} ms allowed"
+        elif (
+            state is not None
+            and state != OPERATIONAL
+            # A heartbeat from before the start command took effect may still be on its way.
+            and (node.has_run or t_ns - since_ns > self.patience_ns)
+        ):
+            complaint = f"state {state}"
+            text = f"is {_STATES.get(state, f'in NMT state {state}')}, OPERATIONAL expected"
+        else:
+            if node.complaint:
+                self._report(Event("info", node.name, "heartbeat: OPERATIONAL again"))
+                node.complaint = ""
+            return ""
+        if complaint != node.complaint:
+            node.complaint = complaint
+            self._report(Event("error", node.name, f"heartbeat: {text}"))
+        return f"{node.name} (node {node.node_id}): {text}"
+
+
+def follow_devices(devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]) -> HeartbeatWatch:
+    """Make the watch over those devices that send heartbeats."""
+    return HeartbeatWatch(
+        [(device.name, device.node_id) for device in devices if device.has(0x1017)], period_ms, report
+    )
+
+
+class DeadlineWatch:
+    """Counts the misses of one attempt over a sliding window."""
+
+    def __init__(self, settings: Settings) -> None:
+        realtime = settings.realtime
+        self._most = realtime.misses
+        self._window_s = realtime.misses_window_s
+        self._window_cycles = max(1, round(realtime.misses_window_s / settings.bus.period_s))
+        self._is_holding = realtime.on_misses == "hold"
+        self._misses: deque[tuple[int, int]] = deque()  # cycle that came late, periods skipped before it
+        self._count = 0
+        self._verdict = ""
+
+    def judge(self, arm: ArmState) -> ArmState:
+        """Take in one cycle; return it as it is, or as that of a host which has missed too many."""
+        misses = self._misses
+        if arm.periods > 1:
+            misses.append((arm.cycle, arm.periods - 1))
+            self._count += arm.periods - 1
+        while misses and arm.cycle - misses[0][0] >= self._window_cycles:
+            self._count -= misses.popleft()[1]
+        if self._count < self._most:
+            return arm
+        self._verdict = f"{self._count} periods missed within {self._window_s:g} s; {self._most} are too many"
+        if self._is_holding:
+            return arm._replace(is_late=True)
+        return arm._replace(fault=FaultReason.DEADLINE) if arm.fault is FaultReason.NONE else arm
+
+    def describe(self) -> str:
+        """Say how many misses the last verdict was about; empty without one."""
+        return self._verdict

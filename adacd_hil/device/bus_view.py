@@ -7,14 +7,14 @@ from collections import deque
 from dataclasses import dataclass
 
 from adacd_hil.device.survey import NMT_STATES, message_name
-from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.bus import MAX_STANDARD_ID, Frame
 from adacd_hil.wire.codec import Codec, MessageCodec
+from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 from adacd_hil.wire.e2e import E2eStatus
-from adacd_hil.wire.load import LoadMeter
+from adacd_hil.wire.traffic import LoadMeter
 
 _WINDOW_NS = 1_000_000_000
 """Rates are means over one to two of these."""
-_HEARTBEAT = 0x700
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class BusView:
         wanted = {
             can_id: self._entries[can_id]
             for can_id in sorted(self._entries)
-            if node_id is None or (can_id <= 0x7FF and can_id & 0x7F == node_id)
+            if node_id is None or (can_id <= MAX_STANDARD_ID and can_id & 0x7F == node_id)
         }
         snapshot = Snapshot(
             frames=self.frames,
@@ -149,7 +149,7 @@ class BusView:
             nodes=[
                 self._node(can_id & 0x7F, entry, t_ns)
                 for can_id, entry in wanted.items()
-                if can_id & ~0x7F == _HEARTBEAT and can_id != _HEARTBEAT
+                if can_id & ~0x7F == HEARTBEAT_ID and can_id != HEARTBEAT_ID
             ],
             messages=[
                 self._message(
@@ -164,7 +164,7 @@ class BusView:
 
     def _node(self, node_id: int, entry: _Entry, t_ns: int) -> NodeView:
         state = entry.data[0] & 0x7F if entry.data else -1
-        name = message_name(self._codec, _HEARTBEAT + node_id).removesuffix("Heartbeat")
+        name = message_name(self._codec, HEARTBEAT_ID + node_id).removesuffix("Heartbeat")
         name = "" if name.startswith("(") else name
         return NodeView(node_id, name, NMT_STATES.get(state, "unknown"), (t_ns - entry.last_ns) * 1e-9)
 

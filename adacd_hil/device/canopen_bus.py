@@ -21,12 +21,12 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoEr
 from adacd_hil.input_files import read_input
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, BusError, Frame
+from adacd_hil.wire.contract_frames import NMT_ID, SDO_REQUEST_ID
 
 ANSWER_TIMEOUT_S = 0.5
 """Longest wait for an answer. CiA 301 gives none; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
-NMT_ID = 0x000
-_SDO_ABORT = 0x80
+SDO_ABORT = 0x80
 _UNFORESEEN = (
     canopen.ObjectDictionaryError,
     struct.error,
@@ -62,7 +62,7 @@ class DeviceError(RuntimeError):
     """A device is missing, not the expected one, or refuses its set-up; one line."""
 
 
-class Variable(NamedTuple):
+class EdsVariable(NamedTuple):
     """One object of an EDS. bits: its size in a PDO, 0 for what has no fixed size."""
 
     name: str
@@ -110,7 +110,7 @@ def _check_eds(text: str) -> None:
                 raise ConfigError(f"[{section}] {key} = {value[:40]!r} is no integer")
 
 
-def find_variable(objects: Any, index: int, sub: int) -> Variable | None:
+def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
     """Describe an object of an object dictionary, None when it isn't listed."""
     entry = objects.get(index)
     if entry is None:
@@ -126,10 +126,10 @@ def find_variable(objects: Any, index: int, sub: int) -> Variable | None:
     default = entry.value if entry.value is not None else entry.default
     is_number = entry.data_type in canopen.objectdictionary.NUMBER_TYPES
     is_signed = entry.data_type in canopen.objectdictionary.SIGNED_TYPES
-    return Variable(name, len(entry) if is_number else 0, is_signed, default if isinstance(default, int) else None)
+    return EdsVariable(name, len(entry) if is_number else 0, is_signed, default if isinstance(default, int) else None)
 
 
-class _Network(canopen.Network):
+class _BusNetwork(canopen.Network):
     """canopen's network over our bus, without its receiving thread."""
 
     def __init__(self, send: Callable[[int, bytes], None]) -> None:
@@ -148,7 +148,7 @@ class CanopenBus:
         self.bystander: Callable[[Frame], object] = lambda _: None
         """Gets every frame that arrives while an answer is awaited, besides canopen."""
         self._bus = bus
-        self._network = _Network(self._send)
+        self._network = _BusNetwork(self._send)
         self.malformed_frames = 0
         """Frames so far whose length or content doesn't fit what their identifier says they are."""
 
@@ -170,7 +170,7 @@ class CanopenBus:
 
     def _send(self, can_id: int, data: bytes) -> None:
         self._bus.send(can_id, data)
-        is_request = can_id & 0x780 == 0x600 and data[0] != _SDO_ABORT
+        is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
         if is_request:
             self.pump(lambda frame: frame.can_id == can_id - 0x80, ANSWER_TIMEOUT_S)
 

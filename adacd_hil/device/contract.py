@@ -9,24 +9,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.device.placement import Device, place_devices
-from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings, PlacedDevice, place_devices
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.output_files import place_file
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
-from adacd_hil.wire.node_offset import NODE_MASK, move_contract
+from adacd_hil.wire.contract_frames import (
+    EMERGENCY_ID,
+    HEARTBEAT_ID,
+    HOST_HEARTBEAT,
+    NMT_ID,
+    NODE_MASK,
+    SDO_REQUEST_ID,
+    SDO_RESPONSE_ID,
+    SYNC_ID,
+    move_contract,
+)
 
 COMPOSED_NAME = "contract.dbc"
 WIRE_VERSION = 1
 _TRIGGERS = ("sync", "command", "event", "request")
 _FRAME_FORMATS = ("StandardCAN", "ExtendedCAN", "reserved", "J1939PG", *("reserved",) * 10, "StandardCAN_FD")
-_CLASSIC_BYTES = 8
-_FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 
 
-class _Signal(NamedTuple):
+class _DbcSignal(NamedTuple):
     name: str
     bits: int
     is_signed: bool = False
@@ -35,12 +43,12 @@ class _Signal(NamedTuple):
 
 
 @dataclass
-class _Message:
+class _DbcMessage:
     can_id: int
     name: str
     sender: str
     receivers: tuple[str, ...]
-    signals: tuple[_Signal, ...]
+    signals: tuple[_DbcSignal, ...]
     trigger: str
     period_ms: int = 0
     delay_ms: int = 0
@@ -57,13 +65,13 @@ _NMT_COMMANDS = {1: "start", 2: "stop", 128: "pre_operational", 129: "reset_node
 _NMT_STATES = {0: "boot_up", 4: "stopped", 5: "operational", 127: "pre_operational"}
 _MODES = {0: "none", 10: "cyclic_synchronous_torque"}
 _EMCY = (
-    _Signal("error_code", 16),
-    _Signal("error_register", 8),
-    _Signal("manufacturer_code", 8),
-    _Signal("manufacturer_data", 32),
+    _DbcSignal("error_code", 16),
+    _DbcSignal("error_register", 8),
+    _DbcSignal("manufacturer_code", 8),
+    _DbcSignal("manufacturer_data", 32),
 )
-_SDO = (_Signal("command", 8), _Signal("index", 16), _Signal("subindex", 8), _Signal("data", 32))
-_HEARTBEAT = (_Signal("state", 8),)
+_SDO = (_DbcSignal("command", 8), _DbcSignal("index", 16), _DbcSignal("subindex", 8), _DbcSignal("data", 32))
+_HEARTBEAT = (_DbcSignal("state", 8),)
 
 
 def load_contract(settings: Settings) -> Codec:
@@ -94,7 +102,7 @@ def write_contract(codec: Codec, folder: Path) -> Path:
     return path
 
 
-def compose(settings: Settings, devices: list[Device]) -> Codec:
+def compose(settings: Settings, devices: list[PlacedDevice]) -> Codec:
     """Compose the contract of these devices. Raises ConfigError, CodecError."""
     text = _write_dbc(settings, _messages(settings, devices))
     return parse_codec(text.encode(), Path(COMPOSED_NAME))
@@ -114,14 +122,14 @@ def find_contract(name: str) -> Path:
     raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint}")
 
 
-def _move(codec: Codec, settings: Settings, devices: list[Device]) -> Codec:
+def _move(codec: Codec, settings: Settings, devices: list[PlacedDevice]) -> Codec:
     """Move a DBC to the configured node ids, if they all lie equally far from its own; else leave them."""
     offsets = {
         device.node_id - (codec.messages[name].can_id & NODE_MASK)
         for device in devices
         if (name := f"{device.name}Heartbeat") in codec.messages
     }
-    if "HostHeartbeat" not in codec.messages:
+    if HOST_HEARTBEAT not in codec.messages:
         return codec
     return move_contract(codec, offsets.pop() if len(offsets) == 1 else 0, settings.bus.host_node)
 
@@ -156,24 +164,30 @@ def _scales(message: MessageCodec) -> str:
     return ", ".join(f"{signal.name} {signal.scale:.17g}" for signal in message.signals if signal.scale != 1.0)
 
 
-def _messages(settings: Settings, devices: list[Device]) -> list[_Message]:
+def _messages(settings: Settings, devices: list[PlacedDevice]) -> list[_DbcMessage]:
     names = tuple(device.name.upper() for device in devices)
     heartbeat_ms = settings.bus.heartbeat_ms
-    nmt = (_Signal("command", 8), _Signal("node", 8))
+    nmt = (_DbcSignal("command", 8), _DbcSignal("node", 8))
     messages = [
-        _Message(0x000, "Nmt", "HOST", names, nmt, "request", values={"command": _NMT_COMMANDS}),
-        _Message(0x080, "Sync", "HOST", names, (_Signal("counter", 8),), "sync"),
+        _DbcMessage(NMT_ID, "Nmt", "HOST", names, nmt, "request", values={"command": _NMT_COMMANDS}),
+        _DbcMessage(SYNC_ID, "Sync", "HOST", names, (_DbcSignal("counter", 8),), "sync"),
         _heartbeat("Host", settings.bus.host_node, "HOST", names, heartbeat_ms),
     ]
     for device in devices:
         node, sender, host = device.node_id, device.name.upper(), ("HOST",)
         messages += [
-            _Message(
-                0x080 + node, f"{device.name}Emcy", sender, host, _EMCY, "event", delay_ms=EMCY_INHIBIT_100US // 10
+            _DbcMessage(
+                EMERGENCY_ID + node,
+                f"{device.name}Emcy",
+                sender,
+                host,
+                _EMCY,
+                "event",
+                delay_ms=EMCY_INHIBIT_100US // 10,
             ),
             *(_pdo_message(device, pdo) for pdo in device.settings.pdo),
-            _Message(0x580 + node, f"{device.name}SdoResponse", sender, host, _SDO, "request"),
-            _Message(0x600 + node, f"{device.name}SdoRequest", "HOST", (sender,), _SDO, "request"),
+            _DbcMessage(SDO_RESPONSE_ID + node, f"{device.name}SdoResponse", sender, host, _SDO, "request"),
+            _DbcMessage(SDO_REQUEST_ID + node, f"{device.name}SdoRequest", "HOST", (sender,), _SDO, "request"),
             _heartbeat(device.name, node, sender, host, heartbeat_ms),
         ]
     messages.sort(key=lambda message: message.can_id)
@@ -181,27 +195,35 @@ def _messages(settings: Settings, devices: list[Device]) -> list[_Message]:
     return messages
 
 
-def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], period_ms: int) -> _Message:
+def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], period_ms: int) -> _DbcMessage:
     values = {"state": _NMT_STATES}
-    return _Message(
-        0x700 + node, f"{name}Heartbeat", sender, receivers, _HEARTBEAT, "event", period_ms, period_ms, values=values
+    return _DbcMessage(
+        HEARTBEAT_ID + node,
+        f"{name}Heartbeat",
+        sender,
+        receivers,
+        _HEARTBEAT,
+        "event",
+        period_ms,
+        period_ms,
+        values=values,
     )
 
 
-def _pdo_message(device: Device, pdo: PdoSettings) -> _Message:
+def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
     profile, name = device.settings, device.name.upper()
-    signals: list[_Signal] = []
+    signals: list[_DbcSignal] = []
     if pdo.data_ids:
-        signals = [_Signal(signal, bits) for signal, bits in HEADER_SIGNALS[profile.protection]]
+        signals = [_DbcSignal(signal, bits) for signal, bits in HEADER_SIGNALS[profile.protection]]
         mapped = sum(device.variable(signal.name).bits for signal in device.header(pdo))
         if mapped != sum(signal.bits for signal in signals):
             raise ConfigError(f"device profile {device.profile.name}: header objects have {mapped} bits in all")
     for signal in pdo.signals:
         variable = device.variable(signal.name)
         scale, unit = profile.unit_of(signal)
-        signals.append(_Signal(signal.signal, variable.bits, variable.is_signed, scale, unit))
+        signals.append(_DbcSignal(signal.signal, variable.bits, variable.is_signed, scale, unit))
     sender, receiver = ("HOST", name) if pdo.is_received else (name, "HOST")
-    message = _Message(
+    message = _DbcMessage(
         device.can_id(pdo),
         f"{device.name}{pdo.message}",
         sender,
@@ -214,15 +236,15 @@ def _pdo_message(device: Device, pdo: PdoSettings) -> _Message:
         pdo.data_ids[device.joint] if pdo.data_ids else "",
         {"mode_display": _MODES} if any(signal.name == "mode_display" for signal in signals) else {},
     )
-    if message.length > _CLASSIC_BYTES and message.length not in _FD_LENGTHS:
+    if message.length > CLASSIC_BYTES and message.length not in FD_LENGTHS:
         raise ConfigError(
             f"device profile {device.profile.name}: {pdo.message} has {message.length} bytes; "
-            f"a frame has 0 to 8, {', '.join(map(str, _FD_LENGTHS))}"
+            f"a frame has 0 to 8, {', '.join(map(str, FD_LENGTHS))}"
         )
     return message
 
 
-def _check_identifiers(messages: list[_Message]) -> None:
+def _check_identifiers(messages: list[_DbcMessage]) -> None:
     owner: dict[int, str] = {}
     for message in messages:
         if message.can_id in owner:
@@ -266,9 +288,9 @@ BA_DEF_DEF_ "GenMsgDelayTime" 0;
 """
 
 
-def _write_dbc(settings: Settings, messages: list[_Message]) -> str:
+def _write_dbc(settings: Settings, messages: list[_DbcMessage]) -> str:
     senders = sorted({message.sender for message in messages} - {"HOST"})
-    is_fd = any(message.length > _CLASSIC_BYTES for message in messages)
+    is_fd = any(message.length > CLASSIC_BYTES for message in messages)
     if is_fd and not settings.devices.data_bitrate:
         raise ConfigError("`devices.data_bitrate` = 0 bit/s, but the device profiles have frames of CAN FD")
     data_bitrate = settings.devices.data_bitrate if is_fd else 0
@@ -287,7 +309,7 @@ def _write_dbc(settings: Settings, messages: list[_Message]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _signal_lines(message: _Message) -> Iterable[str]:
+def _signal_lines(message: _DbcMessage) -> Iterable[str]:
     start = 0
     receivers = ",".join(message.receivers)
     for signal in message.signals:
@@ -305,8 +327,8 @@ def _number(value: float) -> str:
     return str(int(value)) if value == int(value) else repr(float(value))
 
 
-def _attribute_lines(message: _Message) -> Iterable[str]:
-    if message.length > _CLASSIC_BYTES:
+def _attribute_lines(message: _DbcMessage) -> Iterable[str]:
+    if message.length > CLASSIC_BYTES:
         yield f'BA_ "VFrameFormat" BO_ {message.can_id} {_FRAME_FORMATS.index("StandardCAN_FD")};'
     if message.protection:
         yield f'BA_ "E2EProfile" BO_ {message.can_id} "{message.protection}";'
@@ -321,7 +343,7 @@ def _attribute_lines(message: _Message) -> Iterable[str]:
         yield f'BA_ "GenMsgDelayTime" BO_ {message.can_id} {message.delay_ms};'
 
 
-def _value_lines(message: _Message) -> Iterable[str]:
+def _value_lines(message: _DbcMessage) -> Iterable[str]:
     for signal, table in message.values.items():
         values = " ".join(f'{value} "{text}"' for value, text in table.items())
         yield f"VAL_ {message.can_id} {signal} {values} ;"

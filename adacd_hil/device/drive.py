@@ -66,7 +66,7 @@ _STATUSWORD = (  # mask, value: IEC 61800-7-201 table 30
 )
 
 
-class Transition(NamedTuple):
+class Cia402Transition(NamedTuple):
     """One transition that the host commands, with the standard's number."""
 
     number: int
@@ -75,32 +75,32 @@ class Transition(NamedTuple):
 
 
 _S, _C = Cia402State, Controlword
-TRANSITIONS: dict[tuple[Cia402State, Controlword], Transition] = {
-    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): Transition(2, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): Transition(3, _C.SWITCH_ON, _S.SWITCHED_ON),
+TRANSITIONS: dict[tuple[Cia402State, Controlword], Cia402Transition] = {
+    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): Cia402Transition(2, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): Cia402Transition(3, _C.SWITCH_ON, _S.SWITCHED_ON),
     # With all bits of transition 4 set the drive does 3, then 4 by itself.
-    (_S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION): Transition(3, _C.ENABLE_OPERATION, _S.SWITCHED_ON),
-    (_S.SWITCHED_ON, _C.ENABLE_OPERATION): Transition(4, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
-    (_S.OPERATION_ENABLED, _C.DISABLE_OPERATION): Transition(5, _C.DISABLE_OPERATION, _S.SWITCHED_ON),
-    (_S.SWITCHED_ON, _C.SHUTDOWN): Transition(6, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): Transition(7, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): Transition(7, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.OPERATION_ENABLED, _C.SHUTDOWN): Transition(8, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): Transition(9, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.SWITCHED_ON, _C.QUICK_STOP): Transition(10, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): Transition(10, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.OPERATION_ENABLED, _C.QUICK_STOP): Transition(11, _C.QUICK_STOP, _S.QUICK_STOP_ACTIVE),
-    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): Transition(12, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    (_S.FAULT, _C.FAULT_RESET): Transition(15, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
+    (_S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION): Cia402Transition(3, _C.ENABLE_OPERATION, _S.SWITCHED_ON),
+    (_S.SWITCHED_ON, _C.ENABLE_OPERATION): Cia402Transition(4, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+    (_S.OPERATION_ENABLED, _C.DISABLE_OPERATION): Cia402Transition(5, _C.DISABLE_OPERATION, _S.SWITCHED_ON),
+    (_S.SWITCHED_ON, _C.SHUTDOWN): Cia402Transition(6, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): Cia402Transition(7, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): Cia402Transition(7, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.OPERATION_ENABLED, _C.SHUTDOWN): Cia402Transition(8, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): Cia402Transition(9, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.SWITCHED_ON, _C.QUICK_STOP): Cia402Transition(10, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): Cia402Transition(10, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.OPERATION_ENABLED, _C.QUICK_STOP): Cia402Transition(11, _C.QUICK_STOP, _S.QUICK_STOP_ACTIVE),
+    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): Cia402Transition(12, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (_S.FAULT, _C.FAULT_RESET): Cia402Transition(15, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
     # With 0x605A from 5 on; never sent by us: torque would be back at once.
-    (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): Transition(16, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+    (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): Cia402Transition(16, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
 }
 """What each command does in each state, where it does anything; by the drive itself: 0, 1, 12, 13, 14.
 
 IEC 61800-7-201, figure of the power drive system finite state automaton and its table of transitions.
 """
 
-TOWARD_ENABLED: dict[Cia402State, Transition] = {
+TOWARD_ENABLED: dict[Cia402State, Cia402Transition] = {
     state: TRANSITIONS[state, command]
     for state, command in (
         (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN),

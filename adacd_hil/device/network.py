@@ -8,25 +8,20 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from adacd_hil.device.arm import SYNC_OVERFLOW
+from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, follow_devices
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError
-from adacd_hil.device.drive_setup import command_deadline_ms, set_up_drive
+from adacd_hil.device.device_setup import ParameterWatch, Slave, command_deadline_ms, set_up_drive, set_up_sensor
 from adacd_hil.device.emergency import describe_emergency
-from adacd_hil.device.heartbeat import OPERATIONAL, PATIENCE_PERIODS, follow_devices
-from adacd_hil.device.parameter_watch import ParameterWatch
 from adacd_hil.device.pdo_mapping import set_up_pdos
-from adacd_hil.device.placement import place_devices
-from adacd_hil.device.profile import EMCY_INHIBIT_100US
-from adacd_hil.device.sensor_setup import set_up_sensor
-from adacd_hil.device.slave import Slave
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, place_devices
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Frame
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, SYNC_ID
 
 START, ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION = 0x01, 0x80, 0x82
 """NMT commands."""
-_SYNC_ID = 0x080
-_IDENTIFIER_MASK = 0x7FF
 _PROFILE_NUMBER_MASK = 0xFFFF  # of 0x1000
 _MOST_OLD_FRAMES = 10_000  # more than any queue holds; a bus that somebody floods is never empty
 
@@ -58,7 +53,7 @@ class Master:
         self._canopen = CanopenBus(bus)
         self._events: list[Event] = []
         self._emergencies: dict[str, str] = {}
-        self._heartbeat_id = codec.message("HostHeartbeat").can_id
+        self._heartbeat_id = codec.message(HOST_HEARTBEAT).can_id
         self.slaves: list[Slave] = []
         self.nodes: dict[str, Any] = {}
         devices = place_devices(settings)
@@ -185,9 +180,9 @@ class Master:
 
     def _set_up_sync(self, slave: Slave) -> None:
         if slave.has(0x1005):
-            identifier = slave.read(0x1005) & _IDENTIFIER_MASK
-            if identifier != _SYNC_ID:
-                slave.fail(f"SYNC identifier 0x1005 = 0x{identifier:X}, 0x{_SYNC_ID:X} expected")
+            identifier = slave.read(0x1005) & MAX_STANDARD_ID
+            if identifier != SYNC_ID:
+                slave.fail(f"SYNC identifier 0x1005 = 0x{identifier:X}, 0x{SYNC_ID:X} expected")
         counts = slave.has(0x1019) and slave.device.can("sync_counter")
         if counts and slave.read(0x1019) != SYNC_OVERFLOW:
             if slave.has(0x1006):

@@ -22,18 +22,18 @@ from adacd_hil.device.arm_batch import (
     FrameColumns,
     read_cycles,
 )
+from adacd_hil.device.arm_watch import HeartbeatWatch
 from adacd_hil.device.drive import Drive
-from adacd_hil.device.heartbeat import HEARTBEAT_ID, HeartbeatWatch
-from adacd_hil.device.torque_sensor import TorqueSensor
+from adacd_hil.device.torque_sensor import STATUS_BITS, TorqueSensor
 from adacd_hil.records import JOINTS, ArmBatch, ArmState, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import MessageCodec, SignalCodec
+from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 from adacd_hil.wire.e2e_batch import PROFILE_NUMBERS
 
 _MOST_BITS = 32
 _MOST_CYCLES = 8192
 """Cycles of one call."""
-_STATUS_BITS = 0x07
 _ALWAYS_NS = 1 << 62
 
 
@@ -41,7 +41,7 @@ class NotOrdinaryError(ValueError):
     """An arm whose frames can't be read at once; one line."""
 
 
-class Stretch(NamedTuple):
+class OrdinaryStretch(NamedTuple):
     """What one call has read. `last`: where the frames of the last of its cycles begin.
 
     `news`: of each kind of status frame and heartbeat the last one, as its place and the cycle that it was taken for.
@@ -121,7 +121,7 @@ class OrdinaryCycles:
             self._watch_status(index, found, sensor)
         elif sensor.status_in_header is not None:
             byte, shift = sensor.status_in_header
-            self._watch(index, byte, _STATUS_BITS << shift, lambda: sensor.status, up=shift)
+            self._watch(index, byte, STATUS_BITS << shift, lambda: sensor.status, up=shift)
         elif sensor.torque_range_Nm:
             message["range_limit"] = sensor.torque_range_Nm
         status = self._lay_out_status(index, sensor.status_message)
@@ -164,7 +164,7 @@ class OrdinaryCycles:
         signal = next(signal for signal in found.values if signal.name == "status")
         if signal.scale != 1.0 or signal.offset != 0.0 or signal.mask:
             raise NotOrdinaryError(f"{found.name}.status is scaled or shares a byte")
-        self._watch(number, found.first_byte(signal), _STATUS_BITS, lambda: sensor.status)
+        self._watch(number, found.first_byte(signal), STATUS_BITS, lambda: sensor.status)
 
     def _watch(self, number: int, byte: int, mask: int, read: Callable[[], int], down: int = 0, up: int = 0) -> None:
         message = self._messages[number]
@@ -175,7 +175,7 @@ class OrdinaryCycles:
         message["byte"][slot], message["mask"][slot] = byte, mask
         self._watched.append(_Watched(number, slot, read, down, up))
 
-    def read(self, batch: ArmBatch, place: int, frames: FrameColumns, at: int, state: ArmState) -> Stretch:
+    def read(self, batch: ArmBatch, place: int, frames: FrameColumns, at: int, state: ArmState) -> OrdinaryStretch:
         """Fill `batch` from `place` on with ordinary cycles; their frames begin at `at`.
 
         `state`: of the cycle before, which the live classes took.
@@ -200,7 +200,7 @@ class OrdinaryCycles:
         batch.steps[read] = 1
         batch.sampled_ns[read] = batch.t_ns[read]
         places, cycles = memory[0]["frame"].tolist(), memory[0]["frame_cycle"].tolist()
-        return Stretch(count, last, [(at, cycle) for at, cycle in zip(places, cycles, strict=True) if at >= 0])
+        return OrdinaryStretch(count, last, [(at, cycle) for at, cycle in zip(places, cycles, strict=True) if at >= 0])
 
     def _begin(self, state: ArmState) -> bool:
         """Take over from the live classes, where nothing is unusual."""
@@ -225,7 +225,7 @@ class OrdinaryCycles:
         return True
 
 
-_NOTHING = Stretch(0, 0, [])
+_NOTHING = OrdinaryStretch(0, 0, [])
 
 
 def _place_values(message: Any, found: MessageCodec, names: tuple[str, ...]) -> None:

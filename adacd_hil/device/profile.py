@@ -1,17 +1,23 @@
-"""Device profiles: a short TOML that, with an EDS, describes a drive or a sensor well enough to be run.
+"""Device profiles, and the devices of one arm in their places: name in the contract, node id, profile, objects.
+
+A profile is a short TOML that, with an EDS, describes a drive or a sensor well enough to be run.
 
 The EDS says which objects a device has and of what type. The profile says the rest: which of them travel in which
 frame under which signal name, what one count is worth, how frames are protected, what the device can do.
 Source: CiA 306 (EDS), CiA 301 clause 7.5.2 (PDO parameters), CiA 402-2, CiA 404.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from adacd_hil.device.canopen_bus import EdsVariable, find_variable, read_eds
+from adacd_hil.records import JOINTS
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from adacd_hil.wire.codec import contract_folder
@@ -263,7 +269,7 @@ def _is_hex(text: str, digits: int) -> bool:
     return len(text) == digits and all(c in "0123456789abcdefABCDEF" for c in text)
 
 
-class Profile(NamedTuple):
+class DeviceProfile(NamedTuple):
     """A device profile with its name and the place of its EDS."""
 
     name: str
@@ -280,7 +286,7 @@ def profile_names() -> list[str]:
     return toml_names(_builtin_folder())
 
 
-def load_profile(name_or_file: str, kind: str) -> Profile:
+def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
     """Load a device profile by built-in name or file; `kind` is what it must be, drive or sensor.
 
     Raises ConfigError for an unknown name or key, a value outside its bounds, an EDS that isn't there, another kind.
@@ -297,4 +303,79 @@ def load_profile(name_or_file: str, kind: str) -> Profile:
     eds = beside if beside.is_file() else contract_folder() / settings.eds
     if not eds.is_file():
         raise ConfigError(f"device profile {name_or_file}: eds = {settings.eds!r} is neither beside it nor in dbc/")
-    return Profile(path.stem, eds, settings)
+    return DeviceProfile(path.stem, eds, settings)
+
+
+@dataclass(frozen=True)
+class PlacedDevice:
+    """One device of the arm. `joint` counts from 0."""
+
+    name: str
+    joint: int
+    node_id: int
+    profile: DeviceProfile
+
+    @property
+    def settings(self) -> ProfileSettings:
+        """What its profile says."""
+        return self.profile.settings
+
+    @property
+    def objects(self) -> Any:
+        """The object dictionary of its EDS. Raises ConfigError when it can't be read."""
+        return _objects(self.profile.eds, self.node_id)
+
+    def has(self, index: int, sub: int = 0) -> bool:
+        """Whether the EDS lists an object."""
+        return find_variable(self.objects, index, sub) is not None
+
+    def can(self, feature: str) -> bool:
+        """Whether the profile names a feature."""
+        return feature in self.settings.features
+
+    def pdo(self, message: str) -> PdoSettings | None:
+        """Return the PDO that is this message of the contract, None when the device has none."""
+        return next((pdo for pdo in self.settings.pdo if pdo.message == message), None)
+
+    def can_id(self, pdo: PdoSettings) -> int:
+        """Return the identifier of a PDO."""
+        return pdo.cob_id + self.node_id
+
+    def variable(self, name: ObjectName) -> EdsVariable:
+        """Describe an object of the EDS. Raises ConfigError when it lists none or one that fits no PDO."""
+        found = find_variable(self.objects, name.index, name.sub)
+        if found is None:
+            raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds.name}")
+        if not found.bits:
+            raise ConfigError(f"device profile {self.profile.name}: object {name} ({found.name}) fits no PDO")
+        return found
+
+    def mapping(self, pdo: PdoSettings) -> list[int]:
+        """Return the mapping entries of a PDO, CiA 301 figure 70: index, sub-index, bits. Raises ConfigError."""
+        names = [signal.name for signal in self.header(pdo)] + [signal.name for signal in pdo.signals]
+        return [name.index << 16 | name.sub << 8 | self.variable(name).bits for name in names]
+
+    def header(self, pdo: PdoSettings) -> list[SignalSettings]:
+        """Return the header objects of a PDO; none where it is unprotected."""
+        if not pdo.data_ids:
+            return []
+        return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]
+
+
+@functools.lru_cache(maxsize=32)
+def _objects(path: Path, node_id: int) -> Any:
+    return read_eds(path, node_id)
+
+
+def place_devices(settings: Settings) -> list[PlacedDevice]:
+    """Load the profiles of all devices: Drive1, Drive2, Sensor1, Sensor2, in this order. Raises ConfigError."""
+    chosen = settings.devices
+    devices = []
+    for kind, names, nodes in (
+        ("drive", chosen.drive, chosen.drive_node),
+        ("sensor", chosen.sensor, chosen.sensor_node),
+    ):
+        for joint in range(JOINTS):
+            profile = load_profile(names[joint], kind)
+            devices.append(PlacedDevice(f"{kind.capitalize()}{joint + 1}", joint, nodes[joint], profile))
+    return devices

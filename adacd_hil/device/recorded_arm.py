@@ -24,16 +24,15 @@ from numpy.typing import NDArray
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_batch import FrameColumns, columns_of
-from adacd_hil.device.arm_watch import ArmWatch
-from adacd_hil.device.canopen_bus import NMT_ID
-from adacd_hil.device.heartbeat import follow_devices
+from adacd_hil.device.arm_watch import ArmWatch, follow_devices
 from adacd_hil.device.network import RESET_COMMUNICATION, START
 from adacd_hil.device.ordinary_cycles import NotOrdinaryError, OrdinaryCycles
-from adacd_hil.device.placement import place_devices
+from adacd_hil.device.profile import place_devices
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import NMT_ID
 
 _Passed = list[tuple[bool, Frame]]
 """Frames in the order of the log, True for sent."""

@@ -13,13 +13,14 @@ CRC and alive counter are no secret: they find errors, not intent. See `docs/thr
 from collections import deque
 
 from adacd_hil.clock import Clock
+from adacd_hil.device.arm_watch import Notices
 from adacd_hil.device.canopen_bus import DeviceError
-from adacd_hil.device.notices import Notices
-from adacd_hil.device.placement import place_devices
+from adacd_hil.device.profile import place_devices
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_ID
 
 LISTEN_S = 0.3
 """How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats."""
@@ -29,8 +30,6 @@ CONTRADICTIONS = 2
 """Second frames of a device that are no accident."""
 WINDOW_S = 0.1
 """In which they are counted."""
-SDO_REQUEST = 0x600
-_NMT_ID = 0x000
 _NMT_WORDS = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset node", 130: "reset communication"}
 _READING = (2, 3, 5)
 """SDO client commands that change nothing: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
@@ -39,14 +38,14 @@ _READING = (2, 3, 5)
 def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
     """Say by identifier what somebody does who sends what only this host sends."""
     doing = {
-        codec.message("HostHeartbeat").can_id: "sends this host's heartbeat",
-        _NMT_ID: "sends NMT commands",
+        codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
+        NMT_ID: "sends NMT commands",
     }
     if not settings.bus.follows:
         doing[codec.message("Sync").can_id] = "sends SYNC"
     for device in place_devices(settings):
         name = _plain(device.name)
-        doing[SDO_REQUEST + device.node_id] = f"writes objects of {name}"
+        doing[SDO_REQUEST_ID + device.node_id] = f"writes objects of {name}"
         if device.settings.kind == "drive":
             doing[codec.message(f"{device.name}Command").can_id] = f"commands {name}"
     return doing
@@ -100,13 +99,13 @@ class Strangers(Notices):
         doing = self._doing.get(frame.can_id)
         if doing is None:
             return False
-        if frame.can_id == _NMT_ID:
+        if frame.can_id == NMT_ID:
             command, node_id = (*frame.data[:2], 0, 0)[:2]
             if node_id not in self._nodes:
                 return True  # to a node of another arm
             word = _NMT_WORDS.get(command, f"command {command}")
             doing = f"sends NMT {word} to {f'node {node_id}' if node_id else 'all nodes'}"
-        elif frame.can_id & 0x780 == SDO_REQUEST and frame.data and frame.data[0] >> 5 in _READING:
+        elif frame.can_id & 0x780 == SDO_REQUEST_ID and frame.data and frame.data[0] >> 5 in _READING:
             text = f"somebody else {doing.replace('writes', 'reads')} (0x{frame.can_id:03X})"
             self.say(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
             return True

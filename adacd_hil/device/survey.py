@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
-from adacd_hil.device.slave import Slave
-from adacd_hil.wire.bus import Bus
+from adacd_hil.device.device_setup import Slave
+from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Tap
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.tap import Tap
 from adacd_hil.wire.traffic import Talk, Traffic, listen
 
 LISTEN_S = 1.5
@@ -47,7 +46,7 @@ _TPDOS = (0x180, 0x280, 0x380, 0x480)
 
 def function_name(can_id: int) -> str:
     """Name what CiA 301's predefined connection set uses an identifier for; "" when it is not one of them."""
-    if can_id > 0x7FF:
+    if can_id > MAX_STANDARD_ID:
         return ""
     function, node_id = can_id & 0x780, can_id & 0x7F
     if can_id in _BROADCAST:
@@ -156,7 +155,7 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
     found: dict[int, Node] = {}
     for is_sent, frame in tap.take():
         function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
-        if is_sent or frame.is_error or frame.can_id > 0x7FF or node_id == 0:
+        if is_sent or frame.is_error or frame.can_id > MAX_STANDARD_ID or node_id == 0:
             continue
         node = found.get(node_id) or Node(node_id)
         if function == 0x580 and len(frame.data) == 8 and frame.data[1:4] == _UPLOAD_DEVICE_TYPE[1:4]:
@@ -197,7 +196,7 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
     """Give each identifier to the node that produces it by the predefined connection set; return the rest."""
     others = []
     for talk in traffic.sorted():
-        node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= 0x7FF else None
+        node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= MAX_STANDARD_ID else None
         if node is not None and talk.can_id & 0x780 in _PRODUCED and talk.can_id not in _BROADCAST:
             if talk.can_id & 0x780 != 0x580:  # answers to us
                 node.produces.append(talk)

@@ -19,8 +19,8 @@ class SensorStatus(IntFlag):
     NEGATIVE_OVERLOAD = 4
 
 
-_STATUS_BITS = 0x07
-_STATUSES = tuple(SensorStatus(bits) for bits in range(_STATUS_BITS + 1))
+STATUS_BITS = 0x07
+_STATUSES = tuple(SensorStatus(bits) for bits in range(STATUS_BITS + 1))
 USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_VALID)
 """Statuses with which a torque may be used; an overloaded one is a bound."""
 _OVERLOAD = SensorStatus.POSITIVE_OVERLOAD | SensorStatus.NEGATIVE_OVERLOAD
@@ -103,10 +103,10 @@ class TorqueSensor:
 
     def _take_status(self, data: bytes, values: tuple[float, ...], torque: float) -> None:
         if self._status_at is not None:
-            self.status = _STATUSES[int(values[self._status_at]) & _STATUS_BITS]
+            self.status = _STATUSES[int(values[self._status_at]) & STATUS_BITS]
         elif self.status_in_header is not None:
             byte, shift = self.status_in_header
-            self.status = _STATUSES[data[byte] >> shift & _STATUS_BITS]
+            self.status = _STATUSES[data[byte] >> shift & STATUS_BITS]
         elif self.torque_range_Nm:
             self.status = _judge_range(torque, self.torque_range_Nm)
 
@@ -139,7 +139,7 @@ class TorqueSensor:
             return False
         is_valid = receiver.check(data).is_valid
         if is_valid:
-            self.status = _STATUSES[int(message.decode_values(data)[at]) & _STATUS_BITS]
+            self.status = _STATUSES[int(message.decode_values(data)[at]) & STATUS_BITS]
         return is_valid
 
     @property

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, MAX_DATA
 from adacd_hil.log.topic_records import Topic
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES
+from adacd_hil.wire.bus import CLASSIC_BYTES
 
 
 def _frame_dtype(data_bytes: int) -> "np.dtype[Any]":
@@ -25,7 +25,7 @@ def _frame_dtype(data_bytes: int) -> "np.dtype[Any]":
     )
 
 
-FRAME_DTYPE = _frame_dtype(MAX_CLASSIC_BYTES)
+FRAME_DTYPE = _frame_dtype(CLASSIC_BYTES)
 """A frame of a log without FD frames."""
 LONG_FRAME_DTYPE = _frame_dtype(MAX_DATA)
 """A frame of a log with FD frames, classic ones too: `data` (64,). All else is as in the other."""
@@ -92,5 +92,5 @@ def _lengthened(frames: NDArray[Any]) -> NDArray[Any]:
     for name in FRAME_DTYPE.names or ():
         if name != "data":
             long[name] = frames[name]
-    long["data"][:, :MAX_CLASSIC_BYTES] = frames["data"]
+    long["data"][:, :CLASSIC_BYTES] = frames["data"]
     return long

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.ros_types import MAX_DATA
 from adacd_hil.records import Event
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, Frame
+from adacd_hil.wire.bus import CLASSIC_BYTES, Frame
 
 CYCLE = 1
 EVENT = 2
@@ -39,7 +39,7 @@ HEAD_DTYPE = np.dtype(
 FRAME_DTYPE = np.dtype(
     {
         "names": ["can_id", "length", "flags", "data", "t_ns"],
-        "formats": ["<u4", "u1", "u1", ("u1", (MAX_CLASSIC_BYTES,)), "<i8"],
+        "formats": ["<u4", "u1", "u1", ("u1", (CLASSIC_BYTES,)), "<i8"],
         "offsets": [0, 4, 5, 8, 16],
         "itemsize": 24,
     }
@@ -65,8 +65,8 @@ def pack_cycle(
     for is_tx, (can_id, data, frame_t_ns, is_error) in frames:
         length = len(data)
         values += (can_id, length, is_tx | is_error << 1, data, frame_t_ns)
-        if length > MAX_CLASSIC_BYTES:
-            rests.append(data[MAX_CLASSIC_BYTES:])
+        if length > CLASSIC_BYTES:
+            rests.append(data[CLASSIC_BYTES:])
     parts = [b""]
     for channel, body in messages:
         values += (channel, len(body))
@@ -136,7 +136,7 @@ def _unpack(
     frames = gather(data, frame_starts, FRAME_DTYPE.itemsize).view(FRAME_DTYPE)
     messages = gather(data, message_starts, MESSAGE_DTYPE.itemsize).view(MESSAGE_DTYPE)
     bodies_before, body_sums = sums_within(messages["size"], message_counts)
-    rests = np.maximum(frames["length"].astype(np.int64) - MAX_CLASSIC_BYTES, 0)
+    rests = np.maximum(frames["length"].astype(np.int64) - CLASSIC_BYTES, 0)
     rests_before, rest_sums = sums_within(rests, frame_counts)
     is_right = ~is_cycle | (table_bytes + body_sums + rest_sums == sizes)
     columns = Columns(
@@ -169,10 +169,10 @@ def unpack_event(columns: Columns, index: int) -> Event:
 def long_data(columns: Columns, frames: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Return the data of FD frames by their numbers (k, 64), anything beyond their length."""
     data = np.empty((len(frames), MAX_DATA), np.uint8)
-    data[:, :MAX_CLASSIC_BYTES] = columns.frames["data"][frames]
-    rest_bytes = MAX_DATA - MAX_CLASSIC_BYTES
+    data[:, :CLASSIC_BYTES] = columns.frames["data"][frames]
+    rest_bytes = MAX_DATA - CLASSIC_BYTES
     rests = gather(columns.data, columns.rest_starts[frames], rest_bytes)
-    data[:, MAX_CLASSIC_BYTES:] = rests.view(np.uint8).reshape(-1, rest_bytes)
+    data[:, CLASSIC_BYTES:] = rests.view(np.uint8).reshape(-1, rest_bytes)
     return data
 
 

@@ -47,7 +47,7 @@ from adacd_hil.log.ros_types import (
 )
 from adacd_hil.log.topic_records import record_dtype
 from adacd_hil.records import JOINTS, Event, scheme_layout
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES
+from adacd_hil.wire.bus import CLASSIC_BYTES
 
 _HEAD = struct.Struct("<BQHIQQ")
 _CHANNEL = slice(9, 11)
@@ -197,7 +197,7 @@ class PacketWriter:
     def _frame_groups(self, packets: Columns, slots: Numbers, publish_ns: Numbers) -> Iterator[_Group]:
         """Make the records of the frames: those of up to 8 bytes all at once, longer ones by their length."""
         frames = packets.frames
-        is_long = frames["length"] > MAX_CLASSIC_BYTES
+        is_long = frames["length"] > CLASSIC_BYTES
         places = np.flatnonzero(~is_long)
         if len(places):
             rows = _rows(pack_can_frame(_NO_STAMP, 0, b"", 0, False), len(places))
@@ -238,7 +238,7 @@ class PacketWriter:
         for number in np.unique(decoders[decoders >= 0]).tolist():
             decoder = self._decoders[number]
             places = np.flatnonzero(decoders == number)
-            is_long = decoder.length > MAX_CLASSIC_BYTES
+            is_long = decoder.length > CLASSIC_BYTES
             data = long_data(packets, places) if is_long else packets.frames["data"][places]
             rows = _rows(ENCAPSULATION + _NO_STAMP + bytes(8 * decoder.count), len(places))
             decoder.decode(data[:, : decoder.length], rows[:, _BODY:].view(np.float64))

@@ -1,8 +1,5 @@
 """Bit budget of a contract: whether its frames get through in time, from the DBC alone.
 
-DBC attributes: of the network `Baudrate`, `BaudrateCANFD` (bit/s; 0: classic), `BusPeriod_us`; of a message `Trigger`,
-`GenMsgCycleTime` (ms, period of an event frame), `GenMsgDelayTime` (ms, its inhibit time).
-
 | trigger | counted as | must be through |
 |---|---|---|
 | sync | once per SYNC, SYNC itself included | before the next SYNC |
@@ -11,110 +8,128 @@ DBC attributes: of the network `Baudrate`, `BaudrateCANFD` (bit/s; 0: classic), 
 | request | not while operating, or one SDO frame per SYNC | at leisure |
 
 All cyclic frames are taken as queued together with SYNC. That is never better than the truth for the last of them, and
-needs nothing known about the devices' and the host's delays. Response times (`adacd_hil.wire.response_time`) are found
-for three kinds of traffic: operation (without requests and EMCY), which decides whether the contract fits; the same
-with one SDO frame per SYNC; and with the EMCY of every device besides. What the last two make late is said, not failed:
-a command that is late acts one SYNC later. NMT commands begin and end operation and disturb none of them.
+needs nothing known about the devices' and the host's delays. Response times are found for three kinds of traffic:
+operation (without requests and EMCY), which decides whether the contract fits; the same with one SDO frame per SYNC;
+and with the EMCY of every device besides. What the last two make late is said, not failed: a command that is late acts
+one SYNC later. NMT commands begin and end operation and disturb none of them.
 
 On a bus that arms share, what has no node id counts once and everything else once per arm.
+
+Worst-case response times of messages that share a bus by fixed priority, without preemption: Davis, Burns, Bril,
+Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and revised", Real-Time Systems 35
+(2007), section 3.2: level-m busy period, and every instance in it. (The analysis of 1994 looks at the first instance
+only and promises too much.) A response time goes from the queueing of a message to the end of its frame, intermission
+included; errors on the bus are left out.
 """
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
-import cantools
-from cantools.database.can import Database, Message
-
+from adacd_hil.wire.bus import CLASSIC_BYTES
 from adacd_hil.wire.codec import Codec, CodecError
-from adacd_hil.wire.frame_bits import CLASSIC_BYTES, FrameBits, unstuffed_frame, worst_case_frame
-from adacd_hil.wire.node_offset import NODE_MASK, move_id
-from adacd_hil.wire.response_time import Response, Stream, response_time
+from adacd_hil.wire.contract_frames import (
+    ASSUMED_INTERVAL_MS,
+    NMT_ID,
+    ContractFrame,
+    ContractTiming,
+    Trigger,
+    read_contract,
+    share_bus,
+)
+from adacd_hil.wire.frame_bits import FrameBits, unstuffed_frame, worst_case_frame
 
-ASSUMED_INTERVAL_MS = 100
-"""Interval of an event frame that declares none: the usual heartbeat period."""
-_NMT_ID = 0  # CiA 301, pre-defined connection set
-_HOST_HEARTBEAT = "HostHeartbeat"
-_EMCY_FUNCTION = 1  # 0x080 + node; 0x080 itself is SYNC
-_HEARTBEAT_FUNCTION = 14  # 0x700 + node
-
-
-class Trigger(Enum):
-    """When a frame is sent; the DBC's `Trigger`."""
-
-    SYNC = "sync"
-    COMMAND = "command"
-    EVENT = "event"
-    REQUEST = "request"
+HORIZON_NS = 1_000_000_000
+"""Longest busy period that is followed; what isn't through after it counts as unbounded."""
 
 
-class Traffic(Enum):
+class Stream(NamedTuple):
+    """Frames of one message: time on the bus, smallest interval between two, release jitter."""
+
+    duration_ns: int
+    interval_ns: int
+    jitter_ns: int = 0
+
+    def arrivals(self, window_ns: int) -> int:
+        """Most frames that can be queued within a window: ceil((window + J) / T)."""
+        return -(-(window_ns + self.jitter_ns) // self.interval_ns)
+
+
+class ResponseTime(NamedTuple):
+    """A response time; where no bound was found, a time that it reaches at least."""
+
+    time_ns: int
+    is_bounded: bool = True
+
+
+def response_time(
+    stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, deadline_ns: int | None = None
+) -> ResponseTime:
+    """Return the worst-case response time of a message.
+
+    higher: the messages that win arbitration; blocking_ns: the longest frame of those that lose it; bit_ns: one bit at
+    the nominal rate. Where messages use up the bus, a time beyond `deadline_ns` (or the horizon) is returned.
+    """
+    if is_overloaded((*higher, stream)):
+        return _exceeded(stream, higher, blocking_ns, bit_ns, HORIZON_NS if deadline_ns is None else deadline_ns)
+    busy_ns = stream.duration_ns
+    while True:
+        longer_ns = blocking_ns + sum(s.arrivals(busy_ns) * s.duration_ns for s in (*higher, stream))
+        if longer_ns == busy_ns:
+            break
+        busy_ns = longer_ns
+        if busy_ns > HORIZON_NS:
+            return _exceeded(stream, higher, blocking_ns, bit_ns, HORIZON_NS if deadline_ns is None else deadline_ns)
+    worst_ns = 0
+    waiting_ns = blocking_ns
+    for instance in range(stream.arrivals(busy_ns)):
+        waiting_ns = max(waiting_ns, blocking_ns + instance * stream.duration_ns)
+        while True:
+            longer_ns = _waiting(stream, higher, blocking_ns, bit_ns, instance, waiting_ns)
+            if longer_ns == waiting_ns:
+                break
+            waiting_ns = longer_ns
+        worst_ns = max(worst_ns, stream.jitter_ns + waiting_ns - instance * stream.interval_ns + stream.duration_ns)
+    return ResponseTime(worst_ns)
+
+
+def is_overloaded(streams: Sequence[Stream]) -> bool:
+    """Tell whether messages together need more than all of the bus."""
+    common = math.lcm(*(stream.interval_ns for stream in streams))
+    return sum(stream.duration_ns * (common // stream.interval_ns) for stream in streams) > common
+
+
+def _waiting(
+    stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, instance: int, waiting_ns: int
+) -> int:
+    """One step of eq. (9): what is sent before instance q while it waits."""
+    before_ns = sum(s.arrivals(waiting_ns + bit_ns) * s.duration_ns for s in higher)
+    return blocking_ns + instance * stream.duration_ns + before_ns
+
+
+def _exceeded(stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, limit_ns: int) -> ResponseTime:
+    """Return a time, beyond `limit_ns` where there is one, that some frame of an endless busy period takes at least."""
+    worst_ns = 0
+    waiting_ns = blocking_ns
+    instance = 0
+    while worst_ns <= limit_ns and instance * stream.interval_ns <= HORIZON_NS:
+        longer_ns = _waiting(stream, higher, blocking_ns, bit_ns, instance, waiting_ns)
+        worst_ns = max(worst_ns, stream.jitter_ns + longer_ns - instance * stream.interval_ns + stream.duration_ns)
+        if longer_ns == waiting_ns:
+            instance += 1
+            longer_ns += stream.duration_ns
+        waiting_ns = longer_ns
+    return ResponseTime(worst_ns, is_bounded=False)
+
+
+class LoadCase(Enum):
     """Which frames are on the bus besides the cyclic ones."""
 
     OPERATION = "operation"
     REQUESTS = "requests"
     EMERGENCIES = "emergencies"
-
-
-@dataclass(frozen=True)
-class ContractFrame:
-    """What a contract says of a message."""
-
-    name: str
-    can_id: int
-    is_extended: bool
-    length: int
-    trigger: Trigger
-    cycle_ms: int
-    inhibit_ms: int
-
-    @property
-    def priority(self) -> tuple[int, int]:
-        """Order of arbitration; the lower wins. A base frame wins over an extended one with the same first 11 bits."""
-        return (self.can_id >> 18, 1 + (self.can_id & 0x3FFFF)) if self.is_extended else (self.can_id, 0)
-
-    @property
-    def is_cyclic(self) -> bool:
-        """Whether it is sent on every SYNC."""
-        return self.trigger in (Trigger.SYNC, Trigger.COMMAND)
-
-    @property
-    def is_emergency(self) -> bool:
-        """Whether it is a CiA 301 EMCY."""
-        is_emcy_id = not self.is_extended and self.can_id >> 7 == _EMCY_FUNCTION and self.can_id & 0x7F != 0
-        return is_emcy_id and self.trigger is Trigger.EVENT
-
-    @property
-    def has_interval(self) -> bool:
-        """Whether something bounds how often it is sent; a heartbeat keeps its time."""
-        is_heartbeat = not self.is_extended and self.can_id >> 7 == _HEARTBEAT_FUNCTION
-        return self.trigger is not Trigger.EVENT or self.inhibit_ms > 0 or is_heartbeat
-
-    def interval_ns(self, period_ns: int) -> int:
-        """Smallest time between two of them that is counted with."""
-        if self.trigger is Trigger.EVENT:
-            return (self.inhibit_ms or self.cycle_ms or ASSUMED_INTERVAL_MS) * 1_000_000
-        return period_ns
-
-    def deadline_ns(self, period_ns: int) -> int | None:
-        """Time within which it must be through; None: at leisure."""
-        if self.is_cyclic:
-            return period_ns
-        return self.cycle_ms * 1_000_000 if self.trigger is Trigger.EVENT and self.cycle_ms else None
-
-
-@dataclass(frozen=True)
-class Contract:
-    """Frames of a DBC in the order of arbitration; rates in bit/s; a period of 0 is not given.
-
-    `arms`: how many, each with a host.
-    """
-
-    name: str
-    bitrate: int
-    data_bitrate: int
-    period_us: int
-    frames: tuple[ContractFrame, ...]
-    arms: int = 1
 
 
 @dataclass(frozen=True)
@@ -127,9 +142,9 @@ class FrameBudget:
     duration_ns: int
     interval_ns: int
     deadline_ns: int | None
-    responses: dict[Traffic, Response]
+    responses: dict[LoadCase, ResponseTime]
 
-    def late_ns(self, traffic: Traffic = Traffic.OPERATION) -> int:
+    def late_ns(self, traffic: LoadCase = LoadCase.OPERATION) -> int:
         """How far it may be beyond its deadline (at least, where the response is unbounded); 0: in time."""
         response = self.responses[traffic]
         if self.deadline_ns is None:
@@ -141,7 +156,7 @@ class FrameBudget:
 class Budget:
     """Budget of a contract at a period and bit rates. Times in ns, at worst-case stuffing."""
 
-    contract: Contract
+    contract: ContractTiming
     period_us: int
     bitrate: int
     data_bitrate: int
@@ -199,7 +214,9 @@ class Budget:
     @property
     def load(self) -> float:
         """Share of the time in operation: cyclic frames and events, at worst, without requests and EMCY."""
-        return sum(entry.duration_ns / entry.interval_ns for entry in self.frames if _is_sent(entry, Traffic.OPERATION))
+        return sum(
+            entry.duration_ns / entry.interval_ns for entry in self.frames if _is_sent(entry, LoadCase.OPERATION)
+        )
 
     @property
     def late(self) -> tuple[FrameBudget, ...]:
@@ -221,7 +238,7 @@ class Budget:
         if self.host_ns < 0:
             reasons.append(f"the cyclic frames need {us(self.cyclic_ns)} µs, {us(-self.host_ns)} µs too many")
         first, *more = sorted(self.late, key=lambda entry: (not entry.frame.is_cyclic, -entry.late_ns()))
-        reasons.append(_describe_late(first, Traffic.OPERATION) + (f", {len(more)} more miss theirs" if more else ""))
+        reasons.append(_describe_late(first, LoadCase.OPERATION) + (f", {len(more)} more miss theirs" if more else ""))
         return f"{where} doesn't fit: {'; '.join(reasons)}"
 
     @property
@@ -232,9 +249,9 @@ class Budget:
             notes.append(f"each event frame in the way takes up to {us(self.longest_event_ns)} µs of the host's time")
         if any(entry.frame.trigger is Trigger.REQUEST for entry in self.frames):
             whose = "one SDO" if self.contract.arms == 1 else "one SDO of each host"
-            notes.append(f"{whose} in every cycle: {self._describe_traffic(Traffic.REQUESTS)}")
+            notes.append(f"{whose} in every cycle: {self._describe_traffic(LoadCase.REQUESTS)}")
         if any(entry.frame.is_emergency for entry in self.frames):
-            notes.append(f"and every EMCY at once: {self._describe_traffic(Traffic.EMERGENCIES)}")
+            notes.append(f"and every EMCY at once: {self._describe_traffic(LoadCase.EMERGENCIES)}")
         open_ended = [entry.frame for entry in self.frames if not entry.frame.has_interval]
         if open_ended:
             notes.append(
@@ -243,7 +260,7 @@ class Budget:
             )
         return tuple(notes)
 
-    def _describe_traffic(self, traffic: Traffic) -> str:
+    def _describe_traffic(self, traffic: LoadCase) -> str:
         if not self.cyclic:
             return "no cyclic frames"
         last = max(self.cyclic, key=lambda entry: entry.responses[traffic].time_ns)
@@ -257,77 +274,11 @@ def us(time_ns: int) -> str:
     return f"{time_ns / 1000:.0f}" if time_ns % 1000 == 0 else f"{time_ns / 1000:.1f}"
 
 
-def _describe_late(entry: FrameBudget, traffic: Traffic) -> str:
+def _describe_late(entry: FrameBudget, traffic: LoadCase) -> str:
     response = entry.responses[traffic]
     about = "" if response.is_bounded else "at least "
     deadline_ns = entry.deadline_ns or 0
     return f"{entry.frame.name} misses its deadline of {us(deadline_ns)} µs by {about}{us(entry.late_ns(traffic))} µs"
-
-
-def read_contract(text: bytes, name: str) -> Contract:
-    """Read the timing of a DBC that `load_codec` has accepted. Raises CodecError."""
-    database = cantools.database.load_string(text.decode("utf-8"), "dbc")
-    if not isinstance(database, Database):
-        raise CodecError(f"DBC {name} holds no CAN messages")
-    definitions = database.dbc.attribute_definitions if database.dbc else {}
-    if "Trigger" not in definitions:
-        raise CodecError(f"DBC {name} doesn't say when its messages are sent: it has no Trigger attribute")
-    frames = [_read_frame(message, name) for message in database.messages]
-    return Contract(
-        name,
-        int(_attribute(database, "Baudrate")),
-        int(_attribute(database, "BaudrateCANFD")),
-        int(_attribute(database, "BusPeriod_us")),
-        tuple(sorted(frames, key=lambda frame: frame.priority)),
-    )
-
-
-def _read_frame(message: Message, contract: str) -> ContractFrame:
-    choices = list(message.dbc.attribute_definitions["Trigger"].choices or ()) if message.dbc else []
-    value = _attribute(message, "Trigger")
-    chosen = choices[value] if isinstance(value, int) and 0 <= value < len(choices) else value
-    try:
-        trigger = Trigger(chosen)
-    except ValueError:
-        known = ", ".join(trigger.value for trigger in Trigger)
-        raise CodecError(f"DBC {contract}: {message.name}: Trigger = {chosen!r}; known: {known}") from None
-    cycle_ms, inhibit_ms = int(_attribute(message, "GenMsgCycleTime")), int(_attribute(message, "GenMsgDelayTime"))
-    return ContractFrame(
-        message.name, message.frame_id, message.is_extended_frame, message.length, trigger, cycle_ms, inhibit_ms
-    )
-
-
-def _attribute(owner: Database | Message, name: str) -> int | str:
-    """Value of an attribute, its default, or 0 where the DBC doesn't know it."""
-    if owner.dbc is None or name not in owner.dbc.attribute_definitions:
-        return 0
-    attribute = owner.dbc.attributes.get(name)
-    value = owner.dbc.attribute_definitions[name].default_value if attribute is None else attribute.value
-    return value if isinstance(value, str) else int(value or 0)
-
-
-def share_bus(contract: Contract, arms: int) -> Contract:
-    """Return what is on a bus that several arms of a contract share, whatever their order on it.
-
-    The devices' node ids follow each other from 1, the hosts' go down from the contract's. Raises CodecError for an
-    identifier without node id.
-    """
-    if arms == 1:
-        return contract
-    nodes = {f.can_id & NODE_MASK for f in contract.frames if f.name != _HOST_HEARTBEAT and f.can_id & NODE_MASK}
-    first, step = min(nodes, default=1), max(nodes, default=1) - min(nodes, default=1) + 1
-    frames = [frame for frame in contract.frames if not (frame.is_extended or frame.can_id & NODE_MASK)]
-    for arm in range(arms):
-        for frame in contract.frames:
-            if frame in frames:
-                continue
-            if frame.name == _HOST_HEARTBEAT:
-                can_id = frame.can_id - arm
-            else:
-                can_id = move_id(frame.can_id, 1 - first + arm * step, 0, f"DBC {contract.name}: {frame.name}")
-            frames.append(replace(frame, name=f"Arm{arm + 1}.{frame.name}", can_id=can_id))
-    frames.sort(key=lambda frame: frame.priority)
-    return replace(contract, name=f"{arms} × {contract.name}", frames=tuple(frames), arms=arms)
 
 
 def check_budget(
@@ -346,7 +297,7 @@ def check_budget(
 
 
 def find_budget(
-    contract: Contract, period_us: int | None = None, bitrate: int | None = None, data_bitrate: int | None = None
+    contract: ContractTiming, period_us: int | None = None, bitrate: int | None = None, data_bitrate: int | None = None
 ) -> Budget:
     """Find the budget of a contract; see `check_budget`."""
     period_us = _given(contract, "BusPeriod_us", period_us, contract.period_us)
@@ -366,27 +317,27 @@ def find_budget(
         entries.append(FrameBudget(frame, unstuffed, worst, duration_ns, interval_ns, deadline_ns, {}))
     bit_ns = FrameBits(1).duration_ns(bitrate)
     for place, entry in enumerate(entries):
-        for traffic in Traffic:
+        for traffic in LoadCase:
             entry.responses[traffic] = _respond(entries, place, traffic, bit_ns, period_ns, contract.arms)
     return Budget(contract, period_us, bitrate, data_bitrate, tuple(entries))
 
 
-def _given(contract: Contract, attribute: str, chosen: int | None, declared: int) -> int:
+def _given(contract: ContractTiming, attribute: str, chosen: int | None, declared: int) -> int:
     value = declared if chosen is None else chosen
     if value <= 0:
         raise CodecError(f"DBC {contract.name} has no {attribute}, and none is given")
     return value
 
 
-def _is_sent(entry: FrameBudget, traffic: Traffic) -> bool:
+def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
     if entry.frame.trigger is Trigger.REQUEST:
-        return traffic is not Traffic.OPERATION and entry.frame.can_id != _NMT_ID
-    return not entry.frame.is_emergency or traffic is Traffic.EMERGENCIES
+        return traffic is not LoadCase.OPERATION and entry.frame.can_id != NMT_ID
+    return not entry.frame.is_emergency or traffic is LoadCase.EMERGENCIES
 
 
 def _respond(
-    entries: list[FrameBudget], place: int, traffic: Traffic, bit_ns: int, period_ns: int, hosts: int
-) -> Response:
+    entries: list[FrameBudget], place: int, traffic: LoadCase, bit_ns: int, period_ns: int, hosts: int
+) -> ResponseTime:
     """Response time of the frame at `place` in the order of arbitration, one request at most of a host in a period."""
     entry = entries[place]
     above = [other for other in entries[:place] if _is_sent(other, traffic)]

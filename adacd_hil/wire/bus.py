@@ -1,19 +1,14 @@
 """Where frames enter and leave: one seam over SocketCAN, the embedded bus, and every other python-can interface.
 
 The embedded bus joins host and emulator in one process, without threads: what the host sends is handled before `send`
-returns.
+returns. A tap around a bus remembers every frame that passes, both ways, for the log.
 """
 
-import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from adacd_hil.clock import Clock
-
-_INTERFACES = Path("/sys/class/net")
-_ARPHRD_CAN = "280"
 
 
 class BusError(OSError):
@@ -44,7 +39,7 @@ class BusOffError(BusError):
         self.frame = frame
 
 
-MAX_CLASSIC_BYTES = 8
+CLASSIC_BYTES = 8
 """A frame with more data is CAN FD with bit rate switch; one with less is classic, on an FD bus too."""
 MAX_STANDARD_ID = 0x7FF
 """Identifiers beyond it are 29-bit ones."""
@@ -186,27 +181,75 @@ def open_bus(
     return PythonCanBus(interface, channel, clock, bitrate, is_fd)
 
 
-def can_interfaces() -> list[str]:
-    """Name the CAN interfaces of this machine, up or down."""
-    names = []
-    for folder in sorted(_INTERFACES.glob("*")):
-        with contextlib.suppress(OSError):
-            if (folder / "type").read_text().strip() == _ARPHRD_CAN:
-                names.append(folder.name)
-    return names
+class Tap(Bus):
+    """Wraps a bus; `take` returns and forgets the frames since the last call, oldest first, True for sent.
 
-
-def is_virtual(interface: str, channel: str) -> bool:
-    """Tell whether a channel surely has no wire behind it: vcan, vxcan, python-can's own virtual bus.
-
-    A serial adapter (slcan) has no device of its own and is no such channel. Where the kernel doesn't say what kind an
-    interface is, its name does.
+    `held_ns` stamps sent frames instead of the clock when it is set: the cycle has just read the clock itself.
     """
-    if interface != "socketcan":
-        return interface == "virtual"
-    if (_INTERFACES / channel / "device").exists():
-        return False
-    from adacd_hil.wire.link import read_link  # which asks another program
 
-    link = read_link(channel)
-    return link is not None and link.is_virtual
+    def __init__(self, bus: Bus, clock: Clock) -> None:
+        self.channel = bus.channel
+        self._bus = bus
+        self._clock = clock
+        self._passed: list[tuple[bool, Frame]] = []
+        self._unread: Frame | None = None
+        self.held_ns: int | None = None
+
+    @property
+    def waiting_frames(self) -> tuple[int, ...]:
+        """Identifiers of what was sent and would be overtaken by SYNC, as far as the bus behind it knows."""
+        return self._bus.waiting_frames
+
+    @property
+    def frames_lost(self) -> int:
+        """Count of received frames that the bus behind it knows to have dropped."""
+        return self._bus.frames_lost
+
+    def queue_bytes(self) -> QueueBytes:
+        """Look at how much waits in the bus behind it."""
+        return self._bus.queue_bytes()
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send and remember a frame. Raises BusError."""
+        # Remembered first: on the embedded bus the answers come while `send` runs.
+        t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
+        self._passed.append((True, Frame(can_id, data, t_ns)))
+        self._bus.send(can_id, data)
+
+    def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Send and remember some frames. Raises BusError."""
+        t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
+        self._passed += [(True, Frame(can_id, data, t_ns)) for can_id, data in frames]
+        self._bus.send_all(frames)
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        """Receive and remember a frame. Raises BusError."""
+        if self._unread is not None:
+            unread, self._unread = self._unread, None
+            return unread
+        try:
+            frame = self._bus.receive(timeout_s)
+        except BusOffError as error:
+            self._passed.append((False, error.frame))
+            raise
+        if frame is not None:
+            self._passed.append((False, frame))
+        return frame
+
+    def unread(self, frame: Frame) -> None:
+        """Put a received frame back: it is the next one to be received."""
+        self._unread = frame
+
+    def take(self) -> list[tuple[bool, Frame]]:
+        """Return the frames since the last call."""
+        passed, self._passed = self._passed, []
+        return passed
+
+    def recover(self) -> None:
+        """Drop everything queued in the bus behind it; what has passed stays. Raises BusError."""
+        self._unread = None
+        self._bus.recover()
+
+    def close(self) -> None:
+        """Close the bus behind it."""
+        self._bus.close()

@@ -1,21 +1,33 @@
-"""One CAN network interface of this machine: its state, what waits in its transmit queue, taking it down and up.
+"""CAN network interfaces of this machine: their state, what waits in a transmit queue, taking one down and up.
 
-Sources: Linux netdevice(7) for the flags, rtnetlink(7) for the queueing discipline, linux/can/raw.h.
+The state is what the kernel reports by iproute2 (rtnetlink, IFLA_CAN_*) or, without it, by sysfs.
+
+Sources: Linux netdevice(7) for the flags, rtnetlink(7) for the queueing discipline, linux/can/raw.h; Linux,
+Documentation/networking/can.rst, "CAN network device driver interface".
 """
 
+import contextlib
 import errno
 import fcntl
+import json
+import os
+import shutil
 import socket
 import struct
+import subprocess
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from adacd_hil.nearest_name import nearest_name
-from adacd_hil.wire.bus import BusError, InterfaceDownError, can_interfaces, is_virtual
+from adacd_hil.wire.bus import BusError, InterfaceDownError
 
 CANFD_MTU = 72
-"""Size of an FD frame in SocketCAN, bytes."""
+"""sizeof(struct canfd_frame), bytes; a classic-only interface has 16."""
 
+_INTERFACES = Path("/sys/class/net")
+_ARPHRD_CAN = "280"
 _IFF_UP = 0x1
 _SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8913, 0x8914
 _FLAGS_REQUEST = struct.Struct("16sH22x")
@@ -35,7 +47,7 @@ class CanInterface:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._folder = Path("/sys/class/net") / name
+        self._folder = _INTERFACES / name
 
     @property
     def is_up(self) -> bool:
@@ -120,7 +132,7 @@ def _queues() -> Iterator[tuple[int, int, int]]:
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:
         netlink.send(request)
         while True:
-            for kind, body in _messages(netlink.recv(65536)):
+            for kind, body in _netlink_messages(netlink.recv(65536)):
                 if kind == _NLMSG_DONE:
                     return
                 if kind == _NLMSG_ERROR:
@@ -133,7 +145,7 @@ def _queues() -> Iterator[tuple[int, int, int]]:
                     yield interface, parent, struct.unpack_from("=I", queue)[0]
 
 
-def _messages(data: bytes) -> Iterator[tuple[int, bytes]]:
+def _netlink_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
     position = 0
     while position < len(data):
         length, kind, _, _, _ = _NETLINK_HEAD.unpack_from(data, position)
@@ -149,3 +161,133 @@ def _attributes(data: bytes) -> dict[int, bytes]:
         found[kind] = data[position + _ATTRIBUTE.size : position + length]
         position += length + -length % 4
     return found
+
+
+def can_interfaces() -> list[str]:
+    """Name the CAN interfaces of this machine, up or down."""
+    names = []
+    for folder in sorted(_INTERFACES.glob("*")):
+        with contextlib.suppress(OSError):
+            if (folder / "type").read_text().strip() == _ARPHRD_CAN:
+                names.append(folder.name)
+    return names
+
+
+def is_virtual(interface: str, channel: str) -> bool:
+    """Tell whether a channel surely has no wire behind it: vcan, vxcan, python-can's own virtual bus.
+
+    A serial adapter (slcan) has no device of its own and is no such channel. Where the kernel doesn't say what kind an
+    interface is, its name does.
+    """
+    if interface != "socketcan":
+        return interface == "virtual"
+    if (_INTERFACES / channel / "device").exists():
+        return False
+    link = read_link(channel)
+    return link is not None and link.is_virtual
+
+
+_IP_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True)
+class InterfaceState:
+    """One CAN interface. What the source doesn't say is None.
+
+    kind: the driver's rtnetlink kind, `vcan`, `can`, `vxcan`, `slcan`; "" unknown. state: CAN controller state, such
+    as ERROR-ACTIVE. sample_point: share of the bit time. restart_ms: 0 is off. rx/tx: the controller's error counters.
+    """
+
+    name: str
+    is_up: bool
+    kind: str
+    mtu: int
+    txqueuelen: int
+    qdisc: str | None = None
+    bitrate: int | None = None
+    data_bitrate: int | None = None
+    sample_point: float | None = None
+    restart_ms: int | None = None
+    state: str | None = None
+    rx_errors: int | None = None
+    tx_errors: int | None = None
+    bus_offs: int | None = None
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether no wire is behind it."""
+        return self.kind in ("vcan", "vxcan")
+
+
+def read_link(name: str) -> InterfaceState | None:
+    """Read the state of a CAN interface; None when there is no such interface or it is not CAN."""
+    ip = shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
+    if ip is not None:
+        with contextlib.suppress(OSError, subprocess.SubprocessError, ValueError, LookupError):
+            command = [ip, "-details", "-statistics", "-json", "link", "show", "dev", name]
+            shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=_IP_TIMEOUT_S)
+            return parse_ip_link(json.loads(shown.stdout)[0])
+    return read_sysfs_link(_INTERFACES / name)
+
+
+def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
+    """Read one entry of `ip -details -json link`; None when it is not CAN."""
+    if link.get("link_type") != "can":
+        return None
+    info = link.get("linkinfo", {})
+    data = info.get("info_data", {})
+    timing = data.get("bittiming", {})
+    counters = data.get("berr_counter", {})
+    point = timing.get("sample_point")
+    return InterfaceState(
+        name=link["ifname"],
+        is_up="UP" in link["flags"],
+        kind=info.get("info_kind", ""),
+        mtu=int(link["mtu"]),
+        txqueuelen=int(link.get("txqlen", 0)),
+        qdisc=link.get("qdisc"),
+        bitrate=timing.get("bitrate"),
+        data_bitrate=data.get("data_bittiming", {}).get("bitrate"),
+        sample_point=None if point is None else float(point),
+        restart_ms=data.get("restart_ms", 0) if data else None,
+        state=data.get("state"),
+        rx_errors=counters.get("rx"),
+        tx_errors=counters.get("tx"),
+        bus_offs=info.get("info_xstats", {}).get("bus_off"),
+    )
+
+
+def read_sysfs_link(folder: Path) -> InterfaceState | None:
+    """Read what sysfs says of an interface, without bit timing; None when it is not there or not CAN."""
+    try:
+        if (folder / "type").read_text().strip() != _ARPHRD_CAN:
+            return None
+        return InterfaceState(
+            name=folder.name,
+            is_up=bool(int((folder / "flags").read_text(), 16) & _IFF_UP),
+            kind=_kind_of(folder),
+            mtu=int((folder / "mtu").read_text()),
+            txqueuelen=int((folder / "tx_queue_len").read_text()),
+        )
+    except (OSError, ValueError):
+        return None
+
+
+def _kind_of(folder: Path) -> str:
+    """Guess by its name what kind an interface without a device is: sysfs doesn't say. "" where it may be any."""
+    if (folder / "device").exists():
+        return ""
+    return next((kind for kind in ("vcan", "vxcan", "slcan") if folder.name.startswith(kind)), "")
+
+
+def carried_frames(name: str) -> int | None:
+    """Count the frames that an interface has carried so far, both ways; None where the kernel doesn't say.
+
+    A virtual interface counts what it sends as received, too.
+    """
+    folder = _INTERFACES / name / "statistics"
+    try:
+        received, sent = (int((folder / f"{way}_packets").read_text()) for way in ("rx", "tx"))
+    except (OSError, ValueError):
+        return None
+    return received + sent if (_INTERFACES / name / "device").exists() else received

@@ -20,6 +20,7 @@ from cantools.database.can import Database, Message, Signal
 from cantools.database.errors import Error as DatabaseError
 
 from adacd_hil.input_files import read_input
+from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.e2e import (
     E2eReceiver,
     E2eSender,
@@ -38,8 +39,6 @@ _FORMATS = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h"} 
     (64, False): "Q",
     (64, True): "q",
 }
-CLASSIC_BYTES = 8
-FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 _MOST_MESSAGES = 1000
 """Of a contract: to judge their budget takes 3 s, and four times that for twice as many."""
 E2E_SIGNALS = ("e2e_crc", "e2e_counter", "e2e_status")

@@ -57,7 +57,7 @@ class _Head(ctypes.Structure):
     )
 
 
-class _Message(ctypes.Structure):
+class _MessageHead(ctypes.Structure):
     """struct mmsghdr."""
 
     _fields_ = (("head", _Head), ("length", ctypes.c_uint))
@@ -132,7 +132,7 @@ class FrameReceiver:
         if count < 0:
             error = ctypes.get_errno()
             raise OSError(error, os.strerror(error))
-        ctypes.memmove(self._place, self._fresh, count * ctypes.sizeof(_Message))
+        ctypes.memmove(self._place, self._fresh, count * ctypes.sizeof(_MessageHead))
         frames = [self._decode(index * _SLOT_BYTES) for index in range(count)]
         if count and self._lost_before(count - 1) > self.frames_lost:
             self._held = [(self._lost_before(index), frame) for index, frame in enumerate(frames)]
@@ -195,7 +195,7 @@ class FrameSender:
 def _lay_out(memory: int, slot_bytes: int, length: int) -> tuple[Any, Any]:
     """Make the messages of a batch, each with a vector of `length` bytes at the beginning of its slot."""
     vectors = (_Vector * _FRAMES)()
-    messages = (_Message * _FRAMES)()
+    messages = (_MessageHead * _FRAMES)()
     for index in range(_FRAMES):
         vectors[index].base = memory + index * slot_bytes
         vectors[index].length = length

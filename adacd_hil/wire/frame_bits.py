@@ -15,8 +15,9 @@ import functools
 import re
 from typing import NamedTuple
 
-CLASSIC_BYTES = 8
-FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
+
+FRAME_LENGTHS = (*range(CLASSIC_BYTES + 1), *FD_LENGTHS)
 """Bytes that CAN FD can carry, by data length code."""
 CRC15 = 0x4599
 TAIL_BITS = 3 + 7 + 3  # CRC delimiter, acknowledgement, its delimiter; end of frame; intermission
@@ -105,7 +106,7 @@ def exact_fd_bits(can_id: int, data: bytes, is_extended: bool = False) -> FrameB
     else:  # SOF, identifier, RRS, IDE, FDF, res, BRS
         head = (can_id & 0x7FF) << 5 | 0b00101
     # BRS is 1, ESI 0: no run of equal bits crosses the border of the rates.
-    body = f"{FD_LENGTHS.index(len(data)) << 8 * len(data) | int.from_bytes(data):0{5 + 8 * len(data)}b}"
+    body = f"{FRAME_LENGTHS.index(len(data)) << 8 * len(data) | int.from_bytes(data):0{5 + 8 * len(data)}b}"
     stuff = _count_stuff_bits(body) - any(match.end() == len(body) for match in _STUFFED.finditer(body))
     head_stuff = _count_stuff_bits(f"{head:0{_fd_head_bits(is_extended)}b}")
     return FrameBits(plain.nominal + head_stuff, plain.data + stuff)
@@ -138,8 +139,8 @@ def _check_classic(length: int) -> None:
 
 
 def _check_fd(length: int) -> None:
-    if length not in FD_LENGTHS:
-        above = next((known for known in FD_LENGTHS if known > length), FD_LENGTHS[-1])
+    if length not in FRAME_LENGTHS:
+        above = next((known for known in FRAME_LENGTHS if known > length), FRAME_LENGTHS[-1])
         raise ValueError(f"a CAN FD frame can't have {length} bytes; next possible: {above}")
 
 

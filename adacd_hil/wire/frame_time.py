@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.wire.bus import MAX_STANDARD_ID
-from adacd_hil.wire.frame_bits import CLASSIC_BYTES, CRC15, FD_LENGTHS, TAIL_BITS, unstuffed_fd_bits, worst_case_frame
+from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
+from adacd_hil.wire.frame_bits import CRC15, FRAME_LENGTHS, TAIL_BITS, unstuffed_fd_bits, worst_case_frame
 
 _HEAD_BITS: Final = 19  # start of frame, identifier, RTR, IDE, r0, DLC
 _EXTENDED_HEAD_BITS: Final = 39  # and SRR, 18 bits more of the identifier, r1
@@ -105,7 +105,7 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
             return bits_to_ns(stuffed(head, _EXTENDED_HEAD_BITS, value, length) + TAIL_BITS)
         plain = unstuffed_fd_bits(length)
         body = np.frombuffer(data, dtype=np.uint8)
-        before, after = _fd_stuff_bits(can_id << 5 | 0b00101, body, FD_LENGTHS.index(length))
+        before, after = _fd_stuff_bits(can_id << 5 | 0b00101, body, FRAME_LENGTHS.index(length))
         return bits_to_ns(plain.nominal + before) - (-(plain.data + after) * 1_000_000_000 // data_bitrate)
 
     def classic(can_id: int, data: bytes, from_bytes: Callable[..., int] = int.from_bytes) -> int:

@@ -7,7 +7,7 @@ import can
 
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.nearest_name import nearest_name
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, MAX_STANDARD_ID, Bus, BusError, BusMissingError, Frame
+from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID, Bus, BusError, BusMissingError, Frame
 
 _ECHOING_INTERFACES = ("udp_multicast",)
 
@@ -49,7 +49,7 @@ class PythonCanBus(Bus):
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send a frame. Raises BusError."""
-        is_long = len(data) > MAX_CLASSIC_BYTES
+        is_long = len(data) > CLASSIC_BYTES
         if is_long and not self._is_fd:
             raise BusError(f"sending on {self.channel}: {len(data)} data bytes need CAN FD")
         try:

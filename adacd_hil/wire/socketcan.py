@@ -18,8 +18,8 @@ from typing import NoReturn
 
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.wire.bus import (
+    CLASSIC_BYTES,
     FD_LENGTHS,
-    MAX_CLASSIC_BYTES,
     MAX_STANDARD_ID,
     NOTHING_QUEUED,
     Bus,
@@ -135,7 +135,7 @@ class SocketCanBus(Bus):
         if can_id > MAX_STANDARD_ID:
             can_id |= CAN_EFF_FLAG
         length = len(data)
-        return _FRAME.pack(can_id, length, data) if length <= MAX_CLASSIC_BYTES else self._pack_fd(can_id, data)
+        return _FRAME.pack(can_id, length, data) if length <= CLASSIC_BYTES else self._pack_fd(can_id, data)
 
     def _pack_fd(self, can_id: int, data: bytes) -> bytes:
         if not self._is_fd:

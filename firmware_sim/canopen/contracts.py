@@ -6,7 +6,7 @@ from pathlib import Path
 
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
-from adacd_hil.wire.node_offset import move_contract
+from adacd_hil.wire.contract_frames import move_contract
 from firmware_sim.canopen.pdo_record import CLASSIC_BYTES, FD_BYTES
 
 

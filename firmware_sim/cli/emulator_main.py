@@ -23,7 +23,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line, open_terminals
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError, load_codec
-from adacd_hil.wire.node_offset import HOST_NODE, move_contract
+from adacd_hil.wire.contract_frames import HOST_NODE, move_contract
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.injector import OnEvent

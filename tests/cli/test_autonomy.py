@@ -20,7 +20,7 @@ from adacd_hil.cli.main import cli
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
 from adacd_hil.settings.configuration import Settings, builtin_names, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings
-from adacd_hil.wire.bus import is_virtual
+from adacd_hil.wire.can_interface import is_virtual
 
 
 def changed(**sections: dict[str, object]) -> Settings:
@@ -100,9 +100,9 @@ def test_a_script_that_only_ends_the_run_is_no_acknowledgement(tmp_path: Path) -
 def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(
     monkeypatch: pytest.MonkeyPatch, kind: str, name: str, expected: bool
 ) -> None:
-    from adacd_hil.wire.link import Link
+    from adacd_hil.wire.can_interface import InterfaceState
 
-    monkeypatch.setattr("adacd_hil.wire.link.read_link", lambda _: Link(name, True, kind, 16, 10))
+    monkeypatch.setattr("adacd_hil.wire.can_interface.read_link", lambda _: InterfaceState(name, True, kind, 16, 10))
     monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: [name])
     assert is_virtual("socketcan", name) == expected
     assert may_move_an_arm("socketcan", name) != expected

@@ -9,10 +9,10 @@ import pytest
 from adacd_hil.commission.diagnosis import Status
 from adacd_hil.commission.host_checks import HOST_CHECKS, Host
 from adacd_hil.scheduling import RealtimeGrant, Refusal
-from adacd_hil.wire.link import Link, parse_ip_link
+from adacd_hil.wire.can_interface import InterfaceState, parse_ip_link
 
 GRANTED = RealtimeGrant("SCHED_FIFO 80", cpu=3, is_memory_locked=True, is_awake=True)
-CAN0 = Link(
+CAN0 = InterfaceState(
     name="can0",
     is_up=True,
     kind="can",
@@ -38,7 +38,7 @@ THROTTLED_AT = {
 RUN = {check.name: check.run for check in HOST_CHECKS}
 
 
-def host(link: Link | None = CAN0, **changes: Any) -> Host:
+def host(link: InterfaceState | None = CAN0, **changes: Any) -> Host:
     return dataclasses.replace(Host("socketcan", "can0", link, 1_000_000, 0, lambda: GRANTED), **changes)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from session_rig import Rig
 
-from adacd_hil.device.deadline import DeadlineWatch
+from adacd_hil.device.arm_watch import DeadlineWatch
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import ArmState, FaultReason, SchemeState
 from adacd_hil.settings.configuration import load_settings

@@ -6,8 +6,7 @@ import pytest
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.realtime import FollowingPacer
-from adacd_hil.wire.bus import Bus, BusError, Frame
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import Bus, BusError, Frame, Tap
 
 SYNC, FEEDBACK = 0x080, 0x185
 PERIOD_NS = 2_000_000

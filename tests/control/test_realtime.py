@@ -10,8 +10,7 @@ from adacd_hil.control.realtime import GridPacer, Pacer, Tick, calibrate, make_p
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.settings.bus_settings import LockstepSettings
 from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.bus import EmbeddedBus
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.bus import EmbeddedBus, Tap
 
 PERIOD_NS = 1_000_000
 

@@ -9,7 +9,7 @@ import pytest
 
 import adacd_hil
 from adacd_hil.device.contract import compose, load_contract, write_contract
-from adacd_hil.device.placement import place_devices
+from adacd_hil.device.profile import place_devices
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import contract_folder, load_codec

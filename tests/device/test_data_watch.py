@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from adacd_hil.device.data_watch import DataWatch
+from adacd_hil.device.arm_report import DataWatch
 from adacd_hil.settings.configuration import Settings
 
 ROW = "no sample for the model in 2 cycles in a row: so much later a contact is found"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from adacd_hil.device.heartbeat import HeartbeatWatch
+from adacd_hil.device.arm_watch import HeartbeatWatch
 from adacd_hil.records import Event
 from adacd_hil.wire.bus import Frame
 

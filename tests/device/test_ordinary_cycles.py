@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from recorded_arm_rig import Live, play, ticks_of
 
-from adacd_hil.device.ordinary_cycles import OrdinaryCycles, Stretch
+from adacd_hil.device.ordinary_cycles import OrdinaryCycles, OrdinaryStretch
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.records import ArmBatch
 
@@ -136,7 +136,7 @@ def test_what_is_read_at_once_is_what_is_read_frame_by_frame(
     )
     at_once, one_by_one = (RecordedArm(settings, quiet.codec) for _ in range(2))
     found = at_once.read(recording.ticks, recording.frames)
-    monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: Stretch(0, 0, []))
+    monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: OrdinaryStretch(0, 0, []))
     due = one_by_one.read(recording.ticks, recording.frames)
     assert [name for name in ArmBatch._fields if getattr(found, name).tobytes() != getattr(due, name).tobytes()] == []
     assert at_once._arm.frame_checks() == one_by_one._arm.frame_checks()

@@ -15,7 +15,7 @@ from test_two_arms import settings_of as two_arms_settings
 
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.drive import Drive
-from adacd_hil.device.ordinary_cycles import OrdinaryCycles, Stretch
+from adacd_hil.device.ordinary_cycles import OrdinaryCycles, OrdinaryStretch
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.log.reader import read_log
@@ -97,7 +97,7 @@ def test_ordinary_cycles_read_at_once_leave_the_arm_as_frame_by_frame(
     at_once, one_by_one = troubled.recorded_arm(), troubled.recorded_arm()
     ticks, frames = ticks_of(troubled.log), troubled.log.frames
     at_once.read(ticks, frames)
-    monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: Stretch(0, 0, []))
+    monkeypatch.setattr(OrdinaryCycles, "read", lambda *_: OrdinaryStretch(0, 0, []))
     batch = one_by_one.read(ticks, frames)
     assert differences(troubled.states, batch) == []
     assert (at_once.exact_cycles < 0.4 * len(ticks.cycle), one_by_one.exact_cycles) == (True, len(ticks.cycle))

@@ -1,7 +1,7 @@
 """One joint torque sensor as the host sees it."""
 
 from adacd_hil.device.contract import compose
-from adacd_hil.device.placement import place_devices
+from adacd_hil.device.profile import place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec

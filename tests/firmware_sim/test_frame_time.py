@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.wire.frame_bits import FD_LENGTHS, exact_frame, worst_case_frame
+from adacd_hil.wire.frame_bits import FRAME_LENGTHS, exact_frame, worst_case_frame
 from adacd_hil.wire.frame_time import exact_time, worst_time
 
 RATE, DATA_RATE = 1_000_000, 5_000_000
@@ -27,7 +27,7 @@ def test_an_identifier_beyond_11_bits_makes_the_frame_longer(can_id: int, conten
     assert CLASSIC(can_id, data) == exact_frame(can_id, data, is_extended=True).duration_ns(RATE)
 
 
-@pytest.mark.parametrize("length", [length for length in FD_LENGTHS if length > 8])
+@pytest.mark.parametrize("length", [length for length in FRAME_LENGTHS if length > 8])
 @given(can_id=st.integers(0, 0x7FF), content=st.data())
 def test_an_fd_frame_takes_its_exact_bits_at_both_rates(length: int, can_id: int, content: st.DataObject) -> None:
     data = content.draw(

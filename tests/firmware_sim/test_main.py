@@ -348,7 +348,7 @@ def test_on_socketcan_it_answers_a_host_and_ends_with_it(tmp_path, vcan_channel)
 
 @pytest.fixture
 def vcan_channel() -> str:
-    from adacd_hil.wire.bus import can_interfaces
+    from adacd_hil.wire.can_interface import can_interfaces
 
     names = [name for name in can_interfaces() if name.startswith("vcan")]
     if not names:

@@ -12,7 +12,7 @@ from bench_host import (
 
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import contract_folder, load_codec
-from adacd_hil.wire.node_offset import move_contract
+from adacd_hil.wire.contract_frames import move_contract
 from firmware_sim.bench.bench import Bench
 from firmware_sim.canopen.contracts import CONTRACTS
 

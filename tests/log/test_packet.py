@@ -20,7 +20,7 @@ from adacd_hil.log.packet import (
     unpack_event,
 )
 from adacd_hil.records import Event
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, Frame
+from adacd_hil.wire.bus import CLASSIC_BYTES, Frame
 
 TIMES = st.integers(0, 2**62)
 COUNTS = st.integers(0, 2**32 - 1)
@@ -53,7 +53,7 @@ def contents(columns: Columns) -> list:
 
 def frame_of(columns: Columns, number: int) -> tuple[bool, Frame]:
     row = columns.frames[number]
-    is_long = row["length"] > MAX_CLASSIC_BYTES
+    is_long = row["length"] > CLASSIC_BYTES
     data = (long_data(columns, np.array([number]))[0] if is_long else row["data"]).tobytes()[: row["length"]]
     frame = Frame(int(row["can_id"]), data, int(row["t_ns"]), bool(row["flags"] & IS_ERROR))
     return bool(row["flags"] & IS_TX), frame

@@ -6,10 +6,9 @@ from pathlib import Path
 import cantools
 import pytest
 
-from adacd_hil.wire.budget import Budget, ContractFrame, Traffic, Trigger, check_budget, find_budget, read_contract, us
+from adacd_hil.wire.budget import Budget, LoadCase, ResponseTime, check_budget, find_budget, us
 from adacd_hil.wire.codec import CodecError, contract_folder, load_codec
-from adacd_hil.wire.node_offset import move_contract
-from adacd_hil.wire.response_time import Response
+from adacd_hil.wire.contract_frames import ContractFrame, Trigger, move_contract, read_contract
 
 CONTRACTS = Path(__file__).parent / "contracts"
 ARM = load_codec()
@@ -29,7 +28,7 @@ def edited(*edits: tuple[str, str]) -> bytes:
     return text.encode()
 
 
-def response_us(budget: Budget, name: str, traffic: Traffic = Traffic.OPERATION) -> float:
+def response_us(budget: Budget, name: str, traffic: LoadCase = LoadCase.OPERATION) -> float:
     (entry,) = [entry for entry in budget.frames if entry.frame.name == name]
     return entry.responses[traffic].time_ns / 1000
 
@@ -89,7 +88,7 @@ def test_response_times_of_the_arm_by_hand() -> None:
 
 def test_one_sdo_frame_per_cycle_blocks_the_last_command_for_135_us() -> None:
     budget = check_budget(ARM)
-    assert response_us(budget, "Drive2Command", Traffic.REQUESTS) == 135 + 795
+    assert response_us(budget, "Drive2Command", LoadCase.REQUESTS) == 135 + 795
     assert "one SDO in every cycle: in time, Drive2Command within 930 µs" in budget.notes
 
 
@@ -98,31 +97,31 @@ def test_requests_of_several_nodes_are_one_per_cycle() -> None:
     heartbeat = budget.frames[-1]
     assert heartbeat.frame.name == "HostHeartbeat"
     # Eight SDO messages of 135 µs lie above it. Were all of them sent in every cycle, nothing would be left.
-    assert heartbeat.responses[Traffic.REQUESTS].is_bounded
-    assert heartbeat.late_ns(Traffic.REQUESTS) == 0
-    assert heartbeat.responses[Traffic.REQUESTS] > heartbeat.responses[Traffic.OPERATION]
+    assert heartbeat.responses[LoadCase.REQUESTS].is_bounded
+    assert heartbeat.late_ns(LoadCase.REQUESTS) == 0
+    assert heartbeat.responses[LoadCase.REQUESTS] > heartbeat.responses[LoadCase.OPERATION]
     requests = [entry for entry in budget.frames if "Sdo" in entry.frame.name]
     assert len(requests) == 8
-    assert {entry.responses[Traffic.REQUESTS] for entry in requests} == {requests[0].responses[Traffic.REQUESTS]}
+    assert {entry.responses[LoadCase.REQUESTS] for entry in requests} == {requests[0].responses[LoadCase.REQUESTS]}
 
 
 def test_a_single_request_gets_through_where_one_per_cycle_would_not() -> None:
     (request,) = [entry for entry in budget_of("fd_500us").frames if entry.frame.name == "Drive1SdoRequest"]
     # a heartbeat, the cyclic frames, itself
-    assert request.responses[Traffic.OPERATION] == Response(65_000 + 388_500 + 135_000)
-    assert not request.responses[Traffic.REQUESTS].is_bounded
+    assert request.responses[LoadCase.OPERATION] == ResponseTime(65_000 + 388_500 + 135_000)
+    assert not request.responses[LoadCase.REQUESTS].is_bounded
 
 
 def test_a_frame_without_bound_is_late_whatever_was_found() -> None:
     entry = check_budget(ARM).frames[1]
-    endless = dataclasses.replace(entry, responses={Traffic.OPERATION: Response(10_000, is_bounded=False)})
+    endless = dataclasses.replace(entry, responses={LoadCase.OPERATION: ResponseTime(10_000, is_bounded=False)})
     assert (entry.late_ns(), endless.late_ns()) == (0, 1)
 
 
 def test_an_emcy_of_every_device_makes_commands_late_and_is_said() -> None:
     budget = check_budget(ARM)
     # B 135, four EMCY 540: SYNC and feedback of the next two cycles overtake the second command as well
-    assert response_us(budget, "Drive2Command", Traffic.EMERGENCIES) == 135 + 540 + 3 * 680 + 115
+    assert response_us(budget, "Drive2Command", LoadCase.EMERGENCIES) == 135 + 540 + 3 * 680 + 115
     assert "and every EMCY at once: Drive2Command misses its deadline of 1000 µs by 1830 µs" in budget.notes
     assert budget.is_fit
 
@@ -242,7 +241,7 @@ def test_frames_of_two_arms_compete_by_their_identifiers() -> None:
 def test_which_arm_of_a_shared_bus_asks_makes_no_difference() -> None:
     def times(node_offset: int) -> list[tuple[int, str]]:
         budget = check_budget(move_contract(ARM, node_offset), 2000, arms=3)
-        return [(entry.responses[Traffic.EMERGENCIES].time_ns, entry.frame.name) for entry in budget.frames]
+        return [(entry.responses[LoadCase.EMERGENCIES].time_ns, entry.frame.name) for entry in budget.frames]
 
     assert times(0) == times(8)
 
@@ -252,7 +251,7 @@ def test_each_host_of_a_shared_bus_may_ask_once_per_period() -> None:
     alone = check_budget(ARM, 4000).frames[-1]
     assert heartbeat.frame.name == "Arm1.HostHeartbeat"
     waits = [
-        entry.responses[Traffic.REQUESTS].time_ns - entry.responses[Traffic.OPERATION].time_ns
+        entry.responses[LoadCase.REQUESTS].time_ns - entry.responses[LoadCase.OPERATION].time_ns
         for entry in (alone, heartbeat)
     ]
     assert waits == [135_000, 2 * 135_000]

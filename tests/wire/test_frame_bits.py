@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from adacd_hil.wire.frame_bits import (
-    FD_LENGTHS,
+    FRAME_LENGTHS,
     FrameBits,
     exact_bits,
     exact_fd_bits,
@@ -17,7 +17,7 @@ from adacd_hil.wire.frame_bits import (
 
 BASE_ID = st.integers(0, 0x7FF)
 EXTENDED_ID = st.integers(0, 0x1FFFFFFF)
-FD_DATA = st.sampled_from(FD_LENGTHS).flatmap(lambda length: st.binary(min_size=length, max_size=length))
+FD_DATA = st.sampled_from(FRAME_LENGTHS).flatmap(lambda length: st.binary(min_size=length, max_size=length))
 
 
 def to_bits(value: int, count: int) -> list[int]:

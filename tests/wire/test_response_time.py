@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.wire.response_time import HORIZON_NS, Response, Stream, is_overloaded, response_time
+from adacd_hil.wire.budget import HORIZON_NS, ResponseTime, Stream, is_overloaded, response_time
 
 MS = 1_000_000
 BIT_NS = 8_000  # 125 kbit/s
@@ -35,11 +35,11 @@ def play(streams: list[Stream], blocking_ns: int, until_ns: int) -> list[int]:
 
 
 def test_the_published_counter_example_the_second_instance_of_c_is_late() -> None:
-    assert response_time(A, [], 1 * MS, BIT_NS) == Response(2 * MS)
-    assert response_time(B, [A], 1 * MS, BIT_NS) == Response(3 * MS)
+    assert response_time(A, [], 1 * MS, BIT_NS) == ResponseTime(2 * MS)
+    assert response_time(B, [A], 1 * MS, BIT_NS) == ResponseTime(3 * MS)
     worst = response_time(C, [A, B], 0, BIT_NS)
     # The analysis of 1994 stops at the first instance: 3.0 ms, in time. The second takes 3.5 ms.
-    assert worst == Response(3_500_000)
+    assert worst == ResponseTime(3_500_000)
     assert worst.time_ns > DEADLINE_OF_C
 
 
@@ -48,23 +48,25 @@ def test_the_counter_example_happens_on_a_bus_that_is_played() -> None:
 
 
 def test_the_highest_message_waits_for_one_frame_only() -> None:
-    assert response_time(Stream(65_000, MS), [], 135_000, 1000) == Response(200_000)
+    assert response_time(Stream(65_000, MS), [], 135_000, 1000) == ResponseTime(200_000)
 
 
 def test_a_message_waits_for_all_above_it() -> None:
     above = [Stream(65_000, MS), Stream(135_000, MS)]
-    assert response_time(Stream(115_000, MS), above, 125_000, 1000) == Response(125_000 + 65_000 + 135_000 + 115_000)
+    assert response_time(Stream(115_000, MS), above, 125_000, 1000) == ResponseTime(
+        125_000 + 65_000 + 135_000 + 115_000
+    )
 
 
 def test_a_frame_queued_within_the_bit_in_which_arbitration_begins_still_wins() -> None:
     # At 100 µs the bus becomes free; the next frame of the higher message is queued half a bit later.
     higher = [Stream(50_000, 100_500)]
-    assert response_time(Stream(50_000, 10 * MS), higher, 50_000, 1000) == Response(50_000 + 2 * 50_000 + 50_000)
-    assert response_time(Stream(50_000, 10 * MS), higher, 50_000, 100) == Response(50_000 + 50_000 + 50_000)
+    assert response_time(Stream(50_000, 10 * MS), higher, 50_000, 1000) == ResponseTime(50_000 + 2 * 50_000 + 50_000)
+    assert response_time(Stream(50_000, 10 * MS), higher, 50_000, 100) == ResponseTime(50_000 + 50_000 + 50_000)
 
 
 def test_jitter_adds_to_the_own_response_and_brings_others_closer() -> None:
-    assert response_time(Stream(100_000, MS, 20_000), [], 0, 1000) == Response(120_000)
+    assert response_time(Stream(100_000, MS, 20_000), [], 0, 1000) == ResponseTime(120_000)
     late = Stream(100_000, 300_000, 250_000)  # two within 50 µs
     assert response_time(Stream(100_000, MS), [late], 0, 1000).time_ns == 100_000 + 2 * 100_000
     assert response_time(Stream(100_000, MS), [late._replace(jitter_ns=0)], 0, 1000).time_ns == 100_000 + 100_000
@@ -75,13 +77,13 @@ def test_a_message_on_a_bus_that_is_full_has_no_bound() -> None:
     response = response_time(Stream(135_000, MS), full, 135_000, 1000, MS)
     assert not response.is_bounded
     assert response.time_ns > MS
-    assert response_time(Stream(50_000, MS), full, 0, 1000, MS) == Response(995_000)
+    assert response_time(Stream(50_000, MS), full, 0, 1000, MS) == ResponseTime(995_000)
 
 
 def test_a_bus_that_is_exactly_full_is_given_up_at_the_horizon() -> None:
     # Blocked once, it never catches up; no frame is later than 1.1 ms though.
     response = response_time(Stream(500_000, MS), [Stream(500_000, MS)], 100_000, 1000, HORIZON_NS)
-    assert response == Response(1_100_000, is_bounded=False)
+    assert response == ResponseTime(1_100_000, is_bounded=False)
 
 
 def test_overload_is_decided_in_whole_numbers() -> None:

@@ -7,9 +7,9 @@ from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.terminal import in_line
-from adacd_hil.wire.budget import Budget, FrameBudget, Traffic, find_budget, read_contract, share_bus, us
+from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, find_budget, us
 from adacd_hil.wire.codec import load_codec
-from adacd_hil.wire.response_time import Response
+from adacd_hil.wire.contract_frames import read_contract, share_bus
 
 _COLUMNS = ("id", "message", "bytes", "trigger", "every ms", "bits", "µs", "response µs", "disturbed µs", "deadline µs")
 _WIDTH = 120
@@ -103,13 +103,13 @@ def _row(entry: FrameBudget) -> tuple[str, ...]:
         f"{entry.interval_ns / 1e6:g}",
         f"{entry.worst.nominal}+{entry.worst.data}" if entry.worst.data else str(entry.worst.nominal),
         us(entry.duration_ns),
-        _response(entry.responses[Traffic.OPERATION]),
-        _response(entry.responses[Traffic.EMERGENCIES]),
+        _response(entry.responses[LoadCase.OPERATION]),
+        _response(entry.responses[LoadCase.EMERGENCIES]),
         "-" if entry.deadline_ns is None else us(entry.deadline_ns),
     )
 
 
-def _response(response: Response) -> str:
+def _response(response: ResponseTime) -> str:
     return ("" if response.is_bounded else "> ") + us(response.time_ns)
 
 

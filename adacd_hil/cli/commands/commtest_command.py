@@ -14,6 +14,7 @@ from adacd_hil.commission.communication_test import CommunicationReport, Communi
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.control.realtime import prepare_spin
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
@@ -27,10 +28,9 @@ from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.terminal import in_line
-from adacd_hil.wire.bitrate import read_bitrates
-from adacd_hil.wire.bus import BusError
+from adacd_hil.wire.bus import BusError, Tap
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.tap import Tap
+from adacd_hil.wire.contract_frames import read_bitrates
 
 LOG_NAME = "commtest.mcap"
 HTML_NAME = "commtest.html"
@@ -82,7 +82,11 @@ def run_commtest(
                 log_error = "" if summary.is_complete else summary.error or f"log lacks {summary.dropped} packets"
     report = test.report()
     described = describe(report, settings, grant.scheduler)
-    described |= {"fault": fault.name, "is_interrupted": loop.is_interrupted, "device_faults": arm.describe_faults()}
+    described |= {
+        "fault": fault.name,
+        "is_interrupted": loop.is_interrupted,
+        "device_faults": ArmReport(arm).describe_faults(),
+    }
     described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
     if recorder is not None:
         described |= {"log": str(recorder.path), "log_error": log_error}

@@ -11,9 +11,9 @@ from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination
 from adacd_hil.commission.diagnosis import Finding, Status, diagnose, summarise
 from adacd_hil.commission.host_checks import HOST_CHECKS, Host
 from adacd_hil.scheduling import request_realtime
-from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import open_bus
-from adacd_hil.wire.link import Link, read_link
+from adacd_hil.wire.can_interface import InterfaceState, read_link
+from adacd_hil.wire.contract_frames import read_bitrates
 
 _MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", Status.SKIPPED: "skipped"}
 
@@ -27,7 +27,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
     bitrate, data_bitrate = read_bitrates(codec)
     clock = MonotonicClock()
 
-    def link() -> Link | None:
+    def link() -> InterfaceState | None:
         return read_link(connection.channel) if connection.interface == "socketcan" else None
 
     host = Host(

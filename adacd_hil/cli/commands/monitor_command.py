@@ -13,9 +13,9 @@ from adacd_hil.cli.table import format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.device.bus_view import BusView, MessageView, Snapshot
 from adacd_hil.terminal import plain, write_screen
-from adacd_hil.wire.bitrate import read_bitrates
 from adacd_hil.wire.bus import Bus, Frame
-from adacd_hil.wire.link import carried_frames, read_link
+from adacd_hil.wire.can_interface import carried_frames, read_link
+from adacd_hil.wire.contract_frames import read_bitrates
 from adacd_hil.wire.traffic import receive_until
 
 REDRAW_S = 0.2

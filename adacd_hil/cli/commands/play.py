@@ -20,7 +20,8 @@ from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.log.formats.recorded_frames import is_sendable
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.terminal import in_line
-from adacd_hil.wire.bus import Bus, BusError, is_virtual, open_bus
+from adacd_hil.wire.bus import Bus, BusError, open_bus
+from adacd_hil.wire.can_interface import is_virtual
 from adacd_hil.wire.playback import PlayedFrame, play, repeat
 
 _PIECES_AHEAD = 4

@@ -31,7 +31,7 @@ from adacd_hil.log.mcap_file import RUN_METADATA
 from adacd_hil.log.parts import find_parts
 from adacd_hil.log.reader import EPOCH_KEY
 from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME, MAX_DATA
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES
+from adacd_hil.wire.bus import CLASSIC_BYTES
 
 CHANNEL_KEY = "can_channel"
 RATE_SWITCH_KEY = "bit_rate_switch"
@@ -54,7 +54,7 @@ _CLASSIC_DTYPE = np.dtype(
         ("is_extended", "u1"),
         ("is_error", "u1"),
         ("length", "u1"),
-        ("data", "u1", (MAX_CLASSIC_BYTES,)),
+        ("data", "u1", (CLASSIC_BYTES,)),
     ]
 )
 """What follows frame_id in can_msgs/msg/Frame."""
@@ -240,7 +240,7 @@ def _unpack(source: _Source, rows: NDArray[np.uint8], name_bytes: int, epoch_ns:
     else:
         frames["is_remote"] = bodies["is_remote"]
         data_bytes = bodies["data"]
-    frames["length"] = np.minimum(frames["length"], MAX_DATA if source.is_fd else MAX_CLASSIC_BYTES)
+    frames["length"] = np.minimum(frames["length"], MAX_DATA if source.is_fd else CLASSIC_BYTES)
     counts = np.where(frames["is_remote"], 0, frames["length"])
     is_data = np.arange(data_bytes.shape[1]) < counts[:, np.newaxis]
     frames["data"][:, : data_bytes.shape[1]] = np.where(is_data, data_bytes, 0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.bus_frames import LONG_FRAME_DTYPE
-from adacd_hil.wire.bus import MAX_CLASSIC_BYTES, MAX_STANDARD_ID
+from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
 
 MOST_NS = 1 << 62
 """Of a time, either way: the year 2116."""
@@ -46,7 +46,7 @@ def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
 
 def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
     """Say which frames a bus end of ours can send as they are (n,): of FD frames those of more than 8 bytes."""
-    is_short_fd = frames["is_fd"] & (frames["length"] <= MAX_CLASSIC_BYTES)
+    is_short_fd = frames["is_fd"] & (frames["length"] <= CLASSIC_BYTES)
     return np.asarray(is_plain(frames) & ~frames["is_error"] & ~is_short_fd)
 
 

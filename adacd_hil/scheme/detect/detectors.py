@@ -38,11 +38,10 @@ from typing import Any, Final
 import numpy as np
 from scipy.linalg import solve_toeplitz
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import Structured, compiled, packed, zeroed
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model import regressor
 from adacd_hil.settings.schema import ConfigError, setting
-from adacd_hil.structured import Structured, packed, zeroed
 
 VELOCITY_LAG_S: Final = 1.25e-3
 """The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of

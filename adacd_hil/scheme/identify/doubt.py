@@ -27,13 +27,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.identify import belief
 from adacd_hil.scheme.model import bank, friction
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.structured import Structured
 
 WITHIN_S = 60.0
 """How far back the end of a contact may lie."""

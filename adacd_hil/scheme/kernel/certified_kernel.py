@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.contact import contact_estimate
 from adacd_hil.scheme.detect import detector, lost_samples, sensitivity, sight, tail
@@ -39,7 +39,6 @@ from adacd_hil.scheme.identify import (
 from adacd_hil.scheme.kernel.paper_kernel import is_filled, keep_sample, put_between
 from adacd_hil.scheme.model import bank, friction, regressor
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
-from adacd_hil.structured import Structured
 
 # What a cycle does, as bits.
 MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from adacd_hil.compiled import Structured, packed, zeroed
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector, certified_layout
 from adacd_hil.scheme.contact import contact_estimate
 from adacd_hil.scheme.detect import lost_samples, sensitivity, sight, tail
@@ -26,7 +27,6 @@ from adacd_hil.scheme.kernel.paper_kernel import block_dtype, limits_of
 from adacd_hil.scheme.model import bank, friction
 from adacd_hil.settings.certified_settings import CROSS_TALK, FRICTION_TERMS
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.structured import Structured, packed, zeroed
 
 SETTLED = 3.0
 """Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a

@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import compiled, released
+from adacd_hil.compiled import Structured, compiled, released
 from adacd_hil.records import ArmBatch, SchemeState, Vector
 from adacd_hil.scheme.contact import contact_report
 from adacd_hil.scheme.kernel import certified_kernel, paper_kernel, paper_shadow
 from adacd_hil.scheme.model import bank
 from adacd_hil.scheme.supervisor.observation import Observation
 from adacd_hil.scheme.supervisor.skip_conditions import Calm, is_calm
-from adacd_hil.structured import Structured
 
 _ADAPT = int(SchemeState.ADAPT)
 _CERTIFY = int(SchemeState.CERTIFY)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import Structured, compiled, packed, zeroed
 from adacd_hil.records import JOINTS, Layout, Vector, scheme_layout
 from adacd_hil.scheme.contact import contact_estimate
 from adacd_hil.scheme.detect import detector
@@ -29,7 +29,6 @@ from adacd_hil.scheme.identify import estimator, termination
 from adacd_hil.scheme.model import filters, regressor
 from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.structured import Structured, packed, zeroed
 
 # What a cycle does, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
 LEARN = 1

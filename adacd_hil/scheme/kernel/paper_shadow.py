@@ -3,12 +3,11 @@
 It decides nothing; what it comes to is in the block of the scheme in charge.
 """
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import JOINTS
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.supervisor.observation import Observation
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.structured import Structured
 
 _ADAPTED = int(Observation.ADAPTED)
 

@@ -5,13 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from adacd_hil.compiled import Structured
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
 from adacd_hil.scheme.detect import sight, tail
 from adacd_hil.scheme.identify import anchor, earlier, last_certificate, missing_torque, position
 from adacd_hil.scheme.identify.doubt import Verdict
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.scheme.kernel import certified_kernel
-from adacd_hil.structured import Structured
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""

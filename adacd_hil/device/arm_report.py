@@ -1,0 +1,253 @@
+"""What there is to say of an arm's devices and data: ages, gaps, checks and faults in words, shares of cycles.
+
+How much of the cyclic data comes in time: shares of cycles, second by second, against the limits of `[data]`.
+
+MOST_IN_A_ROW cycles without a sample for the model are said at once, too: a contact is found so much later.
+
+Counted while the drives are enabled: what a device does before and after is no measure of a run.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from adacd_hil.device.arm import REMEMBERED_GAPS, Arm
+from adacd_hil.device.drive import Cia402State, Drive
+from adacd_hil.device.emergency import name_error
+from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
+from adacd_hil.records import ArmState, Event
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.e2e import E2eStatus
+
+WINDOW_S = 1.0
+MOST_IN_A_ROW = 2
+SHORTEST_SHARE = 0.2
+"""Part of a window that is judged, too, when the attempt ends in it."""
+
+
+@dataclass(frozen=True)
+class DataShares:
+    """Shares of a run's cycles with enabled drives, 0…1.
+
+    incomplete: some cyclic frame was missing, late or wrong. late: the scheme's sample was older than the cycle.
+    no_new_data, repeated: by device; its frame was not in time, or came again. excesses: what was over its limit in
+    some second, a line each with the worst.
+    """
+
+    cycles: int
+    incomplete: float
+    late: float
+    no_new_data: dict[str, float]
+    repeated: dict[str, float]
+    excesses: tuple[str, ...]
+
+
+class DataWatch:
+    """Follows one attempt."""
+
+    def __init__(self, settings: Settings, arm: Arm) -> None:
+        limits = settings.data
+        self._arm = arm
+        self._window_cycles = max(1, round(WINDOW_S / settings.bus.period_s))
+        self._names = [device.name for device in arm.devices]
+        self._limits = {"incomplete cycles": limits.incomplete_share}
+        self._limits |= {f"no frame of {name} in time": limits.no_new_data_share for name in self._names}
+        self._limits |= {f"frames of {name} repeated": limits.repeated_share for name in self._names}
+        self._totals = dict.fromkeys(self._limits, 0)
+        self._worst = dict.fromkeys(self._limits, 0.0)
+        self._over: set[str] = set()
+        self._missing = [0] * len(self._names)  # of the present window
+        self._repeats_before = list(arm.repeats)
+        self._cycles = self._all_cycles = self._incomplete = self._late = 0
+        self._in_a_row = self._rows = 0  # cycles without a sample; rows of them in the present window
+        self._has_rows = False
+        self._events: list[Event] = []
+
+    def note(self, state: ArmState) -> None:
+        """Take in one cycle, once its frames are in."""
+        if not state.is_enabled:
+            return
+        if self._cycles == 0:
+            self._repeats_before = list(self._arm.repeats)
+        self._cycles += 1
+        self._in_a_row = 0 if state.is_complete else self._in_a_row + 1
+        if self._in_a_row == MOST_IN_A_ROW:
+            self._note_row()
+        if self._arm.missing_frames:
+            self._incomplete += 1
+            self._late += state.is_complete
+            received = self._arm.received
+            for place in range(len(self._missing)):
+                self._missing[place] += ~received >> place & 1
+        if self._cycles == self._window_cycles:
+            self._end_window()
+
+    def _note_row(self) -> None:
+        """Take in that the model waits for a sample; say so, until a window was without."""
+        self._rows += 1
+        if not self._has_rows:
+            self._has_rows = True
+            text = f"no sample for the model in {MOST_IN_A_ROW} cycles in a row: so much later a contact is found"
+            self._events.append(Event("warning", "data", text))
+
+    def _end_window(self) -> None:
+        """Judge the cycles since the last window; say what is over its limit now, and what is no longer."""
+        repeats = [now - before for now, before in zip(self._arm.repeats, self._repeats_before, strict=True)]
+        for name, count in zip(self._limits, [self._incomplete, *self._missing, *repeats], strict=True):
+            share, limit = count / self._cycles, self._limits[name]
+            self._totals[name] += count
+            self._worst[name] = max(self._worst[name], share)
+            if (share > limit) == (name in self._over):
+                continue
+            self._over ^= {name}
+            level = "warning" if share > limit else "info"
+            text = f"{name}: {share:.1%} of the last {self._cycles} cycles, {limit:.1%} allowed"
+            self._events.append(Event(level, "data", text))
+        if self._has_rows and not self._rows:
+            self._has_rows = False
+            text = f"a sample for the model at least every {MOST_IN_A_ROW} cycles again, for {self._cycles} cycles"
+            self._events.append(Event("info", "data", text))
+        self._rows = 0
+        self._all_cycles += self._cycles
+        self._cycles = self._incomplete = 0
+        self._missing = [0] * len(self._names)
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def shares(self) -> DataShares:
+        """Sum up the attempt."""
+        if self._cycles >= SHORTEST_SHARE * self._window_cycles:
+            self._end_window()
+        cycles = max(self._all_cycles, 1)
+        share = [total / cycles for total in self._totals.values()]
+        count = len(self._names)
+        return DataShares(
+            cycles=self._all_cycles,
+            incomplete=share[0],
+            late=self._late / cycles,
+            no_new_data=dict(zip(self._names, share[1 : 1 + count], strict=True)),
+            repeated=dict(zip(self._names, share[1 + count :], strict=True)),
+            excesses=tuple(
+                f"{name}: up to {worst:.1%} of the cycles of a second, {self._limits[name]:.1%} allowed"
+                for name, worst in self._worst.items()
+                if worst > self._limits[name]
+            ),
+        )
+
+
+class SignalAge(NamedTuple):
+    """How old the value of some signals of one device is, in cycles; `limit`: the oldest that is usable."""
+
+    device: str
+    signals: str
+    age: int
+    limit: int
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it is too old."""
+        return self.age > self.limit
+
+
+class ArmReport:
+    """Says in words what is wrong with an arm, from what it has received so far."""
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+
+    def ages(self) -> list[SignalAge]:
+        """Return the age of every signal that the arm is run by, against its limit."""
+        cycle = self._arm.cycle
+        ages = []
+        for drive, status_limit in zip(self._arm.drives, self._arm.status_age_limits, strict=True):
+            ages.append(
+                SignalAge(drive.name, "position, velocity", cycle - drive.sample_cycle, self._arm.max_age_cycles)
+            )
+            if drive.has_status_frame and not math.isinf(status_limit):
+                ages.append(SignalAge(drive.name, "statusword", cycle - drive.status_cycle, int(status_limit)))
+        for sensor in self._arm.sensors:
+            ages.append(SignalAge(sensor.name, "torque", cycle - sensor.sample_cycle, self._arm.max_age_cycles))
+        return ages
+
+    def describe_gaps(self) -> list[str]:
+        """Say of which devices no usable frame came in time in how many of the last cycles, one line each."""
+        present = [~self._arm.received >> place & 1 for place in range(len(self._arm.devices))]
+        gaps = [bits << 1 | now for bits, now in zip(self._arm.gaps, present, strict=True)]
+        cycles = REMEMBERED_GAPS.bit_length() + 1
+        return [
+            f"{device.name}: no usable frame in time in {bits.bit_count()} of the last {cycles} cycles"
+            for device, bits in zip(self._arm.devices, gaps, strict=True)
+            if bits
+        ]
+
+    def describe_checks(self) -> list[str]:
+        """Say how many cyclic frames of each device passed and failed their checks, one line each."""
+        return [_describe_checks(device) for device in self._arm.devices]
+
+    def describe_faults(self) -> list[str]:
+        """Say what is wrong with each device, one line each; empty when nothing is.
+
+        A drive's fault with the name of its error, a sensor's status, and signals that are older than their limit.
+        """
+        lines = []
+        for drive in self._arm.drives:
+            if drive.state in (Cia402State.FAULT, Cia402State.FAULT_REACTION_ACTIVE) or drive.error_code:
+                name = f": {name_error(drive.error_code)}" if drive.error_code else ""
+                lines.append(f"{drive.name}: {drive.state.name}, error code 0x{drive.error_code:04X}{name}")
+            elif self._arm.was_enabled:
+                lines += _describe_disabled(drive)
+        lines += self._arm.strangers.describe(self._arm.cycle)
+        for sensor in self._arm.sensors:
+            if sensor.status:
+                lines.append(f"{sensor.name}: status 0x{int(sensor.status):02X}: {_describe_status(sensor.status)}")
+        lines.extend(
+            f"{age.device}: {age.signals} {age.age} cycles old, {age.limit} allowed"
+            for age in self.ages()
+            if age.is_over
+        )
+        return lines
+
+    def describe_disabled(self) -> list[str]:
+        """Say which drive is not enabled, one line each; empty when both are."""
+        return [line for drive in self._arm.drives for line in _describe_disabled(drive)]
+
+    def describe_excess(self) -> list[str]:
+        """Say which joint is beyond which of the arm's limits, one line each; empty when none is."""
+        lines = []
+        for joint, (drive, sign) in enumerate(zip(self._arm.drives, self._arm.sign, strict=True)):
+            for quantity, value, bound, unit in (
+                ("position", drive.position_rad, self._arm.limits.position_limit_deg[joint], "deg"),
+                ("velocity", drive.velocity_rad_s, self._arm.limits.velocity_limit_deg_s[joint], "deg/s"),
+            ):
+                value_deg = math.degrees(sign * value)
+                if abs(value_deg) > bound:
+                    lines.append(f"joint {joint + 1}: {quantity} {value_deg:.2f} {unit}, ±{bound:g} {unit} allowed")
+        return lines
+
+
+def _describe_disabled(drive: Drive) -> list[str]:
+    if drive.is_enabled:
+        return []
+    return [f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"]
+
+
+def _describe_checks(device: Drive | TorqueSensor) -> str:
+    tally = device.end_to_end.tally()
+    if device.is_protected:
+        return f"{device.name}: " + ", ".join(f"{count} {status.name}" for status, count in tally)
+    missing = dict(tally)[E2eStatus.NO_NEW_DATA]
+    return (
+        f"{device.name}: unprotected, {device.implausible_frames} implausible, {missing} {E2eStatus.NO_NEW_DATA.name}"
+    )
+
+
+def _describe_status(status: SensorStatus) -> str:
+    words = (
+        (SensorStatus.POSITIVE_OVERLOAD, "positive overload"),
+        (SensorStatus.NEGATIVE_OVERLOAD, "negative overload"),
+        (SensorStatus.NOT_VALID, "not valid"),
+    )
+    return ", ".join(text for bit, text in words if status & bit)

@@ -1,0 +1,271 @@
+"""What the devices must be and are told over SDO before a run, and what of it is read again while the arm runs.
+
+A failure is one line with device, object and value. Sources: CiA 402-2 / IEC 61800-7-201 (drives); CiA 404, CiA 303-2
+(sensors and units); CiA 301 (4.2), clause 7.2.4.3 (expedited SDO upload: a request of 8 bytes, and its answer).
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple, NoReturn
+
+from adacd_hil.device.arm_watch import Notices, Recurrence
+from adacd_hil.device.canopen_bus import SDO_ABORT, DeviceError, explained, find_variable
+from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, torque_limit_permille
+from adacd_hil.device.profile import ObjectName, PlacedDevice
+from adacd_hil.records import Event
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import SDO_REQUEST_ID, SDO_RESPONSE_ID
+
+
+class Slave:
+    """A device of the arm on the bus, as its master sees it."""
+
+    def __init__(self, device: PlacedDevice, node: Any) -> None:
+        self.device = device
+        self.name = device.name
+        self.node_id = device.node_id
+        self.known: dict[tuple[int, int], int] = {}
+        """What the set-up has written or compared, by index and sub-index."""
+        self._node = node
+
+    def has(self, index: int, sub: int = 0) -> bool:
+        """Whether the EDS lists an object."""
+        return find_variable(self._node.object_dictionary, index, sub) is not None
+
+    def default(self, index: int, sub: int = 0) -> int:
+        """Return the value that the EDS gives, 0 when it gives none."""
+        variable = find_variable(self._node.object_dictionary, index, sub)
+        return 0 if variable is None or variable.default is None else variable.default
+
+    def read(self, index: int, sub: int = 0) -> int:
+        """Read a number. Raises DeviceError."""
+        with explained(self.name, self.node_id, f"reading {self.describe(index, sub)}"):
+            return int(self._entry(index, sub).raw)
+
+    def write(self, index: int, sub: int, value: int) -> None:
+        """Write a number. Raises DeviceError."""
+        with explained(self.name, self.node_id, f"writing {self.describe(index, sub)} = {_number(value)}"):
+            self._entry(index, sub).raw = value
+        self.known[index, sub] = value
+
+    def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
+        """Write a number and read it back. Raises DeviceError."""
+        self.write(index, sub, value)
+        found = self.read(index, sub)
+        if found != value:
+            self.fail(f"{self.describe(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written")
+
+    def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> None:
+        """Compare an object with what it must be. Raises DeviceError."""
+        found = self.read(index, sub)
+        self.known[index, sub] = expected
+        if found != expected:
+            values = [f"0x{value:08X}" if is_hex else _with(value, unit) for value in (found, expected)]
+            self.fail(f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected")
+
+    def describe(self, index: int, sub: int) -> str:
+        """Name an object as the EDS does."""
+        variable = find_variable(self._node.object_dictionary, index, sub)
+        return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
+
+    def fail(self, text: str) -> NoReturn:
+        """Raise DeviceError with the device's name."""
+        raise DeviceError(f"{self.name} (node {self.node_id}): {text}")
+
+    def _entry(self, index: int, sub: int) -> Any:
+        entry = self._node.sdo.get_variable(index, sub)
+        if entry is None:
+            self.fail(f"{ObjectName(index, sub)} is not in the EDS")
+        return entry
+
+
+def _with(value: int, unit: str) -> str:
+    return f"{_number(value)} {unit}".rstrip()
+
+
+def _number(value: int) -> str:
+    return f"0x{value:08X}" if value > 0xFFFFFF else str(value)
+
+
+_CST_SUPPORTED = 1 << 9  # of 0x6502
+_MODE_READS = 20
+"""A drive may take a few of its own cycles to show a new mode; an SDO takes 0.3 ms at 1 Mbit/s at the least."""
+
+
+def command_deadline_ms(settings: Settings) -> int:
+    """Return the deadline of commands in ms, for drives that count time instead of SYNCs."""
+    return max(1, math.ceil(settings.bus.command_patience_cycles * settings.bus.period_us / 1000))
+
+
+def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> None:
+    """Check what the drive is, write limits, option codes and mode. Raises DeviceError."""
+    arm, joint, profile = settings.arm, slave.device.joint, slave.device.settings
+    if slave.has(0x6502):
+        modes = slave.read(0x6502)
+        if not modes & _CST_SUPPORTED:
+            slave.fail(f"supported modes 0x6502 = 0x{modes:08X}, bit 9 (cyclic synchronous torque) expected")
+    if slave.has(0x6076):
+        slave.expect(0x6076, 0, round(arm.rated_torque_Nm[joint] * 1000), "rated torque", "mNm")
+    _check_resolution(slave, codec)
+    if slave.device.can("option_codes"):
+        quick_stop, fault_reaction = option_codes(settings, profile)
+        for index, value in ((0x605A, quick_stop), (0x605E, fault_reaction)):
+            if value is not None and slave.has(index):
+                slave.write_checked(index, 0, value)
+    if slave.device.can("torque_limits"):
+        for index in (0x6072, 0x60E0, 0x60E1):
+            if slave.has(index):
+                slave.write_checked(index, 0, torque_limit_permille(settings, joint), "per mille")
+    if profile.command_watchdog == "0x2200":
+        slave.write_checked(0x2200, 0, settings.bus.command_patience_cycles, "SYNCs")
+    if slave.device.can("sync_tolerance"):
+        slave.write_checked(0x2201, 0, round(10 * settings.bus.sync_patience_periods), "tenths of a period")
+    _enter_mode(slave)
+
+
+def _check_resolution(slave: Slave, codec: Codec) -> None:
+    """Compare encoder and gear, where the EDS has both, with what the contract makes of an increment."""
+    if not all(slave.has(index, sub) for index in (0x608F, 0x6091) for sub in (1, 2)):
+        return
+    increments, motor_revs = slave.read(0x608F, 1), slave.read(0x608F, 2)
+    gear_in, gear_out = slave.read(0x6091, 1), slave.read(0x6091, 2)
+    feedback = codec.message(f"{slave.name}Feedback")
+    position = next(signal for signal in feedback.values if signal.name == "position")
+    expected = round(2.0 * math.pi / position.scale)
+    if motor_revs * gear_out == 0 or increments * gear_in != expected * motor_revs * gear_out:
+        slave.fail(
+            f"increments per joint revolution 0x608F x 0x6091 = {increments}/{motor_revs} x {gear_in}/{gear_out}, "
+            f"{expected} expected"
+        )
+
+
+def _enter_mode(slave: Slave) -> None:
+    slave.write(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+    for _ in range(_MODE_READS):
+        if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
+            return
+    slave.expect(0x6061, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE, "mode of operation")
+
+
+NEWTON_METRE = 0x00560100
+"""0x6131 without its prefix: numerator Nm, denominator 1."""
+_PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
+
+
+def set_up_sensor(slave: Slave, codec: Codec) -> str:
+    """Compare unit and decimal digits with the contract; return what the status says, empty when nothing.
+
+    Raises DeviceError.
+    """
+    torque = codec.message(f"{slave.name}Torque")
+    scale = next(signal.scale for signal in torque.values if signal.name == "torque")
+    channel = _channel(slave)
+    prefix = 0
+    if slave.has(0x6131, channel):
+        unit = slave.read(0x6131, channel)
+        if unit & 0x00FFFFFF != NEWTON_METRE:
+            slave.fail(f"unit 0x6131:{channel} = 0x{unit:08X}, 0x{NEWTON_METRE:08X} (Nm) expected")
+        prefix = unit >> _PREFIX_SHIFT
+        prefix -= 256 if prefix > 127 else 0
+    if slave.has(0x6132, channel):
+        digits = prefix - math.log10(scale)
+        if abs(digits - round(digits)) > 1e-9:
+            slave.fail(f"a count of {scale:g} Nm can't be said in decimal digits 0x6132:{channel}")
+        slave.expect(0x6132, channel, round(digits), "decimal digits")
+    if slave.has(0x6150, channel):
+        status = slave.read(0x6150, channel)
+        if status:
+            return f"status 0x6150:{channel} = 0x{status:02X}"
+    return ""
+
+
+def _channel(slave: Slave) -> int:
+    pdo = slave.device.pdo("Torque")
+    signals = () if pdo is None else pdo.signals
+    return next((signal.name.sub for signal in signals if signal.signal == "torque"), 0) or 1
+
+
+_UPLOAD = 0x40
+_ANSWER_S = 0.5
+"""Longest wait for an answer, as in the set-up."""
+
+
+class _KnownObject(NamedTuple):
+    slave: Slave
+    place: tuple[int, int]
+    """Index and sub-index."""
+    expected: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.slave.name} (node {self.slave.node_id}): {self.slave.describe(*self.place)}"
+
+
+class ParameterWatch(Notices):
+    """Reads what the set-up has written or compared again, one object after the other, without waiting for it.
+
+    A device that has reset itself to its defaults, or into which somebody else has written, runs the arm with other
+    limits and other watchdogs than the host believes.
+    """
+
+    def __init__(self, settings: Settings, bus: Bus) -> None:
+        super().__init__()
+        self._bus = bus
+        self._objects: tuple[_KnownObject, ...] = ()
+        self._next = 0
+        self._asked: _KnownObject | None = None
+        self._asked_cycle = 0
+        self._answer_cycles = round(_ANSWER_S / settings.bus.period_s)
+        self._due = Recurrence(settings.devices.reread_ms * 1e-3, settings.bus.period_s)
+        self._is_on = settings.devices.reread_ms > 0
+        self.difference = ""
+        """The first object that is no longer what it was, in one line; empty while none is."""
+
+    def follow(self, slaves: Iterable[Slave]) -> None:
+        """Read again from now on what the set-up of these devices has left in them."""
+        found = [[_KnownObject(slave, place, value) for place, value in slave.known.items()] for slave in slaves]
+        # By turns, so that no device waits for all objects of another.
+        longest = max(map(len, found), default=0)
+        self._objects = tuple(objects[k] for k in range(longest) for objects in found if k < len(objects))
+
+    def step(self, cycle: int, t_ns: int) -> None:
+        """Ask for the next object when it is due. Raises BusError."""
+        asked = self._asked
+        if asked is not None and cycle - self._asked_cycle > self._answer_cycles:
+            text = f"{asked.name} is not answered"
+            self.say(t_ns, asked.slave.name, Event("warning", "parameters", text))
+            self._asked = asked = None
+        if asked is not None or not (self._is_on and self._objects and self._due.is_due(cycle)):
+            return
+        self._asked = chosen = self._objects[self._next]
+        self._asked_cycle = cycle
+        self._next = (self._next + 1) % len(self._objects)
+        index, sub = chosen.place
+        request = bytes((_UPLOAD, index & 0xFF, index >> 8, sub, 0, 0, 0, 0))
+        self._bus.send(SDO_REQUEST_ID + chosen.slave.node_id, request)
+
+    def accept(self, frame: Frame) -> bool:
+        """Take an answer; False when it is none that was asked for."""
+        asked, data = self._asked, frame.data
+        if asked is None or frame.can_id != SDO_RESPONSE_ID + asked.slave.node_id or len(data) != 8:
+            return False
+        if (data[1] | data[2] << 8, data[3]) != asked.place:
+            return False
+        self._asked = None
+        if data[0] == SDO_ABORT:
+            code = int.from_bytes(data[4:], "little")
+            text = f"{asked.name} can't be read again: 0x{code:08X}"
+            self.say(frame.t_ns, asked.name, Event("warning", "parameters", text))
+            self._objects = tuple(one for one in self._objects if one is not asked)
+            self._next = self._next % max(len(self._objects), 1)
+        elif data[0] & 0xE2 == 0x42:  # expedited, with or without its size
+            size = 4 - (data[0] >> 2 & 3) if data[0] & 1 else 4
+            self._compare(asked, int.from_bytes(data[4 : 4 + size], "little"), size)
+        return True
+
+    def _compare(self, asked: _KnownObject, found: int, size: int) -> None:
+        expected = asked.expected & (1 << 8 * size) - 1
+        if found != expected and not self.difference:
+            self.difference = f"{asked.name} is 0x{found:X}, 0x{expected:X} was set up"
