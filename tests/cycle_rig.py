@@ -13,7 +13,7 @@ from adacd_hil.control.realtime import GridPacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import EmbeddedBus, Frame, Tap

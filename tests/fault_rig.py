@@ -18,7 +18,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings

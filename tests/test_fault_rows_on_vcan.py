@@ -19,8 +19,8 @@ from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
+from adacd_hil.log.log_files import TRUTH_NAME
 from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.log.run_folder import TRUTH_NAME
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.codec import load_codec

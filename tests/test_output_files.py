@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.log.chunked_file import MAGIC
+from adacd_hil.log.mcap.chunked_file import MAGIC
 from adacd_hil.output_files import (
     InUseError,
     Replacement,

@@ -21,7 +21,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import ArmCommand, FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings

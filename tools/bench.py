@@ -33,9 +33,9 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.realtime import GridPacer, Tick
 from adacd_hil.control.session import Session
-from adacd_hil.log.channels import ChannelId, pack_scheme
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.types.topics import ChannelId, pack_scheme
 from adacd_hil.records import ArmState, FaultReason, Request
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
 from adacd_hil.settings.configuration import load_settings

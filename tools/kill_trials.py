@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from damage_trials import messages_of
 
-from adacd_hil.log.check.check import check_log
+from adacd_hil.log.check.log_check import check_log
 from adacd_hil.log.editing.recover import recover
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 
 VICTIMS = ("writer", "control", "both")

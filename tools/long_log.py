@@ -21,16 +21,23 @@ from typing import Final, NamedTuple
 import numpy as np
 from mcap.records import Attachment
 
-from adacd_hil.log.cdr import MessageType
-from adacd_hil.log.channels import Channel
-from adacd_hil.log.editing.intact import IntactLog
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.chunk_contents import Contents
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
-from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, FIELDS_KEY, PART_KEY, RUN_METADATA, McapFile
-from adacd_hil.log.parts import part_path
-from adacd_hil.log.sink import Sink
-from adacd_hil.log.summary import DROPPED_KEY, count_frames
+from adacd_hil.log.editing.cut_and_merge import IntactLog
+from adacd_hil.log.log_files import (
+    CONTINUED,
+    DROPPED_KEY,
+    ENDING_KEY,
+    FIELDS_KEY,
+    PART_KEY,
+    RUN_METADATA,
+    LogError,
+    count_frames,
+    part_path,
+)
+from adacd_hil.log.mcap.chunks import Contents
+from adacd_hil.log.mcap.records import MESSAGE_HEAD
+from adacd_hil.log.recording.log_file import McapFile, Sink
+from adacd_hil.log.types.message_types import MessageType
+from adacd_hil.log.types.topics import LogChannel
 
 SECOND_NS: Final = 1_000_000_000
 ROUND_S: Final = 6
@@ -99,7 +106,7 @@ class LongLog:
             }
             self._add(item, types)
         self.channels = [
-            Channel(number, channel.topic, types[number])
+            LogChannel(number, channel.topic, types[number])
             for number, channel in sorted(log.definitions.channels.items())
         ]
         self.metadata = log.metadata[RUN_METADATA]

@@ -10,7 +10,7 @@ import numpy as np
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.control.history_file import FORMAT, CertificateRecord, History, devices_digest
-from adacd_hil.log.editing.cut import Stretch, cut
+from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.scheme.model.regressor import inverse_dynamics
@@ -148,7 +148,7 @@ def make_seeds(folder: Path, is_light: bool) -> Seeds:
     )
     run_embedded(resolve("certified", str(played), None, 1), "lockstep", folder / "run")
     short = folder / "short.mcap"
-    cut(folder / "run" / "run.mcap", short, Stretch(0.0, 0.5), ())
+    cut(folder / "run" / "run.mcap", short, TimeWindow(0.0, 0.5), ())
     files = {
         "toml": _texts(folder, "config", MY_ARM, to_toml(load_settings("certified")), to_toml(load_settings("paper"))),
         "scenario": [scenario, *_scenarios()],

@@ -20,8 +20,8 @@ from typing import Any
 
 from long_log import LongLog, write
 
-from adacd_hil.log.parts import find_parts
-from adacd_hil.log.stream import LogStream
+from adacd_hil.log.log_files import find_parts
+from adacd_hil.log.reader import LogStream
 
 ROOT = Path(__file__).resolve().parent.parent
 SECONDS = (60, 300, 900, 3600)

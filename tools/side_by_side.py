@@ -25,8 +25,8 @@ import yardstick
 from numpy.typing import NDArray
 
 import adacd_hil
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.wire.codec import contract_folder, load_codec
 
 ROOT = Path(__file__).resolve().parent.parent

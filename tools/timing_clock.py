@@ -20,8 +20,8 @@ from side_by_side import (
     time_percentiles_us,
 )
 
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.run_folder import LOG_NAME
 
 STEPS_S = {"none": 0.0, "forward an hour": 3600.0, "back an hour": -3600.0, "to 1970": -1e12, "forward a second": 1.0}
 """How far the clock is set; beyond 1970 it is set to the year's first day."""

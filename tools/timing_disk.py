@@ -29,9 +29,8 @@ from side_by_side import (
 )
 from witness import Seen, read_witness, times_after, witness
 
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.run_folder import LOG_NAME
 
 SYNC_ID, FEEDBACK_ID, LAST_COMMAND_ID, STATUS_ID = 0x080, 0x181, 0x202, 0x281
 POSITION_RAD = 2.0 * np.pi / 2**20
@@ -42,7 +41,7 @@ TMPFS_BYTES = 256 * 1024 * 1024
 HOST_WITH_PIPE = """
 import os, sys
 from adacd_hil.cli.main import main
-from adacd_hil.log import recorder
+from adacd_hil.log.recording import recorder
 pipe = sys.argv.pop(1)
 recorder.create_file = lambda path: os.open(pipe, os.O_WRONLY)
 main()

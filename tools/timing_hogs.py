@@ -29,8 +29,8 @@ from side_by_side import (
 )
 from timing_hour import write_contacts
 
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.log.reader import Series, read_log
-from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import load_settings
 from firmware_sim.scenario.scenario import load_scenario

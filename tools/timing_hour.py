@@ -25,8 +25,8 @@ from side_by_side import (
 )
 from witness import Seen, read_witness, witness
 
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.run_folder import LOG_NAME
 
 FIRST_COMMAND_ID = 0x201
 MEMORY_EVERY_S = 10.0

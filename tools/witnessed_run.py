@@ -21,8 +21,8 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import FaultAnswer, Operator, ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.log.run_folder import LOG_NAME
 from adacd_hil.records import TRUTH_LAYOUT, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import EmbeddedBus

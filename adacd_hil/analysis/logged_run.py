@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.host_cycles import Span
 from adacd_hil.analysis.timing import CycleColumns, Cycles
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.log.stretch import Stretch
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import ContactReport, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 
@@ -100,8 +100,8 @@ class StretchOfRun(NamedTuple):
     motion_start_s: s since the beginning of the log.
     """
 
-    asked: Stretch
-    found: Stretch
+    asked: TimeWindow
+    found: TimeWindow
     contacts_before: int
     motion_start_s: float
 

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import Series
-from adacd_hil.log.stream import LogStream
-from adacd_hil.log.stretch import WHOLE, Stretch, begin_of_log
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import LogStream, Series, begin_of_log
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.detect import detectors
 
@@ -98,7 +97,7 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 
 
 def read_motion(
-    path: Path, stretch: Stretch = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
+    path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
 ) -> LoggedMotion:
     """Find the contact-free motion in a log, or in a stretch of it. Raises LogError when there is none.
 

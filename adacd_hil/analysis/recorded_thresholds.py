@@ -39,8 +39,8 @@ from adacd_hil.analysis.motion import (
     sample_of,
 )
 from adacd_hil.compiled import Structured
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.stretch import WHOLE, Stretch
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.model.regressor import mass_matrix
@@ -311,7 +311,7 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 
 
 def thresholds_of_logs(
-    paths: Sequence[Path], rate_per_h: float, stretch: Stretch = WHOLE, progress: Progress = lambda _: None
+    paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
 ) -> tuple[Thresholds, Statistics]:
     """Read logs, or a stretch of each, and calibrate all detectors on what nobody touched.
 

@@ -9,7 +9,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.extras import install_command
-from adacd_hil.log.setup import MOST_VIEWERS
+from adacd_hil.log.recording.processes import MOST_VIEWERS
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import LiveAddress
@@ -79,7 +79,7 @@ def _address(
 ) -> "LiveAddress":
     require_extra("--live", "websockets")
     from adacd_hil.control.session import LiveAddress
-    from adacd_hil.log.live.admission import normal_origin
+    from adacd_hil.log.viewer.admission import normal_origin
 
     try:
         allowed = tuple(map(normal_origin, origins))

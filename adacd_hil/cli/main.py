@@ -38,7 +38,7 @@ from adacd_hil.terminal import is_interrupted, open_terminals
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
     from adacd_hil.control.session import LiveAddress
-    from adacd_hil.log.stretch import Stretch
+    from adacd_hil.log.time_window import TimeWindow
 
 
 @click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})
@@ -155,7 +155,7 @@ def tare(
 @json_option
 @explained
 @stretch_options
-def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Stretch") -> ExitCode:
+def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "TimeWindow") -> ExitCode:
     """Report logs: HTML, PDF, PNG, CSV and JSON. The emulator's truth.mcap beside a log is joined to it.
 
     A folder stands for the run.mcap in it, or without one for all runs in its folders: then index.html leads to their
@@ -198,7 +198,7 @@ def thresholds(
     out: Path | None,
     report: Path | None,
     as_json: bool,
-    stretch: "Stretch",
+    stretch: "TimeWindow",
 ) -> ExitCode:
     """Find every detector's thresholds for a rate of false alarms, from what nobody touched in these logs.
 

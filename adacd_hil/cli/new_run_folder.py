@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from adacd_hil.clock import wall_ns
-from adacd_hil.log.run_folder import check_free, is_there
+from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.output_files import tidied
 
 RUNS = Path("runs")

@@ -11,7 +11,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.log.errors import LogError, LogExistsError
+from adacd_hil.log.log_files import LogError, LogExistsError
 from adacd_hil.output_files import in_words, is_disk_full
 from adacd_hil.settings.configuration import builtin_names
 from adacd_hil.settings.schema import ConfigError
@@ -88,18 +88,18 @@ clock_option = functools.partial(
 
 
 def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Give a command --from and --until; it takes them as a `Stretch`."""
+    """Give a command --from and --until; it takes them as a `TimeWindow`."""
 
     @functools.wraps(command)
     def bounded(*args: Any, from_s: float | None, until_s: float | None, **kwargs: Any) -> ExitCode:
-        from adacd_hil.log.stretch import Stretch
+        from adacd_hil.log.time_window import TimeWindow
 
         for name, bound_s in (("--from", from_s), ("--until", until_s)):
             if bound_s is not None and not math.isfinite(bound_s):
                 raise CommandError(f"{name} {bound_s:g} is not a time", ExitCode.USAGE)
         if from_s is not None and until_s is not None and from_s >= until_s:
             raise CommandError(f"--from {from_s:g} s is not before --until {until_s:g} s", ExitCode.USAGE)
-        stretch = Stretch(-math.inf if from_s is None else from_s, math.inf if until_s is None else until_s)
+        stretch = TimeWindow(-math.inf if from_s is None else from_s, math.inf if until_s is None else until_s)
         return command(*args, stretch=stretch, **kwargs)
 
     until = click.option("--until", "until_s", type=float, help="End before here, s since the beginning of the log.")

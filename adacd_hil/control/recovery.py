@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from adacd_hil.clock import Clock
 from adacd_hil.control.operator import FaultAnswer, Operator
-from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import Event
 from adacd_hil.wire.bus import BusError, Tap
 

@@ -20,12 +20,11 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.strangers import refuse_company
-from adacd_hil.log.layout import LAYOUT_NAME, viewer_layout
-from adacd_hil.log.live.robot_description import ROBOT_NAME, robot_description
-from adacd_hil.log.provenance import arithmetic
-from adacd_hil.log.recorder import LogSummary, Recorder
-from adacd_hil.log.run_folder import LOG_NAME
-from adacd_hil.log.setup import MOST_VIEWERS, LiveSetup
+from adacd_hil.log.log_files import LOG_NAME, arithmetic
+from adacd_hil.log.recording.processes import MOST_VIEWERS, LiveSetup
+from adacd_hil.log.recording.recorder import LogSummary, Recorder
+from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
+from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.output_files import place_file
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name

@@ -1,9 +1,13 @@
-"""A log in memory: one structured array per topic, frames in the order of the bus, events, contacts, attachments.
+"""A log read whole into memory (`read_log`), or piece by piece in constant memory (`LogStream`).
 
-Cut and damaged files are read as far as they are intact; `is_complete` and `problem` say so.
+In memory: one structured array per topic, frames in the order of the bus, events, contacts, attachments. Cut and
+damaged files are read as far as they are intact; `is_complete` and `problem` say so.
+
+On two processors one reads, checks and decompresses ahead while the other gathers the messages; topics that weren't
+asked for cost nothing but their decompression.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -12,15 +16,10 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from adacd_hil.log.bus_frames import FRAME_DTYPE, LONG_FRAME_DTYPE, joined_frames
-from adacd_hil.log.cdr import MessageType
-from adacd_hil.log.channels import DECODED, run_channels, truth_channels
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.log_walk import LogWalk
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD, RECORD_HEAD_BYTES
-from adacd_hil.log.mcap_file import FIELDS_KEY
-from adacd_hil.log.piece_builder import RawPiece
-from adacd_hil.log.ros_types import (
+from adacd_hil.log.log_files import DROPPED_KEY, EPOCH_KEY, FIELDS_KEY, LOST_KEY, LogError, log_in
+from adacd_hil.log.log_walk import LogWalk, RawPiece
+from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
+from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
     FD_FRAME,
@@ -28,11 +27,11 @@ from adacd_hil.log.ros_types import (
     JOINT_STATE,
     JOINT_STATE_DTYPE,
     LOG,
+    MessageType,
     unpack_log,
 )
-from adacd_hil.log.run_folder import log_in
-from adacd_hil.log.summary import LOST_KEY
-from adacd_hil.log.topic_records import Payload, Topic
+from adacd_hil.log.types.record_arrays import FRAME_DTYPE, LONG_FRAME_DTYPE, Payload, Topic, is_of_frames, joined_frames
+from adacd_hil.log.types.topics import DECODED, run_channels, truth_channels
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactKind,
@@ -57,7 +56,6 @@ __all__ = [
     "topic_bytes",
 ]
 
-EPOCH_KEY = "epoch_ns"
 _KNOWN = {
     CAN_FRAME.name: Payload(CAN_FRAME_DTYPE),
     FD_FRAME.name: Payload(FD_FRAME_DTYPE, has_tail=True),
@@ -331,3 +329,111 @@ def contacts_of(series: Series) -> list[LoggedContact]:
             raise LogError(f"/contact has a report that this version does not know: {error}") from None
         contacts.append(LoggedContact(t_ns, report))
     return contacts
+
+
+class Piece(NamedTuple):
+    """A stretch of a log that ends with whole cycles: consecutive pieces have all of it, in order.
+
+    The records of a cycle are those with one publish time, one after the other in the file. An event that happens
+    between two cycles counts as one.
+    """
+
+    series: Mapping[str, Series]
+    """Topics of fixed size that were asked for, but those of bus frames; our own ones are there even when empty."""
+    frames: NDArray[Any]
+    """(n,) of reader.FRAME_DTYPE, or LONG_FRAME_DTYPE in a piece with FD frames; both ways, in the order of the bus."""
+    payloads: Mapping[str, list[bytes]]
+    """Topics of varying size that were asked for, such as /events."""
+
+
+class LogStream:
+    """A log read once from front to back in constant memory, all parts as one.
+
+    What is damaged or missing is left out; `problem` says so.
+    """
+
+    def __init__(self, path: str | Path, topics: Collection[str] | None = None, cycles_per_piece: int = 20_000) -> None:
+        """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
+
+        A folder stands for the run's log in it. Raises LogError when nothing of it can be read.
+        """
+        self._walk, self.epoch_ns = open_log(path, topics)
+        self._topics = topics
+        self._cycles_per_piece = cycles_per_piece
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Of the run."""
+        return self._walk.metadata
+
+    @property
+    def attachments(self) -> dict[str, bytes]:
+        """What the run was made with, by file name."""
+        return self._walk.attachments
+
+    def empty(self) -> Piece:
+        """Give a piece without messages, with our own topics."""
+        return Piece(series_of({}, {}, self._own_topics(), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
+
+    @property
+    def problem(self) -> str:
+        """What is missing, one line, as far as has been read; "" for a whole log."""
+        return self._walk.problem
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all that was read is whole, no packet was dropped, and nothing was lost before a recovery."""
+        return not self.problem and self.summary.get(DROPPED_KEY, "0") == "0" and LOST_KEY not in self.summary
+
+    @property
+    def summary(self) -> dict[str, str]:
+        """Frames, messages, dropped and ending, of the parts that have been read to their ends."""
+        return self._walk.summary
+
+    def events(self, piece: Piece) -> list[LoggedEvent]:
+        """Unpack what a piece has of /events."""
+        return events_of(piece.payloads, self._walk.topics, self.epoch_ns)
+
+    @property
+    def parts(self) -> int:
+        """How many files have been read."""
+        return self._walk.parts
+
+    def _own_topics(self) -> dict[str, Topic]:
+        """List those of our topics that pieces have series of."""
+        own = own_topics(self.metadata)
+        return {
+            name: topic
+            for name, topic in own.items()
+            if not is_of_frames(topic) and (self._topics is None or name in self._topics)
+        }
+
+    def __iter__(self) -> Iterator[Piece]:
+        own = self._own_topics()
+        for piece in self._walk.pieces(self._cycles_per_piece, self.epoch_ns):
+            topics = {name: topic for name, topic in self._walk.topics.items() if not is_of_frames(topic)}
+            yield Piece(series_of(piece.records, topics, own, self.epoch_ns), piece.frames, piece.payloads)
+
+
+def start_of_log(path: Path) -> int | None:
+    """Return the time of the first message of a log of ours, ns of the run's clock; None without one. Raises LogError.
+
+    The host's first frames come before its first decisions.
+    """
+    stream = LogStream(path, cycles_per_piece=1)
+    for piece in stream:
+        times = [event.t_ns for event in stream.events(piece)[:1]]
+        there = [series.records for series in piece.series.values() if len(series)]
+        times += [int(records["publish_time"][0]) - stream.epoch_ns for records in there]
+        times += piece.frames["cycle_t_ns"][:1].tolist()
+        if times:
+            return min(times)
+    return None
+
+
+def begin_of_log(path: Path) -> int:
+    """Return the time of the first message as `start_of_log`. Raises LogError also when there is none."""
+    start_ns = start_of_log(path)
+    if start_ns is None:
+        raise LogError(f"log {path} has no message")
+    return start_ns

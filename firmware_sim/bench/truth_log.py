@@ -11,9 +11,9 @@ from types import TracebackType
 
 import numpy as np
 
-from adacd_hil.log.channels import ChannelId, pack_truth
-from adacd_hil.log.parts import find_parts
-from adacd_hil.log.recorder import LogSummary, Recorder
+from adacd_hil.log.log_files import find_parts
+from adacd_hil.log.recording.recorder import LogSummary, Recorder
+from adacd_hil.log.types.topics import ChannelId, pack_truth
 from adacd_hil.records import TRUTH_LAYOUT, Event, Vector
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.scenario.scenario import Scenario

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import CertifiedStream, PaperStream, Run, Truth
 from adacd_hil.analysis.timing import CycleColumns
-from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
-from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
 from adacd_hil.records import (
     TRUTH_LAYOUT,
     ContactReport,

@@ -10,8 +10,7 @@ import numpy as np
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.log.formats.frame_log import read_frames
-from adacd_hil.log.reader import Series
-from adacd_hil.log.stream import Piece
+from adacd_hil.log.reader import Piece, Series
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import RequestSettings
 from firmware_sim.scenario.scenario import load_scenario

@@ -3,10 +3,9 @@
 import numpy as np
 
 from adacd_hil.analysis.replay.attempts import AttemptSplitter
-from adacd_hil.log.channels import run_channels
-from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, Series
-from adacd_hil.log.stream import Piece
-from adacd_hil.log.topic_records import record_dtype
+from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, Piece, Series
+from adacd_hil.log.types.record_arrays import record_dtype
+from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import SchemeState
 
 DTYPES = {channel.topic: record_dtype(channel.type.dtype) for channel in run_channels(7) if channel.type.fields}

@@ -13,8 +13,8 @@ from adacd_hil.analysis.foreign.recording_identification import identify
 from adacd_hil.analysis.foreign.recording_import import read_recording
 from adacd_hil.analysis.foreign.recording_map import read_map
 from adacd_hil.cli.main import cli
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.stretch import WHOLE, Stretch
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.scheme.identify.offline import model_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.schema import ConfigError
@@ -238,7 +238,7 @@ def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example
         read_recording(free, example)
     with pytest.raises(LogError, match=r"more than 3000 rows: choose a part with --from and --until$"):
         read_recording(free, example, span=WHOLE)
-    part = read_recording(free, example, span=Stretch(4.0, 7.0)).between(4.0, 7.0)
+    part = read_recording(free, example, span=TimeWindow(4.0, 7.0)).between(4.0, 7.0)
     assert part.duration_s == pytest.approx(3.0, abs=2.0 * part.period_s)
     (mine,), (read,) = part.stretches, whole.stretches
     late = round((mine.start_s - read.start_s) / part.period_s)  # by a sample, as the bound falls on one
@@ -246,7 +246,7 @@ def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example
     assert_allclose(mine.record.q[1 - late : -1 - late], read.record.q[1:-1], atol=1e-9)
     assert_allclose(mine.record.dq[1 - late : -1 - late], read.record.dq[1:-1], atol=1e-6)
     with pytest.raises(LogError, match=r"has 0 rows from 1000 s until 2000 s, 50 are the least"):
-        read_recording(free, example, span=Stretch(1000.0, 2000.0))
+        read_recording(free, example, span=TimeWindow(1000.0, 2000.0))
 
 
 def test_a_period_that_would_make_too_many_samples_is_refused(tmp_path: Path, free: Path) -> None:

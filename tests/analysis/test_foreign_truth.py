@@ -15,8 +15,8 @@ from adacd_hil.analysis.score.foreign_truth import config_digest, foreign_truth
 from adacd_hil.analysis.score.truth_contacts import contacts_beside
 from adacd_hil.analysis.score.truth_reading import TruthRows
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.log.recorder import Recorder
-from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
+from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.scenario.scenario import load_scenario

@@ -12,7 +12,7 @@ from adacd_hil.analysis.replay.run_digest import Detection
 from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.cli.commands.compare_command import _contact as in_words
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.toml_files import to_toml
 

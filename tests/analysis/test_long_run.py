@@ -22,12 +22,12 @@ from adacd_hil.analysis.score import truth_reading
 from adacd_hil.analysis.score.truth_reading import TruthRows, read_truth
 from adacd_hil.analysis.verdict import identified_text
 from adacd_hil.cli.main import cli
-from adacd_hil.log import stream
-from adacd_hil.log.channels import ChannelId, pack_contact, pack_cycle, pack_scheme
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import Series
-from adacd_hil.log.recorder import Recorder
-from adacd_hil.log.stretch import Stretch, start_of_log
+from adacd_hil.log import reader
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import Series, start_of_log
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
 from adacd_hil.records import CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.selection import layout_of
 from adacd_hil.settings.toml_files import to_toml
@@ -44,7 +44,7 @@ def few_kept(monkeypatch):
     """Read in short pieces, and keep next to nothing."""
     for name, value in (("BUCKETS", 4), ("TIME_BUCKETS", 4), ("CONTACTS", 0), ("ADAPTATIONS", 0), ("_NOISE_CYCLES", 4)):
         monkeypatch.setattr(long_run, name, value)
-    monkeypatch.setattr(stream.LogStream.__init__, "__defaults__", (None, PIECE))
+    monkeypatch.setattr(reader.LogStream.__init__, "__defaults__", (None, PIECE))
 
 
 def record_certified(path, run):
@@ -219,7 +219,7 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
 
 
 def stretched(path, start_s, end_s, **options):
-    return read_run(path, truth_of(path), Stretch(start_s, end_s), **options)
+    return read_run(path, truth_of(path), TimeWindow(start_s, end_s), **options)
 
 
 def test_a_stretch_has_the_cycles_between_its_times(certified):
@@ -252,7 +252,7 @@ def test_contacts_are_numbered_over_the_whole_log(certified):
 
 
 def test_without_the_truth_detections_are_numbered_over_the_whole_log(certified):
-    read = read_run(certified, None, Stretch(2.9, 4.9))
+    read = read_run(certified, None, TimeWindow(2.9, 4.9))
     assert [contact.number for contact in evaluate(read.run).contacts] == [2]
 
 

@@ -15,9 +15,9 @@ from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.analysis.score.judge import Score
 from adacd_hil.analysis.score.truth_contacts import contacts_beside
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import read_log
-from adacd_hil.log.stretch import Stretch, begin_of_log
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import begin_of_log, read_log
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import FaultReason, SchemeState
 from firmware_sim.bench.truth_log import TruthLog
 
@@ -86,7 +86,7 @@ def at_s(log: Path, t_ns: int) -> float:
     return (t_ns - begin_of_log(log)) * 1e-9
 
 
-def stretched(log: Path, stretch: Stretch, change=lambda piece: piece, cycles_per_piece: int = 20_000) -> Replay:
+def stretched(log: Path, stretch: TimeWindow, change=lambda piece: piece, cycles_per_piece: int = 20_000) -> Replay:
     source = ChangedLog(log, change, cycles_per_piece)
     settings = [source.settings]
     return replay_source(source, settings, contacts_beside(log), script_of=ScriptedOperator, stretch=stretch)[0]
@@ -96,7 +96,7 @@ def stretched(log: Path, stretch: Stretch, change=lambda piece: piece, cycles_pe
 def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piece: int) -> None:
     whole = replay_source(LogSource(log), [LogSource(log).settings], contacts_beside(log))[0]
     contact = whole.score.contacts[0]
-    stretch = Stretch(at_s(log, contact.onset_ns) - 0.2004, at_s(log, contact.onset_ns) + 0.3)
+    stretch = TimeWindow(at_s(log, contact.onset_ns) - 0.2004, at_s(log, contact.onset_ns) + 0.3)
     found = stretched(log, stretch, cycles_per_piece=cycles_per_piece)
     bounds_ns = stretch.bounds_ns(begin_of_log(log))
     t_ns = read_log(log, ("/scheme",)).scheme.t_ns
@@ -110,9 +110,9 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piec
     assert 0 < len(found.contacts) <= len(whole.contacts)
     assert found.adaptations == ()
     assert 0.0 < found.monitored_s < 0.5
-    after = stretched(log, Stretch(stretch.end_s), cycles_per_piece=cycles_per_piece)
+    after = stretched(log, TimeWindow(stretch.end_s), cycles_per_piece=cycles_per_piece)
     assert (after.score, after.detections_ns) == (Score((), ()), ())
-    before = stretched(log, Stretch(end_s=stretch.start_s), cycles_per_piece=cycles_per_piece)
+    before = stretched(log, TimeWindow(end_s=stretch.start_s), cycles_per_piece=cycles_per_piece)
     assert before.cycles + found.cycles + after.cycles == whole.cycles
     assert (before.attempts, before.score.contacts) == (2, ())
     assert [each.took_s for each in before.adaptations] == [each.took_s for each in whole.adaptations]
@@ -127,14 +127,14 @@ def test_only_what_differs_in_the_stretch_is_named(log: Path, row: int, count: i
         flip(records, row, "tau_J")
         return with_records(piece, "/scheme", records)
 
-    stretch = Stretch(at_s(log, scheme.t_ns[900] - 400_000), at_s(log, scheme.t_ns[1100] - 400_000))
+    stretch = TimeWindow(at_s(log, scheme.t_ns[900] - 400_000), at_s(log, scheme.t_ns[1100] - 400_000))
     found = stretched(log, stretch, change)
     assert (found.compared, found.mismatch_count) == (200, count)
 
 
 def test_a_stretch_in_which_nothing_changes_says_what_state_it_is_in(log: Path, whole: Replay) -> None:
     last = whole.states[-1]
-    found = stretched(log, Stretch(at_s(log, last.t_ns) + 0.0014))
+    found = stretched(log, TimeWindow(at_s(log, last.t_ns) + 0.0014))
     assert found.states == ()
     assert found.ending == last
     assert ("ends in", f"{last.state.name} since {whole.time_s(last.t_ns):.2f} s") in side_by_side([found])

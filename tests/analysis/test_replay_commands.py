@@ -9,8 +9,7 @@ from analysis.replay_rig import write_candump
 from click.testing import CliRunner, Result
 
 from adacd_hil.cli.main import cli
-from adacd_hil.log.reader import read_log
-from adacd_hil.log.stretch import begin_of_log
+from adacd_hil.log.reader import begin_of_log, read_log
 
 pytestmark = pytest.mark.slow
 OK, FAILURE, USAGE, PARTIAL = 0, 1, 2, 3

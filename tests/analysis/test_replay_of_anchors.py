@@ -86,6 +86,6 @@ def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
     config = to_toml(LogSource(leant_on).settings).split("\n")
     before = "\n".join(line for line in config if not line.startswith("drift_Nm_sqrt_s"))
     attachments = {**read_log(leant_on).attachments, "config.toml": before.encode()}
-    monkeypatch.setattr("adacd_hil.log.stream.LogStream.attachments", attachments, raising=False)
+    monkeypatch.setattr("adacd_hil.log.reader.LogStream.attachments", attachments, raising=False)
     (then,) = {part.said for part in LogSource(leant_on)}
     assert then == {"margin"}

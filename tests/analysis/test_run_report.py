@@ -21,7 +21,7 @@ from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.reading import Source
 from adacd_hil.analysis.report.report_files import write_report, write_run_report
 from adacd_hil.analysis.report.timing_tables import timing_tables
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import (
     Event,

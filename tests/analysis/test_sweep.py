@@ -11,7 +11,7 @@ from adacd_hil.analysis.sweep.rows import replay_task
 from adacd_hil.analysis.sweep.store import SweepStore
 from adacd_hil.analysis.sweep.sweep import run_sweep
 from adacd_hil.cli.main import cli
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")

@@ -12,7 +12,7 @@ from made_certificates import Authority
 
 from adacd_hil.analysis.sweep.cluster import NO_FILES, TlsFiles, connect
 from adacd_hil.cli.main import cli
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")

@@ -22,7 +22,7 @@ from adacd_hil.analysis.detector_comparison import (
 from adacd_hil.analysis.motion import read_motion, sample_of
 from adacd_hil.analysis.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
 from adacd_hil.cli.main import cli
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.detectors import DetectorSettings
 from adacd_hil.settings.schema import parse

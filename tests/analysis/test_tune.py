@@ -27,9 +27,9 @@ from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, choose
 from adacd_hil.analysis.sweep.tune_scheme import _Shown, candidates, observe_candidates, thresholds_as_changes
 from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.cli.main import cli
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import read_log
-from adacd_hil.log.stretch import Stretch, begin_of_log
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import begin_of_log, read_log
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.pipeline.selection import layout_of
 from adacd_hil.settings.configuration import load_settings
@@ -454,11 +454,11 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
     (whole,) = read_logs([log])
     (window,) = whole.windows
     at_s = (whole.t_ns[window.first] - begin_of_log(log)) * 1e-9
-    (with_it,) = read_logs([log], stretch=Stretch(at_s - 0.0504, at_s + 1.9))
+    (with_it,) = read_logs([log], stretch=TimeWindow(at_s - 0.0504, at_s + 1.9))
     assert len(with_it.t_ns) < len(whole.t_ns)
     assert with_it.t_ns[with_it.windows[0].first] == whole.t_ns[window.first]
     assert with_it.windows[0].number == 1
-    (after,) = read_logs([log], stretch=Stretch(at_s + 0.001))
+    (after,) = read_logs([log], stretch=TimeWindow(at_s + 0.001))
     assert after.windows == ()
     assert after.t_ns[-1] == whole.t_ns[-1]
     done = CliRunner().invoke(cli, ["tune", str(log), "--from", str(at_s - 1.0), "--until", str(at_s), "--json"])

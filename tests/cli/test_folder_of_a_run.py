@@ -9,7 +9,7 @@ from experiment_runs import BIN, PAPER, adacd_hil
 
 from adacd_hil.cli import new_run_folder as run_folder_module
 from adacd_hil.cli.new_run_folder import run_folder
-from adacd_hil.log.errors import LogExistsError
+from adacd_hil.log.log_files import LogExistsError
 from adacd_hil.log.reader import read_log
 from firmware_sim.bench.truth_log import TruthLog
 

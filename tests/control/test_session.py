@@ -20,8 +20,8 @@ from session_rig import (
 
 from adacd_hil.control.gate import GateFlag
 from adacd_hil.control.session import LiveAddress
-from adacd_hil.log.layout import LAYOUT_NAME
-from adacd_hil.log.live.robot_description import ROBOT_NAME
+from adacd_hil.log.viewer.robot_description import ROBOT_NAME
+from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME
 from adacd_hil.records import JOINT_NAMES, FaultReason, SchemeState
 from adacd_hil.scheme.model.urdf import read_urdf
 from adacd_hil.wire.bus import Frame

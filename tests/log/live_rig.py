@@ -9,13 +9,14 @@ from mcap.reader import make_reader
 from recorded_run import CODEC, Run
 from reference_writer import MemorySink
 
-from adacd_hil.log.channels import run_channels
-from adacd_hil.log.live.client import LiveClient, LiveMessage
-from adacd_hil.log.live.feed import LiveFeed
-from adacd_hil.log.mcap_file import McapFile
-from adacd_hil.log.packet import ROOM, pack_cycle, pack_event
-from adacd_hil.log.packet_writer import PacketWriter
-from adacd_hil.log.setup import LiveSetup, Setup, tell_messages
+from adacd_hil.log.recording.log_file import McapFile
+from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
+from adacd_hil.log.recording.packet_writer import PacketWriter
+from adacd_hil.log.recording.processes import LiveSetup, WriterSetup
+from adacd_hil.log.types.decoded_messages import plain_messages
+from adacd_hil.log.types.topics import run_channels
+from adacd_hil.log.viewer.client import LiveClient, LiveMessage
+from adacd_hil.log.viewer.feed import LiveFeed
 from adacd_hil.records import Event
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -25,13 +26,13 @@ SETUP = LiveSetup("127.0.0.1", 0, URDF, LINK_LENGTH_M)
 LAST = Event("info", "test", "last")
 
 
-def setup_of(live: LiveSetup | None, path: Path = Path("run.mcap"), parameter_count: int = 7) -> Setup:
+def setup_of(live: LiveSetup | None, path: Path = Path("run.mcap"), parameter_count: int = 7) -> WriterSetup:
     """What a writer is told of a log in real time."""
-    return Setup(
+    return WriterSetup(
         path=path,
         is_truth=False,
         is_blocking=False,
-        messages=tell_messages(CODEC.messages.values()),
+        messages=plain_messages(CODEC.messages.values()),
         parameter_count=parameter_count,
         epoch_ns=EPOCH_NS,
         part_bytes=0,

@@ -11,10 +11,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, MetadataIndex, Schema
 from mcap.records import SummaryOffset as GroupOffset
 
-from adacd_hil.log.cdr import ENCAPSULATION, Member, number_type
-from adacd_hil.log.chunked_file import ChunkedFile, encode
-from adacd_hil.log.mcap.mcap_records import MAGIC
-from adacd_hil.log.mcap_file import LIBRARY
+from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile, encode
+from adacd_hil.log.mcap.records import MAGIC
+from adacd_hil.log.types.message_types import ENCAPSULATION, Member, number_type
 
 HEAD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<BQHIQQ")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adacd_hil.log.channels import ChannelId, pack_contact, pack_control, pack_cycle, pack_scheme
-from adacd_hil.log.recorder import LogSummary, Recorder
+from adacd_hil.log.recording.recorder import LogSummary, Recorder
+from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_control, pack_cycle, pack_scheme
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     ContactReport,

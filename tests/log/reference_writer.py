@@ -9,10 +9,9 @@ import struct
 import mcap.writer
 
 from adacd_hil import __version__
-from adacd_hil.log.cdr import ENCAPSULATION
-from adacd_hil.log.channels import SCHEME_BLOCK, ChannelId
-from adacd_hil.log.mcap_file import FIELDS_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.ros_types import pack_can_frame, pack_fd_frame, pack_joint_state, pack_log
+from adacd_hil.log.log_files import FIELDS_KEY, RUN_METADATA, SUMMARY_METADATA
+from adacd_hil.log.types.message_types import ENCAPSULATION, pack_can_frame, pack_fd_frame, pack_joint_state, pack_log
+from adacd_hil.log.types.topics import SCHEME_BLOCK, ChannelId
 from adacd_hil.records import Event, scheme_layout
 
 

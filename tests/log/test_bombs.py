@@ -12,16 +12,15 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 from recorded_run import make_run, start
 
-from adacd_hil.log.check.check import check_log
-from adacd_hil.log.editing.attached import attachment
-from adacd_hil.log.editing.cut import Stretch, cut
-from adacd_hil.log.editing.info import read_info
+from adacd_hil.log.check.log_check import check_log
+from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut
+from adacd_hil.log.editing.log_info import attachment, read_info
 from adacd_hil.log.editing.recover import recover
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.formats.export import export_tables
 from adacd_hil.log.formats.frame_log import read_frames
-from adacd_hil.log.mcap.mcap_records import MOST_RECORD_BYTES
-from adacd_hil.log.mcap.opening import FREE_BYTES, MOST_BYTES, MOST_RATIO, ChunkError, Opening, decompress
+from adacd_hil.log.formats.signal_tables import export_tables
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.chunks import FREE_BYTES, MOST_BYTES, MOST_RATIO, ChunkError, Opening, decompress
+from adacd_hil.log.mcap.records import MOST_RECORD_BYTES
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import Event
 from adacd_hil.wire.codec import load_codec
@@ -165,7 +164,7 @@ def test_a_bomb_in_a_log_is_a_problem_in_every_way_of_reading_it(bomb, tmp_path)
         assert problem
         assert peak < MOST_PEAK_BYTES
     with pytest.raises(LogError):
-        cut(path, tmp_path / "cut.mcap", Stretch(0.0, 1.0), ())
+        cut(path, tmp_path / "cut.mcap", TimeWindow(0.0, 1.0), ())
     assert len(read_log(tmp_path / "recovered.mcap").metadata)
 
 

@@ -17,13 +17,12 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 
-from adacd_hil.log.cdr import ENCAPSULATION
-from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.can_io import McapReader, McapWriter
 from adacd_hil.log.formats.can_messages import TimedMessage, to_messages
 from adacd_hil.log.formats.frame_log import read_frames
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.ros_types import CAN_FRAME, FD_FRAME
+from adacd_hil.log.types.message_types import CAN_FRAME, ENCAPSULATION, FD_FRAME
 
 NOON_NS = 1_790_000_000_123_456_789
 

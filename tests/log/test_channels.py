@@ -7,8 +7,16 @@ import pytest
 from mcap_ros2._dynamic import generate_dynamic
 from recorded_run import CODEC
 
-from adacd_hil.log.cdr import ENCAPSULATION, Member, number_type, payload_dtype, ros_field_name, ros_message_name
-from adacd_hil.log.channels import (
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.types.message_types import (
+    ENCAPSULATION,
+    Member,
+    number_type,
+    payload_dtype,
+    ros_field_name,
+    ros_message_name,
+)
+from adacd_hil.log.types.topics import (
     ChannelId,
     pack_contact,
     pack_control,
@@ -18,7 +26,6 @@ from adacd_hil.log.channels import (
     run_channels,
     truth_channels,
 )
-from adacd_hil.log.errors import LogError
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     TRUTH_LAYOUT,

@@ -23,10 +23,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Schema, Statistics
 from mcap.writer import CompressionType, Writer
 
-from adacd_hil.log.check.check import check_log, find_logs
+from adacd_hil.log.check.content_checks import text_problem
 from adacd_hil.log.check.findings import RULES
-from adacd_hil.log.check.ros_text import text_problem
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.check.log_check import check_log, find_logs
+from adacd_hil.log.log_files import LogError
 
 WHOLE = make_log()
 SCHEMA = Schema(id=1, name=TYPE.name, encoding="ros2msg", data=TYPE.text.encode())

@@ -8,7 +8,7 @@ from made_log import kinds, make_log, message, payload, put_together, rechunk, t
 from mcap.opcode import Opcode
 
 from adacd_hil.log import log_walk
-from adacd_hil.log.mcap import chunk_contents
+from adacd_hil.log.mcap import chunks as chunks_module
 from adacd_hil.log.reader import read_log
 
 CHUNKS = ((0, 5), (5, 10), (10, 15))
@@ -81,9 +81,9 @@ def test_chunks_whose_indexes_are_right_are_not_walked_through(monkeypatch):
     chunks = [b"".join(records[:2]), b"".join(records[2:])]
     size = len(records[0])
     indexes = [b"".join(struct.pack("<QQ", 0, size * place) for place in range(count)) for count in (2, 4)]
-    walked = chunk_contents.read_chunks(chunks, [b"", b""], bytearray())
-    monkeypatch.setattr(chunk_contents, "_walk_through", None)
-    indexed = chunk_contents.read_chunks(chunks, indexes, bytearray(4))
+    walked = chunks_module.read_chunks(chunks, [b"", b""], bytearray())
+    monkeypatch.setattr(chunks_module, "_walk_through", None)
+    indexed = chunks_module.read_chunks(chunks, indexes, bytearray(4))
     assert indexed.starts.tolist() == walked.starts.tolist() == [size * place for place in range(6)]
     assert indexed.ends.tolist() == walked.ends.tolist()
     assert indexed.log_times.tolist() == walked.log_times.tolist() == list(range(6))
@@ -96,6 +96,6 @@ def test_a_record_that_goes_on_in_the_next_chunk_is_none():
     data, size = b"".join(records), len(records[0])
     chunks = [data[: size + 40], data[size + 40 :]]
     indexes = [struct.pack("<QQQQ", 0, 0, 1, size), struct.pack("<QQ", 2, size - 40)]
-    contents = chunk_contents.read_chunks(chunks, indexes, bytearray())
+    contents = chunks_module.read_chunks(chunks, indexes, bytearray())
     assert contents.breaks[0] == size
     assert size not in contents.starts

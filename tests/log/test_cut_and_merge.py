@@ -6,10 +6,9 @@ from made_log import ATTACHMENTS, MILLISECOND, RUN, SUMMARY, kinds, make_log, pu
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
-from adacd_hil.log.check.check import check_log
-from adacd_hil.log.editing.cut import Stretch, contacts_begun, cut, find_contact
-from adacd_hil.log.editing.merge import log_names, merge
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.check.log_check import check_log
+from adacd_hil.log.editing.cut_and_merge import TimeWindow, contacts_begun, cut, find_contact, log_names, merge
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedContact, read_log
 from adacd_hil.records import ContactReport
 
@@ -51,21 +50,21 @@ def log_path(tmp_path):
 def test_what_no_log_command_has_made_is_not_replaced(log_path, tmp_path, name):
     (tmp_path / name).write_text("(1.0) can0 123#00\n")
     with pytest.raises(LogError, match="is no result of these commands"):
-        cut(log_path, tmp_path / name, Stretch(0.040, 0.1205))
+        cut(log_path, tmp_path / name, TimeWindow(0.040, 0.1205))
     assert (tmp_path / name).read_text() == "(1.0) can0 123#00\n"
     for _ in range(2):  # a result is
-        cut(log_path, tmp_path / "out.mcap", Stretch(0.040, 0.1205))
+        cut(log_path, tmp_path / "out.mcap", TimeWindow(0.040, 0.1205))
 
 
 def test_a_result_is_not_named_like_a_part_of_the_log_beside_it(log_path, tmp_path):
     with pytest.raises(LogError, match="would be taken for a part of the log beside it"):
-        cut(log_path, tmp_path / "run_001.mcap", Stretch(0.040, 0.1205))
-    cut(log_path, tmp_path / "other_001.mcap", Stretch(0.040, 0.1205))
+        cut(log_path, tmp_path / "run_001.mcap", TimeWindow(0.040, 0.1205))
+    cut(log_path, tmp_path / "other_001.mcap", TimeWindow(0.040, 0.1205))
 
 
 def test_a_stretch_has_its_cycles_whole_and_all_that_explains_them(log_path, tmp_path):
     out = tmp_path / "out.mcap"
-    done = cut(log_path, out, Stretch(0.040, 0.1205))
+    done = cut(log_path, out, TimeWindow(0.040, 0.1205))
     messages, attachments, metadata = read(out)
     assert messages == [message for message in read(log_path)[0] if 40 <= (message[2] - LATE_NS) / MILLISECOND <= 120]
     assert done.messages == len(messages) == 2 * 81
@@ -83,14 +82,14 @@ def test_a_stretch_has_its_cycles_whole_and_all_that_explains_them(log_path, tmp
 
 
 def test_an_open_end_takes_the_rest(log_path, tmp_path):
-    assert cut(log_path, tmp_path / "all.mcap", Stretch(-INFINITE, INFINITE)).messages == 2 * CYCLES
-    assert cut(log_path, tmp_path / "end.mcap", Stretch(0.290, INFINITE)).messages == 20
-    assert cut(log_path, tmp_path / "start.mcap", Stretch(-INFINITE, 0.010)).messages == 20
+    assert cut(log_path, tmp_path / "all.mcap", TimeWindow(-INFINITE, INFINITE)).messages == 2 * CYCLES
+    assert cut(log_path, tmp_path / "end.mcap", TimeWindow(0.290, INFINITE)).messages == 20
+    assert cut(log_path, tmp_path / "start.mcap", TimeWindow(-INFINITE, 0.010)).messages == 20
 
 
 def test_only_the_asked_topics_are_taken(log_path, tmp_path):
     out = tmp_path / "out.mcap"
-    cut(log_path, out, Stretch(0.0, 0.1), topics=("/b",))
+    cut(log_path, out, TimeWindow(0.0, 0.1), topics=("/b",))
     assert {topic for topic, *_ in read(out)[0]} == {"/b"}
     with make_reader(out.open("rb"))._stream as file:
         file.seek(0)
@@ -100,8 +99,8 @@ def test_only_the_asked_topics_are_taken(log_path, tmp_path):
 @pytest.mark.parametrize(
     ("stretch", "topics", "text"),
     [
-        (Stretch(7.0, 8.0), (), "has no message from 7 to 8 s"),
-        (Stretch(0.0, 1.0), ("/c",), "has no topic /c; it has /a, /b"),
+        (TimeWindow(7.0, 8.0), (), "has no message from 7 to 8 s"),
+        (TimeWindow(0.0, 1.0), ("/c",), "has no topic /c; it has /a, /b"),
     ],
 )
 def test_a_stretch_of_nothing_is_an_error_and_leaves_no_file(stretch, topics, text, log_path, tmp_path):
@@ -113,7 +112,7 @@ def test_a_stretch_of_nothing_is_an_error_and_leaves_no_file(stretch, topics, te
 def test_of_a_strangers_log_messages_are_taken_by_log_time(tmp_path):
     log = write(tmp_path / "x.mcap", run=None, summary=None, times=lambda number: (number * MILLISECOND, 0))
     out = tmp_path / "out.mcap"
-    assert cut(log, out, Stretch(0.002, 0.004)).messages == 4
+    assert cut(log, out, TimeWindow(0.002, 0.004)).messages == 4
 
 
 def spoil_chunk(data):
@@ -143,7 +142,7 @@ def without_crc(data):
 def test_a_damaged_log_is_recovered_first(spoil, reason, log_path, tmp_path):
     log_path.write_bytes(spoil(log_path.read_bytes()))
     for work in (
-        lambda out: cut(log_path, out, Stretch(-INFINITE, INFINITE)),
+        lambda out: cut(log_path, out, TimeWindow(-INFINITE, INFINITE)),
         lambda out: merge([log_path], out),
     ):
         with pytest.raises(LogError, match=f"^{log_path} {reason}: recover it first$"):
@@ -159,7 +158,7 @@ def test_a_strangers_log_without_crcs_is_taken_as_it_is(log_path, tmp_path):
 def test_a_log_is_not_overwritten_by_what_is_made_of_it(log_path):
     before = log_path.read_bytes()
     with pytest.raises(LogError, match="is the log itself"):
-        cut(log_path, log_path, Stretch(-INFINITE, INFINITE))
+        cut(log_path, log_path, TimeWindow(-INFINITE, INFINITE))
     with pytest.raises(LogError, match="is one of the logs"):
         merge([log_path], log_path)
     assert log_path.read_bytes() == before
@@ -252,7 +251,7 @@ def test_parts_are_one_log(tmp_path):
     path = write_parts(tmp_path)
     whole = read(path)[0] + read(tmp_path / "run_001.mcap")[0]
     merge([path, tmp_path / "run_001.mcap"], tmp_path / "merged.mcap")
-    cut(path, tmp_path / "cut.mcap", Stretch(-INFINITE, INFINITE))
+    cut(path, tmp_path / "cut.mcap", TimeWindow(-INFINITE, INFINITE))
     for out in (tmp_path / "merged.mcap", tmp_path / "cut.mcap"):
         messages, attachments, metadata = read(out)
         assert (messages, attachments, metadata["run"]) == (whole, ATTACHMENTS, RUN)

@@ -10,15 +10,16 @@ import threading
 import pytest
 from recorded_run import CODEC, make_run
 
-from adacd_hil.log import log_words
-from adacd_hil.log import sink as sink_module
-from adacd_hil.log.packet import pack_cycle, pack_event
-from adacd_hil.log.parts import find_parts
+from adacd_hil.log.log_files import find_parts
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.ring import Ring, RingReader
-from adacd_hil.log.setup import Setup, tell_messages
-from adacd_hil.log.sink import Sink
-from adacd_hil.log.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
+from adacd_hil.log.recording import log_file as sink_module
+from adacd_hil.log.recording import processes
+from adacd_hil.log.recording.log_file import Sink
+from adacd_hil.log.recording.packet import pack_cycle, pack_event
+from adacd_hil.log.recording.processes import WriterSetup
+from adacd_hil.log.recording.ring import Ring, RingReader
+from adacd_hil.log.recording.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
+from adacd_hil.log.types.decoded_messages import plain_messages
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +48,7 @@ class Writer:
         self.sink = Sink(descriptor, path, waits=False, most_waiting=MOST_WAITING)
         self._reader = RingReader(self.ring.descriptor)
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        setup = Setup(
+        setup = WriterSetup(
             path=path,
             is_truth=False,
             is_blocking=False,
@@ -84,9 +85,9 @@ class Writer:
         self.wait(lambda: self.clock.now > seen + STEP_NS)
 
     def end(self):
-        self._socket.send(log_words.END)
+        self._socket.send(processes.END)
         self._thread.join()
-        word = json.loads(self._socket.recv(log_words.MOST_BYTES))
+        word = json.loads(self._socket.recv(processes.MOST_BYTES))
         self._reader.close()
         self.ring.close()
         self._socket.close()
@@ -246,7 +247,7 @@ def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):
 
 
 def test_the_setup_arrives_as_it_was_sent(tmp_path):
-    messages = tell_messages(CODEC.messages.values())
-    setup = Setup(tmp_path, True, False, messages, 7, 5, 1, 2, {"a": b"\xff"}, {"b": "c"})
-    assert Setup.from_json(setup.to_json()) == setup
+    messages = plain_messages(CODEC.messages.values())
+    setup = WriterSetup(tmp_path, True, False, messages, 7, 5, 1, 2, {"a": b"\xff"}, {"b": "c"})
+    assert WriterSetup.from_json(setup.to_json()) == setup
     assert len(messages) == len(CODEC.messages)

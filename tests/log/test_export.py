@@ -15,13 +15,12 @@ from recorded_run import CODEC, make_run, record
 from test_can_io import all_kinds, content, write
 
 from adacd_hil.cli.commands.log_export import export
-from adacd_hil.log.chunked_file import MAGIC
-from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.can_messages import TimedMessage, to_messages
-from adacd_hil.log.formats.export import choose_topics, export_tables
-from adacd_hil.log.formats.frame_choice import FrameChoice, sides
-from adacd_hil.log.formats.frame_export import export_frames
+from adacd_hil.log.formats.frame_export import FrameChoice, export_frames, sides
 from adacd_hil.log.formats.frame_log import open_frames, read_frames
+from adacd_hil.log.formats.signal_tables import choose_topics, export_tables
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.chunked_file import MAGIC
 from adacd_hil.log.reader import read_log
 
 MILLISECOND_NS = 1_000_000

@@ -9,7 +9,7 @@ from mcap_ros2.decoder import DecoderFactory
 from recorded_run import LONG_ID, fd_contract, make_run, record
 
 from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, read_log, topic_bytes
-from adacd_hil.log.ros_types import pack_fd_frame
+from adacd_hil.log.types.message_types import pack_fd_frame
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import load_codec
 

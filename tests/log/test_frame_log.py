@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from recorded_run import make_run, record
 
-from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.frame_log import read_frames
-from adacd_hil.log.formats.recorded_frames import as_logged
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.record_arrays import as_logged
 
 NOON_NS = 1_790_000_000_123_000_000
 """Whole milliseconds, as BLF's start."""

@@ -31,17 +31,17 @@ from recorded_run import CODEC, feed, make_run, start
 from websockets.sync.client import connect
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.log import log_words
-from adacd_hil.log.channels import run_channels
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.live.client import LiveClient, live_client
-from adacd_hil.log.live.rates import Decimator, rate_of
-from adacd_hil.log.packet import pack_cycle, pack_event
-from adacd_hil.log.recorder import Recorder
-from adacd_hil.log.ring import Ring, RingReader
-from adacd_hil.log.setup import LiveSetup
-from adacd_hil.log.sink import Sink
-from adacd_hil.log.writer import SHOW_PERIOD_NS, WriterProcess
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.recording import processes
+from adacd_hil.log.recording.log_file import Sink
+from adacd_hil.log.recording.packet import pack_cycle, pack_event
+from adacd_hil.log.recording.processes import LiveSetup
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.recording.ring import Ring, RingReader
+from adacd_hil.log.recording.writer import SHOW_PERIOD_NS, WriterProcess
+from adacd_hil.log.types.topics import run_channels
+from adacd_hil.log.viewer.client import LiveClient, live_client
+from adacd_hil.log.viewer.live_topics import Decimator, rate_of
 from adacd_hil.records import Event
 
 STATED_HZ = {
@@ -276,7 +276,7 @@ def test_no_server_is_one_line():
 
 def test_a_viewer_that_leaves_amid_what_it_has_not_read_leaves_at_once(run, monkeypatch):
     endless = functools.partial(connect, close_timeout=2 * HANG_S)  # one that waited for it would meet the time limit
-    monkeypatch.setattr("adacd_hil.log.live.client.connect", endless)
+    monkeypatch.setattr("adacd_hil.log.viewer.client.connect", endless)
     fed = Feed()
     with live_client(fed.live.url) as client:
         fed.cycles(run, 100)
@@ -340,7 +340,7 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobo
         ring.put(pack_event(run.cycles[0].t_ns, 0, LAST))
         clock.sleep_until_ns(clock.now_ns() + SHOW_PERIOD_NS)
         assert "/scheme" in by_topic(receive_until_last(client))
-        ours.send(log_words.END)
+        ours.send(processes.END)
         thread.join()
     process.live.process.wait(HANG_S)
     assert clock.now_ns() == 3_000_000_000 + SHOW_PERIOD_NS

@@ -18,9 +18,9 @@ from adacd_hil.cli.live_options import live_options
 from adacd_hil.cli.main import cli
 from adacd_hil.control.session import LiveAddress
 from adacd_hil.extras import install_command
-from adacd_hil.log.cdr import payload_dtype
-from adacd_hil.log.channels import run_channels
-from adacd_hil.log.live.client import LiveMessage, live_client
+from adacd_hil.log.types.message_types import payload_dtype
+from adacd_hil.log.types.topics import run_channels
+from adacd_hil.log.viewer.client import LiveMessage, live_client
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactKind,

@@ -21,15 +21,15 @@ from recorded_run import CODEC, feed, make_run, start
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from adacd_hil.log import log_words
-from adacd_hil.log.channels import run_channels
-from adacd_hil.log.live import server as server_module
-from adacd_hil.log.live.admission import FULL, NOTICES, Admission
-from adacd_hil.log.live.client import live_client
-from adacd_hil.log.live.server import listen, make_server, url_of
-from adacd_hil.log.live.told import Told
-from adacd_hil.log.ring import Ring, RingReader
-from adacd_hil.log.setup import LiveSetup
+from adacd_hil.log.recording import processes
+from adacd_hil.log.recording.processes import LiveSetup
+from adacd_hil.log.recording.ring import Ring, RingReader
+from adacd_hil.log.types.topics import run_channels
+from adacd_hil.log.viewer import server as server_module
+from adacd_hil.log.viewer.admission import FULL, NOTICES, Admission
+from adacd_hil.log.viewer.client import live_client
+from adacd_hil.log.viewer.feed import ServerSetup
+from adacd_hil.log.viewer.server import listen, make_server, url_of
 
 SDK = "foxglove.sdk.v1"
 OLD = "foxglove.websocket.v1"
@@ -487,7 +487,7 @@ def unstarted():
     ring = Ring(2**16)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     reader = RingReader(ring.descriptor)
-    server = make_server(Told(setup_of(SETUP), CHANNEL_IDS, EPOCH_NS), reader, theirs)
+    server = make_server(ServerSetup(setup_of(SETUP), CHANNEL_IDS, EPOCH_NS), reader, theirs)
     listening = listen(SETUP)
     yield Unstarted(server, listening, listening.getsockname(), ours)
     for end in (ours, theirs, reader, ring):
@@ -502,7 +502,7 @@ def test_the_port_is_free_while_the_last_viewers_say_goodbye(monkeypatch, unstar
     with socket.create_connection(address) as deaf:  # for whose goodbye the server waits
         deaf.sendall(raw_request("127.0.0.1"))
         assert deaf.recv(12) == b"HTTP/1.1 101"
-        writer.send(log_words.END)
+        writer.send(processes.END)
         with contextlib.suppress(ConnectionRefusedError):
             while True:
                 socket.create_connection(address).close()
@@ -521,7 +521,7 @@ def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarte
         refused = await asyncio.open_connection(*address)
         refused[1].write(raw_request("elsewhere.example"))
         assert (await refused[0].read()).startswith(b"HTTP/1.1 403")
-        writer.send(log_words.END)
+        writer.send(processes.END)
         for _ in range(steps):
             await asyncio.sleep(0)
         with contextlib.suppress(ConnectionRefusedError), socket.create_connection(address):

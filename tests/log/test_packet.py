@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.log.packet import (
+from adacd_hil.log.recording.packet import (
     EVENT,
     IS_ERROR,
     IS_TX,

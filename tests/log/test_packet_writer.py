@@ -5,10 +5,10 @@ import pytest
 from recorded_run import CODEC, LONG_ID, PERIOD_NS, make_run
 from reference_writer import MemorySink, ReferenceWriter
 
-from adacd_hil.log.channels import ChannelId, pack_truth, run_channels, truth_channels
-from adacd_hil.log.mcap_file import McapFile
-from adacd_hil.log.packet import ROOM, pack_cycle, pack_event
-from adacd_hil.log.packet_writer import PacketWriter
+from adacd_hil.log.recording.log_file import McapFile
+from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
+from adacd_hil.log.recording.packet_writer import PacketWriter
+from adacd_hil.log.types.topics import ChannelId, pack_truth, run_channels, truth_channels
 from adacd_hil.records import TRUTH_LAYOUT, Event
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import parse_codec

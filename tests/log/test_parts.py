@@ -8,10 +8,9 @@ import pytest
 from mcap.reader import make_reader
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
-from adacd_hil.log.errors import LogExistsError
-from adacd_hil.log.parts import find_parts, part_path
+from adacd_hil.log.log_files import LogExistsError, find_parts, part_path
 from adacd_hil.log.reader import read_log, topic_bytes
-from adacd_hil.log.recorder import Recorder
+from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.settings.run_settings import LogSettings
 
 pytestmark = pytest.mark.slow  # each log starts a process

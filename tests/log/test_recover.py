@@ -21,9 +21,9 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Metadata
 
-from adacd_hil.log.check.check import check_log
+from adacd_hil.log.check.log_check import check_log
 from adacd_hil.log.editing.recover import recover
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))

@@ -10,7 +10,7 @@ from mcap.stream_reader import StreamReader
 from recorded_run import feed, make_run, start, wait_until_taken
 
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.ring import LEAST_BYTES, Ring, RingReader, room_of, split
+from adacd_hil.log.recording.ring import LEAST_BYTES, Ring, RingReader, room_of, split
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
 

@@ -13,11 +13,10 @@ from mcap_ros2.decoder import DecoderFactory
 from recorded_run import fd_contract, make_run, record
 from rosbags.highlevel import AnyReader, AnyReaderError
 
-from adacd_hil.log.check.check import check_log
-from adacd_hil.log.editing.cut import Stretch, cut
-from adacd_hil.log.editing.merge import merge
+from adacd_hil.log.check.log_check import check_log
+from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut, merge
 from adacd_hil.log.editing.recover import recover
-from adacd_hil.log.formats.mcap_frame_writer import FrameWriter, RecordedFrame
+from adacd_hil.log.formats.mcap_frames import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import read_log
 from adacd_hil.wire.codec import load_codec
 
@@ -111,7 +110,7 @@ def test_a_log_of_before_the_profile_is_read_as_ever_and_a_copy_of_it_opens_in_r
     assert before.contacts == now.contacts
     assert [finding for finding in check_log(old).findings if finding.rule == "profile"] == []
     copies = [tmp_path / name for name in ("cut.mcap", "merged.mcap", "recovered.mcap")]
-    cut(old, copies[0], Stretch(0.02, 0.05))
+    cut(old, copies[0], TimeWindow(0.02, 0.05))
     merge([old, log_path], copies[1], has_prefix=True)
     recover(old, copies[2])
     assert [header_of(copy).profile for copy in copies] == ["ros2"] * 3
@@ -124,9 +123,9 @@ def test_a_copy_of_somebody_elses_log_does_not_claim_the_profile(tmp_path):
     theirs.write_bytes(make_log(library="somebody 1.0"))
     ours = tmp_path / "ours.mcap"
     ours.write_bytes(make_log())
-    cut(theirs, tmp_path / "cut.mcap", Stretch(0.0, 1.0))
+    cut(theirs, tmp_path / "cut.mcap", TimeWindow(0.0, 1.0))
     merge([ours, theirs], tmp_path / "merged.mcap", has_prefix=True)
-    cut(ours, tmp_path / "own.mcap", Stretch(0.0, 1.0))
+    cut(ours, tmp_path / "own.mcap", TimeWindow(0.0, 1.0))
     profiles = [header_of(tmp_path / f"{name}.mcap").profile for name in ("cut", "merged", "own")]
     assert profiles == ["", "", "ros2"]
 

@@ -9,11 +9,10 @@ import pytest
 from hang import HANG_S
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
-from adacd_hil.log.errors import LogError, LogExistsError
-from adacd_hil.log.parts import part_path
+from adacd_hil.log.log_files import LogError, LogExistsError, log_in, part_path
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.recorder import Recorder
-from adacd_hil.log.run_folder import check_free, log_in
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
 
@@ -63,7 +62,9 @@ def test_a_run_is_going_on_after_its_first_part(tmp_path):
 def test_of_two_runs_that_begin_at_once_one_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "run.mcap"
     first = start(path, make_run(0))
-    monkeypatch.setattr("adacd_hil.log.recorder.make_room", lambda path: None)  # it looked before there was one
+    monkeypatch.setattr(
+        "adacd_hil.log.recording.recorder.make_room", lambda path: None
+    )  # it looked before there was one
     with pytest.raises(LogExistsError, match="is being written by another run"):
         Recorder(path)
     assert first.close().is_complete
@@ -95,7 +96,7 @@ def test_the_log_of_a_start_that_failed_is_kept_aside(tmp_path):
 def test_a_log_with_nothing_in_it_is_kept_aside_though_its_host_was_killed(tmp_path):
     path = tmp_path / "truth.mcap"
     dies = (
-        "import os, sys; from pathlib import Path; from adacd_hil.log.recorder import Recorder;"
+        "import os, sys; from pathlib import Path; from adacd_hil.log.recording.recorder import Recorder;"
         "Recorder(Path(sys.argv[1]), metadata={'name': 'made'}, is_truth=True); os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", dies, str(path)], check=False, timeout=HANG_S)

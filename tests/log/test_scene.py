@@ -7,22 +7,26 @@ import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
-from adacd_hil.log.channels import pack_contact, unpack_contact
-from adacd_hil.log.live.scene import (
+from adacd_hil.log.types.topics import pack_contact, unpack_contact
+from adacd_hil.log.viewer.scene import (
     ARROW_LIFETIME_NS,
     GREEN,
     GREY,
     LARGEST_SPHERE_M,
     RED,
+    SCENE,
     SMALLEST_SPHERE_M,
+    TRANSFORMS,
     YELLOW,
+    MessageType,
     Shape,
     draw_contact,
     draw_joints,
+    pack_scene,
+    pack_transforms,
     share_of_threshold,
     transforms_of,
 )
-from adacd_hil.log.live.scene_types import SCENE, TRANSFORMS, MessageType, pack_scene, pack_transforms
 from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
 
 SHAPE = Shape((0.35, 0.30))

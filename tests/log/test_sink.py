@@ -3,7 +3,7 @@
 import os
 import resource
 
-from adacd_hil.log.sink import Sink
+from adacd_hil.log.recording.log_file import Sink
 
 
 def test_what_is_written_is_in_the_file_in_order(tmp_path):

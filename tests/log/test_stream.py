@@ -18,14 +18,11 @@ from mcap.writer import CompressionType, Writer
 from recorded_run import make_run, record
 
 from adacd_hil.log import log_walk
-from adacd_hil.log.channels import run_channels
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.formats.export import export_tables
-from adacd_hil.log.mcap_file import FIELDS_KEY
-from adacd_hil.log.parts import find_parts, part_path
-from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, read_log
-from adacd_hil.log.ros_types import LOG, pack_log, unpack_log
-from adacd_hil.log.stream import LogStream
+from adacd_hil.log.formats.signal_tables import export_tables
+from adacd_hil.log.log_files import FIELDS_KEY, LogError, find_parts, part_path
+from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, LogStream, read_log
+from adacd_hil.log.types.message_types import LOG, pack_log, unpack_log
+from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.codec import load_codec
@@ -318,9 +315,9 @@ def test_a_log_that_does_not_exist_is_an_error_of_one_line(tmp_path):
 @pytest.mark.slow
 def test_neither_the_writer_process_nor_reading_a_log_loads_the_compiler(path):
     code = (
-        "import sys, adacd_hil.log.writer, adacd_hil.log.reader, adacd_hil.log.stream\n"
+        "import sys, adacd_hil.log.recording.writer, adacd_hil.log.reader, adacd_hil.log.reader\n"
         "assert adacd_hil.log.reader.read_log(sys.argv[1]).parts\n"
-        "assert list(adacd_hil.log.stream.LogStream(sys.argv[1]))\n"
+        "assert list(adacd_hil.log.reader.LogStream(sys.argv[1]))\n"
         "print('numba' in sys.modules)"
     )
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.foreign.recording_import import Recording, Stretch
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.analysis.score.judge import explained_until, owners
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify import offline
 from adacd_hil.scheme.identify.offline import Certificate, Estimate, OfflineSettings

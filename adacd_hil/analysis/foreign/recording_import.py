@@ -22,8 +22,8 @@ from scipy.signal import savgol_filter
 
 from adacd_hil.analysis.foreign.recording_map import RecordingMap
 from adacd_hil.input_files import open_input
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.stretch import Stretch as Span
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify.offline import Record
@@ -95,7 +95,9 @@ class Recording:
         return [part for part in parts if len(part.record.q) >= _SHORTEST_SAMPLES]
 
 
-def read_recording(path: Path, described: RecordingMap, period_s: float = 0.0, span: Span | None = None) -> Recording:
+def read_recording(
+    path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
+) -> Recording:
     """Read a CSV file. period_s: of the samples, where neither the map nor the recording is to say.
 
     span: what has to be read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError when
@@ -143,7 +145,7 @@ def read_recording(path: Path, described: RecordingMap, period_s: float = 0.0, s
 
 
 def _read_columns(
-    path: Path, described: RecordingMap, span: Span | None
+    path: Path, described: RecordingMap, span: TimeWindow | None
 ) -> tuple[Vector, float, Vector, NDArray[np.bool_] | None]:
     """Return time (k,) s and that of the file's first row, values (k, 2 n or 3 n) in SI units, touches (k,).
 
@@ -178,7 +180,9 @@ def _read_columns(
     return time_s, begin_s, values, table[:, -1] != 0.0 if columns.contact else None
 
 
-def _read_table(path: Path, described: RecordingMap, places: list[int], span: Span | None) -> tuple[Vector, float]:
+def _read_table(
+    path: Path, described: RecordingMap, places: list[int], span: TimeWindow | None
+) -> tuple[Vector, float]:
     """Return the columns at such places of all rows, or of those of a span; and the time in the first row."""
     form = described.csv
     head = form.skip_rows + form.has_header

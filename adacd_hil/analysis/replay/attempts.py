@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.reader import Series
-from adacd_hil.log.stream import Piece
+from adacd_hil.log.reader import Piece, Series
 from adacd_hil.records import SchemeState
 
 NMT_ID, RESET_COMMUNICATION = 0x000, 0x82

@@ -22,11 +22,10 @@ from adacd_hil.analysis.replay.attempts import NMT_ID, RESET_COMMUNICATION, Plac
 from adacd_hil.analysis.replay.source import FRAME_TOPICS, LogSource, Part
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.errors import LogError
 from adacd_hil.log.formats.frame_log import read_frames
-from adacd_hil.log.formats.recorded_frames import as_logged
-from adacd_hil.log.reader import Series
-from adacd_hil.log.stream import LogStream, Piece
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import LogStream, Piece, Series
+from adacd_hil.log.types.record_arrays import as_logged
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.replay.run_digest import Detection, RunDigest, RunReader
 from adacd_hil.analysis.replay.what_if import changed_keys
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.stretch import WHOLE, Stretch, begin_of_log
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import begin_of_log
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 
 PROGRESS_CYCLES: Final = 1_000_000
 MATCH_S: Final = 0.5
@@ -64,7 +65,7 @@ class LogComparison:
     cycles: int
     only: tuple[int, int]
     notes: tuple[str, ...]
-    stretch: Stretch = WHOLE
+    stretch: TimeWindow = WHOLE
 
     @property
     def is_same(self) -> bool:
@@ -144,7 +145,7 @@ def _fields(records: NDArray[Any]) -> list[str]:
 
 
 def compare_logs(
-    first: Path, second: Path, progress: Callable[[str], None] = lambda _: None, stretch: Stretch = WHOLE
+    first: Path, second: Path, progress: Callable[[str], None] = lambda _: None, stretch: TimeWindow = WHOLE
 ) -> LogComparison:
     """Compare two logs. Raises LogError, ConfigError.
 

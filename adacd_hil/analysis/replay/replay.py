@@ -31,10 +31,9 @@ from adacd_hil.analysis.score.judge import Score
 from adacd_hil.analysis.score.score_words import unjudged_sentence
 from adacd_hil.analysis.score.truth_contacts import TrueContacts, contacts_beside
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedContact
-from adacd_hil.log.stretch import EVER_NS, WHOLE
-from adacd_hil.log.stretch import Stretch as LogStretch
+from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.batch import SchemeBatch, arm_at
 from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
@@ -128,7 +127,7 @@ def replay_many(
     progress: Progress = lambda _: None,
     *,
     watch: Watch | None = None,
-    stretch: LogStretch = WHOLE,
+    stretch: TimeWindow = WHOLE,
 ) -> list[Replay]:
     """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
 
@@ -256,7 +255,7 @@ def replay_source(
     script_of: ScriptOf | None = None,
     shown: int = SHOWN,
     watch: Watch | None = None,
-    stretch: LogStretch = WHOLE,
+    stretch: TimeWindow = WHOLE,
 ) -> list[Replay]:
     """Replay what a source gives, once for each of the settings; shown: mismatches that are kept.
 

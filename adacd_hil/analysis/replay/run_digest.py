@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.distribution import Distribution
 from adacd_hil.analysis.replay.source import settings_of
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import Series
-from adacd_hil.log.stream import LogStream
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import LogStream, Series
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings
 

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.provenance import arithmetic
+from adacd_hil.log.log_files import LogError, arithmetic
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Vector
 from adacd_hil.scheme.pipeline.batch import SchemeBatch

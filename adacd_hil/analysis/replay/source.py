@@ -9,10 +9,8 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from adacd_hil.analysis.replay.attempts import AttemptSplitter, Stretch
 from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.log.stream import LogStream, Piece
-from adacd_hil.log.stretch import begin_of_log
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, begin_of_log
 from adacd_hil.records import CERTIFICATE_EVENTS
 from adacd_hil.settings.configuration import Settings, renewed
 from adacd_hil.settings.schema import parse

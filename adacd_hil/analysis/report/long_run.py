@@ -37,8 +37,7 @@ from adacd_hil.analysis.timing import (
     find_reactions,
 )
 from adacd_hil.analysis.untouched import UntouchedGatherer
-from adacd_hil.log.reader import Series
-from adacd_hil.log.stream import Piece
+from adacd_hil.log.reader import Piece, Series
 from adacd_hil.records import SchemeState, Vector
 
 BUCKETS: Final = 2_500

@@ -16,8 +16,7 @@ from adacd_hil.analysis.logged_run import CheckCounts, Run
 from adacd_hil.analysis.report.scheme_rows import SchemeRows
 from adacd_hil.analysis.score.truth_reading import TruthRows, host_truth
 from adacd_hil.analysis.timing import Cycles
-from adacd_hil.log.reader import LoggedEvent, Series, contacts_of
-from adacd_hil.log.stream import LogStream, Piece
+from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, contacts_of
 from adacd_hil.records import ContactReport, Request, SchemeState
 
 BUSY: Final = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.REACT, SchemeState.STOPPED)

@@ -27,13 +27,9 @@ from adacd_hil.analysis.score.score_words import unjudged_sentence
 from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.analysis.score.truth_reading import TruthRows, host_truth, read_truth
 from adacd_hil.analysis.timing import CycleColumns, columns_of_series
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_file import ENDING_KEY
-from adacd_hil.log.reader import Series, check_states
-from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY
-from adacd_hil.log.stream import LogStream, Piece
-from adacd_hil.log.stretch import WHOLE, Stretch, start_of_log
-from adacd_hil.log.summary import PLANNED_ENDINGS
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, LogError
+from adacd_hil.log.reader import LogStream, Piece, Series, check_states, start_of_log
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS
 from adacd_hil.terminal import one_line
 
@@ -68,7 +64,7 @@ class ReadRun(NamedTuple):
 def read_run(
     log_path: Path,
     truth_path: Path | None,
-    stretch: Stretch = WHOLE,
+    stretch: TimeWindow = WHOLE,
     progress: Progress = lambda _: None,
     full_cycles: int = FULL_CYCLES,
 ) -> ReadRun:
@@ -210,7 +206,7 @@ class _Reading:
             long_run.add(piece)
         return self._done(*long_run.done())
 
-    def read_stretch(self, stretch: Stretch, most_cycles: int) -> ReadRun:
+    def read_stretch(self, stretch: TimeWindow, most_cycles: int) -> ReadRun:
         """Read a stretch of the log, and what of it is needed to cut nothing. Raises LogError if nothing is in it."""
         start_ns = self._shell.log_start_ns
         if start_ns is None:
@@ -221,7 +217,7 @@ class _Reading:
         asked_s = ((asked_ns[0] - zero_ns) * 1e-9, (asked_ns[1] - zero_ns) * 1e-9)
         bounds_s = widen(run, *asked_s)
         bounds_ns = (round(bounds_s[0] * 1e9) + zero_ns, round(bounds_s[1] * 1e9) + zero_ns)
-        found = Stretch(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns))
+        found = TimeWindow(*((bound_ns - start_ns) * 1e-9 for bound_ns in bounds_ns))
         begun_s = [d.detected_s for d in find_detections(run)]
         if run.truth is not None:
             begun_s = [touch.onset_s for touch in true_contacts(run)]

@@ -28,8 +28,8 @@ from adacd_hil.analysis.report.words import (
     shown_contacts,
 )
 from adacd_hil.analysis.timing_figures import draw_timing
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.stretch import WHOLE, Stretch
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.output_files import replace_file
 from adacd_hil.terminal import fit_table, in_line, terminal_columns
 
@@ -82,7 +82,7 @@ def write_report(
     out_dir: Path,
     *,
     is_printed: bool = False,
-    stretch: Stretch = WHOLE,
+    stretch: TimeWindow = WHOLE,
     progress: Progress = lambda _: None,
 ) -> Report:
     """Read a log, or a stretch of it, and the emulator's truth if there is one, and write the report into `out_dir`.

@@ -4,8 +4,8 @@ import hashlib
 import json
 from pathlib import Path
 
-from adacd_hil.log.editing.attached import attachment, run_metadata
-from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY
+from adacd_hil.log.editing.log_info import attachment, run_metadata
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
 

@@ -18,7 +18,7 @@ from adacd_hil.analysis.score.touches import contact_rows, forgotten_after_s
 from adacd_hil.analysis.score.truth_reading import TruthRows, read_truth
 from adacd_hil.analysis.sections import is_interrupted
 from adacd_hil.analysis.timing import Cycles
-from adacd_hil.log.run_folder import TRUTH_NAME
+from adacd_hil.log.log_files import TRUTH_NAME
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 

@@ -17,8 +17,7 @@ from adacd_hil.analysis.host_cycles import EmulatorSpan, host_cycles, host_span
 from adacd_hil.analysis.logged_run import Truth
 from adacd_hil.analysis.thinning import extreme_rows
 from adacd_hil.analysis.timing import Cycles
-from adacd_hil.log.reader import Series
-from adacd_hil.log.stream import LogStream
+from adacd_hil.log.reader import LogStream, Series
 from adacd_hil.records import PARAMETER_NAMES, Vector
 
 _BEGINNING: Final = (10_000, 1_000)

@@ -9,7 +9,7 @@ from adacd_hil.analysis.replay.replay import Replay, replay_many
 from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.analysis.replay.what_if import apply_settings, keep_facts
 from adacd_hil.analysis.sweep.plan import Row, Subject, Task
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError

@@ -11,7 +11,7 @@ from typing import Any
 
 from adacd_hil.analysis.sweep.rows import Values
 from adacd_hil.extras import install_command
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.output_files import replace_file, replacing
 
 TABLE_NAME = "sweep.parquet"

@@ -12,7 +12,7 @@ from adacd_hil.analysis.sweep.plan import Plan, Task
 from adacd_hil.analysis.sweep.rows import Values, failed
 from adacd_hil.analysis.sweep.store import SweepStore
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 
 ROWS_PER_TASK = 20
 """So many replays share the decoding of a log; more would make a lost worker cost more."""

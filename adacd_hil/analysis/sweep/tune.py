@@ -29,7 +29,7 @@ from adacd_hil.analysis.sweep.tune_scheme import (
     observe_candidates,
     thresholds_as_changes,
 )
-from adacd_hil.log.stretch import WHOLE, Stretch
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 
 LIMITS: Final = (
     "The arm in the logs moved as its own scheme had it move. After a contact it braked when that scheme found it, the "
@@ -153,7 +153,7 @@ def tune(
     rate_per_h: float,
     config: str | None,
     progress: Callable[[str], None],
-    stretch: Stretch = WHOLE,
+    stretch: TimeWindow = WHOLE,
 ) -> Tuning:
     """Find thresholds, filter and gain. config: name or file of the settings to start from.
 

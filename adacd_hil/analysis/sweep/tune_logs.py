@@ -23,9 +23,9 @@ from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
 from adacd_hil.analysis.score.judge import Times, TouchWindow, explained_until
 from adacd_hil.analysis.score.truth_contacts import HostCycles, TrueContact, contacts_beside, windows_of
 from adacd_hil.input_files import open_input
-from adacd_hil.log.errors import LogError
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import Series
-from adacd_hil.log.stretch import EVER_NS, WHOLE, Stretch
+from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings, load_settings
 
@@ -57,7 +57,7 @@ class TunedLog:
     t_ns: NDArray[np.int64]  # (N,)
     windows: tuple[Window, ...] | None
     is_chosen_on: NDArray[np.bool_]
-    stretch: Stretch = WHOLE
+    stretch: TimeWindow = WHOLE
 
     @property
     def block(self) -> int:
@@ -68,7 +68,7 @@ class TunedLog:
 def read_logs(
     paths: Sequence[Path],
     config: str | None = None,
-    stretch: Stretch = WHOLE,
+    stretch: TimeWindow = WHOLE,
     progress: Progress = lambda _: None,
 ) -> list[TunedLog]:
     """Read logs, or a stretch of each. config: name or file of the settings to start from, in place of the logs' own.
@@ -93,7 +93,7 @@ def _tunable(settings: Settings) -> Settings:
     return dataclasses.replace(Settings(), **{name: getattr(settings, name) for name in names})
 
 
-def _read(path: Path, place: int, count: int, config: str | None, stretch: Stretch, progress: Progress) -> TunedLog:
+def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeWindow, progress: Progress) -> TunedLog:
     own = LogSource(path).settings
     parts = _Index()
     motion = read_motion(path, stretch, progress, parts.add)

@@ -18,10 +18,10 @@ from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
-from adacd_hil.log.channels import ChannelId, pack_cycle
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.recorder import Recorder
-from adacd_hil.log.run_folder import check_free
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.recording.run_folder import check_free
+from adacd_hil.log.types.topics import ChannelId, pack_cycle
 from adacd_hil.output_files import replace_file
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime

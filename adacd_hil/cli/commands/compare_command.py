@@ -11,14 +11,14 @@ from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.cli.progress import Progress
 from adacd_hil.given_path import GivenPath
-from adacd_hil.log.run_folder import log_in
+from adacd_hil.log.log_files import log_in
 from adacd_hil.records import Location
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_comparison import LogComparison
     from adacd_hil.analysis.replay.run_digest import Detection
-    from adacd_hil.log.stretch import Stretch
+    from adacd_hil.log.time_window import TimeWindow
 
 _EPILOG = (
     "Exit status: 0 both decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
@@ -32,7 +32,7 @@ _EPILOG = (
 @json_option
 @explained
 @stretch_options
-def compare(first: Path, second: Path, as_json: bool, stretch: "Stretch") -> ExitCode:
+def compare(first: Path, second: Path, as_json: bool, stretch: "TimeWindow") -> ExitCode:
     """Compare two runs: settings, every field of /scheme, states, contacts, parameters, timing.
 
     Times count from motion start, the first cycle in ADAPT. A folder stands for the run log in it.

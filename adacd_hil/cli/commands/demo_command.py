@@ -16,8 +16,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.run_folder import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.output_files import in_words
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings

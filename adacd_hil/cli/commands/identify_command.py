@@ -52,7 +52,7 @@ def identify(
     from adacd_hil.analysis.foreign.recording_import import read_recording
     from adacd_hil.analysis.foreign.recording_map import read_map
     from adacd_hil.cli.progress import Progress
-    from adacd_hil.log.stretch import Stretch
+    from adacd_hil.log.time_window import TimeWindow
 
     if not start_s < end_s:
         raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)
@@ -63,7 +63,7 @@ def identify(
         for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
             # From 0 s on: nothing is left out before.
-            span = Stretch(start_s or -math.inf, end_s) if place < len(recordings) else None
+            span = TimeWindow(start_s or -math.inf, end_s) if place < len(recordings) else None
             read.append(read_recording(path, described, read[0].period_s if read else 0.0, span))
         fitted = [recording.between(start_s, end_s) for recording in read[: len(recordings)]]
         tested = read[len(recordings)] if test else None

@@ -16,9 +16,9 @@ from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.table import format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.live.client import LiveClient, LiveMessage, live_client
-from adacd_hil.log.ros_types import unpack_log
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.types.message_types import unpack_log
+from adacd_hil.log.viewer.client import LiveClient, LiveMessage, live_client
 from adacd_hil.records import (
     GRAVITY_PARAMETER_NAMES,
     JOINT_NAMES,

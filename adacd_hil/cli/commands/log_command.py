@@ -14,7 +14,7 @@ from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.log.stretch import Stretch
+    from adacd_hil.log.time_window import TimeWindow
 
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False))
 _out_option = click.option("--out", type=WrittenPath(dir_okay=False), metavar="FILE")
@@ -39,8 +39,8 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     A folder stands for the logs in it.
     """
     from adacd_hil.cli.commands import log_text
-    from adacd_hil.log.check.check import find_logs
-    from adacd_hil.log.editing.info import read_info
+    from adacd_hil.log.check.log_check import find_logs
+    from adacd_hil.log.editing.log_info import read_info
 
     found = [read_info(path) for path in find_logs(logs)]
     if as_json:
@@ -60,7 +60,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     A folder stands for the logs in it. docs/log-tools.md lists the rules.
     """
     from adacd_hil.cli.commands import log_text
-    from adacd_hil.log.check.check import check_log, find_logs
+    from adacd_hil.log.check.log_check import check_log, find_logs
 
     checked = [check_log(path, _tell) for path in find_logs(logs)]
     if as_json:
@@ -116,11 +116,11 @@ def cut(
     topics: tuple[str, ...],
     out: Path | None,
     as_json: bool,
-    stretch: "Stretch",
+    stretch: "TimeWindow",
 ) -> ExitCode:
     """Cut a stretch out of a log, whole cycles, with attachments and metadata. --out: default NAME.cut.mcap."""
-    from adacd_hil.log.editing.cut import cut as cut_log
-    from adacd_hil.log.editing.cut import default_out, find_contact
+    from adacd_hil.log.editing.cut_and_merge import cut as cut_log
+    from adacd_hil.log.editing.cut_and_merge import default_out, find_contact
 
     if contact is not None:
         if not stretch.is_whole:
@@ -145,7 +145,7 @@ def _finite(value: float) -> float | str | None:
 @explained
 def merge(logs: tuple[Path, ...], out: Path, has_prefix: bool, as_json: bool) -> ExitCode:
     """Merge logs into one by their log times: of several hosts, of a run and the emulator, or of one log's parts."""
-    from adacd_hil.log.editing.merge import merge as merge_logs
+    from adacd_hil.log.editing.cut_and_merge import merge as merge_logs
 
     done = merge_logs(logs, out, has_prefix, _tell)
     if done.shared and not has_prefix:

@@ -109,7 +109,7 @@ def export(
 
 def contract_of(log: Path, dbc: Path | None) -> "Codec":
     """Load the contract: the given one, else the one that is attached to the log, else the arm's."""
-    from adacd_hil.log.editing.attached import attachment
+    from adacd_hil.log.editing.log_info import attachment
     from adacd_hil.wire.codec import load_codec, parse_codec
 
     if dbc is not None:
@@ -121,7 +121,7 @@ def contract_of(log: Path, dbc: Path | None) -> "Codec":
 def _export_tables(
     log: Path, out: Path, kind: str, topics: tuple[str, ...], codec: "Codec"
 ) -> tuple[dict[str, Any], str]:
-    from adacd_hil.log.formats.export import export_tables
+    from adacd_hil.log.formats.signal_tables import export_tables
 
     summary = export_tables(log, out, kind, topics, codec, _Teller("rows"))
     lines = [in_line(f"{path}: {rows} rows") for path, rows in summary.rows.items()]
@@ -135,8 +135,7 @@ def _export_tables(
 def _export_frames(
     log: Path, out: Path, kind: str, only: Any, can_ids: tuple[int, ...], codec: "Codec", has_direction: bool
 ) -> tuple[dict[str, Any], str]:
-    from adacd_hil.log.formats.frame_choice import FrameChoice, sides
-    from adacd_hil.log.formats.frame_export import export_frames
+    from adacd_hil.log.formats.frame_export import FrameChoice, export_frames, sides
     from adacd_hil.log.formats.frame_log import open_frames
 
     if out.exists() and log.exists() and out.samefile(log):

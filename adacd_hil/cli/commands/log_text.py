@@ -3,9 +3,9 @@
 from typing import Any
 
 from adacd_hil.cli.table import format_table
-from adacd_hil.log.check.check import Check
-from adacd_hil.log.editing.info import LogInfo
-from adacd_hil.log.editing.recover import Recovery
+from adacd_hil.log.check.log_check import LogCheck
+from adacd_hil.log.editing.log_info import LogInfo
+from adacd_hil.log.editing.recover import LogRecovery
 from adacd_hil.terminal import in_line
 
 _TOLD_FAULTS = 5
@@ -74,7 +74,7 @@ def _bytes(count: int | None) -> str:
     return "–" if count is None else str(count)
 
 
-def check_as_json(check: Check) -> dict[str, Any]:
+def check_as_json(check: LogCheck) -> dict[str, Any]:
     """Make a table of what was found."""
     return {
         "path": str(check.path),
@@ -86,7 +86,7 @@ def check_as_json(check: Check) -> dict[str, Any]:
     }
 
 
-def check_as_text(check: Check) -> str:
+def check_as_text(check: LogCheck) -> str:
     """Tell what was found, and the sum of it."""
     lines = []
     for finding in check.findings:
@@ -100,7 +100,7 @@ def check_as_text(check: Check) -> str:
     return "\n".join(in_line(line) for line in lines)
 
 
-def recovery_as_json(recovery: Recovery) -> dict[str, Any]:
+def recovery_as_json(recovery: LogRecovery) -> dict[str, Any]:
     """Make a table of what was saved and lost."""
     losses = recovery.losses
     return {
@@ -121,7 +121,7 @@ def recovery_as_json(recovery: Recovery) -> dict[str, Any]:
     }
 
 
-def recovery_as_text(recovery: Recovery) -> str:
+def recovery_as_text(recovery: LogRecovery) -> str:
     """Tell what was saved and lost."""
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
     lost = recovery.describe_loss()

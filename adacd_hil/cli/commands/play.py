@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.formats.frame_choice import FrameChoice
+from adacd_hil.log.formats.frame_export import FrameChoice
 from adacd_hil.log.formats.frame_log import open_frames
-from adacd_hil.log.formats.recorded_frames import is_sendable
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.types.record_arrays import is_sendable
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.terminal import in_line
 from adacd_hil.wire.bus import Bus, BusError, open_bus

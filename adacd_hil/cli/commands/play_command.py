@@ -56,7 +56,7 @@ def play(
     send are sent, unless --commands asks for the others: NMT, SDO and torque commands can move an arm.
     """
     from adacd_hil.cli.commands.play import Playback, as_text, may_move_an_arm, run_playback
-    from adacd_hil.log.formats.frame_choice import FrameChoice, sides
+    from adacd_hil.log.formats.frame_export import FrameChoice, sides
 
     codec = contract_of(log, dbc)
     choice = FrameChoice(

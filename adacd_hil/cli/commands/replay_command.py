@@ -9,13 +9,13 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option, stretch_options
 from adacd_hil.given_path import GivenPath
-from adacd_hil.log.run_folder import log_in
+from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.replay import Replay
     from adacd_hil.analysis.replay.source import Source
-    from adacd_hil.log.stretch import Stretch
+    from adacd_hil.log.time_window import TimeWindow
     from adacd_hil.settings.configuration import Settings
 
 _EPILOG = (
@@ -52,7 +52,7 @@ def replay(
     tolerance: float | None,
     shown: int,
     as_json: bool,
-    stretch: "Stretch",
+    stretch: "TimeWindow",
 ) -> ExitCode:
     """Replay logs: the raw frames once more through codec, arm and scheme.
 
@@ -96,7 +96,7 @@ def _replay_one(
     against: Path | None,
     tolerance: float | None,
     shown: int,
-    stretch: "Stretch",
+    stretch: "TimeWindow",
     progress: Any,
 ) -> _Result:
     from adacd_hil.analysis.replay.replay import replay_source
@@ -176,7 +176,7 @@ def _verdict(own: "Replay") -> str:
     return f"identical, {exact}"
 
 
-def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "Stretch") -> str:
+def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow") -> str:
     from adacd_hil.analysis.replay.what_if import NOTE, side_by_side
     from adacd_hil.cli.table import format_table
 
@@ -203,7 +203,9 @@ def _counts(own: "Replay") -> str:
     return ", ".join(f"{count} of {field}" for field, count in own.mismatched_fields.items())
 
 
-def _as_json(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "Stretch") -> dict[str, Any]:
+def _as_json(
+    path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow"
+) -> dict[str, Any]:
     from adacd_hil.analysis.replay.what_if import as_json, changed_keys
 
     own = replays[0]

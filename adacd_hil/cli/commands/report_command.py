@@ -9,9 +9,8 @@ from adacd_hil.analysis.report.index_page import INDEX_NAME, Entry, count_text, 
 from adacd_hil.analysis.report.report_files import Report, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.run_folder import LOG_NAME, TRUTH_NAME, log_in
-from adacd_hil.log.stretch import Stretch
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, log_in
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.output_files import replace_file
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
@@ -37,7 +36,7 @@ class Index(NamedTuple):
 Reported = Report | Index
 
 
-def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: Stretch) -> tuple[list[Reported], ExitCode]:
+def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -> tuple[list[Reported], ExitCode]:
     """Report each log, or a stretch of it, beside it or in `out`; of several logs in folders of `out`.
 
     A folder stands for the run log in it, or without one for the runs in its folders; of those one that can't be read
@@ -86,7 +85,7 @@ def runs_in(given: Path) -> tuple[Path, ...]:
     return tuple(found)
 
 
-def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: Stretch, progress: Progress) -> Index:
+def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
     """Report the runs of a folder, and write the page over them."""
     entries = []
     for number, run in enumerate(runs, start=1):
@@ -116,7 +115,7 @@ def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
     return tables
 
 
-def _report_one(path: Path, folder: Path, stretch: Stretch, progress: Progress) -> Report:
+def _report_one(path: Path, folder: Path, stretch: TimeWindow, progress: Progress) -> Report:
     truth = path.parent / TRUTH_NAME
     truth_path = truth if truth.exists() else None
     return write_report(path, truth_path, folder, is_printed=True, stretch=stretch, progress=progress)

@@ -29,7 +29,7 @@ from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperat
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.control.tare_file import use_tare
 from adacd_hil.device.contract import load_contract
-from adacd_hil.log.run_folder import LOG_NAME
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import in_line, one_line

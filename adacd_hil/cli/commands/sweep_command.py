@@ -11,7 +11,7 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.log.run_folder import LOG_NAME
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:

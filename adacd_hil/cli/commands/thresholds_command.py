@@ -11,12 +11,12 @@ from adacd_hil.analysis.recorded_thresholds import Thresholds, thresholds_of_log
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table
-from adacd_hil.log.run_folder import log_in
-from adacd_hil.log.stretch import WHOLE, Stretch
+from adacd_hil.log.log_files import log_in
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 
 
 def find(
-    logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: Stretch = WHOLE
+    logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow = WHOLE
 ) -> tuple[Thresholds, Comparison | None]:
     """Find the thresholds, and compare the detectors where asked for. Raises LogError, CommandError."""
     paths = [log_in(given) for given in logs]

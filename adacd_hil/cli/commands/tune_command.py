@@ -10,13 +10,13 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
 from adacd_hil.cli.result_file import tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.log.run_folder import log_in
+from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.tune import Candidate, Tuning
     from adacd_hil.analysis.sweep.tune_roc import Found
-    from adacd_hil.log.stretch import Stretch
+    from adacd_hil.log.time_window import TimeWindow
 
 
 @click.command(
@@ -44,7 +44,7 @@ def tune(
     out: Path | None,
     report: Path | None,
     as_json: bool,
-    stretch: "Stretch",
+    stretch: "TimeWindow",
 ) -> ExitCode:
     """Find thresholds, filter and gain from LOGS; a folder stands for the run log in it.
 

@@ -10,15 +10,10 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, ChunkIndex
 from numpy.typing import NDArray
 
-from adacd_hil.log.check.content_checks import ContentCheck
-from adacd_hil.log.check.definition_checks import DefinitionCheck
+from adacd_hil.log.check.content_checks import ContentCheck, DefinitionCheck
 from adacd_hil.log.check.findings import Findings
-from adacd_hil.log.chunked_file import INDEX_ENTRY
-from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
-from adacd_hil.log.mcap.mcap_records import HEAD, RawRecord, name_of, parse
-from adacd_hil.log.mcap.opening import ChunkError, Opening
-
-_CHANNEL_NUMBERS = 2**16
+from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
+from adacd_hil.log.mcap.records import CHANNEL_NUMBERS, HEAD, INDEX_ENTRY, RawRecord, name_of, parse
 
 
 @dataclass
@@ -48,7 +43,7 @@ class ChunkCheck:
     def __init__(self, findings: Findings, definitions: DefinitionCheck) -> None:
         self.facts: dict[int, ChunkFacts] = {}
         """By where the chunk begins."""
-        self.counts = np.zeros(_CHANNEL_NUMBERS, np.int64)
+        self.counts = np.zeros(CHANNEL_NUMBERS, np.int64)
         """Messages of each channel."""
         self.start_ns, self.end_ns = 2**64, 0
         self.has_outside = False
@@ -169,7 +164,7 @@ class ChunkCheck:
                 text = f"messages of channel {channel} come before its definition"
                 self._findings.add("undefined-channel", text, offset)
         if len(contents.starts):
-            self.counts += np.bincount(contents.channels, minlength=_CHANNEL_NUMBERS)
+            self.counts += np.bincount(contents.channels, minlength=CHANNEL_NUMBERS)
             self.start_ns = min(self.start_ns, int(contents.log_times.min()))
             self.end_ns = max(self.end_ns, int(contents.log_times.max()))
             self.content.messages(contents, self._definitions, offset)

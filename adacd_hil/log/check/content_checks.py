@@ -1,34 +1,109 @@
-"""The rules on what messages hold: the order of their times, and cdr payloads as their schemas describe them."""
+"""The rules on definitions (schemas, channels, .msg texts) and messages (order of times, cdr payloads)."""
 
 import contextlib
+import re
 
 import numpy as np
 from mcap.records import Channel, Schema
 
-from adacd_hil.log.cdr import ENCAPSULATION, MessageType, payload_dtype
-from adacd_hil.log.check.definition_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings
-from adacd_hil.log.check.ros_text import text_problem
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.chunk_contents import Contents
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
-from adacd_hil.log.ros_types import (
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.chunks import Contents
+from adacd_hil.log.mcap.records import CHANNEL_NUMBERS, MESSAGE_HEAD
+from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
+    ENCAPSULATION,
     FD_FRAME,
     FD_FRAME_DTYPE,
     JOINT_STATE,
     JOINT_STATE_DTYPE,
     LOG,
+    SEPARATOR,
+    MessageType,
     is_log,
+    payload_dtype,
 )
 
-_CHANNEL_NUMBERS = 2**16
-_ANY = -1
+_ANY_SIZE = -1
 _OWN_TEXT = b"# Written by adacd-hil."
 _LAST_ENCAPSULATION = 0x0D
 """DDS-XTypes 7.6.3.1.2."""
 _SIZES = ((CAN_FRAME, CAN_FRAME_DTYPE.itemsize), (JOINT_STATE, JOINT_STATE_DTYPE.itemsize))
+
+
+class DefinitionCheck:
+    """Watches the definitions of a file, in the data section and then in the summary."""
+
+    def __init__(self, findings: Findings) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.summary_schemas: set[int] = set()
+        self.summary_channels: set[int] = set()
+        self._findings = findings
+        self._summary_only: list[tuple[str, int]] = []
+        self._duplicates: set[str] = set()
+
+    def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
+        """Take in a schema."""
+        name = f"schema {schema.id}"
+        if schema.id == 0:
+            self._findings.add("schema-id", f"schema {schema.name!r} has the number 0", offset)
+        if not schema.encoding and schema.data:
+            self._findings.add("schema-encoding", f"{name} has data but no encoding", offset)
+        elif not schema.encoding:
+            self._findings.add("empty-schema", f"{name} ({schema.name!r}) is empty", offset)
+        known = self.schemas.get(schema.id)
+        if known is not None:
+            pairs = (("name", "name"), ("encoding", "encoding"), ("data", "data"))
+            self._compare(name, known, schema, pairs, offset)
+        self._place(name, schema.id in self.schemas, offset, is_summary)
+        if is_summary:
+            self.summary_schemas.add(schema.id)
+        else:
+            self.schemas.setdefault(schema.id, schema)
+
+    def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
+        """Take in a channel."""
+        name = f"channel {channel.id}"
+        known = self.channels.get(channel.id)
+        if known is not None:
+            pairs = (
+                ("schema", "schema_id"),
+                ("topic", "topic"),
+                ("message encoding", "message_encoding"),
+                ("metadata", "metadata"),
+            )
+            self._compare(name, known, channel, pairs, offset)
+        is_defined = channel.schema_id in self.schemas or (is_summary and channel.schema_id in self.summary_schemas)
+        if channel.schema_id and not is_defined:
+            text = f"{name} ({channel.topic}) has the schema {channel.schema_id}, which is not defined"
+            self._findings.add("undefined-schema", text, offset)
+        self._place(name, channel.id in self.channels, offset, is_summary)
+        if is_summary:
+            self.summary_channels.add(channel.id)
+        else:
+            self.channels.setdefault(channel.id, channel)
+
+    def _compare(
+        self, name: str, known: object, other: object, pairs: tuple[tuple[str, str], ...], offset: int
+    ) -> None:
+        different = [what for what, field in pairs if getattr(known, field) != getattr(other, field)]
+        if different:
+            self._findings.add("redefinition", f"{name} is defined again with another {', '.join(different)}", offset)
+
+    def _place(self, name: str, is_known: bool, offset: int, is_summary: bool) -> None:
+        if is_summary and not is_known:
+            self._summary_only.append((name, offset))
+        elif not is_summary and is_known and name not in self._duplicates:
+            self._duplicates.add(name)
+            self._findings.add("duplicate", f"{name} is defined more than once in the data section", offset)
+
+    def finish(self, has_messages: bool) -> None:
+        """Judge what the summary alone defines."""
+        rule = "summary-only" if has_messages else "unused-summary-only"
+        for name, offset in self._summary_only:
+            self._findings.add(rule, f"{name} is defined in the summary only", offset)
 
 
 class ContentCheck:
@@ -38,9 +113,9 @@ class ContentCheck:
         self._findings = findings
         self._described: set[int] = set()
         self._read: set[int] = set()  # schemas
-        self._latest = np.zeros(_CHANNEL_NUMBERS, np.uint64)  # log time of each channel
-        self._sizes = np.full(_CHANNEL_NUMBERS, _ANY, np.int64)
-        self._is_cdr = np.zeros(_CHANNEL_NUMBERS, np.bool_)
+        self._latest = np.zeros(CHANNEL_NUMBERS, np.uint64)  # log time of each channel
+        self._sizes = np.full(CHANNEL_NUMBERS, _ANY_SIZE, np.int64)
+        self._is_cdr = np.zeros(CHANNEL_NUMBERS, np.bool_)
         self._fd_frames: set[int] = set()
         self._logs: set[int] = set()
 
@@ -64,7 +139,7 @@ class ContentCheck:
         """Note what the payloads of a channel must be."""
         self._described.add(channel.id)
         self._is_cdr[channel.id] = channel.message_encoding == "cdr"
-        self._sizes[channel.id] = _ANY if (size := payload_size(channel, schema)) is None else size
+        self._sizes[channel.id] = _ANY_SIZE if (size := payload_size(channel, schema)) is None else size
         if schema is not None and _is_own(channel, schema, FD_FRAME):
             self._fd_frames.add(channel.id)
         elif schema is not None and _is_own(channel, schema, LOG):
@@ -93,7 +168,7 @@ class ContentCheck:
         sizes = contents.ends - contents.starts - MESSAGE_HEAD
         is_cdr = self._is_cdr[contents.channels]
         expected = self._sizes[contents.channels]
-        is_wrong = is_cdr & ((sizes < len(ENCAPSULATION)) | ((expected != _ANY) & (sizes != expected)))
+        is_wrong = is_cdr & ((sizes < len(ENCAPSULATION)) | ((expected != _ANY_SIZE) & (sizes != expected)))
         looked_at = np.flatnonzero(is_cdr & ~is_wrong)
         heads = data[contents.starts[looked_at, np.newaxis] + np.arange(MESSAGE_HEAD, MESSAGE_HEAD + 4)]
         is_wrong[looked_at] = (heads[:, 0] != 0) | (heads[:, 1] > _LAST_ENCAPSULATION)
@@ -130,3 +205,56 @@ def _is_fd_frame(payload: bytes) -> bool:
     assert FD_FRAME_DTYPE.fields is not None
     head, place = int(FD_FRAME_DTYPE.fields["data"][1]), int(FD_FRAME_DTYPE.fields["count"][1])
     return len(payload) >= head and len(payload) == head + int.from_bytes(payload[place : place + 4], "little")
+
+
+_PRIMITIVES = {
+    *("bool", "byte", "char", "string", "wstring", "float32", "float64"),
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}
+_LINE = re.compile(
+    r"(?P<type>[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){0,2})(<=\d+)?(?P<array>\[(<=)?\d*\])?"
+    r"\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)"
+)
+_CONSTANT = re.compile(r"=\s*\S.*")
+
+
+def text_problem(data: bytes) -> str:
+    """Say what is wrong with the text of a schema; "" when it can be read."""
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError:
+        return "is not UTF-8"
+    first, *others = re.split(rf"^={{{len(SEPARATOR)}}}$\n?", text, flags=re.MULTILINE)
+    types = {"": first}
+    for other in others:
+        head, _, body = other.partition("\n")
+        if not head.startswith("MSG: "):
+            return f"a type has no name: {head!r}"
+        types[head.removeprefix("MSG: ").strip()] = body
+    known = {_short(name) for name in types}
+    for name, body in types.items():
+        for line in body.splitlines():
+            if problem := _line_problem(line.strip(), known):
+                return f"{name or 'the type'}: {problem}"
+    return ""
+
+
+def _line_problem(line: str, known: set[str]) -> str:
+    if not line or line.startswith("#"):
+        return ""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return f"no field: {line!r}"
+    rest = match["rest"]
+    if rest.startswith("=") and not (_CONSTANT.fullmatch(rest) and match["type"] in _PRIMITIVES):
+        return f"no constant: {line!r}"
+    if match["type"] in _PRIMITIVES or _short(match["type"]) in known:
+        return ""
+    names = {name.rsplit("/")[-1] for name in known}
+    return "" if "/" not in match["type"] and match["type"] in names else f"unknown type {match['type']}"
+
+
+def _short(name: str) -> str:
+    """Spell package/msg/Type as package/Type."""
+    parts = name.split("/")
+    return f"{parts[0]}/{parts[-1]}" if len(parts) > 1 else name

@@ -16,7 +16,7 @@ class Severity(StrEnum):
     WARNING = "warning"
 
 
-class Finding(NamedTuple):
+class LogFinding(NamedTuple):
     """One place where a rule is broken. `offset`: byte of the file, -1 for the file as a whole."""
 
     file: str
@@ -31,7 +31,7 @@ class Findings:
     """The findings of one file."""
 
     file: str
-    found: list[Finding] = field(default_factory=list)
+    found: list[LogFinding] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
     """All findings by rule, those that aren't told too."""
 
@@ -39,7 +39,7 @@ class Findings:
         """Add a finding of a rule of `RULES`."""
         self.counts[rule] += 1
         if self.counts[rule] <= _TOLD:
-            self.found.append(Finding(self.file, RULES[rule].severity, rule, text, offset))
+            self.found.append(LogFinding(self.file, RULES[rule].severity, rule, text, offset))
 
     def count(self, severity: Severity) -> int:
         """Count all findings of a severity."""

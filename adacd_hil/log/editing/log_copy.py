@@ -15,18 +15,13 @@ from mcap.records import Attachment, Channel, Header, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.chunked_file import ChunkedFile
-from adacd_hil.log.editing.info import read_info
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.chunk_contents import Contents
-from adacd_hil.log.mcap.file_end import read_end
-from adacd_hil.log.mcap.mcap_records import read_header
-from adacd_hil.log.mcap_file import LIBRARY, PRODUCT, ROS_PROFILE, SUMMARY_METADATA
-from adacd_hil.log.parts import is_part_name
-from adacd_hil.log.summary import COPY_ENDINGS
+from adacd_hil.log.editing.log_info import read_info
+from adacd_hil.log.log_files import COPY_ENDINGS, PRODUCT, ROS_PROFILE, SUMMARY_METADATA, LogError, is_part_name
+from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
+from adacd_hil.log.mcap.chunks import Contents
+from adacd_hil.log.mcap.records import CHANNEL_NUMBERS, read_end, read_header
 from adacd_hil.output_files import Replacement
 
-_CHANNEL_NUMBERS = 2**16
 _CHANNEL = 9
 """Where the number of the channel is in a message record, bytes."""
 
@@ -52,15 +47,15 @@ class LogCopy:
     def __init__(self, path: Path, sources: Iterable[Path]) -> None:
         """Begin a log at `path` that is copied from others. Raises LogError."""
         self.path = path
-        self._target = _Target(path)
+        self._target = _CopyTarget(path)
         self.file = ChunkedFile(self._target, LIBRARY, _common_profile(sources))
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels = 0
         self._metadata: set[str] = set()
 
-    def source(self, prefix: str = "", topics: frozenset[str] | None = None) -> "Source":
+    def source(self, prefix: str = "", topics: frozenset[str] | None = None) -> "CopySource":
         """Begin to copy from another log: put `prefix` before its topics, copy only `topics` if given."""
-        return Source(self, prefix, topics)
+        return CopySource(self, prefix, topics)
 
     def attach(self, attachment: Attachment) -> None:
         """Add an attachment."""
@@ -90,8 +85,8 @@ class LogCopy:
                 )
             schema_id = self._schemas[key]
         self._channels += 1
-        if self._channels >= _CHANNEL_NUMBERS:
-            raise LogError(f"more than {_CHANNEL_NUMBERS - 1} channels don't go into one file")
+        if self._channels >= CHANNEL_NUMBERS:
+            raise LogError(f"more than {CHANNEL_NUMBERS - 1} channels don't go into one file")
         self.file.define_channel(
             Channel(
                 id=self._channels,
@@ -129,7 +124,7 @@ def _is_ros(header: Header) -> bool:
     return header.profile == ROS_PROFILE or (header.profile == "" and header.library.startswith(f"{PRODUCT} "))
 
 
-class Source:
+class CopySource:
     """One log that is copied from."""
 
     def __init__(self, copy: LogCopy, prefix: str, topics: frozenset[str] | None) -> None:
@@ -139,7 +134,7 @@ class Source:
         self.topics: dict[int, str] = {}
         """Topics by the copy's number of their channel."""
         self._numbers: dict[int, tuple[Channel, int]] = {}
-        self._map = np.full(_CHANNEL_NUMBERS, -1, np.int32)
+        self._map = np.full(CHANNEL_NUMBERS, -1, np.int32)
 
     def define(self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]) -> None:
         """Take in what the source has defined so far."""
@@ -180,7 +175,7 @@ def _gather(
     return data[np.arange(lengths.sum()) + np.repeat(shifts, lengths)], new_ends
 
 
-class _Target:
+class _CopyTarget:
     """A file beside the one that it becomes."""
 
     def __init__(self, path: Path) -> None:

@@ -14,13 +14,24 @@ from mcap.records import Attachment, Metadata
 
 from adacd_hil.log.editing.log_copy import LogCopy
 from adacd_hil.log.editing.salvage import Losses, Salvage
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap_file import CONTINUED, ENDING_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.parts import find_parts, part_path
-from adacd_hil.log.summary import DROPPED_KEY, LOST_KEY, RECOVERED, count_frames, number
+from adacd_hil.log.log_files import (
+    CONTINUED,
+    DROPPED_KEY,
+    ENDING_KEY,
+    LOST_KEY,
+    PART_KEY,
+    RECOVERED,
+    RUN_METADATA,
+    SUMMARY_METADATA,
+    LogError,
+    count_frames,
+    find_parts,
+    number,
+    part_path,
+)
 
 
-class Recovery(NamedTuple):
+class LogRecovery(NamedTuple):
     """What `recover` did."""
 
     path: Path
@@ -63,7 +74,7 @@ def default_out(path: Path) -> Path:
     return path.with_name(f"{path.stem}.{RECOVERED}{path.suffix}")
 
 
-def recover(path: Path, out: Path | None = None, progress: Callable[[str], None] = lambda _: None) -> Recovery:
+def recover(path: Path, out: Path | None = None, progress: Callable[[str], None] = lambda _: None) -> LogRecovery:
     """Save what can be trusted of the log whose first part is `path`, with all its parts, to `out`.
 
     Raises LogError when there is nothing, when a file can't be read, or when `out` is the log itself.
@@ -142,7 +153,7 @@ class _Work:
             self._is_vouched |= is_vouched and item.name == RUN_METADATA
             self._copy.add_all_metadata({item.name: item.metadata})
 
-    def finish(self, parts: dict[int, Path]) -> Recovery:
+    def finish(self, parts: dict[int, Path]) -> LogRecovery:
         """End the log."""
         file = self._copy.file
         missing = [
@@ -150,7 +161,7 @@ class _Work:
         ]
         if self._ending == CONTINUED:
             missing.append(part_path(self._path, max(parts) + 1))
-        recovery = Recovery(
+        recovery = LogRecovery(
             self._path,
             self._copy.path,
             file.messages,
@@ -162,7 +173,7 @@ class _Work:
         self._copy.finish(self._summary(recovery))
         return recovery
 
-    def _summary(self, recovery: Recovery) -> dict[str, str]:
+    def _summary(self, recovery: LogRecovery) -> dict[str, str]:
         file = self._copy.file
         file.flush()
         losses = recovery.losses

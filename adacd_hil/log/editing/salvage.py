@@ -17,20 +17,20 @@ from mcap.records import Attachment, Chunk, Metadata, Statistics
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.mcap.chunk_contents import Contents, message_contents, read_contents
-from adacd_hil.log.mcap.definitions import Definitions
-from adacd_hil.log.mcap.file_end import crc_of, read_end
-from adacd_hil.log.mcap.mcap_records import (
-    Gap,
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
+from adacd_hil.log.mcap.records import (
+    DEFINITIONS,
+    Definitions,
+    FileGap,
     RawRecord,
     attachment_crc_fits,
+    crc_of,
     parse,
+    read_end,
     scan,
 )
-from adacd_hil.log.mcap.opening import ChunkError, Opening
 
-_DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _NOTES = 20
 """Damages that are told one by one."""
 
@@ -120,7 +120,7 @@ class Salvage:
             return
         self.is_vouched = end.data_crc != 0 and end.data_crc == crc_of(file, 0, end.data_end)
         with contextlib.suppress(LogError):  # written wrong: of no use
-            self.definitions.take(record for record in end.summary if record.opcode in _DEFINITIONS)
+            self.definitions.take(record for record in end.summary if record.opcode in DEFINITIONS)
             for record in end.summary:
                 if record.opcode == Opcode.STATISTICS:
                     self._statistics = parse(record.opcode, record.body)
@@ -132,7 +132,7 @@ class Salvage:
                     break
                 if isinstance(item, RawRecord):
                     yield from self._take(item)
-                elif isinstance(item, Gap):
+                elif isinstance(item, FileGap):
                     self._lose(item.offset, item.size, "no record")
             if self._has_data_end and not self.is_vouched and not self._is_explained:
                 self._doubt(file)
@@ -148,7 +148,7 @@ class Salvage:
                 yield from self._give(message_contents(record))
             elif opcode == Opcode.MESSAGE:
                 self._left_out += 1
-            elif opcode in _DEFINITIONS and self.is_vouched:
+            elif opcode in DEFINITIONS and self.is_vouched:
                 self.definitions.take((record,))
             elif opcode == Opcode.ATTACHMENT:
                 if not attachment_crc_fits(record.body, self.is_vouched):

@@ -13,8 +13,7 @@ import can
 from can.io.generic import BinaryIOMessageReader, BinaryIOMessageWriter
 
 from adacd_hil.log.formats.can_messages import channel_name, time_ns, to_messages
-from adacd_hil.log.formats.mcap_frame_writer import FrameWriter, RecordedFrame
-from adacd_hil.log.formats.mcap_frames import McapFrames
+from adacd_hil.log.formats.mcap_frames import FrameWriter, McapFrames, RecordedFrame
 
 
 class McapReader(BinaryIOMessageReader):

@@ -28,13 +28,11 @@ from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.input_files import open_input
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.formats.recorded_frames import MOST_CHANNELS, MOST_NS, RECORDED_FRAME_DTYPE
-from adacd_hil.log.mcap.opening import MOST_BYTES, Opening
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.chunks import MOST_BYTES, Opening
+from adacd_hil.log.types.message_types import MAX_DATA
+from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
 
-_PIECE = 10_000
-"""Frames that are gathered."""
-_MAX_DATA = 64
 _MOST_DIGITS = 9
 """Of a channel that is a number."""
 
@@ -69,7 +67,7 @@ def to_row(message: can.Message, channel: int = 0, start_ns: int = 0) -> tuple[A
     """
     data = bytes(message.data)
     length = len(data) if not (message.is_remote_frame or message.is_error_frame) else message.dlc
-    if max(len(data), length) > (_MAX_DATA if message.is_fd else 8):
+    if max(len(data), length) > (MAX_DATA if message.is_fd else 8):
         raise LogError(f"frame 0x{message.arbitration_id:X} has {max(len(data), length)} bytes of data")
     if not 0 <= message.arbitration_id < 1 << 29:
         raise LogError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")
@@ -83,7 +81,7 @@ def to_row(message: can.Message, channel: int = 0, start_ns: int = 0) -> tuple[A
         not message.is_rx,
         message.is_error_frame,
         length,
-        list(data.ljust(_MAX_DATA, b"\0")),
+        list(data.ljust(MAX_DATA, b"\0")),
         channel,
         message.is_extended_id,
         message.is_remote_frame,
@@ -190,7 +188,7 @@ class PythonCanFrames:
                 for message in self._reader:
                     rows.append(to_row(message, self._channel(message), self._start_ns))
                     count += 1
-                    if len(rows) == _PIECE:
+                    if len(rows) == PIECE_FRAMES:
                         yield np.array(rows, RECORDED_FRAME_DTYPE)
                         rows = []
             except Exception as error:  # each reader has failures of its own

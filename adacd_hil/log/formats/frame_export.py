@@ -1,24 +1,25 @@
-"""Frames to BLF, ASC and candump files, with a count of what each format can't hold.
+"""Frames of a recording, chosen by sender, identifier and time, to BLF, ASC and candump files.
 
-Times are exact to what the format has: BLF 1 ns, ASC and candump 1 µs. BLF and ASC begin at a whole millisecond; a time
-before 1990, as of a run in lockstep, has no date in BLF and counts from 0.
+What a format can't hold is counted. Times are exact to what the format has: BLF 1 ns, ASC and candump 1 µs. BLF and ASC
+begin at a whole millisecond; a time before 1990, as of a run in lockstep, has no date in BLF and counts from 0.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 import can
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.formats import candump
 from adacd_hil.log.formats.can_messages import to_messages
-from adacd_hil.log.formats.frame_log import FrameSource
+from adacd_hil.log.formats.frame_log import FrameSource, candump_channel, candump_line
+from adacd_hil.log.log_files import LogError
 from adacd_hil.output_files import placing
+from adacd_hil.wire.codec import Codec
 
 _MS_NS = 1_000_000
 _US_NS = 1_000
@@ -41,7 +42,7 @@ _Loss = tuple[str, NDArray[np.bool_]]
 """What is lost, and of which frames."""
 
 
-class _Target(Protocol):
+class _FrameTarget(Protocol):
     """A file of one format."""
 
     def write(self, frames: NDArray[Any], channels: list[str], epoch_ns: int) -> "list[_Loss]":
@@ -159,8 +160,8 @@ class _Candump:
         self._has_direction = has_direction
 
     def write(self, frames: NDArray[Any], channels: list[str], epoch_ns: int) -> list[_Loss]:
-        names = [candump.channel_name(name) for name in channels]
-        self._file.writelines(candump.line(row, names[row["channel"]], epoch_ns, self._has_direction) for row in frames)
+        names = [candump_channel(name) for name in channels]
+        self._file.writelines(candump_line(row, names[row["channel"]], epoch_ns, self._has_direction) for row in frames)
         is_sent = frames["is_tx"] & (not self._has_direction)
         return [_nanoseconds(frames, epoch_ns), _fd_errors(frames), ("frames lose that they were sent", is_sent)]
 
@@ -168,7 +169,7 @@ class _Candump:
         self._file.close()
 
 
-def _open(kind: str, path: Path, has_direction: bool) -> _Target:
+def _open(kind: str, path: Path, has_direction: bool) -> _FrameTarget:
     if kind == "candump":
         return _Candump(path, has_direction)
     return _Blf(path) if kind == "blf" else _Asc(path)
@@ -189,3 +190,65 @@ def _nanoseconds(frames: NDArray[Any], epoch_ns: int) -> _Loss:
 
 def _fd_errors(frames: NDArray[Any]) -> _Loss:
     return "error frames lose that they were FD", frames["is_error"] & frames["is_fd"]
+
+
+Side = Literal["host", "devices", "both"]
+HOST: Final = "HOST"
+"""Name of the host among a DBC's nodes."""
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """A choice of frames. Whose a frame is, the contract says by its identifier, of an unknown one its direction.
+
+    `start_ns`, `end_ns` count from the first frame of the recording; `can_ids` empty: all.
+    """
+
+    only: Side = "both"
+    host_ids: frozenset[int] = frozenset()
+    device_ids: frozenset[int] = frozenset()
+    can_ids: frozenset[int] = frozenset()
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def pieces(self, source: FrameSource) -> Iterator[NDArray[Any]]:
+        """Give what is chosen of each piece of a recording."""
+        first_ns = None
+        for frames in source:
+            if first_ns is None and len(frames):
+                first_ns = int(frames["t_ns"][0])
+            chosen = frames[self._is_chosen(frames, first_ns or 0)]
+            if len(chosen):
+                yield chosen
+
+    def _is_chosen(self, frames: NDArray[Any], first_ns: int) -> NDArray[np.bool_]:
+        t_ns = frames["t_ns"] - first_ns
+        is_chosen = np.ones(len(frames), np.bool_)
+        if self.start_ns is not None:
+            is_chosen &= t_ns >= self.start_ns
+        if self.end_ns is not None:
+            is_chosen &= t_ns < self.end_ns
+        if self.can_ids:
+            is_chosen &= np.isin(frames["can_id"], list(self.can_ids))
+        if self.only != "both":
+            is_hosts = self._is_hosts(frames)
+            is_chosen &= is_hosts if self.only == "host" else ~is_hosts
+        return is_chosen
+
+    def _is_hosts(self, frames: NDArray[Any]) -> NDArray[np.bool_]:
+        is_known = ~frames["is_error"] & ~frames["is_remote"]
+        is_host = is_known & np.isin(frames["can_id"], list(self.host_ids))
+        is_device = is_known & np.isin(frames["can_id"], list(self.device_ids))
+        return np.asarray(is_host | (frames["is_tx"] & ~is_device))
+
+
+def sides(codec: Codec) -> tuple[frozenset[int], frozenset[int]]:
+    """List the identifiers that a contract's host and its devices send."""
+    return (
+        _ids(message.can_id for message in codec.messages.values() if HOST in message.senders),
+        _ids(message.can_id for message in codec.messages.values() if HOST not in message.senders),
+    )
+
+
+def _ids(can_ids: Iterable[int]) -> frozenset[int]:
+    return frozenset(can_ids)

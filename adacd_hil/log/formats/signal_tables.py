@@ -1,27 +1,36 @@
-"""Topics and decoded frames as tables, in Parquet or CSV, one file each; a stretch of the log in memory at a time.
+"""Recordings to tables in Parquet or CSV, one file each: topics of our logs, and frames decoded by a contract.
 
-A table begins with `t_ns` (of the run's clock) and `cycle_t_ns` (of the cycle that it was logged with, by which tables
-are joined); a field of several numbers becomes as many columns, `tau_J_1`, `tau_J_2`. Booleans stay booleans, states
-and reasons are the numbers that the schemas name.
+A stretch of the log is in memory at a time. A table begins with `t_ns` (of the run's clock) and `cycle_t_ns` (of the
+cycle that it was logged with, by which tables are joined); a field of several numbers becomes as many columns,
+`tau_J_1`, `tau_J_2`. Booleans stay booleans, states and reasons are the numbers that the schemas name.
 """
 
+import contextlib
 import csv
 import errno
+import fnmatch
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Protocol
+from typing import IO, Any, NamedTuple, Protocol
 
 import numpy as np
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
-from adacd_hil.log.decoding import Decoder
-from adacd_hil.log.errors import LogError
-from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.input_files import open_input
+from adacd_hil.log.formats.frame_log import open_frames
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
+from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
+from adacd_hil.log.reader import LoggedEvent, LogStream, Series
+from adacd_hil.log.types.decoded_messages import ColumnDecoder
+from adacd_hil.log.types.topics import DECODED, EVENTS_TOPIC
+from adacd_hil.nearest_name import nearest_name
 from adacd_hil.output_files import is_anothers, replacing
 from adacd_hil.wire.codec import Codec
 
@@ -63,7 +72,7 @@ def frame_columns(frames: NDArray[Any], codec: Codec) -> Iterator[tuple[str, dic
         found = frames[is_data & (frames["can_id"] == message.can_id) & (frames["length"] == message.length)]
         if not len(found):
             continue
-        decoder = Decoder(message)
+        decoder = ColumnDecoder(message)
         values = np.empty((len(found), decoder.count))
         decoder.decode(np.ascontiguousarray(found["data"][:, : message.length]), values)
         columns: dict[str, Any] = {"t_ns": found["t_ns"], "cycle_t_ns": found["cycle_t_ns"]}
@@ -185,3 +194,121 @@ def _import_pyarrow() -> tuple[Any, Any]:
         hint = f"Parquet is written with pyarrow: {install_command('tables')}, or choose csv"
         raise LogError(hint) from None
     return pyarrow, pyarrow.parquet
+
+
+_RAW = ("to_can_bus", "from_can_bus", "to_can_bus_fd", "from_can_bus_fd")
+"""Ends of the topics of frames, which other formats are for."""
+
+
+class TableSummary(NamedTuple):
+    """What was written: rows of each file. `problem`: what is missing of the recording, one line."""
+
+    rows: Mapping[Path, int]
+    problem: str
+
+
+def export_tables(
+    path: Path,
+    out: Path,
+    kind: str,
+    wanted: Collection[str],
+    codec: Codec,
+    progress: Callable[[int], None] = lambda _: None,
+) -> TableSummary:
+    """Write the tables of a recording into the folder `out`.
+
+    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. codec:
+    decodes the frames of recordings that have no decoded topics. progress: is told the rows so far.
+    Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
+    """
+    is_mcap = path.suffix.lower() == ".mcap"
+    defined = _topics(path) if is_mcap else []
+    raw = [topic for topic in defined if topic.rsplit("/", 1)[-1] in _RAW]
+    topics = [topic for topic in defined if topic not in raw]
+    if topics:
+        return _export_topics(path, out, kind, choose_topics(topics, wanted, raw), progress)
+    if is_mcap and wanted and not raw:
+        raise LogError(f"{path} has no topic that can be read")
+    return _export_frames(path, out, kind, wanted, codec, progress)
+
+
+def choose_topics(
+    topics: Collection[str], wanted: Collection[str], raw: Collection[str] = (), owner: str = "the log"
+) -> list[str]:
+    """Choose topics by names or patterns. Raises LogError for one that fits none, with the nearest.
+
+    raw: topics of frames, of which no table is made. owner: who has the topics, for the error.
+    """
+    if not wanted:
+        return list(topics)
+    chosen: list[str] = []
+    for pattern in wanted:
+        found = _matching(topics, pattern)
+        if not found:
+            if frames := _matching(raw, pattern):
+                raise LogError(f"topic {frames[0]} holds frames, which become no table: --format candump, blf or asc")
+            near = nearest_name("/" + pattern.strip("/"), topics) or nearest_name(DECODED + pattern, topics)
+            hint = f"did you mean {near}" if near else f"there are {', '.join(topics)}"
+            raise LogError(f"{owner} has no topic {pattern}, {hint}")
+        chosen += found
+    return list(dict.fromkeys(chosen))
+
+
+def _matching(topics: Collection[str], pattern: str) -> list[str]:
+    forms = ("/" + pattern.strip("/"), DECODED + pattern)
+    return [topic for topic in topics if any(fnmatch.fnmatchcase(topic, form) for form in forms)]
+
+
+def _export_topics(
+    path: Path, out: Path, kind: str, topics: list[str], progress: Callable[[int], None]
+) -> TableSummary:
+    stream = LogStream(path, topics)
+    with Tables(out, kind, stream.metadata) as tables:
+        for piece in stream:
+            for topic, series in piece.series.items():
+                if topic in topics:
+                    tables.write(topic, series_columns(series, stream.epoch_ns))
+            if events := stream.events(piece):
+                tables.write(EVENTS_TOPIC, event_columns(events))
+            progress(sum(tables.rows.values()))
+    return TableSummary(tables.rows, stream.problem)
+
+
+def _export_frames(
+    path: Path, out: Path, kind: str, wanted: Collection[str], codec: Codec, progress: Callable[[int], None]
+) -> TableSummary:
+    source = open_frames(path)
+    owner = f"{path} has frames only, and their contract {codec.path.name}"
+    chosen = choose_topics([DECODED + name for name in codec.messages], wanted, owner=owner)
+    pieces = iter(source)
+    with Tables(out, kind, {"contract": codec.path.name}) as tables:
+        for frames in pieces:
+            for name, columns in frame_columns(frames, codec):
+                if DECODED + name in chosen:
+                    tables.write(DECODED + name, columns)
+            progress(sum(tables.rows.values()))
+    return TableSummary(tables.rows, source.problem)
+
+
+def _topics(path: Path) -> list[str]:
+    """List the topics that the first chunk of an MCAP file defines. Raises LogError when it is none."""
+    topics: list[str] = []
+    try:
+        file = open_input(path)
+    except OSError as error:
+        raise LogError(f"log {path} can't be read: {error.strerror}") from None
+    with file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise LogError(f"{path} is not an MCAP file")
+        with contextlib.suppress(OSError, LogError, ChunkError):  # who reads the log says what is wrong with it
+            for record in scan(file):
+                if not isinstance(record, RawRecord):
+                    break
+                if record.opcode == Opcode.CHANNEL:
+                    topics.append(parse(record.opcode, record.body).topic)
+                elif record.opcode == Opcode.CHUNK:
+                    contents = read_contents(Opening().open_checked(parse(record.opcode, record.body)))
+                    channels = (found for found in contents.definitions if found.opcode == Opcode.CHANNEL)
+                    topics += [parse(channel.opcode, channel.body).topic for channel in channels]
+                    break
+    return list(dict.fromkeys(topics))

@@ -1,0 +1,107 @@
+"""The files of a log: their names, the words in their headers and summaries, and what goes wrong with them."""
+
+import platform
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+
+class LogError(Exception):
+    """A log that can't be written or read; the message is one line: file, reason."""
+
+
+class LogExistsError(LogError):
+    """A log that would have to take the place of another; the message is one line."""
+
+
+PRODUCT = "adacd-hil"
+RUN_METADATA = "run"
+SUMMARY_METADATA = "summary"
+EPOCH_KEY = "epoch_ns"
+"""Of the metadata `run`: what was added to t_ns for the times in the file."""
+PART_KEY = "part"
+"""Of the metadata `run`: number of the part, from 0."""
+ENDING_KEY = "ending"
+"""Of the summary: why the part ended."""
+CONTINUED = "continued"
+"""The ending of a part that another follows."""
+ROS_PROFILE = "ros2"
+"""Of the header: every channel is CDR with a schema of ROS 2, so rosbags and rosbag2 take the file."""
+QOS_KEY = "offered_qos_profiles"
+"""Channel metadata that the profile asks for; nobody offered one."""
+FIELDS_KEY = "fields"
+"""Channel metadata: our names of the fields, which ROS would have in lower case."""
+LOG_NAME = "run.mcap"
+"""The host's log."""
+TRUTH_NAME = "truth.mcap"
+"""The emulator's."""
+CONFIG_DIGEST_KEY = "host_config_sha256"
+"""Metadata of the emulator's log where the host is in the same process: of its configuration."""
+_DIGITS, _MOST_DIGITS = 3, 5
+
+
+def log_in(given: str | Path) -> Path:
+    """Name the log that is meant: a folder stands for the run's log in it."""
+    path = Path(given)
+    return path / LOG_NAME if path.is_dir() else path
+
+
+def part_path(path: Path, number: int) -> Path:
+    """Name a part of the log `path`; part 0 is `path` itself."""
+    return path.with_name(f"{path.stem}_{number:0{_DIGITS}d}{path.suffix}") if number else path
+
+
+def is_part_name(path: Path) -> bool:
+    """Tell whether a file of this name would be taken for a part of a log that lies beside it."""
+    match = re.fullmatch(rf"(.+)_\d{{{_DIGITS},{_MOST_DIGITS}}}", path.stem)
+    return match is not None and path.with_name(f"{match[1]}{path.suffix}").exists()
+
+
+def find_parts(path: Path) -> dict[int, Path]:
+    """Find the parts of the log `path` that exist, by their numbers, in order. Raises OSError."""
+    pattern = re.compile(rf"{re.escape(path.stem)}_(\d{{{_DIGITS},{_MOST_DIGITS}}}){re.escape(path.suffix)}")
+    matches = (pattern.fullmatch(entry.name) for entry in path.parent.iterdir())
+    numbers = {int(match[1]) for match in matches if match}
+    if path.exists():
+        numbers.add(0)
+    named = {number: part_path(path, number) for number in sorted(numbers)}
+    return {number: part for number, part in named.items() if part.exists()}
+
+
+RECOVERED = "recovered"
+"""The ending of a recovered log."""
+CUT = "cut"
+"""The ending of a stretch of a log."""
+MERGED = "merged"
+"""The ending of several logs in one."""
+COPY_ENDINGS = (RECOVERED, CUT, MERGED)
+"""The endings of logs that are made of others."""
+PLANNED_ENDINGS = ("closed", "continued", *COPY_ENDINGS)
+LOST_KEY = "lost"
+"""Of the summary of a recovered log: what was lost, in words; missing when nothing was."""
+DROPPED_KEY = "dropped"
+"""Of the summary: packets that are not in the log."""
+_FRAME_TOPICS = {"/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd"}
+
+
+def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
+    """Count the frames in a file by its channels' topics and their counts of messages."""
+    return sum(count for channel, count in counts.items() if topics.get(channel) in _FRAME_TOPICS)
+
+
+def number(texts: Mapping[str, str], key: str) -> int:
+    """Read a count; what isn't one counts as 0."""
+    text = texts.get(key, "0")
+    return int(text) if text.isdecimal() else 0
+
+
+def arithmetic() -> dict[str, str]:
+    """Describe what this machine computes with, for a log's metadata: equal descriptions compute equal bits."""
+    from importlib.metadata import version  # costs 20 ms, which most who import this file can spare
+
+    return {
+        "machine": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
+    }

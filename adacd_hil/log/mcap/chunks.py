@@ -1,0 +1,409 @@
+"""Chunks, opened and read: decompressed within bounds, their messages as columns, many chunks ahead of who asks.
+
+Neither a chunk nor a whole file may open to more than makes sense. Our chunks have 256 KiB before compression and
+shrink to 40 %; those of others have 1 to 16 MiB. A file of a few kilobytes that opens to gigabytes is no log.
+
+Files are read from front to back, so that one that is being written, or cut, is read as far as it goes. The message
+indexes behind a chunk say where its messages begin; they are used where they fill the chunks exactly. Otherwise each
+record takes a step.
+"""
+
+import struct
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import accumulate, pairwise
+from typing import IO, Any, NamedTuple, TypeAlias
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from numpy.typing import NDArray
+
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.records import (
+    DEFINITIONS,
+    HEAD,
+    INDEX_ENTRY,
+    MAGIC,
+    MESSAGE_HEAD,
+    IndexRun,
+    Problem,
+    RawRecord,
+    crc32,
+    parse,
+    walk,
+)
+
+MOST_BYTES = 32 << 20
+"""Of a chunk, before compression."""
+MOST_RATIO = 200
+"""How many times its size in the file all that has been opened of it may have."""
+FREE_BYTES = 64 << 20
+"""What may be opened of a file whatever its size."""
+_PIECE_BYTES = 1 << 20
+_KINDS = ("", "zstd", "lz4")
+
+
+class ChunkError(ValueError):
+    """A chunk that can't be trusted; the message says why."""
+
+
+class Opening:
+    """Counts what has been opened of a file. One for each reading of it."""
+
+    def __init__(self) -> None:
+        self._packed = self._opened = 0
+
+    def allow(self, packed: int, size: int) -> None:
+        """Count a chunk of `packed` bytes in the file and `size` opened. Raises ChunkError when that's too much."""
+        if size > MOST_BYTES:
+            raise ChunkError(f"opens to {size} bytes, more than {MOST_BYTES}")
+        self._packed += packed
+        self._opened += size
+        if self._opened > FREE_BYTES + MOST_RATIO * self._packed:
+            raise ChunkError(f"opens to more than {MOST_RATIO} times the file before it")
+
+    def open(self, chunk: Chunk) -> bytes:
+        """Return what a chunk holds, as long as it is. Raises ChunkError when that can't be had."""
+        data = decompress(chunk.compression, chunk.data)
+        self.allow(len(chunk.data), len(data))
+        return data
+
+    def open_checked(self, chunk: Chunk) -> bytes:
+        """Return what a chunk holds. Raises ChunkError when it isn't what was put in, as far as that can be told."""
+        return _checked(chunk, self.open(chunk), is_size_certain=bool(chunk.uncompressed_crc))
+
+
+def open_as_claimed(chunk: Chunk) -> bytes:
+    """Return what a chunk holds, whose size has been allowed. Raises ChunkError when that isn't as it says."""
+    data = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
+    return _checked(chunk, data, is_size_certain=False)
+
+
+def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
+    if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
+        raise ChunkError("fails its CRC")
+    if not is_size_certain and len(data) != chunk.uncompressed_size:
+        raise ChunkError(f"holds {len(data)} bytes, not {chunk.uncompressed_size}")
+    return data
+
+
+def decompress(compression: str, data: bytes, most_bytes: int = MOST_BYTES) -> bytes:
+    """Decompress the records of a chunk. Raises ChunkError when that fails, and for more than `most_bytes`."""
+    if compression not in _KINDS:
+        raise ChunkError(f"unknown compression {compression[:20]!r}")
+    try:
+        opened = _decompress(compression, data, most_bytes)
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+        raise ChunkError(f"can't be decompressed: {error or type(error).__name__}") from None
+    if len(opened) > most_bytes:
+        raise ChunkError(f"opens to more than {most_bytes} bytes")
+    return opened
+
+
+def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
+    if compression == "":
+        return data
+    if compression == "zstd":
+        return _unzstd(data, most_bytes)
+    stream = lz4.frame.LZ4FrameDecompressor()
+    opened: bytes = stream.decompress(data, most_bytes + 1)
+    if not stream.eof and len(opened) <= most_bytes:
+        raise ChunkError("can't be decompressed: it is cut")
+    return opened
+
+
+def _unzstd(data: bytes, most_bytes: int) -> bytes:
+    size = zstandard.frame_content_size(data)
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
+    if size > most_bytes:
+        raise ChunkError(f"claims {size} bytes, more than {most_bytes}")
+    if size >= 0:
+        return decompressor.decompress(data, max_output_size=max(size, 1))
+    pieces, left = [], most_bytes + 1
+    with decompressor.stream_reader(data) as reader:  # a writer that didn't know
+        while left > 0 and (piece := reader.read(min(left, _PIECE_BYTES))):
+            pieces.append(piece)
+            left -= len(piece)
+    return b"".join(pieces)
+
+
+_START = struct.Struct("<BQ")
+_LEAST_LENGTH = MESSAGE_HEAD - HEAD.size
+_MESSAGE = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "log_time", "publish_time"],
+        "formats": ["u1", "<i8", "<u2", "<u8", "<u8"],
+        "offsets": [0, 1, 9, 15, 23],
+        "itemsize": MESSAGE_HEAD,
+    }
+)
+_PADDING = 128
+"""Behind chunks: a record whose size varies is taken as if it were the longest, which has 64 bytes of data."""
+
+
+Data: TypeAlias = bytes | bytearray
+
+
+class Contents(NamedTuple):
+    """The records of chunks. Messages as columns (n,): their numbers of channels, times, and where they are."""
+
+    data: Data
+    definitions: list[RawRecord]  # schemas and channels; `offset`: where they are in the data
+    strangers: list[int]  # opcodes of what has no place in a chunk; Message: one that is too short to be one
+    breaks: list[int]  # where what follows is no record, up to the end of the chunk
+    starts: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    channels: NDArray[np.uint16]
+    log_times: NDArray[np.uint64]
+    publish_times: NDArray[np.uint64]
+
+    @property
+    def entries(self) -> NDArray[Any]:
+        """What the message indexes must say of the messages."""
+        entries = np.empty(len(self.starts), INDEX_ENTRY)
+        entries["log_time"] = self.log_times
+        entries["offset"] = self.starts
+        return entries
+
+    def payload(self, message: int) -> bytes:
+        """Copy the payload of a message."""
+        return bytes(self.data[self.starts[message] + MESSAGE_HEAD : self.ends[message]])
+
+    def rows(self, starts: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
+        """Copy the `size` bytes from each of `starts` on, (n, size)."""
+        return _windows(self.data, size)[starts].view(np.uint8).reshape(len(starts), size)
+
+
+def read_contents(data: bytes) -> Contents:
+    """Find the records of an opened chunk."""
+    return _walk_through(data, (len(data),))
+
+
+def read_chunks(chunks: Sequence[bytes], indexes: Sequence[bytes], memory: bytearray) -> Contents:
+    """Find the records of opened chunks, one after the other; bytes of no meaning follow the last.
+
+    indexes: the entries of all message indexes of each chunk; without them, and where they are wrong, each record
+    takes a step. memory: holds the chunks from now on, unless it is too small.
+    """
+    ends = list(accumulate(map(len, chunks)))
+    size = (ends[-1] if ends else 0) + _PADDING
+    if len(memory) < size:
+        memory = bytearray(size)
+    for end, chunk in zip(ends, chunks, strict=True):
+        memory[end - len(chunk) : end] = chunk
+    indexed = _indexed(memory, ends, indexes)
+    return _walk_through(memory, ends) if indexed is None else indexed
+
+
+def _indexed(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
+    """Take where messages begin from the indexes; None where these leave out anything that chunks hold."""
+    if not indexes or not all(index and len(index) % INDEX_ENTRY.itemsize == 0 for index in indexes):
+        return None
+    pairs = zip(indexes, (0, *ends[:-1]), strict=True)
+    offsets = [np.frombuffer(index, INDEX_ENTRY)["offset"] + first for index, first in pairs]
+    starts = np.sort(np.concatenate(offsets).view(np.int64), kind="stable")
+    if starts[0] != 0 or starts[-1] > ends[-1] - MESSAGE_HEAD:
+        return None
+    heads = _windows(data, MESSAGE_HEAD)[starts].view(_MESSAGE)
+    contents = _contents(data, [], [], [], starts, heads)
+    is_message = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] >= _LEAST_LENGTH)
+    is_filled = np.array_equal(contents.ends[:-1], starts[1:]) and contents.ends[-1] == ends[-1]
+    if not is_filled or not is_message.all():
+        return None
+    lasts = contents.ends[np.searchsorted(contents.ends, ends)]
+    return contents if np.array_equal(lasts, ends) else None
+
+
+def _walk_through(data: Data, ends: Sequence[int]) -> Contents:
+    """Find the records of chunks step by step."""
+    definitions: list[RawRecord] = []
+    strangers: list[int] = []
+    breaks: list[int] = []
+    starts: list[int] = []
+    unpack, add = _START.unpack_from, starts.append
+    message, head, least = int(Opcode.MESSAGE), HEAD.size, _LEAST_LENGTH
+    for first, size in pairwise((0, *ends)):
+        position = first
+        while position + head <= size:
+            opcode, length = unpack(data, position)
+            end = position + head + length
+            if end > size:
+                break
+            if opcode == message and length >= least:
+                add(position)
+            elif opcode in DEFINITIONS:
+                definitions.append(RawRecord(position, opcode, bytes(data[position + head : end])))
+            else:
+                strangers.append(opcode)
+            position = end
+        if position < size:
+            breaks.append(position)
+    return _found(data, definitions, strangers, breaks, np.array(starts, np.int64))
+
+
+def message_contents(record: RawRecord) -> Contents:
+    """Take a message outside of chunks as a chunk of its own."""
+    data = HEAD.pack(record.opcode, len(record.body)) + record.body
+    return _found(data, [], [], [], np.zeros(1, np.int64))
+
+
+def _found(
+    data: Data,
+    definitions: list[RawRecord],
+    strangers: list[int],
+    breaks: list[int],
+    starts: NDArray[np.int64],
+) -> Contents:
+    heads = _windows(data, MESSAGE_HEAD)[starts].view(_MESSAGE) if len(starts) else np.empty(0, _MESSAGE)
+    return _contents(data, definitions, strangers, breaks, starts, heads)
+
+
+def _contents(
+    data: Data,
+    definitions: list[RawRecord],
+    strangers: list[int],
+    breaks: list[int],
+    starts: NDArray[np.int64],
+    heads: NDArray[Any],
+) -> Contents:
+    ends = starts + heads["length"] + HEAD.size
+    channels, log_times, publish_times = (heads[name].copy() for name in ("channel", "log_time", "publish_time"))
+    return Contents(data, definitions, strangers, breaks, starts, ends, channels, log_times, publish_times)
+
+
+def _windows(data: Data, size: int) -> NDArray[Any]:
+    """View the `size` bytes that begin at each byte as one item."""
+    windows: NDArray[Any] = np.ndarray((max(0, len(data) - size + 1),), f"V{size}", data, strides=(1,))
+    return windows
+
+
+BLOCK_BYTES = 1 << 21
+AHEAD = 6
+"""Blocks that may wait or be in work."""
+_OUTSIDE = (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA)
+_OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
+
+
+class Block(NamedTuple):
+    """Records of chunks, one chunk after the other; a message or a definition outside chunks is one by itself."""
+
+    contents: Contents
+    memory: bytearray  # of the contents, used again after the next item is asked for
+    position: int  # in the file, of the first of them
+    problem: str  # why chunks are missing, "" if none is
+
+
+Item: TypeAlias = Block | RawRecord | Problem
+
+
+class _Packed(NamedTuple):
+    """A chunk as it is in the file, or a record outside chunks."""
+
+    chunk: Chunk | bytes
+    size: int  # when opened
+    position: int
+    entries: list[bytes]  # of the message indexes behind it
+
+
+def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES) -> Iterator[Item]:
+    """Read a file from front to end: blocks, attachments and metadata, and what is missing.
+
+    block_bytes: of the chunks that make a block; 1: each chunk is one. Raises LogError when it isn't MCAP.
+    """
+    waiting: deque[Future[Block] | RawRecord | Problem] = deque()
+    free: list[bytearray] = []
+    # A second thread would wait for Python's lock more than it opens: 1.3 times the processor time, no sooner done.
+    with ThreadPoolExecutor(1, "log-reader") as thread:
+        try:
+            for item in _pack(file, name, block_bytes):
+                if isinstance(item, list):
+                    waiting.append(thread.submit(_open, item, free.pop() if free else bytearray()))
+                else:
+                    waiting.append(item)
+                if len(waiting) > AHEAD:
+                    yield from _finished(waiting.popleft(), free)
+            while waiting:
+                yield from _finished(waiting.popleft(), free)
+        finally:
+            thread.shutdown(cancel_futures=True)
+
+
+def _finished(item: Future[Block] | RawRecord | Problem, free: list[bytearray]) -> Iterator[Item]:
+    """Give an item; take back its memory afterwards: pages that are new cost more than what is done with them."""
+    if not isinstance(item, Future):
+        yield item
+        return
+    block = item.result()
+    yield block
+    free.append(block.memory)
+
+
+def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed] | RawRecord | Problem]:
+    """Read a file, chunks as they are."""
+    packed: list[_Packed] = []
+    size, crc = 0, crc32(MAGIC)
+    opening = Opening()
+    for record in walk(file, name):
+        if isinstance(record, IndexRun):
+            crc = crc32(record.data, crc)
+            if packed:
+                packed[-1].entries.extend(record.entries)
+            continue
+        found = _look_at(record, opening, crc)
+        if isinstance(record, RawRecord):
+            crc = crc32(record.body, crc32(HEAD.pack(record.opcode, len(record.body)), crc))
+        if found is None:
+            continue
+        if packed and (not isinstance(found, _Packed) or size + found.size > block_bytes):
+            yield packed
+            packed, size = [], 0
+        if isinstance(found, _Packed):
+            packed.append(found)
+            size += found.size
+        else:
+            yield found
+    if packed:
+        yield packed
+
+
+def _look_at(record: RawRecord | Problem, opening: Opening, crc: int) -> _Packed | RawRecord | Problem | None:
+    """Take a record as it is passed on; None for one that isn't. crc: of all before it."""
+    if isinstance(record, Problem) or record.opcode in _OTHERS:
+        return record
+    if record.opcode == Opcode.CHUNK or record.opcode in _OUTSIDE:
+        return _packed(record, opening)
+    if record.opcode == Opcode.DATA_END and int.from_bytes(record.body[:4], "little") not in (0, crc):
+        return Problem("the data section fails its CRC")
+    return None
+
+
+def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
+    """Look at a chunk, or take a record outside chunks."""
+    position = record.offset + HEAD.size
+    if record.opcode != Opcode.CHUNK:
+        whole = HEAD.pack(record.opcode, len(record.body)) + record.body
+        return _Packed(whole, len(whole), position, [])
+    try:
+        chunk: Chunk = parse(record.opcode, record.body)
+        opening.allow(len(chunk.data), chunk.uncompressed_size)
+    except (LogError, ChunkError):
+        return Problem(f"damaged at byte {position}", is_damage=True)
+    return _Packed(chunk, chunk.uncompressed_size, position, [])
+
+
+def _open(packed: list[_Packed], memory: bytearray) -> Block:
+    chunks, indexes, problem = [], [], ""
+    for one in packed:
+        try:
+            chunks.append(one.chunk if isinstance(one.chunk, bytes) else open_as_claimed(one.chunk))
+        except ChunkError:
+            problem = problem or f"damaged at byte {one.position}"
+        else:
+            indexes.append(b"".join(one.entries))
+    contents = read_chunks(chunks, indexes, memory)
+    memory = contents.data if isinstance(contents.data, bytearray) else memory
+    return Block(contents, memory, packed[0].position, problem)

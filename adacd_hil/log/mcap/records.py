@@ -1,0 +1,429 @@
+"""The records of an MCAP file: in order, after damage, at the end of the file, and parsed by mcap's classes.
+
+A record repeats its length: what its strings, maps and arrays say they hold must fill it exactly. In random bytes that
+happens once in 2^72 and more, so that it says where records go on after damage. A message record has no such shape.
+
+Constant memory: one record at a time; one of more than MOST_RECORD_BYTES is none. Chunks stay closed.
+"""
+
+import io
+import os
+import re
+import struct
+from collections.abc import Callable, Collection, Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from adacd_hil.input_files import open_input
+from adacd_hil.log.log_files import LogError
+
+_TEXT = _TABLE = -4  # a length of 4 bytes, then so many bytes
+_DATA = -8  # a length of 8 bytes, then so many bytes
+
+_SHAPES: dict[int, tuple[int, ...]] = {
+    Opcode.HEADER: (_TEXT, _TEXT),
+    Opcode.FOOTER: (20,),
+    Opcode.SCHEMA: (2, _TEXT, _TEXT, _TABLE),
+    Opcode.CHANNEL: (4, _TEXT, _TEXT, _TABLE),
+    Opcode.CHUNK: (28, _TEXT, _DATA),
+    Opcode.MESSAGE_INDEX: (2, _TABLE),
+    Opcode.CHUNK_INDEX: (32, _TABLE, 8, _TEXT, 16),
+    Opcode.ATTACHMENT: (16, _TEXT, _TEXT, _DATA, 4),
+    Opcode.ATTACHMENT_INDEX: (40, _TEXT, _TEXT),
+    Opcode.STATISTICS: (42, _TABLE),
+    Opcode.METADATA: (_TEXT, _TABLE),
+    Opcode.METADATA_INDEX: (16, _TEXT),
+    Opcode.SUMMARY_OFFSET: (17,),
+    Opcode.DATA_END: (4,),
+}
+LEAST_MESSAGE = 22
+"""Bytes of a message record without payload, without opcode and length."""
+
+
+def has_shape(opcode: int) -> bool:
+    """Say whether records of this kind repeat their length."""
+    return opcode in _SHAPES
+
+
+def fits(opcode: int, length: int, read: Callable[[int, int], bytes]) -> bool:
+    """Say whether a record of this kind can be `length` bytes long; `read` gives bytes of it, by place and count."""
+    if opcode not in _SHAPES:
+        return opcode == Opcode.MESSAGE and length >= LEAST_MESSAGE
+    position = 0
+    for part in _SHAPES[opcode]:
+        if part > 0:
+            position += part
+            continue
+        prefix = read(position, -part)
+        position += -part + int.from_bytes(prefix, "little")
+        if position > length or len(prefix) < -part:
+            return False
+    return position == length
+
+
+try:
+    from zlib_ng import zlib_ng as fast_zlib  # six times as fast, which saves a sixth of the time to read a log
+except ImportError:
+    import zlib as fast_zlib  # type: ignore[no-redef]
+
+crc32: Callable[..., int] = fast_zlib.crc32
+MAGIC = b"\x89MCAP0\r\n"
+HEAD = struct.Struct("<BQ")
+RECORD_HEAD_BYTES = HEAD.size
+"""Bytes of a record that its length doesn't count: opcode, length."""
+MESSAGE_HEAD = 31
+"""Bytes of a message record before its payload: opcode, length, channel, sequence, log time, publish time."""
+MOST_RECORD_BYTES = 64 << 20
+"""Of a record that is read. A chunk of ours has 0.1 MB, one of others up to 16 MB; an attachment of a run 0.2 MB."""
+CHANNEL_NUMBERS = 1 << 16
+DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
+_WINDOW = 1 << 20
+_RUN_BYTES = 1 << 15
+INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_INDEX_HEAD = 6
+"""Bytes of a message index before its entries: its channel, how many bytes they have."""
+_READERS: dict[int, Any] = {
+    Opcode.HEADER: Header.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.MESSAGE_INDEX: MessageIndex.read,
+    Opcode.CHUNK_INDEX: ChunkIndex.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
+    Opcode.STATISTICS: Statistics.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.METADATA_INDEX: MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: SummaryOffset.read,
+    Opcode.DATA_END: DataEnd.read,
+}
+_BEGINNING = re.compile(rb"(?=[\x01-\x04\x06-\x0f].{5}\0\0\0)", re.DOTALL)
+"""Where a record of less than a TiB may begin."""
+
+
+class RawRecord(NamedTuple):
+    """A record as it is in the file."""
+
+    offset: int
+    opcode: int
+    body: bytes
+
+    @property
+    def end(self) -> int:
+        """Where the next one begins."""
+        return self.offset + HEAD.size + len(self.body)
+
+
+class IndexRun(NamedTuple):
+    """Message indexes that follow each other."""
+
+    data: bytes  # their records
+    entries: list[bytes]  # of each
+
+
+class FileGap(NamedTuple):
+    """Bytes that are no record."""
+
+    offset: int
+    size: int
+
+
+class Problem(NamedTuple):
+    """Something that is missing of a file, in words. `is_damage`: these follow "the file is"."""
+
+    text: str
+    is_damage: bool = False
+
+
+class Trailer(NamedTuple):
+    """The magic behind the footer."""
+
+    offset: int
+
+
+def name_of(opcode: int) -> str:
+    """Name a kind of record as the specification does."""
+    if opcode not in set(Opcode):
+        return f"record 0x{opcode:02x}"
+    return "".join(word.capitalize() for word in Opcode(opcode).name.split("_"))
+
+
+def parse(opcode: int, body: bytes) -> Any:
+    """Read a record with mcap's class for it. Raises LogError when it makes no sense."""
+    try:
+        return _READERS[opcode](ReadDataStream(io.BytesIO(body)))
+    except (McapError, struct.error, ValueError, OverflowError, MemoryError) as error:
+        raise LogError(f"{name_of(opcode)} can't be read: {error or type(error).__name__}") from None
+
+
+def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
+    """List the records of a file up to its end, or to what can't be one; message indexes, which are many, in runs.
+
+    passed: kinds whose bodies aren't read. Raises LogError, which begins with `name`, when it isn't MCAP.
+    """
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    magic = file.read(len(MAGIC))
+    if not MAGIC.startswith(magic):
+        raise LogError(f"{name} is not an MCAP file")
+    position, is_whole = len(magic), False
+    while len(head := file.read(HEAD.size)) == HEAD.size:
+        opcode, length = HEAD.unpack(head)
+        if length > MOST_RECORD_BYTES:
+            yield Problem(f"the record at byte {position} has {length} bytes, more than {MOST_RECORD_BYTES}")
+            return
+        end = position + HEAD.size + length
+        if not opcode or end > size:
+            break
+        if opcode in passed:
+            file.seek(length, io.SEEK_CUR)
+            yield RawRecord(position, opcode, b"")
+        elif opcode == Opcode.MESSAGE_INDEX:
+            run = _index_run(head + file.read(max(length, _RUN_BYTES)))
+            if not run.data:  # the file has become shorter meanwhile
+                break
+            end = position + len(run.data)
+            file.seek(end)
+            yield run
+        else:
+            body = file.read(length)
+            if len(body) < length:
+                break
+            yield RawRecord(position, opcode, body)
+        position = end
+        if opcode == Opcode.FOOTER:
+            is_whole = file.read(len(MAGIC)) == MAGIC
+            break
+    if not is_whole:
+        yield Problem(f"cut after {size} bytes", is_damage=True)
+
+
+def _index_run(data: bytes) -> IndexRun:
+    """Take the message indexes at the beginning of `data`, of which the first is whole."""
+    position, entries = 0, []
+    while len(data) - position >= HEAD.size:
+        opcode, length = HEAD.unpack_from(data, position)
+        end = position + HEAD.size + length
+        if opcode != Opcode.MESSAGE_INDEX or end > len(data):
+            break
+        entries.append(data[position + HEAD.size + _INDEX_HEAD : end])
+        position = end
+    return IndexRun(data[:position], entries)
+
+
+def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap | Trailer]:
+    """List the records of a file, and the gaps between them: what follows damage is found again."""
+    return _Scan(file).items()
+
+
+def read_header(path: Path) -> Header | None:
+    """Read the header of a file; None where it has none that can be trusted."""
+    try:
+        with open_input(path) as file:
+            first = next(scan(file), None)
+        if not isinstance(first, RawRecord) or first.opcode != Opcode.HEADER:
+            return None
+        header: Header = parse(first.opcode, first.body)
+    except (OSError, LogError):
+        return None
+    return header
+
+
+class _Scan:
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._size = os.fstat(file.fileno()).st_size
+
+    def items(self) -> Iterator[RawRecord | FileGap | Trailer]:
+        position = len(MAGIC)
+        if self._read(0, position) != MAGIC:
+            position = 0
+        while position < self._size:
+            head = self._head(position)
+            if head is None:
+                found = self._find(position + 1)
+                yield FileGap(position, found - position)
+                position = found
+                continue
+            record = RawRecord(position, head[0], self._read(position + HEAD.size, head[1]))
+            yield record
+            position = record.end
+            if record.opcode == Opcode.FOOTER and self._read(position, len(MAGIC)) == MAGIC:
+                yield Trailer(position)
+                return
+
+    def _read(self, position: int, count: int) -> bytes:
+        self._file.seek(position)
+        return self._file.read(count)
+
+    def _head(self, position: int) -> tuple[int, int] | None:
+        """Return opcode and length of the record at `position`, if one is there."""
+        head = self._read(position, HEAD.size)
+        if len(head) < HEAD.size:
+            return None
+        opcode, length = HEAD.unpack(head)
+        start = position + HEAD.size
+        if not opcode or length > min(self._size - start, MOST_RECORD_BYTES):
+            return None
+        if opcode in set(Opcode):
+            is_there = fits(opcode, length, lambda place, count: self._read(start + place, count))
+        else:  # a kind that is not known, if a known one follows
+            is_there = self._is_shaped(start + length)
+        return (opcode, length) if is_there else None
+
+    def _is_shaped(self, position: int) -> bool:
+        """Say whether a record that repeats its length is at `position`."""
+        head = self._read(position, HEAD.size)
+        if len(head) < HEAD.size or not has_shape(head[0]):
+            return False
+        opcode, length = HEAD.unpack(head)
+        start = position + HEAD.size
+        return length <= min(self._size - start, MOST_RECORD_BYTES) and fits(
+            opcode, length, lambda place, count: self._read(start + place, count)
+        )
+
+    def _find(self, position: int) -> int:
+        """Find the next record that repeats its length; the end of the file if there is none."""
+        while position < self._size:
+            window = self._read(position, _WINDOW + HEAD.size)
+            for match in _BEGINNING.finditer(window):
+                if self._is_shaped(position + match.start()):
+                    return position + match.start()
+            position += _WINDOW
+        return self._size
+
+
+def attachment_crc_fits(body: bytes, is_vouched: bool = True) -> bool:
+    """Say whether the body of an attachment fits its CRC; 0, for none, does if something else vouches for it."""
+    stored = int.from_bytes(body[-4:], "little")
+    return stored == crc32(body[:-4]) or (stored == 0 and is_vouched)
+
+
+_FOOTER = HEAD.size + 20
+_DATA_END = HEAD.size + 4
+
+
+class FileEnd(NamedTuple):
+    """What the end of a file says."""
+
+    data_end: int  # where the DataEnd begins
+    data_crc: int  # stored there; 0: none
+    summary: list[RawRecord]  # empty where its CRC doesn't fit
+
+
+def read_end(file: IO[bytes]) -> FileEnd | None:
+    """Read the end of a file; None where there is none."""
+    found = _find(file)
+    if found is None:
+        return None
+    place, end, footer = found
+    data_end = _read(file, end - _DATA_END, _DATA_END)
+    if data_end[0] != Opcode.DATA_END:
+        return None
+    data_crc = int.from_bytes(data_end[HEAD.size :], "little")
+    summary: list[RawRecord] = []
+    if (
+        footer.summary_crc
+        and place - end <= MOST_RECORD_BYTES
+        and footer.summary_crc == crc_of(file, end, place + _FOOTER - 4)
+    ):
+        summary = _split(_read(file, end, place - end), end)
+    return FileEnd(end - _DATA_END, data_crc, summary)
+
+
+def summary_of(file: IO[bytes]) -> list[RawRecord]:
+    """Read the summary of a file, whether or not it has a CRC that fits; empty where there is none."""
+    found = _find(file)
+    if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
+        return []
+    place, end, _ = found
+    return _split(_read(file, end, place - end), end)
+
+
+def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
+    """Find where the footer is, and where the summary begins; None where there is no end."""
+    size = file.seek(0, os.SEEK_END)
+    place = size - len(MAGIC) - _FOOTER
+    tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
+    if place < len(MAGIC) + _DATA_END or not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER:
+        return None
+    footer: Footer = parse(Opcode.FOOTER, tail[HEAD.size : _FOOTER])
+    end = footer.summary_start or place
+    return (place, end, footer) if len(MAGIC) + _DATA_END <= end <= place else None
+
+
+def _split(data: bytes, offset: int) -> list[RawRecord]:
+    records = []
+    position = 0
+    while position + HEAD.size <= len(data):
+        opcode, length = HEAD.unpack_from(data, position)
+        start = position + HEAD.size
+        records.append(RawRecord(offset + position, opcode, data[start : start + length]))
+        position = start + length
+    return records
+
+
+def read_record(file: IO[bytes], offset: int) -> RawRecord:
+    """Read the record that begins at `offset`. Raises LogError when there is none."""
+    head = _read(file, offset, HEAD.size)
+    if len(head) < HEAD.size:
+        raise LogError(f"no record at byte {offset}")
+    opcode, length = HEAD.unpack(head)
+    size = os.fstat(file.fileno()).st_size
+    if length > min(size - offset - HEAD.size, MOST_RECORD_BYTES):
+        raise LogError(f"no record at byte {offset}")
+    return RawRecord(offset, opcode, file.read(length))
+
+
+def crc_of(file: IO[bytes], start: int, end: int, crc: int = 0) -> int:
+    """Compute the CRC of bytes of a file; `crc`: of what comes before them."""
+    file.seek(start)
+    while start < end and (block := file.read(min(_WINDOW, end - start))):
+        crc = crc32(block, crc)
+        start += len(block)
+    return crc
+
+
+def _read(file: IO[bytes], place: int, count: int) -> bytes:
+    file.seek(place)
+    return file.read(count)
+
+
+class Definitions:
+    """Schemas and channels by their numbers."""
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+
+    def take(self, records: Iterable[RawRecord]) -> None:
+        """Take in definitions. Raises LogError for one that makes no sense or contradicts an earlier one."""
+        for record in records:
+            known: dict[int, Schema] | dict[int, Channel] = self.channels
+            if record.opcode == Opcode.SCHEMA:
+                known = self.schemas
+            definition = parse(record.opcode, record.body)
+            if known.setdefault(definition.id, definition) != definition:
+                raise LogError(f"{type(definition).__name__.lower()} {definition.id} is defined in two ways")

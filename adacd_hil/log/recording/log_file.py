@@ -1,0 +1,234 @@
+"""The MCAP file of a run, and the thread that writes it: a slow disk doesn't stop the writer from taking packets.
+
+The file: header, attachments and metadata first, then chunks, then the summary. Attachments and metadata come before
+the first chunk, so that they survive when the file is cut.
+
+The thread: what waits for the disk is bounded. When it is more, `is_behind` says so until half of that is written, and
+whoever must lose nothing lets `write` wait. The first failure (disk full) ends a file at the last whole write; what
+comes after is swallowed and its packets are counted, until another file is begun.
+"""
+
+import contextlib
+import os
+import threading
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path, PurePath
+from typing import NamedTuple
+
+from mcap.records import Attachment, Schema
+from mcap.records import Channel as ChannelRecord
+
+from adacd_hil.log.log_files import FIELDS_KEY, QOS_KEY, ROS_PROFILE, RUN_METADATA, SUMMARY_METADATA
+from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
+from adacd_hil.log.types.topics import LogChannel
+from adacd_hil.output_files import create_file
+
+WAITING_BYTES = 32 * 1024 * 1024
+"""What may wait for the disk: about 45 s of a run at 1 kHz, compressed."""
+
+
+class _Write(NamedTuple):
+    data: bytes
+    packets: int
+
+
+class Sink:
+    """What `McapFile` needs of a stream, over a file descriptor that it closes."""
+
+    def __init__(
+        self,
+        descriptor: int,
+        path: Path | None = None,
+        waits: bool = True,
+        most_waiting: int = WAITING_BYTES,
+        on_written: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        """Write to `descriptor`, which is of the file `path`.
+
+        waits: `write` waits rather than let more than `most_waiting` bytes wait. on_written: is told, by the thread,
+        how many packets each write has brought to the disk.
+        """
+        self.error = ""
+        """Why the file in progress ended early."""
+        self.first_error = ""
+        """Why the first of all files that did ended early."""
+        self.written = 0
+        """Bytes of the file in progress that are on the disk."""
+        self.path = path
+        """The file in progress; None when it could not be created."""
+        self._descriptor = descriptor
+        self._name = ""  # of a later file
+        self._waits = waits
+        self._most_waiting = most_waiting
+        self._on_written = on_written
+        self._position = 0
+        self._tasks: deque[_Write | Path | None] = deque()
+        self._waiting = 0  # bytes
+        self._is_idle = True
+        self._is_behind = False
+        self._lost = 0
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._work, name="log sink", daemon=True)
+        self._thread.start()
+
+    def write(self, data: bytes, packets: int = 0) -> int:
+        """Queue `data`, which completes so many packets."""
+        self._position += len(data)
+        if data:
+            with self._changed:
+                self._changed.wait_for(lambda: not self._waits or self._waiting < self._most_waiting)
+                self._waiting += len(data)
+                self._tasks.append(_Write(data, packets))
+                self._changed.notify_all()
+        return len(data)
+
+    def begin(self, path: Path) -> None:
+        """Go on with a new file, or with the one in progress from its start, once all before is written or failed."""
+        self._position = 0
+        with self._changed:
+            self._tasks.append(path)
+            self._changed.notify_all()
+
+    def tell(self) -> int:
+        """Return how many bytes of the file have been handed over."""
+        return self._position
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._waiting
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether so much waits for the disk that nothing should be added."""
+        self._is_behind = self._waiting > (self._most_waiting // 2 if self._is_behind else self._most_waiting)
+        return self._is_behind
+
+    def take_lost(self) -> int:
+        """Count the packets that were swallowed since this was last asked."""
+        with self._changed:
+            lost, self._lost = self._lost, 0
+        return lost
+
+    def settle(self) -> None:
+        """Wait until everything handed over is written or has failed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_idle and not self._tasks)
+
+    def close(self) -> None:
+        """Write what is waiting, then close the file."""
+        with self._changed:
+            self._tasks.append(None)
+            self._changed.notify_all()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while (task := self._next()) is not None:
+            if isinstance(task, Path):
+                self._open(task)
+            else:
+                self._write(task)
+        self._close()
+
+    def _next(self) -> _Write | Path | None:
+        with self._changed:
+            self._is_idle = True
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._tasks)
+            self._is_idle = False
+            return self._tasks.popleft()
+
+    def _write(self, task: _Write) -> None:
+        if not self.error:
+            try:
+                _write_all(self._descriptor, task.data)
+                self.written += len(task.data)
+                self._on_written(task.packets)
+            except OSError as error:
+                self._fail(error)
+                with contextlib.suppress(OSError):  # not everything that can be written can be cut
+                    os.ftruncate(self._descriptor, self.written)
+        with self._changed:
+            self._waiting -= len(task.data)
+            self._lost += task.packets if self.error else 0
+
+    def _open(self, path: Path) -> None:
+        is_new = path != self.path or self._descriptor < 0
+        if is_new:
+            self._close()
+            self.path = None
+        self.error, self.written, self._name = "", 0, f"{path.name}: "
+        try:
+            if is_new:
+                self._descriptor = create_file(path)
+                self.path = path
+            else:
+                os.lseek(self._descriptor, 0, os.SEEK_SET)
+                os.ftruncate(self._descriptor, 0)
+        except OSError as error:
+            self._fail(error)
+
+    def _close(self) -> None:
+        if self._descriptor < 0:
+            return
+        try:
+            os.close(self._descriptor)
+        except OSError as error:  # network file systems report their failures here
+            self._fail(error)
+        self._descriptor = -1
+
+    def _fail(self, error: OSError) -> None:
+        self.error = self.error or f"{self._name}{error.strerror} after {self.written} bytes"
+        self.first_error = self.first_error or self.error
+
+
+def _write_all(descriptor: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(descriptor, view) :]
+
+
+_MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
+
+
+class McapFile(ChunkedFile):
+    """One file of a run, over a sink."""
+
+    def __init__(
+        self, sink: Sink, channels: tuple[LogChannel, ...], attachments: dict[str, bytes], metadata: dict[str, str]
+    ) -> None:
+        super().__init__(sink, LIBRARY, ROS_PROFILE)
+        self.ids: dict[int, int] = {}
+        """The file's number of each channel, by ours."""
+        for name, data in attachments.items():
+            media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "text/plain")
+            self.attach(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
+        self.add_metadata(RUN_METADATA, metadata)
+        self._define(channels)
+        self.head_bytes = sink.tell()
+        """Bytes before the first chunk."""
+
+    def _define(self, channels: tuple[LogChannel, ...]) -> None:
+        """Give schemas and channels numbers from 1; the first chunk begins with them."""
+        schema_ids: dict[str, int] = {}
+        for number, channel in enumerate(channels, start=1):
+            name, text = channel.type.name, channel.type.text
+            if name not in schema_ids:
+                schema_ids[name] = len(schema_ids) + 1
+                self.define_schema(Schema(id=schema_ids[name], name=name, encoding="ros2msg", data=text.encode()))
+            record = ChannelRecord(
+                id=number,
+                topic=channel.topic,
+                message_encoding="cdr",
+                schema_id=schema_ids[name],
+                metadata={QOS_KEY: "", **({FIELDS_KEY: " ".join(channel.type.fields)} if channel.type.fields else {})},
+            )
+            self.define_channel(record)
+            self.ids[channel.id] = number
+
+    def finish(self, summary: dict[str, str]) -> None:
+        """End the file, with what is to be said of it."""
+        self.flush()
+        self.add_metadata(SUMMARY_METADATA, summary)
+        self.complete()

@@ -1,0 +1,261 @@
+"""The control side of the log: hands each cycle to the writer process in one packet, and never waits in real time.
+
+In real time a packet costs no system call: it goes into memory that the writer looks into by itself. A full ring (the
+writer is behind, stopped or dead) costs packets, never time and never an exception: `dropped` counts. In lockstep
+(`blocking`) the writer is woken now and then, a full ring is waited for, and nothing is lost.
+"""
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
+from adacd_hil.log.recording import packet, processes
+from adacd_hil.log.recording.processes import LiveSetup, WriterSetup, start_module
+from adacd_hil.log.recording.ring import Ring, room_of
+from adacd_hil.log.recording.run_folder import check_free, make_room
+from adacd_hil.log.types.decoded_messages import MessageLike, plain_messages
+from adacd_hil.log.viewer.robot_description import ROBOT_NAME
+from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
+from adacd_hil.output_files import create_file
+from adacd_hil.records import PARAMETER_NAMES, Event
+from adacd_hil.settings.run_settings import LogSettings
+from adacd_hil.wire.bus import Frame
+
+START_TIMEOUT_S = 60.0
+END_TIMEOUT_S = 60.0
+DEATH_TIMEOUT_S = 1.0
+"""Longest from the end of the writer's socket to the end of its process."""
+WAKE_BYTES = 64 * 1024
+"""So many bytes, about 100 cycles, go to the writer together in lockstep: the system calls of each are then cheap."""
+_MIB = 1024 * 1024
+_MINUTE_NS = 60_000_000_000
+_FORMAT_VERSION = "1"
+
+
+class LogSummary(NamedTuple):
+    """How a log ended. `frames` and `messages` are 0 when the writer died; `error` says what went wrong."""
+
+    path: Path  # of the first part
+    frames: int
+    messages: int
+    dropped: int  # packets (cycles and events) that are not in the log
+    is_complete: bool
+    error: str = ""
+    parts: int = 1
+    queue_peak_bytes: int = 0  # most that the writer found waiting for it
+
+
+class Recorder:
+    """Writes one log. Start it before the process pins itself to a processor: the writer inherits that."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        messages: Iterable[MessageLike] | None = None,
+        parameter_count: int = len(PARAMETER_NAMES),
+        further_count: int = 0,
+        channel_count: int = 0,
+        attachments: Mapping[str, bytes] | None = None,
+        metadata: Mapping[str, str] | None = None,
+        epoch_ns: int = 0,
+        blocking: bool = False,
+        is_truth: bool = False,
+        settings: LogSettings | None = None,
+        robot: bytes = b"",
+        live: LiveSetup | None = None,
+    ) -> None:
+        """Create the file, which must not be there (see run_folder.py), and start the writer.
+
+        messages: of the DBC, default those of the one that comes with the package. epoch_ns: added to t_ns for the
+        log's times; 0 in lockstep. is_truth: the emulator's own log, /truth and /events only. robot: the arm's URDF,
+        for viewers. live: serve what is logged. Raises LogExistsError, LogError.
+        """
+        settings = settings or LogSettings()
+        own = {
+            "format_version": _FORMAT_VERSION,
+            "epoch_ns": str(epoch_ns),
+            "parameter_count": str(parameter_count),
+            "mode": "lockstep" if blocking else "realtime",
+        }
+        layout = {} if is_truth else {LAYOUT_NAME: viewer_layout(robot)}
+        drawn = {ROBOT_NAME: robot} if robot else {}
+        self.path = path
+        self.dropped = 0
+        self.live_url = ""
+        """Where the live view is, if there is one."""
+        self._summary: LogSummary | None = None
+        self._is_blocking = blocking
+        self._unannounced = 0  # bytes in the ring that the writer was not woken for
+        file = _create(path, is_truth)
+        setup = WriterSetup(
+            path=path.absolute(),
+            is_truth=is_truth,
+            is_blocking=blocking,
+            messages=() if is_truth else plain_messages(_own_messages() if messages is None else messages),
+            parameter_count=parameter_count,
+            further_count=further_count,
+            channel_count=channel_count,
+            epoch_ns=epoch_ns,
+            part_bytes=settings.part_MiB * _MIB,
+            part_ns=round(settings.part_min * _MINUTE_NS),
+            attachments={**(attachments or {}), **drawn, **layout},
+            metadata={**(metadata or {}), **own},
+            live=live,
+        )
+        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._ring = Ring(settings.buffer_MiB * _MIB)
+            self._process = start_module(
+                "adacd_hil.log.recording.writer", (theirs.fileno(), file, self._ring.descriptor), setup.to_json()
+            )
+        except OSError as error:
+            self._socket.close()
+            raise LogError(f"log {path}: no writer with a buffer of {settings.buffer_MiB} MiB: {error}") from None
+        finally:
+            theirs.close()
+            os.close(file)
+        self._wait_until_ready()
+        self._socket.setblocking(True)
+
+    def _wait_until_ready(self) -> None:
+        word = self._hear(START_TIMEOUT_S)
+        error = "the writer did not start" if word is None else word["error"]
+        if error:
+            self._process.kill()
+            self._process.wait()
+            self._release()
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+            raise LogError(f"log {self.path} can't be written: {error}")
+        assert word is not None
+        self.live_url = word["live_url"]
+
+    @property
+    def pid(self) -> int:
+        """Process id of the writer."""
+        return self._process.pid
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that wait for the writer; 0 in lockstep, where they say nothing of the run. Costs no system call."""
+        return 0 if self._is_blocking else self._ring.waiting
+
+    def cycle(
+        self, t_ns: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]] = ()
+    ) -> None:
+        """Log a cycle: messages as (ChannelId, body), and its frames, oldest first, True for sent."""
+        self._put(packet.pack_cycle(t_ns, self.dropped, messages, frames))
+
+    def event(self, t_ns: int, event: Event) -> None:
+        """Log an event."""
+        self._put(packet.pack_event(t_ns, self.dropped, event))
+
+    def flush(self) -> None:
+        """Wake the writer for what waits in the ring."""
+        self._unannounced = 0
+        with contextlib.suppress(OSError):  # words that it hasn't heard yet will do, and the dead hear nothing
+            self._socket.send(processes.WAKE, socket.MSG_DONTWAIT)
+
+    def _put(self, data: bytes) -> None:
+        if not self._ring.put(data) and not (self._is_blocking and self._put_patiently(data)):
+            self.dropped += 1
+            self._ring.count_dropped(self.dropped)
+        elif self._is_blocking:
+            self._unannounced += len(data)
+            if self._unannounced >= WAKE_BYTES:
+                self.flush()
+
+    def _put_patiently(self, data: bytes) -> bool:
+        """Add a packet once the writer has made room; False when it is dead, or the packet larger than the ring."""
+        is_put = False
+        with contextlib.suppress(OSError):  # nobody there
+            while not is_put and room_of(len(data)) <= self._ring.capacity:
+                self._socket.send(processes.ROOM)
+                if self._socket.recv(processes.MOST_BYTES) == processes.NOTHING:
+                    break
+                is_put = self._ring.put(data)
+        return is_put
+
+    def close(self) -> LogSummary:
+        """End the log and say how it went; never raises, twice is once."""
+        if self._summary is None:
+            self._socket.settimeout(END_TIMEOUT_S)
+            with contextlib.suppress(OSError):
+                self._socket.send(processes.END)
+            self._summary = self._summarise(self._hear(END_TIMEOUT_S))
+            self._release()
+        return self._summary
+
+    def _release(self) -> None:
+        self._socket.close()
+        self._ring.close()
+
+    def _summarise(self, word: dict[str, str] | None) -> LogSummary:
+        """Tell how it went, by the writer's last word if there is one, and wait for the end of the writer."""
+        error = ""
+        if word is None:
+            error = self._end_writer()
+        self._process.wait()
+        peak = self._ring.peak
+        if word is not None:
+            dropped = self.dropped + int(word["lost"])
+            counts = int(word["frames"]), int(word["messages"]), dropped
+            is_complete = not word["error"] and dropped == 0
+            return LogSummary(self.path, *counts, is_complete, word["error"], int(word["parts"]), peak)
+        self.dropped += self._ring.packets - self._ring.written
+        return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
+
+    def _end_writer(self) -> str:
+        """End a writer that says nothing; return what was wrong with it."""
+        try:
+            return f"the writer died (exit status {self._process.wait(DEATH_TIMEOUT_S)})"
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return f"the writer did not end within {END_TIMEOUT_S:g} s"
+
+    def _hear(self, timeout_s: float) -> dict[str, str] | None:
+        """Receive the writer's word; None when it died or stays silent."""
+        self._socket.settimeout(timeout_s)
+        try:
+            received = self._socket.recv(processes.MOST_BYTES)
+        except OSError:
+            return None
+        word: dict[str, str] = json.loads(received) if received else {}
+        return word or None
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _create(path: Path, is_truth: bool) -> int:
+    """Create the first part. Raises LogExistsError, LogError."""
+    if is_truth:
+        check_free(path)
+    else:
+        make_room(path)
+    try:
+        return create_file(path)
+    except FileExistsError:  # since it was looked at
+        raise LogExistsError(f"{path} is being written by another run; choose another folder with --out") from None
+    except OSError as error:
+        raise LogError(f"log {path} can't be created: {error.strerror}") from None
+
+
+def _own_messages() -> Iterable[MessageLike]:
+    # Takes 0.2 s, which whoever has a codec can spare.
+    from adacd_hil.wire.codec import load_codec
+
+    return load_codec().messages.values()

@@ -1,0 +1,78 @@
+"""Where a new log may be: in place of no other log, but for one of a start that failed before the first cycle.
+
+That one is moved aside, so that the same command can be given again once the cause is mended.
+"""
+
+import itertools
+from pathlib import Path
+
+from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
+from adacd_hil.output_files import InUseError, check_unused
+
+_FAILED_NAME = "failed-start-{}.mcap"
+
+
+def check_free(path: Path) -> None:
+    """Raise LogExistsError where `path` can't be the first part of a new log, LogError where that can't be told."""
+    if is_taken(path) and not _is_failed_start(path):
+        raise _refusal(path)
+
+
+def make_room(path: Path) -> None:
+    """Move aside the log of a start that failed. Raises LogExistsError for any other log, LogError."""
+    check_free(path)
+    if not is_taken(path):
+        return
+    names = (path.with_name(_FAILED_NAME.format(number)) for number in itertools.count(1))
+    aside = next(name for name in names if not is_there(name))
+    try:
+        path.rename(aside)
+    except OSError as error:
+        raise LogError(f"log {path} of a start that failed can't become {aside.name}: {error.strerror}") from None
+
+
+def is_taken(path: Path) -> bool:
+    """Tell whether anything, a dangling link included, is where a log or one of its parts would be.
+
+    Raises LogExistsError when a folder on the way to it is none, LogError.
+    """
+    try:
+        return is_there(path) or bool(find_parts(path))
+    except FileNotFoundError:
+        return False
+    except NotADirectoryError:  # something else is where its folder would be
+        raise LogExistsError(f"log {path} can't be created: Not a directory") from None
+    except OSError as error:
+        raise LogError(f"log {path} can't be created: {error.strerror}") from None
+
+
+def is_there(path: Path) -> bool:
+    """Tell whether there is anything of that name, a dangling link included."""
+    return path.is_symlink() or path.exists()
+
+
+def _refusal(path: Path) -> LogExistsError:
+    found = path if is_there(path) else next(iter(find_parts(path).values()))
+    kind = "" if found.is_file() and not found.is_symlink() else ", which is no regular file"
+    return LogExistsError(f"{found} is there already{kind}; choose another folder with --out, or move it away")
+
+
+def _is_failed_start(path: Path) -> bool:
+    """Tell whether a log has nothing, or, ended as it should, no cycle.
+
+    Raises LogExistsError for one that is being written.
+    """
+    try:
+        check_unused(path)
+    except InUseError as error:
+        raise LogExistsError(f"{error}; choose another folder with --out") from None
+    if path.is_symlink() or not path.is_file() or list(find_parts(path)) != [0]:
+        return False
+    from adacd_hil.log.editing.log_info import read_info  # only where there is something to look at
+
+    try:
+        info = read_info(path)
+    except LogError:
+        return False
+    has_no_cycle = info.ending == "closed" and not info.cycles
+    return bool(info.metadata) and not info.problems and (has_no_cycle or not info.messages)

@@ -1,0 +1,300 @@
+"""The writer process: packets from a ring in, the files of one log out. Run by `Recorder`, never by hand.
+
+It shares nothing with the control process but the ring and a socket for words: neither its CAN sockets nor its
+scheduling, nor its session, so that Ctrl-C reaches only the control process. It ends the log when it is told to or when
+the control process dies, after it has taken what that left in the ring.
+
+Packets are gathered and written many at a time, at the latest when a chunk has to end: see packet_writer.py. While
+somebody watches the live view that is more often.
+
+In lockstep the files depend on the packets only, bit for bit; so chunks end by log time there, and nothing is lost but
+to a full disk. Otherwise they end by the clock, so that silence doesn't keep data from the disk; and a disk that is too
+slow or full costs packets, which are counted, while the ring is emptied as ever. A full disk is tried again with
+another part.
+"""
+
+import contextlib
+import json
+import os
+import socket
+import struct
+import sys
+
+import numpy as np
+
+from adacd_hil.clock import Clock, MonotonicClock
+from adacd_hil.log.log_files import CONTINUED, ENDING_KEY, PART_KEY, LogError, part_path
+from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS
+from adacd_hil.log.recording import packet, processes
+from adacd_hil.log.recording.log_file import McapFile, Sink
+from adacd_hil.log.recording.packet_writer import Numbers, PacketWriter, Rows
+from adacd_hil.log.recording.processes import WriterSetup
+from adacd_hil.log.recording.ring import RingReader, split
+from adacd_hil.log.recording.run_folder import is_there
+from adacd_hil.log.types.topics import run_channels, truth_channels
+from adacd_hil.log.viewer.feed import LiveFeed
+
+POLL_PERIOD_US = 25_000
+"""How often the ring is looked into in real time. To be woken would cost the control process more than the packet does;
+to look costs the writer as much as to write two cycles."""
+RETRY_PERIOD_NS = 5_000_000_000
+"""How long a disk that failed is left alone."""
+SHOW_PERIOD_NS = 45_000_000
+"""How often packets are written while somebody watches in real time: at every second look into the ring. At every one
+the writer would take 10 % of a processor instead of 6 %."""
+BATCH_BYTES = 256 * 1024
+"""Packets that are gathered at most, about 400 cycles: more would be no cheaper, each."""
+
+
+class WriterProcess:
+    """The loop around a PacketWriter."""
+
+    def __init__(
+        self, connection: socket.socket, ring: RingReader, sink: Sink, setup: WriterSetup, clock: Clock | None = None
+    ) -> None:
+        messages = setup.messages
+        counts = setup.further_count, setup.channel_count
+        channels = run_channels(setup.parameter_count, messages, *counts)
+        self._channels = truth_channels() if setup.is_truth else channels
+        self._connection = connection
+        self._ring = ring
+        self._sink = sink
+        self._setup = setup
+        self._part = 0
+        self._parts = 1
+        self._file = self._begin_file()
+        self._clock = clock or MonotonicClock()
+        self.live = self._open_live() if setup.live else None
+        watch = self.live.show if self.live else None
+        self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count, watch)
+        self._gathered: list[bytes] = []
+        self._gathered_bytes = 0
+        self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
+        self._shown_ns = self._flushed_ns
+        self._failed_ns: int | None = None  # when the disk was seen to fail, or was last tried
+        self._part_ns: tuple[int, int] | None = None  # t_ns of the first and the last packet of the part
+        self._lost = 0  # packets that were taken but are in no file
+        self._frames = self._messages = self._dropped = 0  # of the parts before
+        if not setup.is_blocking:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
+
+    def _open_live(self) -> LiveFeed:
+        start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())
+        return LiveFeed(self._setup, self._file.ids, start_ns)
+
+    def run(self) -> None:
+        """Write until the end, then answer with the last word."""
+        while True:
+            word = self._hear()
+            if word == processes.ROOM:
+                self._take_some()
+                _send(self._connection, processes.ROOM)  # before the rest, so that both sides work at once
+            self._take()
+            if word in (processes.END, processes.NOTHING):
+                break
+        self._write()
+        self._end(self._finish("closed" if word == processes.END else "control process died"))
+
+    def _end(self, summary: dict[str, str]) -> None:
+        """Close the last file and say how it went."""
+        self._sink.close()
+        path = part_path(self._setup.path, self._part)
+        if self._part and self._sink.error and self._sink.path == path and not self._has_chunks:
+            with contextlib.suppress(OSError):
+                path.unlink()
+        lost = self._lost + self._sink.take_lost()
+        last = {"parts": str(self._parts), "lost": str(lost), "error": self._sink.first_error}
+        _send(self._connection, json.dumps({**summary, **last}).encode())
+        if self.live is not None:
+            self.live.close()
+
+    def _hear(self) -> bytes | None:
+        """Receive a word, NOTHING when the control process is dead; None when there is none for a while."""
+        try:
+            return self._connection.recv(processes.MOST_BYTES)
+        except BlockingIOError:
+            return None
+        except ConnectionResetError:
+            return processes.NOTHING
+
+    def _take(self) -> None:
+        """Take all that waits in the ring; in real time, flush by the clock."""
+        while True:
+            self._take_some()
+            if self._gathered_bytes >= BATCH_BYTES or (self._setup.is_blocking and self._is_watched):
+                self._write()
+            if not self._setup.is_blocking:
+                self._look_at_clock()
+            if not self._ring.waiting:
+                return
+
+    def _take_some(self) -> None:
+        if data := self._ring.take(BATCH_BYTES):
+            self._gathered.append(data)
+            self._gathered_bytes += len(data)
+
+    def _look_at_clock(self) -> None:
+        """Flush or show if it is time, and see to a disk that has failed."""
+        now_ns = self._clock.now_ns()
+        if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
+            self._write()
+            self._flush(now_ns)
+            self._look_at_disk(now_ns)
+        elif self._is_watched and now_ns - self._shown_ns >= SHOW_PERIOD_NS:
+            self._shown_ns = now_ns
+            self._write()
+
+    @property
+    def _is_watched(self) -> bool:
+        return self.live is not None and self.live.is_watched
+
+    def _look_at_disk(self, now_ns: int) -> None:
+        """Begin another part where the disk has failed some time ago."""
+        if not self._sink.error:
+            self._failed_ns = None
+        elif self._failed_ns is None:
+            self._failed_ns = now_ns
+        elif now_ns - self._failed_ns >= RETRY_PERIOD_NS:
+            self._failed_ns = now_ns
+            self._begin_part(is_next=self._has_chunks)
+
+    @property
+    def _has_chunks(self) -> bool:
+        """Whether a chunk of the part is on the disk."""
+        return self._sink.written > self._file.head_bytes
+
+    def _flush(self, now_ns: int) -> None:
+        """End the chunk in progress, and the part where it is time."""
+        self._file.flush()
+        self._flushed_ns = now_ns
+        if self._is_part_full() and not self._sink.error and not self._sink.is_behind:
+            self._finish(CONTINUED)
+            self._begin_part(is_next=True)
+
+    def _is_part_full(self) -> bool:
+        if self._part_ns is None:
+            return False
+        first_ns, last_ns = self._part_ns
+        part_bytes, part_ns = self._setup.part_bytes, self._setup.part_ns
+        return 0 < part_bytes <= self._file.record_bytes or 0 < part_ns <= last_ns - first_ns
+
+    def _begin_part(self, is_next: bool) -> None:
+        """Begin the next part, or the present one again; names that somebody else has taken are passed over."""
+        self._part += is_next
+        self._parts += is_next
+        while self._sink.path != (path := part_path(self._setup.path, self._part)) and is_there(path):
+            self._part += 1
+        self._frames += self._packets.frames
+        self._messages += self._file.messages
+        self._packets.frames = 0
+        self._part_ns = None
+        self._sink.begin(path)
+        self._file = self._begin_file()
+        self._packets.begin(self._file)
+
+    def _begin_file(self) -> McapFile:
+        setup = self._setup
+        metadata = {**setup.metadata, PART_KEY: str(self._part)}
+        return McapFile(self._sink, self._channels, setup.attachments, metadata)
+
+    def _finish(self, ending: str) -> dict[str, str]:
+        """End the part in progress; return the summary of all parts so far."""
+        self._note_lost()
+        dropped = self._ring.dropped if ending != CONTINUED else self._packets.dropped
+        dropped += self._lost
+        summary = {
+            "frames": str(self._packets.frames),
+            "messages": str(self._file.messages),
+            "dropped": str(dropped - self._dropped),
+            ENDING_KEY: ending,
+        }
+        self._dropped = dropped
+        self._file.finish(summary)
+        return {
+            "frames": str(self._frames + self._packets.frames),
+            "messages": str(self._messages + self._file.messages),
+        }
+
+    def _write(self) -> None:
+        """Write what has been gathered, in lockstep with an end of the chunk where its log time says so."""
+        data = b"".join(self._gathered)
+        starts, sizes = split(data)
+        self._gathered = []
+        self._gathered_bytes = 0
+        if not len(starts):
+            return
+        if self._sink.error or (not self._setup.is_blocking and self._sink.is_behind):
+            self._lose(len(starts))
+            return
+        self._note_lost()
+        block = np.frombuffer(data + bytes(packet.ROOM), np.uint8)
+        is_whole = packet.is_whole(block, starts, sizes)
+        self._lost += int(np.count_nonzero(~is_whole))
+        starts, sizes = starts[is_whole], sizes[is_whole]
+        times_ns = packet.times_ns(block, starts)
+        if self._setup.is_blocking:
+            self._write_by_log_time(block, starts, sizes, times_ns)
+        else:
+            self._write_packets(block, starts, sizes, times_ns)
+
+    def _write_by_log_time(self, block: Rows, starts: Numbers, sizes: Numbers, times_ns: Numbers) -> None:
+        first = 0
+        while first < len(starts):
+            is_due = times_ns[first:] - self._flushed_ns >= FLUSH_PERIOD_NS
+            if is_due[0]:
+                self._flush(int(times_ns[first]))
+                is_due[0] = False
+            stop = first + int(np.argmax(is_due)) if is_due.any() else len(starts)
+            self._write_packets(block, starts[first:stop], sizes[first:stop], times_ns[first:stop])
+            first = stop
+
+    def _write_packets(self, block: Rows, starts: Numbers, sizes: Numbers, times_ns: Numbers) -> None:
+        if not len(starts):
+            return
+        first_ns = int(times_ns[0]) if self._part_ns is None else self._part_ns[0]
+        self._part_ns = first_ns, int(times_ns[-1])
+        self._lost += self._packets.write(block, starts, sizes)
+
+    def _note_lost(self) -> None:
+        """Take in what the sink has swallowed."""
+        self._lose(self._sink.take_lost())
+
+    def _lose(self, count: int) -> None:
+        self._lost += count
+        self._packets.lose(count)
+
+
+def _send(connection: socket.socket, word: bytes) -> None:
+    with contextlib.suppress(OSError):  # nobody is left to hear it
+        connection.send(word)
+
+
+def _schedule_plainly() -> None:
+    """Leave the real-time class that the control process may have passed on."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> None:
+    """Write a log: say when ready, take packets until the end, say how it went."""
+    _schedule_plainly()
+    connection = socket.socket(fileno=socket_descriptor)
+    error = url = ""
+    try:
+        setup = WriterSetup.from_json(sys.stdin.buffer.read())
+        ring = RingReader(ring_descriptor)
+        os.dup(file_descriptor)  # never closed: the lock of the first part lasts as long as this process
+        sink = Sink(file_descriptor, setup.path, waits=setup.is_blocking, on_written=ring.count_written)
+        process = WriterProcess(connection, ring, sink, setup)
+        sink.settle()
+        error = sink.error
+        url = process.live.url if process.live else ""
+    except (LogError, OSError, ValueError) as reason:
+        error = " ".join(str(reason).split())
+    _send(connection, json.dumps({"error": error, "live_url": url}).encode())
+    if not error:
+        process.run()
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,166 @@
+"""The arm as a URDF of two links and a tip, made from the settings: for viewers, and for physics engines.
+
+Frames: `base` stands still, `link1` and `link2` begin at their joints with x along the link, `tip` is at the end. Joint
+axes are z. Where gravity acts on the joints the plane of motion is upright: `world` carries `base` with y up.
+
+Masses and friction are those of the CAD model, `arm.cad_theta`, without payload. It knows inertia about the joint axes
+only; about the link's own axis it is that of a bar of LINK_WIDTH_M. Without a CAD model the links have no inertia, and
+a comment says so: an engine then refuses the file, a viewer doesn't mind.
+
+The parameters of eq. (17) are lumped, in the frame of `records.PARAMETER_NAMES`; two rigid links that move so:
+
+    a1 - a3 = I1 + m1 c1² + m2 l1²     a2 = l1 m2 c2     a3 = I2 + m2 c2²     a4 = g (m1 c1 + m2 l1)     a5 = g m2 c2
+
+m mass kg, c place of the centre of mass along the link m, I inertia about it kg m², l length m. Every distribution of
+masses that fits is as right as any other: torque and motion are the same. Link 2's centre of mass must lie within
+l1 a2 / (a1 - a3) < c2 < l1 a3 / a2, or an inertia is negative; the geometric mean of both is taken. Link 1 is a uniform
+rod, unless gravity says where its centre of mass is.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Comment, Element, SubElement
+
+import numpy as np
+
+from adacd_hil.records import JOINT_NAMES, PARAMETER_NAMES
+from adacd_hil.settings.configuration import Settings
+
+GRAVITY_M_S2 = 9.80665
+_A1, _A2, _A3, _A4, _A5 = 0, 1, 2, 7, 8
+_ROD_C, _ROD_I = 1.0 / 2.0, 1.0 / 12.0  # of a uniform rod: place of its centre and inertia about it
+_AGREEMENT = 0.01
+"""Share by which a5 may differ from what a2 makes of it."""
+
+
+class LinkBody(NamedTuple):
+    """One link's mass in kg, its centre along the link in m, inertia about it in kg m²."""
+
+    mass_kg: float
+    center_m: float
+    inertia_kg_m2: float
+
+
+class ModelError(ValueError):
+    """Parameters that belong to no rigid links; one line."""
+
+
+def find_bodies(theta: Sequence[float], length1_m: float) -> tuple[LinkBody, LinkBody]:
+    """Find two links with these parameters (p,), 7 or 9 of them. Raises ModelError when there are none."""
+    alpha, beta, gamma = theta[_A1] - theta[_A3], theta[_A2], theta[_A3]
+    if not (gamma > 0.0 and alpha * gamma > beta * beta):
+        raise ModelError(f"a1 = {theta[_A1]:g}, a2 = {beta:g}, a3 = {gamma:g} kg m² belong to no rigid links")
+    if beta > 0.0:
+        center2_m = length1_m * math.sqrt(gamma / alpha)
+        mass2_kg = beta / (length1_m * center2_m)
+    else:
+        center2_m, mass2_kg = 0.0, 0.5 * alpha / length1_m**2
+    second = LinkBody(mass2_kg, center2_m, gamma - mass2_kg * center2_m**2)
+    left = alpha - mass2_kg * length1_m**2  # of link 1 about joint 1
+    if len(theta) <= _A5:
+        mass1_kg = left / ((_ROD_C**2 + _ROD_I) * length1_m**2)
+        return LinkBody(mass1_kg, _ROD_C * length1_m, _ROD_I * mass1_kg * length1_m**2), second
+    expected_Nm = GRAVITY_M_S2 * mass2_kg * center2_m
+    if abs(theta[_A5] - expected_Nm) > _AGREEMENT * max(expected_Nm, theta[_A5]):
+        raise ModelError(f"a5 = {theta[_A5]:g} Nm, but a2 = {beta:g} kg m² makes it {expected_Nm:g} Nm")
+    moment = theta[_A4] / GRAVITY_M_S2 - mass2_kg * length1_m
+    if moment == 0.0:
+        return LinkBody(3.0 * left / length1_m**2, 0.0, left), second
+    center1_m = math.copysign(min(_ROD_C * length1_m, 0.5 * left / abs(moment)), moment)
+    return LinkBody(moment / center1_m, center1_m, left - moment * center1_m), second
+
+
+ROBOT_NAME = "robot.urdf"
+WORLD, BASE, TIP = "world", "base", "tip"
+LINK_NAMES = ("link1", "link2")
+LINK_WIDTH_M = 0.04
+_JOINT_RADIUS_M = 0.035
+_TIP_RADIUS_M = 0.02
+_COLORS = {"link": "0.35 0.45 0.6 1", "joint": "0.25 0.27 0.3 1"}
+
+
+def robot_description(settings: Settings) -> str:
+    """Write the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction."""
+    arm = settings.arm
+    robot = Element("robot", name="adacd")
+    bodies: tuple[LinkBody, ...] = ()
+    try:
+        bodies = find_bodies(arm.cad_theta, arm.link_length_m[0]) if arm.cad_theta else ()
+        reason = "arm.cad_theta is not given"
+    except ModelError as error:
+        reason = f"arm.cad_theta: {error}"
+    if not bodies:
+        robot.append(Comment(f" no inertia: {reason} "))
+    for color, rgba in _COLORS.items():
+        SubElement(SubElement(robot, "material", name=color), "color", rgba=rgba)
+    SubElement(robot, "link", name=WORLD)
+    _add_joint(robot, "mount", "fixed", WORLD, BASE, roll_rad=mount_roll_rad(settings.estimator.gravity))
+    base = SubElement(robot, "link", name=BASE)
+    _add_shape(base, "joint", "cylinder", radius=_JOINT_RADIUS_M, length=2.0 * LINK_WIDTH_M)
+    reach_m = 0.0
+    parent = BASE
+    for index, (joint_name, link_name) in enumerate(zip(JOINT_NAMES, LINK_NAMES, strict=True)):
+        joint = _add_joint(robot, joint_name, "revolute", parent, link_name, x_m=reach_m)
+        SubElement(joint, "axis", xyz="0 0 1")
+        limit_rad = float(arm.position_limit_rad[index])
+        SubElement(
+            joint,
+            "limit",
+            lower=_text(-limit_rad),
+            upper=_text(limit_rad),
+            velocity=_text(arm.velocity_limit_rad_s[index]),
+            effort=_text(arm.torque_limit_Nm[index]),
+        )
+        if bodies:
+            viscous, coulomb = (arm.cad_theta[PARAMETER_NAMES.index(f"{name}{index + 1}")] for name in ("F_v", "F_c"))
+            SubElement(joint, "dynamics", damping=_text(viscous), friction=_text(coulomb))
+        reach_m, parent = arm.link_length_m[index], link_name
+        link = SubElement(robot, "link", name=link_name)
+        if bodies:
+            _add_inertia(link, bodies[index])
+        size = f"{_text(reach_m)} {_text(LINK_WIDTH_M)} {_text(LINK_WIDTH_M)}"
+        _add_shape(link, "link", "box", x_m=0.5 * reach_m, size=size)
+        _add_shape(link, "joint", "cylinder", radius=_JOINT_RADIUS_M, length=1.5 * LINK_WIDTH_M)
+    _add_joint(robot, "tip_mount", "fixed", parent, TIP, x_m=reach_m)
+    _add_shape(SubElement(robot, "link", name=TIP), "joint", "sphere", radius=_TIP_RADIUS_M)
+    ElementTree.indent(robot)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def mount_roll_rad(is_upright: bool) -> float:
+    """Return how far `base` is turned about the x axis of `world`."""
+    return 0.5 * math.pi if is_upright else 0.0
+
+
+def _add_joint(
+    robot: Element, name: str, kind: str, parent: str, child: str, x_m: float = 0.0, roll_rad: float = 0.0
+) -> Element:
+    joint = SubElement(robot, "joint", name=name, type=kind)
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)
+    SubElement(joint, "origin", xyz=f"{_text(x_m)} 0 0", rpy=f"{_text(roll_rad)} 0 0")
+    return joint
+
+
+def _add_inertia(link: Element, body: LinkBody) -> None:
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "origin", xyz=f"{_text(body.center_m)} 0 0", rpy="0 0 0")
+    SubElement(inertial, "mass", value=_text(body.mass_kg))
+    across = body.inertia_kg_m2
+    along = min(across, body.mass_kg * LINK_WIDTH_M**2 / 6.0)  # any more would be more than a rigid body can have
+    moments = {"ixx": along, "iyy": across, "izz": across}
+    SubElement(inertial, "inertia", {"ixy": "0", "ixz": "0", "iyz": "0"} | {k: _text(v) for k, v in moments.items()})
+
+
+def _add_shape(link: Element, color: str, shape: str, x_m: float = 0.0, **sizes: float | str) -> None:
+    visual = SubElement(link, "visual")
+    SubElement(visual, "origin", xyz=f"{_text(x_m)} 0 0", rpy="0 0 0")
+    SubElement(SubElement(visual, "geometry"), shape, {key: str(value) for key, value in sizes.items()})
+    SubElement(visual, "material", name=color)
+
+
+def _text(value: float | np.floating) -> str:
+    """Write a number so that it is read back the same."""
+    return repr(float(value))
