@@ -23,19 +23,16 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+import attack_vcan
+from attacked_run import Finding, play_attack
+from attacks import ATTACKS, find_attack
+from campaign_loop import add_jobs, play_trials
 
-import attack_vcan  # noqa: E402
-from attacked_run import Finding, play_attack  # noqa: E402
-from attacks import ATTACKS, find_attack  # noqa: E402
-
-from adacd_hil.cli.table import format_table  # noqa: E402
+from adacd_hil.cli.table import format_table
 
 NOTHING = "nothing"
 """The run without an attacker, for comparison."""
@@ -58,18 +55,15 @@ def _run(job: tuple[str, Path | None]) -> Finding:
 def play_virtual(names: Sequence[str], jobs: int, keep: Path | None) -> Iterator[Finding]:
     """Play attacks in virtual time, in order."""
     work = [(name, keep) for name in names]
-    if jobs == 1:
-        yield from map(_run, work)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_run, work)
+    yield from play_trials(_run, work, jobs, lambda found: f"{found.name}: {found.verdict}")
 
 
 def play_vcan(names: Sequence[str], channel: str, period_us: int, keep: Path | None) -> Iterator[Finding]:
     """Play attacks on an interface, one after the other."""
     with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            yield attack_vcan.play_on_vcan(name, channel, period_us, Path(folder) if keep is None else keep)
+        place = Path(folder) if keep is None else keep
+        one = partial(attack_vcan.play_on_vcan, channel=channel, period_us=period_us, folder=place)
+        yield from play_trials(one, names, 1, lambda found: f"{found.name}: {found.verdict}")
 
 
 def as_table(findings: Sequence[Finding]) -> str:
@@ -98,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(prog="attack_campaign", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("words", nargs="*", help="play only attacks whose names have one of these words")
-    parser.add_argument("-j", "--jobs", type=int, default=2, help="processes, in virtual time; default %(default)s")
+    add_jobs(parser)
     parser.add_argument("--keep", type=Path, help="folder that keeps the logs")
     parser.add_argument("--vcan", metavar="NAME", nargs="?", const="vcan0", help="on this interface; default vcan0")
     parser.add_argument("--period-us", type=int, default=2000, help="cycle with --vcan; default %(default)s")
@@ -106,20 +100,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(argv)
     everything = attack_vcan.names() if chosen.vcan else virtual_names()
     names = [name for name in everything if not chosen.words or any(word in name for word in chosen.words)]
-    if not names or chosen.jobs < 1:
-        parser.error("no attack has such a name" if not names else f"--jobs {chosen.jobs} is below 1")
+    if not names:
+        parser.error("no attack has such a name")
     if chosen.vcan and not Path("/sys/class/net", chosen.vcan).exists():
         print(f"attack_campaign: there is no interface {chosen.vcan}; run it by tools/with-vcan", file=sys.stderr)
         return BUS_MISSING
-    findings = []
-    played = (
-        play_vcan(names, chosen.vcan, chosen.period_us, chosen.keep)
-        if chosen.vcan
-        else play_virtual(names, chosen.jobs, chosen.keep)
-    )
-    for found in played:
-        findings.append(found)
-        print(f"{len(findings)} of {len(names)}: {found.name}: {found.verdict}", file=sys.stderr)
+    if chosen.vcan:
+        findings = list(play_vcan(names, chosen.vcan, chosen.period_us, chosen.keep))
+    else:
+        findings = list(play_virtual(names, chosen.jobs, chosen.keep))
     if chosen.json:
         print(json.dumps([asdict(found) for found in findings], indent=1))
     else:

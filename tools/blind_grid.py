@@ -21,26 +21,22 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
+import numpy as np
+from campaign_loop import add_jobs, play_trials
+from random_run import CONFIGURATION, quick_paper
+from run_rules import Case, judge
+from witnessed_run import Played, play_witnessed
 
-import numpy as np  # noqa: E402
-from random_run import CONFIGURATION, quick_paper  # noqa: E402
-from run_rules import Case, judge  # noqa: E402
-from witnessed_run import Played, play_witnessed  # noqa: E402
-
-from adacd_hil.cli.table import format_table  # noqa: E402
-from adacd_hil.records import SchemeState  # noqa: E402
-from adacd_hil.settings.configuration import Settings, load_settings  # noqa: E402
-from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings  # noqa: E402
-from adacd_hil.settings.schema import parse  # noqa: E402
-from firmware_sim.scenario.scenario import Scenario  # noqa: E402
+from adacd_hil.cli.table import format_table
+from adacd_hil.records import SchemeState
+from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.schema import parse
+from firmware_sim.scenario.scenario import Scenario
 
 PLACES = (
     ("feedback", "drive1"), ("feedback", "drive2"), ("torque", "sensor1"), ("torque", "sensor2"),
@@ -230,11 +226,7 @@ def _run(job: tuple[Row, Times, Path | None]) -> Outcome:
 def play_rows(rows: Sequence[Row], times: Times, jobs: int, keep: Path | None) -> Iterator[Outcome]:
     """Play rows, in order."""
     work = [(row, times, None if keep is None else keep / f"{index:04}") for index, row in enumerate(rows)]
-    if jobs == 1 or len(rows) == 1:
-        yield from map(_run, work)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_run, work)
+    yield from play_trials(_run, work, jobs)
 
 
 HEAD = (
@@ -302,13 +294,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1, help="play one row in so many; default: all")
     parser.add_argument("--offset", type=int, default=0, help="beginning with this one")
     parser.add_argument("--first", action="store_true", help="torque of sensor 1 late by 550 µs, pushes at 8 and 9.5 s")
-    parser.add_argument("-j", "--jobs", type=int, default=2, help="processes; default %(default)s")
+    add_jobs(parser)
     parser.add_argument("--keep", type=Path, help="folder that keeps the logs")
     parser.add_argument("--all", action="store_true", help="print every row, not only the bad ones")
     parser.add_argument("--json", action="store_true", help="print all rows as JSON")
     chosen = parser.parse_args(argv)
-    if min(chosen.jobs, chosen.every) < 1 or chosen.offset < 0:
-        parser.error("--jobs and --every are 1 or more, --offset 0 or more")
+    if chosen.every < 1 or chosen.offset < 0:
+        parser.error("--every is 1 or more, --offset 0 or more")
     rows = chosen_rows(chosen)
     if not rows:
         parser.error("no row of the grid is left")
@@ -317,8 +309,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         outcomes.append(outcome)
         if outcome.is_bad:
             print(f"bad: {outcome.row}: {', '.join(outcome.pushes)}; {', '.join(outcome.rules)}", file=sys.stderr)
-        if len(outcomes) % 20 == 0:
-            print(f"{len(outcomes)} of {len(rows)} rows", file=sys.stderr)
     totals = summary(outcomes)
     if chosen.json:
         print(json.dumps({**totals, "outcomes": [asdict(outcome) for outcome in outcomes]}, indent=1))

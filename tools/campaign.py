@@ -17,11 +17,12 @@ import json
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from campaign_loop import play_trials
 
 from adacd_hil.cli.table import format_table
 from adacd_hil.settings.configuration import load_settings
@@ -52,11 +53,12 @@ class Row:
         return not self.deviations and not self.problem
 
 
-def play(name_or_file: str, config: str, seed: int | None, keep: Path | None) -> Row:
-    """Play one scenario with one configuration, its logs in a folder of `keep` or nowhere."""
+def play(task: tuple[str, str], seed: int | None, keep: Path | None) -> Row:
+    """Play one scenario, or its file, with one configuration, its logs in a folder of `keep` or nowhere."""
     from adacd_hil.cli.commands.demo_command import resolve, run_embedded
     from adacd_hil.cli.run_outcome import outcome_of
 
+    name_or_file, config = task
     scenario = load_scenario(name_or_file)
     expect = scenario.expected_of(load_settings(config).scheme)
     expected = expect.text if expect else "–"
@@ -105,6 +107,12 @@ def as_text(rows: Sequence[Row]) -> str:
     return "\n".join([*lines, f"{sum(row.is_good for row in rows)} of {len(rows)} as expected"])
 
 
+def progress_line(row: Row) -> str:
+    """Say of one run whether it came as expected, and what did not."""
+    state = "as expected" if row.is_good else "; ".join((*row.deviations, row.problem)).strip("; ")
+    return f"{row.name}, {row.config}: {state}"
+
+
 def main() -> int:
     """Play what was asked for."""
     parser = argparse.ArgumentParser(description="Plays scenarios and compares them with what they expect.")
@@ -130,15 +138,8 @@ def main() -> int:
         print("campaign: no scenario fits, or no process to play it in", file=sys.stderr)
         return 2
     tasks = [(name, config) for config in configs for name in names]
-    rows: dict[tuple[str, str], Row] = {}
-    # Spawned: what is compiled and logged here is nobody else's.
-    with ProcessPoolExecutor(min(options.jobs, len(tasks)), mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(play, *task, options.seed, options.keep): task for task in tasks}
-        for future in as_completed(futures):
-            row = rows[futures[future]] = future.result()
-            state = "as expected" if row.is_good else "; ".join((*row.deviations, row.problem)).strip("; ")
-            print(f"{len(rows)}/{len(tasks)} {row.name}, {row.config}: {state}", file=sys.stderr, flush=True)
-    played = [rows[task] for task in tasks]
+    one = partial(play, seed=options.seed, keep=options.keep)
+    played = list(play_trials(one, tasks, options.jobs, progress_line))
     if options.as_json:
         print(json.dumps([vars(row) | {"is_good": row.is_good} for row in played], indent=2))
     else:

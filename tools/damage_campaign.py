@@ -21,22 +21,20 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from campaign_loop import add_jobs, play_trials
+from damage_trials import DamageResult, Undamaged, make_undamaged, run_trial
+from kill_trials import LOSS_BOUND_S, KillResult, kill_trial
+from side_by_side import CHANNEL
+from vcan_kills import VcanKill, kill_on_vcan
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
-
-from damage_trials import DamageResult, Undamaged, make_undamaged, run_trial  # noqa: E402
-from kill_trials import LOSS_BOUND_S, KillResult, kill_trial  # noqa: E402
-from side_by_side import CHANNEL  # noqa: E402
-from vcan_kills import VcanKill, kill_on_vcan  # noqa: E402
-
-REPORT_EVERY = 100
+ResultT = TypeVar("ResultT", DamageResult, KillResult, VcanKill)
 
 
 def damaged_logs(count: int, seed: int, jobs: int, folder: Path) -> list[DamageResult]:
@@ -44,48 +42,50 @@ def damaged_logs(count: int, seed: int, jobs: int, folder: Path) -> list[DamageR
     if not count:
         return []
     whole = make_undamaged(folder)
-    results = []
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(_trial, whole, seed + index, folder / str(index)) for index in range(count)]
-        for future in futures:
-            results.append(future.result())
-            _tell_violations(results[-1].seed, results[-1].violations)
-            if len(results) % REPORT_EVERY == 0:
-                print(f"{len(results)} of {count} damaged logs", file=sys.stderr)
-    return results
+    return _judged(play_trials(partial(_damage, whole=whole, folder=folder), range(seed, seed + count), jobs))
 
 
-def _trial(whole: Undamaged, seed: int, folder: Path) -> DamageResult:
-    return run_trial(whole, seed, folder)
+def _damage(seed: int, whole: Undamaged, folder: Path) -> DamageResult:
+    return run_trial(whole, seed, folder / str(seed))
 
 
 def killed_runs(count: int, seed: int, folder: Path) -> list[KillResult]:
     """Kill `count` runs."""
-    results = []
-    for index in range(count):
-        result = kill_trial(seed + index, folder / f"kill{index}")
-        results.append(result)
-        _tell_violations(result.seed, result.violations)
-        line = f"{result.victim} killed after {result.cycles} cycles, lost {result.lost_s:.3f} s"
-        print(f"{index + 1} of {count} killed runs: {line}", file=sys.stderr)
-    return results
+    one = partial(_kill, folder=folder)
+    return _judged(
+        play_trials(
+            one,
+            range(seed, seed + count),
+            1,
+            lambda run: f"{run.victim} killed after {run.cycles} cycles, lost {run.lost_s:.3f} s",
+        )
+    )
 
 
-def _tell_violations(seed: int, violations: Sequence[str]) -> None:
-    for violation in violations:
-        print(f"seed {seed}: {violation}", file=sys.stderr)
+def _kill(seed: int, folder: Path) -> KillResult:
+    return kill_trial(seed, folder / f"kill{seed}")
+
+
+def _judged(results: Iterable[ResultT]) -> list[ResultT]:
+    """Collect results; violations are printed as they come."""
+    found = []
+    for result in results:
+        found.append(result)
+        for violation in result.violations:
+            print(f"seed {result.seed}: {violation}", file=sys.stderr)
+    return found
 
 
 def killed_on_vcan(count: int, seed: int) -> list[VcanKill]:
     """Kill somebody in `count` runs on a vcan."""
-    results = []
-    for index in range(count):
-        result = kill_on_vcan(seed + index)
-        results.append(result)
-        _tell_violations(result.seed, result.violations)
-        line = f"{result.victim} killed, {result.cycles} cycles saved, host's status {result.status}"
-        print(f"{index + 1} of {count} on vcan: {line}", file=sys.stderr)
-    return results
+    return _judged(
+        play_trials(
+            kill_on_vcan,
+            range(seed, seed + count),
+            1,
+            lambda run: f"{run.victim} killed, {run.cycles} cycles saved, host's status {run.status}",
+        )
+    )
 
 
 def summary(logs: Sequence[DamageResult], kills: Sequence[KillResult], vcan: Sequence[VcanKill]) -> dict[str, Any]:
@@ -114,11 +114,11 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=20, help="runs to kill, one at a time")
     parser.add_argument("--vcan-kills", type=int, default=0, help="the same with processes on a vcan")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("-j", "--jobs", type=int, default=2, help="processes that damage logs")
+    add_jobs(parser)
     parser.add_argument("--json", action="store_true", help="print every trial")
     arguments = parser.parse_args()
-    if min(arguments.logs, arguments.kills, arguments.vcan_kills, arguments.seed) < 0 or arguments.jobs < 1:
-        parser.error("counts and seed are 0 or more, jobs 1 or more")
+    if min(arguments.logs, arguments.kills, arguments.vcan_kills, arguments.seed) < 0:
+        parser.error("counts and seed are 0 or more")
     if arguments.vcan_kills and not Path("/sys/class/net", CHANNEL).exists():
         launcher = [ROOT / "tools" / "with-vcan", "--can", CHANNEL, "--", sys.executable, __file__, *sys.argv[1:]]
         return subprocess.run(launcher, check=False).returncode

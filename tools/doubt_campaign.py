@@ -11,19 +11,16 @@ one is not, 2 wrong usage.
 """
 
 import argparse
-import os
 import re
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from property_campaign import parse_seeds
+from campaign_loop import Figure, add_jobs, add_seeds, exit_status, play_trials, print_figures
 from touch_trials import PERIOD_S, HandLoop
 
-from adacd_hil.cli.table import format_table
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.identify.belief import payload_direction
 
@@ -129,8 +126,8 @@ def _touches(armed: Armed) -> Iterator[str]:
             return
 
 
-def payload_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
-    """Return name, value, bound of each figure, and whether it is within."""
+def payload_figures(rows: list[Played]) -> list[Figure]:
+    """Return the figures of payloads that nobody announced."""
     found = []
     for size in sorted({row.size for row in rows}):
         mine = [row for row in rows if row.size == size]
@@ -141,7 +138,7 @@ def payload_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
         percentile = float(np.percentile(contacts, 95.0, method="higher"))
         is_met = len(named) == len(mine) and near >= share * len(mine) and (not most or percentile <= most)
         found.append(
-            (
+            Figure(
                 f"{size:g} kg: named, within 10 %, contacts median / 95 % / worst",
                 f"{len(named)}, {near} of {len(mine)}, {np.median(contacts):g} / {percentile:g} / {max(contacts)}",
                 f"all, {share:.0%}, 5" if most else "all",
@@ -151,8 +148,8 @@ def payload_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
     return found
 
 
-def wrong_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
-    """Return name, value, bound of each figure, and whether it is within."""
+def wrong_figures(rows: list[Played]) -> list[Figure]:
+    """Return the figures of certificates that have become wrong."""
     found = []
     for what in sorted({row.what for row in rows}):
         mine = [row for row in rows if row.what == what]
@@ -162,20 +159,21 @@ def wrong_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
         soon = sum(row.contacts <= WITHIN_CONTACTS for row in revoked)
         quiet = max((row.size for row in mine if not row.contacts), default=0.0)
         text = f"{len(revoked)}, {told}, {len(seen)} of {len(mine)}; without a contact up to {quiet:.2f}"
-        found.append((f"{what}: taken back, said, met by a contact", text, "each that is met", told == len(seen)))
+        is_met = told == len(seen)
+        found.append(Figure(f"{what}: taken back, said, met by a contact", text, "each that is met", is_met))
         slowest_s = max((row.after_s for row in revoked), default=0.0)
         text = f"{soon} of {len(revoked)} within {WITHIN_CONTACTS}, the slowest after {slowest_s:.1f} s"
-        found.append((f"{what}: contacts until it is taken back", text, "", True))
+        found.append(Figure(f"{what}: contacts until it is taken back", text))
     return found
 
 
-def touches_figures(rows: list[Played]) -> list[tuple[str, str, str, bool]]:
-    """Return name, value, bound of each figure, and whether it is within."""
+def touches_figures(rows: list[Played]) -> list[Figure]:
+    """Return the figures of touches."""
     contacts = sum(row.contacts for row in rows)
     named, lost = sum(row.named > 0.0 for row in rows), sum(bool(row.said) for row in rows)
     return [
-        ("sequences that were named as an error", f"{named} of {len(rows)}", "1 %", named <= 0.01 * len(rows)),
-        ("sequences that took the certificate back", f"{lost} of {len(rows)}, {contacts} contacts", "", True),
+        Figure("sequences that were named as an error", f"{named} of {len(rows)}", "1 %", named <= 0.01 * len(rows)),
+        Figure("sequences that took the certificate back", f"{lost} of {len(rows)}, {contacts} contacts"),
     ]
 
 
@@ -186,23 +184,17 @@ def main() -> int:
     """Play the seeds that were asked for."""
     parser = argparse.ArgumentParser(description="What contacts have in common, played.")
     parser.add_argument("part", choices=list(FIGURES))
-    parser.add_argument("--seeds", type=parse_seeds, default=range(60), help="A:B, B excluded, or one; default 0:60")
-    parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
+    add_seeds(parser, 60)
+    add_jobs(parser)
     parser.add_argument("--list", action="store_true", help="print what was said of each arm")
     options = parser.parse_args()
-    rows = []
-    with ProcessPoolExecutor(options.jobs) as pool:
-        for row in pool.map(partial(play, part=options.part), options.seeds):
-            rows.append(row)
-            if len(rows) % 20 == 0:
-                print(f"{len(rows)}/{len(options.seeds)}", file=sys.stderr, flush=True)
+    rows = list(play_trials(partial(play, part=options.part), options.seeds, options.jobs))
     if options.list:
         for row in rows:
             print(f"{row.seed} {row.what} {row.size:.3g}: {row.contacts} contacts, {row.after_s:.1f} s: {row.said}")
     figures = FIGURES[options.part](rows)
-    table = [[name, value, bound, "" if is_met else "not met"] for name, value, bound, is_met in figures]
-    print(format_table(("figure", "measured", "bound", ""), table))
-    return 0 if all(row[3] for row in figures) else 1
+    print_figures(figures)
+    return exit_status(figures)
 
 
 if __name__ == "__main__":

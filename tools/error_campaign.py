@@ -13,15 +13,14 @@ usage.
 import argparse
 import fnmatch
 import json
-import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 
 import numpy as np
 from campaign_certified import CertifiedScheme
+from campaign_loop import add_jobs, play_trials
 from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record, still
 from numpy.typing import NDArray
 
@@ -287,7 +286,7 @@ def main() -> int:
     parser.add_argument("--seeds", default="1", metavar="NUMBERS")
     parser.add_argument("--minutes", type=float, default=3.0, help="of random motion; default 3")
     parser.add_argument("--position-torque", type=float, default=0.0, metavar="NM", help="arm.position_torque_Nm")
-    parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
+    add_jobs(parser)
     parser.add_argument("--json", action="store_true", help="print each arm as JSON")
     options = parser.parse_args()
     patterns = options.only.split(",")
@@ -296,12 +295,8 @@ def main() -> int:
         parser.error(f"--only {options.only!r} fits none of {', '.join(ERRORS)}")
     lists = options.profiles.split(","), errors, options.kg.split(","), options.seeds.split(",")
     cases = [Case(profile, error, float(kg), int(seed)) for profile, error, kg, seed in product(*lists)]
-    rows = []
-    played_by = partial(play, minutes=options.minutes, position_torque_Nm=options.position_torque)
-    with ProcessPoolExecutor(options.jobs) as pool:
-        for played in pool.map(played_by, cases):
-            rows.append(played)
-            print(f"{len(rows)}/{len(cases)}", file=sys.stderr, flush=True)
+    one = partial(play, minutes=options.minutes, position_torque_Nm=options.position_torque)
+    rows = list(play_trials(one, cases, options.jobs, lambda played: f"{played.case.profile} {played.case.error}"))
     print(json.dumps([asdict(row) for row in rows]) if options.json else format_table(HEAD, map(row_of, rows)))
     return 0
 

@@ -11,18 +11,16 @@ second each, after compiling.
 
 import argparse
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
+from campaign_loop import add_jobs, play_trials  # noqa: E402
 from fault_rig import Outcome, deviations, play  # noqa: E402 (they are the tests')
 from fault_table import CASES, CLOCKS, Case, Expected  # noqa: E402
 
@@ -127,25 +125,25 @@ def table(results: Sequence[Result]) -> list[str]:
     return lines
 
 
+def progress_line(result: Result) -> str:
+    """Say of one run whether it is as its row says."""
+    return f"{'DEVIATES' if result.deviations else 'ok':8}  {result.clock:8}  {result.case}"
+
+
 def main() -> int:
     """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("words", nargs="*", help="play only cases whose names have one of these words")
-    parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: all CPUs)")
+    add_jobs(parser)
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print an array of objects")
     form.add_argument("--markdown", action="store_true", help="print the table of docs/emulator/faults.md")
     arguments = parser.parse_args()
     indices = [i for i, case in enumerate(CASES) if not arguments.words or any(w in case.name for w in arguments.words)]
-    if not indices or arguments.jobs < 1:
-        parser.error("no case has such a name" if not indices else f"--jobs {arguments.jobs} is below 1")
+    if not indices:
+        parser.error("no case has such a name")
     jobs = [(index, clock) for index in indices for clock in CLOCKS]
-    results: list[Result] = []
-    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-        for result in pool.map(run, jobs):
-            results.append(result)
-            mark = "DEVIATES" if result.deviations else "ok"
-            print(f"{len(results):3} of {len(jobs)}  {mark:8}  {result.clock:8}  {result.case}", file=sys.stderr)
+    results = list(play_trials(run, jobs, arguments.jobs, progress_line))
     deviating = sum(bool(result.deviations) for result in results)
     if arguments.json:
         print(json.dumps([asdict(result) for result in results], indent=1))

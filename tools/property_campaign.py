@@ -19,23 +19,20 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
+from campaign_loop import add_jobs, add_seeds, play_trials
+from random_run import Drawn, draw_run
+from run_rules import Case, Violation, clear_contacts, judge
+from wire_record import write_candump
+from witnessed_run import Played, play_witnessed
+
+from adacd_hil.cli.table import format_table
+from adacd_hil.records import SchemeState
+
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
-
-import numpy as np  # noqa: E402
-from random_run import Drawn, draw_run  # noqa: E402
-from run_rules import Case, Violation, clear_contacts, judge  # noqa: E402
-from wire_record import write_candump  # noqa: E402
-from witnessed_run import Played, play_witnessed  # noqa: E402
-
-from adacd_hil.cli.table import format_table  # noqa: E402
-from adacd_hil.records import SchemeState  # noqa: E402
-
 LEAST_ARMED = 0.8
 """Share of the runs that must reach MONITOR; with fewer, the rules about it say little."""
 REPLAY_S = 300.0
@@ -159,11 +156,7 @@ def play_all(seeds: Sequence[int], jobs: int, keep: Path | None, replay_every: i
         (seed, None if keep is None else keep / f"seed{seed}", bool(replay_every) and index % replay_every == 0)
         for index, seed in enumerate(seeds)
     ]
-    if jobs == 1:
-        yield from map(_run, work)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_run, work)
+    yield from play_trials(_run, work, jobs)
 
 
 def summary(results: Sequence[Result]) -> dict[str, object]:
@@ -202,36 +195,24 @@ def as_table(results: Sequence[Result]) -> str:
     return format_table(["rule", "runs", "seeds", "first"], rows, right=(1,)) if rows else "nothing violated"
 
 
-def parse_seeds(text: str) -> range:
-    """Read `17` or `A:B`, B excluded."""
-    first, colon, last = text.partition(":")
-    begin = int(first)
-    end = int(last) if colon else begin + 1
-    if begin < 0 or end <= begin:
-        raise argparse.ArgumentTypeError(f"{text}: A:B with 0 <= A < B, or one number")
-    return range(begin, end)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(
         prog="property_campaign", description=(__doc__ or "").splitlines()[0], epilog="Exit status: see the head."
     )
-    parser.add_argument("--seeds", type=parse_seeds, default=range(100), help="A:B, B excluded, or one; default 0:100")
-    parser.add_argument("-j", "--jobs", type=int, default=2, help="processes; default %(default)s")
+    add_seeds(parser, 100)
+    add_jobs(parser)
     parser.add_argument("--keep", type=Path, help="folder that keeps log, wire and settings of each run")
     parser.add_argument("--replay-every", type=int, default=20, help="replay one run in so many; 0: none")
     parser.add_argument("--json", action="store_true", help="print all results")
     chosen = parser.parse_args(argv)
-    if chosen.jobs < 1 or chosen.replay_every < 0:
-        parser.error("--jobs is 1 or more, --replay-every 0 or more")
+    if chosen.replay_every < 0:
+        parser.error("--replay-every is 0 or more")
     results = []
     for result in play_all(chosen.seeds, chosen.jobs, chosen.keep, chosen.replay_every):
         results.append(result)
         for violation in result.violations:
             print(f"seed {result.seed}: {violation.rule} at {violation.t_s:.3f} s: {violation.text}", file=sys.stderr)
-        if len(results) % 20 == 0:
-            print(f"{len(results)} of {len(chosen.seeds)} runs", file=sys.stderr)
     totals = summary(results)
     if chosen.json:
         print(json.dumps({**totals, "results": [as_dict(result) for result in results]}, indent=1))

@@ -12,19 +12,16 @@ its seed. Tables go to stdout, progress to stderr. Exit status: 0 the last schem
 import argparse
 import json
 import math
-import os
 import sys
-import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from campaign_bound import Bound
 from campaign_figures import figure_table, is_all_good, variant_table
+from campaign_loop import add_jobs, play_trials
 from campaign_trials import (
     CONTACTS_PER_RECORD,
     Case,
@@ -103,21 +100,9 @@ def jobs_of(scheme: str, size: Size) -> Iterator[Job]:
 
 def play(jobs: list[Job], processes: int) -> dict[str, list[Row]]:
     """Play all jobs, and give the rows of each part in the order of the jobs."""
-    results: dict[int, list[Row]] = {}
-    begin_s = time.monotonic()
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(job.run): index for index, job in enumerate(jobs)}
-        for future in as_completed(futures):
-            if future.exception():
-                pool.shutdown(cancel_futures=True)
-            results[futures[future]] = future.result()
-            done = len(results)
-            spent_s = time.monotonic() - begin_s
-            if done % max(1, len(jobs) // 20) == 0 or done == len(jobs):
-                print(f"{done}/{len(jobs)} after {spent_s:.0f} s", file=sys.stderr, flush=True)
     rows: dict[str, list[Row]] = {part: [] for part in PARTS}
-    for index, job in enumerate(jobs):
-        rows[job.part] += results[index]
+    for job, tried in zip(jobs, play_trials(Job.run, jobs, processes), strict=True):
+        rows[job.part] += tried
     return rows
 
 
@@ -145,7 +130,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="a few minutes' worth")
     for name, value in vars(Size()).items():
         parser.add_argument(f"--{name}", type=type(value), metavar="N", help=f"default {value:g}")
-    parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="processes")
+    add_jobs(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows and figures")
     options = parser.parse_args()
     base = QUICK if options.quick else Size()
@@ -153,7 +138,7 @@ def main() -> int:
     size = Size(**{name: getattr(base, name) if value is None else value for name, value in given.items()})
     schemes, parts = options.schemes.split(","), options.only.split(",")
     unknown = set(parts) - set(PARTS)
-    if unknown or options.jobs < 1:
+    if unknown:
         print(f"scheme_campaign: no part is called {', '.join(sorted(unknown))}", file=sys.stderr)
         return 2
     jobs = [job for scheme in schemes for job in jobs_of(scheme, size) if job.part in parts]

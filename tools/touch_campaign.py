@@ -10,14 +10,12 @@ within their bounds, 1 one is not, 2 wrong usage.
 
 import argparse
 import json
-import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from functools import partial
 
 import numpy as np
-from property_campaign import parse_seeds
+from campaign_loop import Figure, add_jobs, add_seeds, exit_status, play_trials, print_figures
 from touch_trials import AFTER_S, KINDS, RULES, Trial, play
 
 from adacd_hil.cli.table import format_table
@@ -29,8 +27,8 @@ NEVER_SHARE = 0.01
 WITHHELD_SHARE = 0.01
 
 
-def touched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
-    """Return name, value, bound of each figure, and whether it is within."""
+def touched_figures(trials: list[Trial]) -> list[Figure]:
+    """Return the figures of touched arms."""
     judged = [max(trial.errors_Nm, default=0.0) for trial in trials if not trial.is_excused]
     wrong, large = sum(error > WRONG_NM for error in judged), sum(error > LARGE_NM for error in judged)
     by_word = sum(max(trial.by_word_Nm, default=0.0) > WRONG_NM for trial in trials if not trial.is_excused)
@@ -40,39 +38,41 @@ def touched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
     back = sum(trial.back_after_s is not None and trial.back_after_s <= BACK_S for trial in waited)
     apart = "hands like a joint from before 0.5 s apart"
     return [
-        (f"off by > {WRONG_NM:g} Nm, {apart}", f"{wrong} of {len(judged)}", "1 %", wrong <= WRONG_SHARE * len(judged)),
-        (f"off by > {LARGE_NM:g} Nm, {apart}", f"{large} of {len(judged)}", "0", large == 0),
-        (
+        Figure(
+            f"off by > {WRONG_NM:g} Nm, {apart}", f"{wrong} of {len(judged)}", "1 %", wrong <= WRONG_SHARE * len(judged)
+        ),
+        Figure(f"off by > {LARGE_NM:g} Nm, {apart}", f"{large} of {len(judged)}", "0", large == 0),
+        Figure(
             f"back within {BACK_S:g} s of the release",
             f"{back} of {len(waited)}",
             "92 %",
             back >= BACK_SHARE * len(waited),
         ),
-        (f"not back within {AFTER_S:g} s", f"{never} of {released}", "1 %", never <= NEVER_SHARE * released),
-        (f"by the user's word, off by > {WRONG_NM:g} Nm", f"{by_word} of {len(judged)}", "", True),
+        Figure(f"not back within {AFTER_S:g} s", f"{never} of {released}", "1 %", never <= NEVER_SHARE * released),
+        Figure(f"by the user's word, off by > {WRONG_NM:g} Nm", f"{by_word} of {len(judged)}"),
     ]
 
 
-def untouched_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
-    """Return name, value, bound of each figure, and whether it is within."""
+def untouched_figures(trials: list[Trial]) -> list[Figure]:
+    """Return the figures of arms that nobody touches."""
     withheld = sum(trial.is_withheld or trial.is_reported for trial in trials)
     times_s = [trial.certified_s for trial in trials if trial.certified_s is not None]
     worst = max((error for trial in trials for error in trial.errors_Nm), default=0.0)
     took = f"{np.median(times_s):.2f}, {max(times_s):.2f} s" if times_s else "never"
     return [
-        ("withheld or reported", f"{withheld} of {len(trials)}", "1 %", withheld <= WITHHELD_SHARE * len(trials)),
-        ("certified", f"{len(times_s)} of {len(trials)}", "all", len(times_s) == len(trials)),
-        ("certified after, median and worst", took, "", True),
-        ("largest error", f"{worst:.3f} Nm", f"{WRONG_NM:g} Nm", worst <= WRONG_NM),
+        Figure("withheld or reported", f"{withheld} of {len(trials)}", "1 %", withheld <= WITHHELD_SHARE * len(trials)),
+        Figure("certified", f"{len(times_s)} of {len(trials)}", "all", len(times_s) == len(trials)),
+        Figure("certified after, median and worst", took),
+        Figure("largest error", f"{worst:.3f} Nm", f"{WRONG_NM:g} Nm", worst <= WRONG_NM),
         *_rule_figures(trials),
     ]
 
 
-def _rule_figures(trials: list[Trial]) -> list[tuple[str, str, str, bool]]:
+def _rule_figures(trials: list[Trial]) -> list[Figure]:
     """Return of each rule how much of its limit a fit was that led to a test."""
     shares = np.array([share for trial in trials for share in trial.rule_shares]).reshape(-1, len(RULES))
     return [
-        (f"share of its limit: {rule}, median and worst", f"{np.median(column):.2f}, {column.max():.2f}", "", True)
+        Figure(f"share of its limit: {rule}, median and worst", f"{np.median(column):.2f}, {column.max():.2f}")
         for rule, column in zip(RULES, shares.T, strict=True)
         if column.size
     ]
@@ -97,28 +97,22 @@ def kind_table(trials: list[Trial]) -> str:
 def main() -> int:
     """Play the seeds that were asked for."""
     parser = argparse.ArgumentParser(description="Hands on an arm that learns.")
-    parser.add_argument("--seeds", type=parse_seeds, default=range(200), help="A:B, B excluded, or one; default 0:200")
+    add_seeds(parser, 200)
     parser.add_argument("--untouched", action="store_true", help="leave the arms alone")
     parser.add_argument("--mujoco", action="store_true", help="play the arm in MuJoCo, with its friction")
-    parser.add_argument("-j", "--jobs", type=int, default=os.cpu_count() or 1, metavar="N")
+    add_jobs(parser)
     parser.add_argument("--json", action="store_true", help="print each trial as JSON")
     options = parser.parse_args()
-    trials = []
     one = partial(play, is_touched=not options.untouched, is_foreign=options.mujoco)
-    with ProcessPoolExecutor(options.jobs) as pool:
-        for trial in pool.map(one, options.seeds):
-            trials.append(trial)
-            if len(trials) % 20 == 0:
-                print(f"{len(trials)}/{len(options.seeds)}", file=sys.stderr, flush=True)
+    trials = list(play_trials(one, options.seeds, options.jobs))
     figures = untouched_figures(trials) if options.untouched else touched_figures(trials)
     if options.json:
         print(json.dumps([asdict(trial) for trial in trials]))
     else:
         if not options.untouched:
             print(kind_table(trials))
-        rows = [[name, value, bound, "" if is_met else "not met"] for name, value, bound, is_met in figures]
-        print(format_table(("figure", "measured", "bound", ""), rows))
-    return 0 if all(row[3] for row in figures) else 1
+        print_figures(figures)
+    return exit_status(figures)
 
 
 if __name__ == "__main__":

@@ -362,11 +362,6 @@ def test_the_summary_counts_runs_and_not_violations() -> None:
     assert "blind" in table
 
 
-@pytest.mark.parametrize(("text", "seeds"), [("3", range(3, 4)), ("2:5", range(2, 5))])
-def test_seeds_are_one_or_a_range(text: str, seeds: range) -> None:
-    assert property_campaign.parse_seeds(text) == seeds
-
-
 def test_a_seed_that_the_judge_itself_cannot_bear_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(property_campaign, "draw_run", lambda seed: 1 / 0)
     result = property_campaign._run((4, None, False))

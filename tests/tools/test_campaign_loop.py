@@ -1,0 +1,82 @@
+"""tools/campaign_loop.py: trials in order in any number of processes, progress, options, and the table of figures."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+from campaign_loop import (
+    Figure,
+    add_jobs,
+    add_seeds,
+    exit_status,
+    parse_seeds,
+    play_trials,
+    print_figures,
+)
+
+
+def square(number):
+    return number * number
+
+
+def process_of(_):
+    return os.getpid()
+
+
+def test_one_job_plays_in_this_process():
+    assert set(play_trials(process_of, range(3), 1)) == {os.getpid()}
+
+
+@pytest.mark.slow
+def test_two_jobs_play_in_processes_of_their_own_and_give_the_results_in_order():
+    assert list(play_trials(square, range(30), 2)) == [number * number for number in range(30)]
+    assert os.getpid() not in set(play_trials(process_of, range(3), 2))
+
+
+def test_no_trial_gives_no_result():
+    assert list(play_trials(square, [], 4)) == []
+
+
+def test_progress_is_a_count_every_twenty_trials_or_a_line_for_each(capsys):
+    list(play_trials(square, range(45), 1))
+    assert capsys.readouterr().err == "20/45\n40/45\n"
+    list(play_trials(square, range(2), 1, lambda result: f"came to {result}"))
+    assert capsys.readouterr().err == "1/2 came to 0\n2/2 came to 1\n"
+
+
+def options_of(*arguments):
+    parser = argparse.ArgumentParser()
+    add_seeds(parser, 60)
+    add_jobs(parser)
+    return parser.parse_args(arguments)
+
+
+def test_seeds_and_jobs_have_defaults():
+    assert options_of().seeds == range(60)
+    assert options_of().jobs == os.cpu_count()
+    assert options_of("--seeds", "5:7", "-j", "3").seeds == range(5, 7)
+
+
+@pytest.mark.parametrize("arguments", [("-j", "0"), ("-j", "two"), ("--seeds", "4:4"), ("--seeds", "x")])
+def test_wrong_usage_is_exit_status_2(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        options_of(*arguments)
+    assert ended.value.code == 2
+    assert arguments[0] in capsys.readouterr().err
+
+
+def test_seeds_are_one_or_a_range():
+    assert parse_seeds("17") == range(17, 18)
+    assert parse_seeds("0:40") == range(40)
+
+
+def test_a_figure_beyond_its_bound_is_named_in_the_table_and_is_the_exit_status(capsys):
+    good, bad = Figure("certified", "3 of 3", "all", True), Figure("missed", "2 of 3", "0", False)
+    print_figures([good, bad])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if "not met" in line] == [line for line in lines if line.startswith("missed")]
+    assert (exit_status([good]), exit_status([good, bad])) == (0, 1)
