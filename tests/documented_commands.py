@@ -21,7 +21,7 @@ import can
 import click
 from documents import ROOT
 
-from adacd_hil.analysis.foreign.recording_map import read_map
+from adacd_hil.analysis.foreign.recording_import import read_map
 from adacd_hil.analysis.replay.what_if import apply_settings, parse_changes, parse_variations
 from adacd_hil.cli.main import cli as host_cli
 from adacd_hil.control.tare_file import Tare, read_tare

@@ -29,7 +29,7 @@ from lab import (
 )
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.score.alarms import begins_of
+from adacd_hil.analysis.score.judge import begins_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 
 PAYLOAD_KG = 1.0

@@ -24,7 +24,7 @@ from campaign_loop import add_jobs, play_trials
 from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record, still
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.score.alarms import begins_of
+from adacd_hil.analysis.score.judge import begins_of
 from adacd_hil.cli.table import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState

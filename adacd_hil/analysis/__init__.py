@@ -1,1 +1,1 @@
-"""What a log says: figures, metrics, reports."""
+"""What a log says: scores, reports, replays, sweeps, thresholds."""

@@ -1,22 +1,89 @@
-"""A run as plain arrays: what the host recorded, what the emulator knows, and the streams of the certified scheme.
+"""A run as plain arrays: what the host recorded, what the emulator knows, the streams of the certified scheme.
 
 Torques in Nm, joint arrays (2,), histories time-first (n, 2). Times in s count from *motion start*: the first cycle in
 ADAPT.
+
+**Attempts.** The emulator counts cycles by the counter of SYNC, anew after each reset: in every attempt of a run it
+begins with the first cycle's number less all whole rounds of the counter. The host counts on.
+
+**Sections** are lettered. *adaptation* lasts from ADAPT until MONITOR, the test of the frozen model (CERTIFY) included;
+*detection* from there to the announcement of a payload change; *payload* is PAYLOAD, *fault* is FAULT. REACT and
+STOPPED belong to the section that they interrupt. The paper's experiment gives A to E.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.host_cycles import Span
-from adacd_hil.analysis.timing import CycleColumns, Cycles
+from adacd_hil.analysis.score.timing import CycleColumns, Cycles
+from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import ContactReport, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
+
+_BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
+_NEVER: Final = 1 << 62
+
+EmulatorSpan = tuple[tuple[int, int], tuple[int, int]]
+"""Attempt and cycle, as the emulator counts, of the first and the last one that it recorded."""
+
+
+class AttemptBegins:
+    """Finds them, piece by piece."""
+
+    def __init__(self) -> None:
+        self._begins: list[int] = []
+        self._was_beginning: bool | None = None  # None before the first cycle
+
+    def add(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
+        """Take in the next cycles (k,), k > 0."""
+        is_beginning = np.isin(state, _BEGINNING)
+        if self._was_beginning is None and not is_beginning[0]:
+            self._begins.append(0)
+        before = np.concatenate(([bool(self._was_beginning)], is_beginning[:-1]))
+        self._begins += cycle[is_beginning & ~before].astype(np.int64).tolist()
+        self._was_beginning = bool(is_beginning[-1])
+
+    @property
+    def begins(self) -> Cycles:
+        """First cycle of each attempt so far; of one that began before the log, 0."""
+        return np.array(self._begins or [0], np.int64)
+
+
+class Span(NamedTuple):
+    """The first and the last cycle of the host that the emulator recorded."""
+
+    first: int
+    last: int
+
+    def covers(self, cycle: Cycles) -> NDArray[np.bool_]:
+        """Mark those of some cycles (n,) that the emulator recorded."""
+        return np.asarray((cycle >= self.first) & (cycle <= self.last))
+
+
+def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
+    """Turn the emulator's cycles (m,) of attempts (m,) into the host's; begins: first cycle of each attempt."""
+    return np.asarray(cycle + whole_rounds(begins)[np.minimum(attempt, len(begins) - 1)])
+
+
+def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
+    """Turn what the emulator recorded into the host's cycles; what goes on after the host's log has no last one."""
+    attempts, cycles = (np.array(column) for column in zip(*span, strict=True))
+    first, last = host_cycles(cycles, attempts, begins).tolist()
+    return Span(first, last if attempts[1] < len(begins) else _NEVER)
+
+
+def whole_rounds(begins: Cycles) -> Cycles:
+    """Give what the emulator's cycles lack of the host's, in attempts that begin with such cycles (k,)."""
+    return np.asarray(begins - begins % SYNC_OVERFLOW)
+
+
+Rows = NDArray[np.int64]
+
 
 Mask = NDArray[np.bool_]
 
@@ -108,7 +175,7 @@ class StretchOfRun(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """A run as plain arrays over n of its cycles: over all, or of a long one over those that `long_run` keeps.
+    """A run as plain arrays over n of its cycles: over all, or of a long one over those that `LongRun` keeps.
 
     `truth` is None on a real arm.
     """
@@ -190,3 +257,94 @@ class Run:
             return np.zeros(0)
         time_s = self.truth.time_s
         return self.time_of_s(self.truth.cycle[rows]) if time_s is None else time_s[rows]
+
+
+def extreme_rows(series: Iterable[Vector], starts: Rows) -> Rows:
+    """Choose of every bucket the rows in which a series (n,) is smallest and largest, the first of equal ones.
+
+    starts: where the buckets begin, from 0, ascending. Rows ascend. NaN is chosen nowhere.
+    """
+    chosen: list[Rows] = [np.empty(0, np.int64)]
+    for values in series:
+        bucket = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
+        for extreme in (np.fmin, np.fmax):
+            hits = np.flatnonzero(values == extreme.reduceat(values, starts)[bucket])
+            chosen.append(hits[np.diff(bucket[hits], prepend=-1) != 0])
+    return np.unique(np.concatenate(chosen))
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of a run; `is_complete` is False if the run ended, or failed, in it."""
+
+    label: str
+    kind: str  # "adaptation", "detection", "payload", "fault"
+    start_s: float
+    end_s: float
+    is_complete: bool
+
+    @property
+    def duration_s(self) -> float:
+        """Length in s."""
+        return self.end_s - self.start_s
+
+
+_KINDS: Final = {
+    SchemeState.ADAPT: "adaptation",
+    SchemeState.CERTIFY: "adaptation",
+    SchemeState.MONITOR: "detection",
+    SchemeState.PAYLOAD: "payload",
+    SchemeState.FAULT: "fault",
+}
+
+
+def section_label(index: int) -> str:
+    """Name a section by its place: A to Z, then AA, AB and so on."""
+    letter = chr(ord("A") + index % 26)
+    return letter if index < 26 else section_label(index // 26 - 1) + letter
+
+
+def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Give for each cycle (n,) the state, where it is REACT or STOPPED the one that was interrupted."""
+    rows = np.arange(state.size)
+    own = np.maximum.accumulate(np.where(is_interrupted(state), -1, rows))
+    return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
+
+
+def is_interrupted(state: NDArray[np.uint8]) -> Mask:
+    """Mark the cycles (n,) of REACT and STOPPED."""
+    return np.isin(state, (SchemeState.REACT, SchemeState.STOPPED))
+
+
+def split_sections(run: Run) -> tuple[Section, ...]:
+    """Split a run into lettered sections; what comes before the first ADAPT belongs to none."""
+    if run.state.size == 0:
+        return ()
+    kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
+    starts = np.concatenate(([0], np.flatnonzero(kinds[1:] != kinds[:-1]) + 1))
+    time_s = run.time_s()
+    sections: list[Section] = []
+    for start, end in zip(starts, [*starts[1:], None], strict=True):
+        kind = str(kinds[start])
+        if not kind:
+            continue
+        end_s = float(time_s[-1] if end is None else time_s[end])
+        following = "" if end is None else str(kinds[end])
+        is_complete = following == "detection" if kind == "adaptation" else following not in ("", "fault")
+        sections.append(Section(section_label(len(sections)), kind, float(time_s[start]), end_s, is_complete))
+    return tuple(sections)
+
+
+def section_at(sections: Iterable[Section], time_s: float) -> str | None:
+    """Name the section that a time belongs to, None before the first."""
+    return next((section.label for section in sections if section.start_s <= time_s <= section.end_s), None)
+
+
+def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
+    """Give the rows of a section among cycles at such times (n,), which ascend.
+
+    end_s: when the run ends. Its last cycle belongs to the last section; the first one of the next section to that.
+    """
+    is_last = bool(section.end_s >= end_s)
+    first = int(np.searchsorted(time_s, section.start_s))
+    return slice(first, int(np.searchsorted(time_s, section.end_s, side="right" if is_last else "left")))

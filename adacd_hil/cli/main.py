@@ -205,7 +205,7 @@ def thresholds(
     Each comes with what limits it, and with the rate that half of the motion predicts for the other half. --from and
     --until choose a stretch of each log.
     """
-    from adacd_hil.analysis.detector_comparison import write_comparison
+    from adacd_hil.analysis.thresholds.detector_comparison import write_comparison
     from adacd_hil.cli.commands import thresholds_command as command
 
     with tried(out):

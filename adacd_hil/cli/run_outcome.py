@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report.reading import read_run
+from adacd_hil.analysis.report.run_reading import read_run
+from adacd_hil.analysis.score.metrics import evaluate
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import FaultReason
 from firmware_sim.scenario.expectation import ScenarioOutcome

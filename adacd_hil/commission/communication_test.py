@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.timing import CycleColumns, columns_of_records
+from adacd_hil.analysis.score.timing import CycleColumns, columns_of_records
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.drive import Drive

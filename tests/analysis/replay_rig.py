@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.analysis.replay.source import LogSource
+from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.log.reader import Piece, Series

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adacd_hil.analysis.replay.attempts import AttemptSplitter
+from adacd_hil.analysis.replay.log_source import AttemptSplitter
 from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, Piece, Series
 from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import run_channels

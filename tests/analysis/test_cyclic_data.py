@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns
 
-from adacd_hil.analysis.cyclic_data import CyclicDataGatherer, data_text, gather_data, percent_text
-from adacd_hil.analysis.endings import find_faults
 from adacd_hil.analysis.logged_run import CheckCounts
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.timing import CycleColumns
+from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.run_faults import CyclicDataGatherer, data_text, find_faults, gather_data, percent_text
+from adacd_hil.analysis.score.timing import CycleColumns
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
 

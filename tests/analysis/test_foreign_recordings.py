@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose
 
 from adacd_hil.analysis.foreign import recording_import
 from adacd_hil.analysis.foreign.recording_identification import identify
-from adacd_hil.analysis.foreign.recording_import import read_recording
-from adacd_hil.analysis.foreign.recording_map import read_map
+from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import WHOLE, TimeWindow

@@ -8,12 +8,10 @@ import pytest
 from hand_made_run import record, record_truth, touched_run
 
 from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.report.reading import read_run
 from adacd_hil.analysis.report.report_files import write_report
-from adacd_hil.analysis.score import truth_reading
-from adacd_hil.analysis.score.foreign_truth import config_digest, foreign_truth
-from adacd_hil.analysis.score.truth_contacts import contacts_beside
-from adacd_hil.analysis.score.truth_reading import TruthRows
+from adacd_hil.analysis.report.run_reading import read_run
+from adacd_hil.analysis.score import emulator_truth
+from adacd_hil.analysis.score.emulator_truth import TruthRows, config_digest, contacts_beside, foreign_truth
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
 from adacd_hil.log.recording.recorder import Recorder
@@ -87,7 +85,7 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(
     rows: slice, false_alarms: int, unjudged: str, full_cycles: int, tmp_path: Path
 ) -> None:
     run, gathered, source = read_run(*recorded(tmp_path, with_truth_of(touched_run(), rows)), full_cycles=full_cycles)
-    from adacd_hil.analysis.metrics import evaluate
+    from adacd_hil.analysis.score.metrics import evaluate
 
     assert evaluate(run, gathered).false_alarms == false_alarms
     said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else ""
@@ -121,7 +119,7 @@ def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() ->
         nothing, nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), None, nothing, nothing, np.zeros(1),
         np.zeros((1, 7)), {}, "", True, ((0, 3), (1, 50)),
     )  # fmt: skip
-    one, both = (truth_reading.host_truth(rows, np.array(begins), 1000, None) for begins in ([0], [0, 480]))
+    one, both = (emulator_truth.host_truth(rows, np.array(begins), 1000, None) for begins in ([0], [0, 480]))
     assert one is not None
     assert both is not None
     assert (one.covers(2), one.covers(3), one.covers(900)) == (False, True, True)

@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 
-from adacd_hil.analysis.score.alarms import Alarm, begins_of, enters_react
-from adacd_hil.analysis.score.judge import Score, StreamJudge, TouchWindow, explained_until, judge
-from adacd_hil.analysis.score.touches import contact_rows
+from adacd_hil.analysis.score.contacts import contact_rows
+from adacd_hil.analysis.score.judge import (
+    Alarm,
+    Score,
+    StreamJudge,
+    TouchWindow,
+    begins_of,
+    enters_react,
+    explained_until,
+    judge,
+)
 from adacd_hil.records import SchemeState
 
 MS = 1_000_000

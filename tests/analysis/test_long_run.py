@@ -10,17 +10,16 @@ from click.testing import CliRunner
 from hand_made_run import make_certified_run, make_run, react, touch
 from test_run_report import record_truth
 
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report import long_run
-from adacd_hil.analysis.report.json_form import report_json
+from adacd_hil.analysis.report import run_reading
 from adacd_hil.analysis.report.outline import Facts, TruthClock
-from adacd_hil.analysis.report.reading import read_run
-from adacd_hil.analysis.report.report_files import write_run_report
+from adacd_hil.analysis.report.page import left_out_text, shown_contacts
+from adacd_hil.analysis.report.report_files import report_json, write_run_report
+from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.report.timeline import timeline_of
-from adacd_hil.analysis.report.words import left_out_text, shown_contacts
-from adacd_hil.analysis.score import truth_reading
-from adacd_hil.analysis.score.truth_reading import TruthRows, read_truth
-from adacd_hil.analysis.verdict import identified_text
+from adacd_hil.analysis.score import emulator_truth
+from adacd_hil.analysis.score.emulator_truth import TruthRows, read_truth
+from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.verdict import identified_text
 from adacd_hil.cli.main import cli
 from adacd_hil.log import reader
 from adacd_hil.log.log_files import LogError
@@ -42,8 +41,14 @@ def table_of(read):
 @pytest.fixture
 def few_kept(monkeypatch):
     """Read in short pieces, and keep next to nothing."""
-    for name, value in (("BUCKETS", 4), ("TIME_BUCKETS", 4), ("CONTACTS", 0), ("ADAPTATIONS", 0), ("_NOISE_CYCLES", 4)):
-        monkeypatch.setattr(long_run, name, value)
+    for name, value in (
+        ("BUCKETS", 4),
+        ("TIME_BUCKETS", 4),
+        ("TRACED_CONTACTS", 0),
+        ("ADAPTATIONS", 0),
+        ("_NOISE_CYCLES", 4),
+    ):
+        monkeypatch.setattr(run_reading, name, value)
     monkeypatch.setattr(reader.LogStream.__init__, "__defaults__", (None, PIECE))
 
 
@@ -153,7 +158,7 @@ def test_the_kept_cycles_are_cycles_of_the_run(few_kept, path):
 
 
 def test_around_the_first_contacts_every_cycle_is_kept(few_kept, monkeypatch, certified):
-    monkeypatch.setattr(long_run, "CONTACTS", 1)
+    monkeypatch.setattr(run_reading, "TRACED_CONTACTS", 1)
     run = read_run(certified, truth_of(certified), full_cycles=1000).run
     onset_s = 1.45
     around = run.cycle[(run.time_s() > onset_s - 0.14) & (run.time_s() < onset_s + 0.59)]
@@ -174,7 +179,7 @@ def test_a_log_of_just_so_many_cycles_is_kept_whole(certified):
 
 def test_a_long_truth_keeps_what_is_asked_of_its_contacts(monkeypatch, certified):
     for name, value in (("_BEGINNING", (50, 20)), ("_ENDING", 60), ("_HELD", 150), ("_BUCKET", 10)):
-        monkeypatch.setattr(truth_reading, name, value)
+        monkeypatch.setattr(emulator_truth, name, value)
     whole, thinned = (read_truth(truth_of(certified), most) for most in (10**6, 100))
     assert len(thinned.cycle) < 450
     for index in (0, 1, 2):
@@ -208,7 +213,7 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
         problem="",
         is_complete=True,
     )
-    truth = truth_reading.host_truth(rows, np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
+    truth = emulator_truth.host_truth(rows, np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
     assert truth.cycle.tolist() == [98, 99, 100]
     columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
     assert [len(column) for column in columns] == [3] * 5

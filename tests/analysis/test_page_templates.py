@@ -16,17 +16,16 @@ from jinja2 import UndefinedError
 from parsed_page import Page
 
 from adacd_hil.analysis.drawing import Drawing
-from adacd_hil.analysis.figures import draw
 from adacd_hil.analysis.logged_run import Motion, Run
-from adacd_hil.analysis.metrics import evaluate
 from adacd_hil.analysis.report import page
-from adacd_hil.analysis.report.index_page import Entry, index_page
 from adacd_hil.analysis.report.page import Heading, render, render_page
-from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.report.report_files import Report
+from adacd_hil.analysis.report.report_files import Entry, Report, index_page
+from adacd_hil.analysis.report.report_tables import timing_tables
+from adacd_hil.analysis.report.run_figures import draw
 from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.timing_tables import timing_tables
-from adacd_hil.analysis.timing_figures import draw_timing
+from adacd_hil.analysis.report.run_reading import Source
+from adacd_hil.analysis.report.timing_figures import draw_timing
+from adacd_hil.analysis.score.metrics import evaluate
 
 pytestmark = pytest.mark.slow
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from adacd_hil.analysis.replay.asked import RequestCheck
+from adacd_hil.analysis.replay.scheme_comparison import RequestCheck
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import Request
 

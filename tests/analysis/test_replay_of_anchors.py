@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.replay.replay import replay
-from adacd_hil.analysis.replay.source import LogSource
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.reader import read_log

@@ -10,9 +10,9 @@ import pytest
 from hand_made_run import make_certified_run, make_run, react, touch, touched_run
 
 from adacd_hil.analysis.drawing import COLOURS
-from adacd_hil.analysis.figures import CLOSE_UPS, draw, parameter_label, residuals
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.timing_figures import draw_timing
+from adacd_hil.analysis.report.run_figures import CLOSE_UPS, draw, parameter_label, residuals
+from adacd_hil.analysis.report.timing_figures import draw_timing
+from adacd_hil.analysis.score.metrics import evaluate
 from adacd_hil.records import SchemeState
 
 pytestmark = pytest.mark.slow

@@ -15,12 +15,11 @@ import pytest
 from hand_made_run import A, M, like_an_old_log, make_run, react, record, record_truth, touched_run
 from parsed_page import Page
 
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report.json_form import report_json
 from adacd_hil.analysis.report.page import render
-from adacd_hil.analysis.report.reading import Source
-from adacd_hil.analysis.report.report_files import write_report, write_run_report
-from adacd_hil.analysis.report.timing_tables import timing_tables
+from adacd_hil.analysis.report.report_files import report_json, write_report, write_run_report
+from adacd_hil.analysis.report.report_tables import timing_tables
+from adacd_hil.analysis.report.run_reading import Source
+from adacd_hil.analysis.score.metrics import evaluate
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import (

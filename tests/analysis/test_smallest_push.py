@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from hand_made_run import A, C, M, make_certified_run, make_run, react, touch
 
-from adacd_hil.analysis.host_cycles import Span
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report import bounds
+from adacd_hil.analysis.logged_run import Span
 from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.report_tables import counted_sentence, push_table
+from adacd_hil.analysis.score.metrics import evaluate
 from adacd_hil.scheme.detect.sensitivity import AGREES
 
 SLOWEST = 0.612758  # what 10 and then 200 rad/s show of a step after 0.1 s: 1 - (200 e^-1 - 10 e^-20) / 190
@@ -85,9 +84,7 @@ def test_what_was_never_armed_says_nothing():
 def told(metrics):
     """Give what the page says of it."""
     push = push_table(metrics.evidence)
-    html = render(
-        "margins.html.j2", metrics=metrics, bounds=bounds, margins=None, push=push, counted=counted_sentence(metrics)
-    )
+    html = render("margins.html.j2", metrics=metrics, margins=None, push=push, counted=counted_sentence(metrics))
     return " ".join(html.split())
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.analysis import motion as module
-from adacd_hil.analysis.detector_comparison import (
+from adacd_hil.analysis.thresholds import free_motion as module
+from adacd_hil.analysis.thresholds.detector_comparison import (
     STEPS_NM,
     Comparison,
     Row,
@@ -19,8 +19,8 @@ from adacd_hil.analysis.detector_comparison import (
     step_shape,
     write_comparison,
 )
-from adacd_hil.analysis.motion import read_motion, sample_of
-from adacd_hil.analysis.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
+from adacd_hil.analysis.thresholds.free_motion import read_motion, sample_of
+from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState

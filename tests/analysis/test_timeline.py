@@ -8,11 +8,10 @@ import pytest
 from hand_made_run import A, M, make_run, react, touch, touched_run
 
 from adacd_hil.analysis.logged_run import Motion
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.report.arm_drawing import Push, draw_arm
-from adacd_hil.analysis.report.contact_cards import CARDS, contact_cards
+from adacd_hil.analysis.report.contact_cards import CARDS, Push, contact_cards, draw_arm
 from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.timeline import notices_of, state_key, stays_of, timeline_of
+from adacd_hil.analysis.score.metrics import evaluate
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, Location, SchemeState
 

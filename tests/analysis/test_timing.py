@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hand_made_run import A, M, R, S, like_an_old_log, make_run, with_columns
 
-from adacd_hil.analysis.metrics import evaluate
-from adacd_hil.analysis.timing import (
+from adacd_hil.analysis.report.timing_figures import draw_timing
+from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.timing import (
     COMPUTE,
     OLDEST_CYCLES,
     CycleColumns,
@@ -16,7 +17,6 @@ from adacd_hil.analysis.timing import (
     columns_of_series,
     find_reactions,
 )
-from adacd_hil.analysis.timing_figures import draw_timing
 from adacd_hil.log.reader import Series
 from adacd_hil.records import CycleRecord
 

@@ -13,18 +13,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.analysis.false_alarms import TooLittleMotionError, calibrate_detector
-from adacd_hil.analysis.replay.source import LogSource
+from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.replay.what_if import apply_settings
-from adacd_hil.analysis.score.confidence_bounds import least_rate_per_h, rate_bound_per_h, share_bounds
-from adacd_hil.analysis.score.truth_contacts import contacts_beside
-from adacd_hil.analysis.sweep import tune_logs
-from adacd_hil.analysis.sweep.tune import Candidate, Outcome, Tuning, _best, _problems
-from adacd_hil.analysis.sweep.tune_config import base_of, suggested_toml
+from adacd_hil.analysis.score.emulator_truth import contacts_beside
+from adacd_hil.analysis.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
+from adacd_hil.analysis.sweep import tune_roc
+from adacd_hil.analysis.sweep.tune import Candidate, Outcome, Tuning, _best, _problems, base_of, suggested_toml
+from adacd_hil.analysis.sweep.tune_candidates import _Shown, candidates, observe_candidates, thresholds_as_changes
 from adacd_hil.analysis.sweep.tune_figures import write_tuning
-from adacd_hil.analysis.sweep.tune_logs import Window, read_logs
-from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, choose, delay_ms, rising
-from adacd_hil.analysis.sweep.tune_scheme import _Shown, candidates, observe_candidates, thresholds_as_changes
+from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, Window, choose, delay_ms, read_logs, rising
+from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError
@@ -431,7 +429,7 @@ def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
     cycle = read_log(log, ("/scheme",)).scheme["cycle"].reshape(-1)
     first, last = np.quantile(cycle[whole.motion.is_free], (0.2, 0.8), method="lower").tolist()
     short = truth._replace(span=((attempt, first), (attempt, last)))
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: short)
+    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: short)
     (read,) = read_logs([log])
     is_covered = (first <= cycle) & (cycle <= last)
     assert read.motion.is_free.tolist() == (whole.motion.is_free & is_covered).tolist()
@@ -442,8 +440,8 @@ def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeyp
     truth = contacts_beside(log)
     (first,) = truth.contacts
     later = [dataclasses.replace(first, number=n + 1, attempt=n) for n in range(3)]
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: truth._replace(contacts=later))
-    monkeypatch.setattr(tune_logs, "_begins", lambda *_: [0, 241])
+    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: truth._replace(contacts=later))
+    monkeypatch.setattr(tune_roc, "_begins", lambda *_: [0, 241])
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
     assert [(window.number, cycle[window.first] - first.onset) for window in read.windows] == [(1, 0), (2, 240)]
@@ -472,7 +470,7 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
     truth = contacts_beside(log)
     three = [dataclasses.replace(truth.contacts[0], number=number) for number in (1, 2, 3)]
-    monkeypatch.setattr(tune_logs, "contacts_beside", lambda *_: truth._replace(contacts=three))
+    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: truth._replace(contacts=three))
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 
@@ -541,6 +539,6 @@ def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
 def test_logs_of_different_settings_are_not_tuned_together(log, monkeypatch):
     one = read_logs([log])[0]
     others = iter([one, dataclasses.replace(one, settings=apply_settings(one.settings, {"filter.a_rad_s": "12"}))])
-    monkeypatch.setattr(tune_logs, "_read", lambda *_: next(others))
+    monkeypatch.setattr(tune_roc, "_read", lambda *_: next(others))
     with pytest.raises(LogError, match=r"different settings, such as filter.a_rad_s"):
         read_logs([log, log])

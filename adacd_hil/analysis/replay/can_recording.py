@@ -18,8 +18,15 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.replay.attempts import NMT_ID, RESET_COMMUNICATION, Places, Stretch
-from adacd_hil.analysis.replay.source import FRAME_TOPICS, LogSource, Part
+from adacd_hil.analysis.replay.log_source import (
+    FRAME_TOPICS,
+    NMT_ID,
+    RESET_COMMUNICATION,
+    LogSource,
+    Part,
+    Places,
+    Stretch,
+)
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.formats.frame_log import read_frames

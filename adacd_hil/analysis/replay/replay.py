@@ -16,20 +16,20 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.replay.asked import Asking, RequestCheck, ScriptOf
-from adacd_hil.analysis.replay.attempts import Stretch
+from adacd_hil.analysis.replay.log_source import LogSource, Part, Source, Stretch
 from adacd_hil.analysis.replay.replayed_outcome import Adaptation, OutcomeGatherer, Transition
 from adacd_hil.analysis.replay.scheme_comparison import (
     SHOWN,
     TOLERANCE,
+    Asking,
     Mismatch,
+    RequestCheck,
     SchemeComparison,
+    ScriptOf,
     different_arithmetic,
 )
-from adacd_hil.analysis.replay.source import LogSource, Part, Source
-from adacd_hil.analysis.score.judge import Score
-from adacd_hil.analysis.score.score_words import unjudged_sentence
-from adacd_hil.analysis.score.truth_contacts import TrueContacts, contacts_beside
+from adacd_hil.analysis.score.emulator_truth import TrueContacts, contacts_beside
+from adacd_hil.analysis.score.judge import Score, unjudged_sentence
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedContact

@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.host_cycles import host_span
-from adacd_hil.analysis.score.alarms import Alarm, enters_react
-from adacd_hil.analysis.score.judge import Score, TouchWindow, judge
-from adacd_hil.analysis.score.truth_contacts import HostCycles, TrueContact, TrueContacts, windows_of
+from adacd_hil.analysis.logged_run import host_span
+from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, TrueContacts, windows_of
+from adacd_hil.analysis.score.judge import Alarm, Score, TouchWindow, enters_react, judge
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.records import FaultReason, SchemeState, Vector

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from adacd_hil.analysis.replay.replay import Replay
-from adacd_hil.analysis.score.score_words import found_text, why_not_found
+from adacd_hil.analysis.score.judge import found_text, why_not_found
 from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
 from adacd_hil.settings.configuration import Settings

@@ -1,12 +1,15 @@
-"""Pages from the Jinja2 templates in `templates`: the forms that all of them share, and the only place that renders.
+"""Pages from the Jinja2 templates in `templates`: words, forms and limits that all share; the only place that renders.
 
 A page needs nothing from outside and allows nothing but what it brings: its styles and scripts by their digests, no
 inline style, no request (content security policy). Every value is escaped; where a template marks one as safe, it says
 why it is. A template that asks for a value that it isn't given is an error. Pages follow the reader's light or dark
 scheme and print in the light one.
+
+The size of a report is bounded, whatever the length of the run. The tables as CSV and JSON have all.
 """
 
 import hashlib
+import math
 import re
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
@@ -16,7 +19,22 @@ from typing import Any, Final, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from adacd_hil.analysis.report.words import number_text
+from adacd_hil.analysis.logged_run import StretchOfRun
+from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.judge import why_not_found
+from adacd_hil.analysis.score.metrics import Metrics
+
+SECTIONS: Final = 60
+"""Sections with a row in the tables of sections and margins."""
+CONTACTS: Final = 200
+"""Contacts with a row in the table of contacts, and so many more that went wrong."""
+PRINTED_CONTACTS: Final = 40
+"""The same for a terminal and on paper."""
+ADAPTATIONS: Final = 8
+"""Adaptations with a figure, and with columns in the tables of parameters."""
+MARKS: Final = 1_500
+"""Stays and contacts on the timeline, each; beyond, those that are narrower than a mark are drawn as one."""
+
 
 _PACKAGE: Final = "adacd_hil.analysis.report"
 _UNIT: Final = re.compile(r"(?<=\d) (?=(?:s|kg|%)(?!\w))")
@@ -82,6 +100,8 @@ def _environment() -> Environment:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    bounds = {"ADAPTATIONS": ADAPTATIONS, "CONTACTS": CONTACTS, "SECTIONS": SECTIONS}
+    environment.globals["bounds"] = bounds
     environment.filters |= {"number": number_text, "keep_units": lambda text: _UNIT.sub("\u00a0", text)}
     environment.policies["json.dumps_kwargs"] = {
         "ensure_ascii": False, "allow_nan": False, "separators": (",", ":"),
@@ -93,3 +113,143 @@ def _environment() -> Environment:
 def _asset(name: str) -> _Asset:
     text = f"\n{resources.files(_PACKAGE).joinpath('assets', name).read_text(encoding='utf-8').strip()}\n"
     return _Asset(text, b64encode(hashlib.sha256(text.encode()).digest()).decode())
+
+
+NONE: Final = "–"
+
+
+def number_text(value: float | None, digits: int, unit: str = "") -> str:
+    """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    text = f"{value:.{digits}f}".replace("-", "−")
+    return f"{text} {unit}" if unit else text
+
+
+def pair_text(values: Sequence[float] | None, digits: int) -> str:
+    """Write the values of both joints; a dash for None."""
+    return NONE if values is None else " / ".join(number_text(value, digits) for value in values)
+
+
+def yes_text(value: bool | None) -> str:
+    """Write yes or no; a dash for None."""
+    return NONE if value is None else "yes" if value else "no"
+
+
+def signs_text(direction: tuple[int, int] | None) -> str:
+    """Write the signs of both joints; a dash for None."""
+    return NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
+
+
+_CONTACT_HEAD: Final = (
+    "contact", "section", "link", "found", "at alarm", "onset s", "delay ms", "law ms", "ideal ms", "direction",
+    "right", "true Nm", "peak ratio",
+)  # fmt: skip
+
+
+def _contact_words(contact: Contact) -> tuple[str, ...]:
+    delay = number_text(contact.delay_ms, 0)
+    if contact.detected_s is None:
+        delay = why_not_found(contact.is_armed)
+    onset_s = contact.detected_s if contact.onset_s is None else contact.onset_s
+    return (
+        str(contact.number),
+        contact.section or NONE,
+        number_text(contact.link, 0),
+        number_text(contact.link_detected, 0),
+        number_text(contact.link_at_alarm, 0),
+        number_text(onset_s, 3),
+        delay,
+        number_text(contact.law_ms, 1),
+        number_text(contact.ideal_ms, 0),
+        signs_text(contact.direction),
+        yes_text(contact.direction_ok),
+        pair_text(contact.tau_ext_Nm, 2),
+        number_text(contact.torque_error_ratio, 2),
+    )
+
+
+def shown_contacts(metrics: Metrics, most: int) -> tuple[Contact, ...]:
+    """Choose the first contacts to be listed, and of the others as many that went wrong."""
+    later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
+    return (*metrics.contacts[:most], *later[:most])
+
+
+def went_wrong(contact: Contact) -> bool:
+    """Tell whether a contact was missed, or its link or direction is not the true one."""
+    is_missed = contact.is_armed and contact.detected_s is None
+    is_wrong_link = contact.link is not None and contact.link_detected not in (None, contact.link)
+    return is_missed or is_wrong_link or contact.direction_ok is False
+
+
+def left_out_text(metrics: Metrics, most: int) -> str:
+    """Say which contacts are not listed; nothing where all are."""
+    count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
+    if shown == count:
+        return ""
+    wrong = f" and {shown - most} more that went wrong" if shown > most else ""
+    return f"The first {most}{wrong} of {count} contacts; all are in contacts.csv."
+
+
+def contact_rows(metrics: Metrics, contacts: Sequence[Contact]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Give head and rows of a list of contacts, where it is known with the delay of the paper's scheme beside."""
+    rows = [_contact_words(contact) for contact in contacts]
+    beside = None if metrics.evidence is None else metrics.evidence.paper_beside
+    if beside is None or not beside.contacts:
+        return _CONTACT_HEAD, rows
+    delays = {c.number: number_text(c.delay_ms, 0) if c.is_armed else "not armed" for c in beside.contacts}
+    return (*_CONTACT_HEAD, "paper's ms"), [
+        (*row, delays[contact.number]) for row, contact in zip(rows, contacts, strict=True)
+    ]
+
+
+def has_paper(metrics: Metrics) -> bool:
+    """Tell whether the run is of the paper's experiment."""
+    return any(row.paper is not None for row in metrics.paper)
+
+
+def paper_head(metrics: Metrics) -> tuple[str, ...]:
+    """Name the columns of paper against measured; the paper's own is there where its experiment was played."""
+    if metrics.evidence is None:
+        return ("", "paper", "measured") if has_paper(metrics) else ("", "measured")
+    paper = ("paper (printed)",) if has_paper(metrics) else ()
+    return ("", *paper, "paper's scheme, same stream", "certified")
+
+
+def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
+    """Write a row per quantity."""
+    rows = []
+    for row in metrics.paper:
+        beside = () if metrics.evidence is None else (row.beside or NONE,)
+        rows.append((row.quantity, *(() if row.paper is None else (row.paper,)), *beside, row.measured))
+    return rows
+
+
+def stretch_text(stretch: StretchOfRun) -> str:
+    """Say which stretch of a log was taken, and why it is not the one that was asked for."""
+    start_s, end_s = stretch.found
+    text = (
+        "the log"
+        + ("" if math.isinf(start_s) else f" from {start_s:.2f} s")
+        + ("" if math.isinf(end_s) else f" until {end_s:.2f} s")
+    )
+    if stretch.found == stretch.asked:
+        return text
+    return f"{text}, widened so that no contact and no adaptation is cut"
+
+
+def signed_text(value: float) -> str:
+    """Write a number with its sign and one decimal."""
+    return f"{value:+.1f}".replace("-", "−")
+
+
+def scaled(value: float | None, factor: float) -> float | None:
+    """Multiply what is known."""
+    return None if value is None else factor * value
+
+
+def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
+    """Write a value with its standard deviation; a dash where either is not known."""
+    if value is None or sigma is None:
+        return NONE
+    return f"{number_text(value, digits)} ± {number_text(sigma, digits)} {unit}"

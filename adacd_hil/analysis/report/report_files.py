@@ -1,36 +1,54 @@
-"""The report of a run: one self-contained HTML page, the same numbers as JSON and CSV, and the paper's figures as PNG.
+"""The report's files: a self-contained HTML page, its numbers as JSON and CSV, figures as PNG, the index of a folder.
 
 Where it is asked for, it is printed, too: report.pdf and report.png have the words and all figures.
 
-The same log gives the same bytes.
+The same log gives the same bytes. Tables in CSV have times in s since motion start, and units in the names.
 """
 
+import csv
+import dataclasses
+import io
 import json
-from collections.abc import Mapping
+import math
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
+from urllib.parse import quote
 
-from adacd_hil.analysis.figures import draw
-from adacd_hil.analysis.logged_run import Run, StretchOfRun
-from adacd_hil.analysis.metrics import Gathered, Metrics, evaluate
-from adacd_hil.analysis.report.bounds import PRINTED_CONTACTS
-from adacd_hil.analysis.report.csv_tables import report_tables
-from adacd_hil.analysis.report.json_form import report_json
-from adacd_hil.analysis.report.print_form import report_pdf, report_png
-from adacd_hil.analysis.report.reading import Progress, Source, read_run
-from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.words import (
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+
+from adacd_hil.analysis.drawing import COLOURS, Drawing, style
+from adacd_hil.analysis.logged_run import Run, StretchOfRun, section_at
+from adacd_hil.analysis.report.page import (
+    NONE,
+    PRINTED_CONTACTS,
+    Heading,
     contact_rows,
     left_out_text,
     paper_cells,
     paper_head,
+    render_page,
     shown_contacts,
 )
-from adacd_hil.analysis.timing_figures import draw_timing
+from adacd_hil.analysis.report.run_figures import draw
+from adacd_hil.analysis.report.run_page import report_page
+from adacd_hil.analysis.report.run_reading import Progress, Source, read_run
+from adacd_hil.analysis.report.timeline import stays_of
+from adacd_hil.analysis.report.timing_figures import draw_timing
+from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.margins import Evidence
+from adacd_hil.analysis.score.metrics import Gathered, Metrics, evaluate
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.output_files import replace_file
+from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.terminal import fit_table, in_line, terminal_columns
 
 HTML_NAME: Final = "report.html"
@@ -132,3 +150,273 @@ def write_run_report(
     except OSError as error:
         raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
     return report
+
+
+SCHEMA: Final = 3
+"""Version of report.json; goes up when a key changes its meaning or disappears."""
+_DIGITS: Final = 6
+
+
+def report_json(
+    metrics: Metrics, metadata: Mapping[str, str], source: Source, stretch: StretchOfRun | None = None
+) -> dict[str, Any]:
+    """Give the content of report.json; the keys are described in `adacd_hil.analysis.score.metrics`."""
+    fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
+    plain: dict[str, Any] = _plain(
+        {
+            "schema": SCHEMA,
+            "verdict": metrics.verdict,
+            "is_clean": metrics.is_clean,
+            "time_zero": "first cycle in ADAPT (motion start)",
+            "adaptation_s": metrics.adaptation_s,
+            "sections": {
+                section.label: {**dataclasses.asdict(section), "duration_s": section.duration_s}
+                for section in metrics.sections
+            },
+            "frozen_residual_max_Nm": {
+                label: dataclasses.asdict(residual) for label, residual in metrics.frozen_residual_max_Nm.items()
+            },
+            "contacts": [dataclasses.asdict(contact) for contact in metrics.contacts],
+            "false_alarms": metrics.false_alarms,
+            "false_alarms_s": metrics.false_alarms_s,
+            "false_alarm_bound_per_h": metrics.false_alarm_bound_per_h,
+            "missed": metrics.missed,
+            "parameters": metrics.parameters,
+            "payload_kg": metrics.payload_kg,
+            "certified": None if metrics.evidence is None else _evidence_json(metrics.evidence),
+            "fault": fault,
+            "cycle": dataclasses.asdict(metrics.cycle),
+            "timing": metrics.timing.as_json(),
+            "data": metrics.data.as_json(),
+            "log": {
+                "name": source.log_name,
+                "frames": metrics.frames,
+                "dropped": metrics.dropped,
+                "is_complete": source.is_complete,
+                "problem": source.problem,
+            },
+            "stretch": None if stretch is None else _stretch_json(stretch),
+            "paper": [row._asdict() for row in metrics.paper],
+            "run": dict(sorted(metadata.items())),
+        }
+    )
+    return plain
+
+
+def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
+    """Give a stretch, s since the beginning of the log; null where it is not bounded."""
+    return {
+        "from_s": stretch.found.start_s,
+        "until_s": stretch.found.end_s,
+        "asked_from_s": stretch.asked.start_s,
+        "asked_until_s": stretch.asked.end_s,
+        "motion_start_s": stretch.motion_start_s,
+    }
+
+
+def _evidence_json(evidence: Evidence) -> dict[str, Any]:
+    """Give what only the certified scheme has; the keys are described in `adacd_hil.analysis.score.margins`."""
+    return {**dataclasses.asdict(evidence), "smallest_margin": evidence.smallest_margin}
+
+
+def _plain(value: Any) -> Any:
+    """Make a value of JSON's types: numbers with six digits, null for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+    return value
+
+
+_PARAMETERS: Final = ("section", "parameter", "unit", "true", "identified", "std", "cad")
+_STATES: Final = ("state", "section", "start_s", "end_s", "duration_s")
+_CSV_DIGITS: Final = 9
+
+
+def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
+    """Write each table, by its file's name."""
+    names = [field.name for field in dataclasses.fields(Contact)]
+    pairs = [name for name in names if any(isinstance(getattr(c, name), tuple) for c in metrics.contacts)]
+    head = [column for name in names for column in ((f"{name}_1", f"{name}_2") if name in pairs else (name,))]
+    contacts = ([cell for name in names for cell in _cells(getattr(c, name), name in pairs)] for c in metrics.contacts)
+    return {
+        "contacts.csv": _table(head, contacts),
+        "parameters.csv": _table(_PARAMETERS, _parameters(run, metrics)),
+        "states.csv": _table(_STATES, _states(run, metrics)),
+    }
+
+
+def _cells(value: Any, is_pair: bool) -> Sequence[Any]:
+    """Give a value, or that of each joint."""
+    if not is_pair:
+        return (value,)
+    return (None, None) if value is None else tuple(value)
+
+
+def _parameters(run: Run, metrics: Metrics) -> Iterable[Sequence[Any]]:
+    cad: Mapping[str, float] = (
+        dict(zip(run.parameter_names, run.settings.arm.cad_theta, strict=True)) if run.has_cad else {}
+    )
+    for label, found in metrics.parameters.items():
+        estimates = {} if metrics.evidence is None else metrics.evidence.estimates.get(label, {})
+        for name, (true, identified) in found.items():
+            std = estimates[name].std if name in estimates else None
+            yield label, name, PARAMETER_UNITS[name], true, identified, std, cad.get(name)
+        for name in (name for name in estimates if name not in found):
+            yield label, name, PARAMETER_UNITS.get(name, "Nm"), None, estimates[name].value, estimates[name].std, None
+
+
+def _states(run: Run, metrics: Metrics) -> Iterable[Sequence[Any]]:
+    for stay in stays_of(run):
+        label = section_at(metrics.sections, 0.5 * (stay.start_s + stay.end_s))
+        yield stay.state.name, label, stay.start_s, stay.end_s, stay.end_s - stay.start_s
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows([f"{cell:.{_CSV_DIGITS}g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
+    return out.getvalue()
+
+
+_WIDTH_IN: Final = 10.0
+"""That of all figures."""
+_LINES_A_PAGE: Final = 62
+_LINE_IN: Final = 0.105
+_FONT_SIZE: Final = 5.6
+_VERDICT_LETTERS: Final = 96
+_PNG_DOTS_PER_INCH: Final = 110
+_ROOM_IN: Final = 0.32
+"""Above each figure, for its title."""
+
+
+def report_pdf(verdict: str, is_good: bool, lines: Sequence[str], drawings: Sequence[Drawing]) -> bytes:
+    """Write verdict and tables, as many pages as they need, then a page per figure."""
+    out = io.BytesIO()
+    metadata: Any = {"CreationDate": None, "Creator": "adacd-hil"}  # None: without it
+    with style(), PdfPages(out, metadata=metadata) as pages:
+        for figure in _word_pages(verdict, is_good, lines):
+            pages.savefig(figure)
+        for drawing in drawings:
+            pages.savefig(drawing.figure)
+    return out.getvalue()
+
+
+def report_png(verdict: str, is_good: bool, drawings: Sequence[Drawing]) -> bytes:
+    """Draw the verdict and all figures below one another, each with its title."""
+    with style():
+        strips = [_pixels(_head(verdict, is_good))]
+        for drawing in drawings:
+            strips += [_pixels(_title(drawing.title)), _pixels(drawing.figure)]
+    width = max(strip.shape[1] for strip in strips)
+    sheet = np.full((sum(len(strip) for strip in strips), width, 4), 255, np.uint8)
+    row = 0
+    for strip in strips:
+        sheet[row : row + len(strip), : strip.shape[1]] = strip
+        row += len(strip)
+    out = io.BytesIO()
+    without_versions: Any = {"Software": None}
+    imsave(out, sheet, format="png", metadata=without_versions)
+    return out.getvalue()
+
+
+def _pixels(figure: Figure) -> NDArray[np.uint8]:
+    canvas: Any = FigureCanvasAgg(figure)
+    figure.dpi = _PNG_DOTS_PER_INCH
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())
+
+
+def _word_pages(verdict: str, is_good: bool, lines: Sequence[str]) -> Iterator[Figure]:
+    for first in range(0, max(len(lines), 1), _LINES_A_PAGE):
+        chosen = lines[first : first + _LINES_A_PAGE]
+        head = _head(verdict, is_good) if first == 0 else Figure(figsize=(_WIDTH_IN, 0.4))
+        top_in = head.get_figheight()
+        height_in = top_in + _LINE_IN * (len(chosen) + 4)
+        head.set_figheight(height_in)
+        for text in head.texts:
+            text.set_y(1.0 - 0.35 / height_in)
+        for number, line in enumerate(chosen):
+            y = 1.0 - (top_in + _LINE_IN * number) / height_in
+            head.text(0.04, y, line, fontsize=_FONT_SIZE, family="DejaVu Sans Mono", va="top", parse_math=False)
+        yield head
+
+
+def _head(verdict: str, is_good: bool) -> Figure:
+    """Write the verdict, in the colour and the words of whether it is good."""
+    words = textwrap.wrap(verdict, _VERDICT_LETTERS)
+    figure = Figure(figsize=(_WIDTH_IN, 0.55 + 0.24 * len(words)))
+    colour = COLOURS["good" if is_good else "alarm"]
+    height_in = figure.get_figheight()
+    text = "\n".join([("Good: " if is_good else "Not good: ") + words[0], *words[1:]])
+    figure.text(
+        0.04, 1.0 - 0.35 / height_in, text, fontsize=12, fontweight="bold", color=colour, va="top", parse_math=False
+    )
+    return figure
+
+
+def _title(title: str) -> Figure:
+    figure = Figure(figsize=(_WIDTH_IN, _ROOM_IN))
+    figure.text(0.04, 0.25, title, fontsize=10.5, fontweight="bold", va="bottom", parse_math=False)
+    return figure
+
+
+INDEX_NAME: Final = "index.html"
+_ORIGIN: Final = ("config", "profile", "interface")
+"""Metadata with a column each."""
+
+
+class Entry(NamedTuple):
+    """A run of the folder: its name there, and its report, or why it has none."""
+
+    name: str
+    report: Report | None
+    problem: str = ""
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether the run was good and its log is whole."""
+        return self.report is not None and self.report.metrics.is_clean and self.report.is_complete
+
+    @property
+    def verdict(self) -> str:
+        """What is to be said of it in a line."""
+        if self.report is None:
+            return f"The log can't be reported: {self.problem}"
+        missing = f" The log is not whole: {self.report.source.problem}" if self.report.source.problem else ""
+        return self.report.metrics.verdict + missing
+
+
+def count_text(entries: Sequence[Entry]) -> str:
+    """Say how many runs there are and how many of them are not good."""
+    bad = sum(not entry.is_clean for entry in entries)
+    runs = "1 run" if len(entries) == 1 else f"{len(entries)} runs"
+    return f"{runs}, {'all good' if bad == 0 else f'{bad} not good'}"
+
+
+class _IndexRow(NamedTuple):
+    """A run in the table: the place of its report, how long it lasted, and what it was made with."""
+
+    entry: Entry
+    place: str
+    lasts: str
+    origin: Sequence[str]
+
+
+def index_page(folder: Path, entries: Sequence[Entry]) -> str:
+    """Write the page, which lies in `folder`."""
+    count = count_text(entries)
+    heading = Heading("adacd-hil run reports", f"{count}.", (), all(entry.is_clean for entry in entries))
+    rows = [_row(folder, entry) for entry in entries]
+    return render_page("index_page.html.j2", f"{count} – run reports", heading, rows=rows)
+
+
+def _row(folder: Path, entry: Entry) -> _IndexRow:
+    if entry.report is None:
+        return _IndexRow(entry, "", NONE, [NONE] * len(_ORIGIN))
+    place = quote(entry.report.html_path.relative_to(folder).as_posix())
+    origin = [entry.report.metadata.get(key) or NONE for key in _ORIGIN]
+    return _IndexRow(entry, place, f"{entry.report.metrics.cycle.duration_s:.1f}", origin)

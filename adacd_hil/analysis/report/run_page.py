@@ -4,17 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adacd_hil.analysis.cyclic_data import percent_text
 from adacd_hil.analysis.drawing import Drawing
 from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.margin_evidence import Evidence
-from adacd_hil.analysis.metrics import Metrics
-from adacd_hil.analysis.report import bounds
 from adacd_hil.analysis.report.contact_cards import contact_cards, contacts_table
-from adacd_hil.analysis.report.long_run import CONTACTS as TRACED_CONTACTS
-from adacd_hil.analysis.report.packed_traces import SCRIPTS, STYLES, traces_of
-from adacd_hil.analysis.report.page import Heading, render_page
-from adacd_hil.analysis.report.reading import Source
+from adacd_hil.analysis.report.page import (
+    CONTACTS,
+    NONE,
+    Heading,
+    has_paper,
+    left_out_text,
+    number_text,
+    render_page,
+    stretch_text,
+)
 from adacd_hil.analysis.report.report_tables import (
     counted_sentence,
     data_table,
@@ -25,11 +27,15 @@ from adacd_hil.analysis.report.report_tables import (
     parameters_table,
     push_table,
     sections_table,
+    timing_tables,
 )
+from adacd_hil.analysis.report.run_reading import TRACED_CONTACTS, Source
 from adacd_hil.analysis.report.timeline import state_key, timeline_of
-from adacd_hil.analysis.report.timing_tables import timing_tables
-from adacd_hil.analysis.report.words import NONE, has_paper, left_out_text, number_text, stretch_text
-from adacd_hil.analysis.verdict import LISTED
+from adacd_hil.analysis.report.traces import SCRIPTS, STYLES, traces_of
+from adacd_hil.analysis.score.margins import Evidence
+from adacd_hil.analysis.score.metrics import Metrics
+from adacd_hil.analysis.score.run_faults import percent_text
+from adacd_hil.analysis.score.verdict import LISTED
 
 
 def report_page(
@@ -47,7 +53,6 @@ def report_page(
         SCRIPTS if traces else (),
         run=run,
         metrics=metrics,
-        bounds=bounds,
         tiles=_tiles(metrics),
         timeline=timeline_of(run, metrics),
         state_key=state_key(run),
@@ -60,7 +65,7 @@ def report_page(
         counted=counted_sentence(metrics),
         close_ups=figures.get("contacts"),
         contacts=contacts_table(metrics),
-        left_out=left_out_text(metrics, bounds.CONTACTS),
+        left_out=left_out_text(metrics, CONTACTS),
         cards=contact_cards(metrics, run),
         adaptations=[figures[name] for name in figures if name.removeprefix("fig") not in (name, "5")],
         parameters=parameters_table(metrics, run),

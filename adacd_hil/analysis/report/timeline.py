@@ -11,10 +11,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.metrics import Metrics
-from adacd_hil.analysis.report.bounds import MARKS
-from adacd_hil.analysis.report.words import number_text
+from adacd_hil.analysis.report.page import MARKS, number_text
 from adacd_hil.analysis.score.contacts import Contact
+from adacd_hil.analysis.score.metrics import Metrics
 from adacd_hil.records import SchemeState
 
 STATE_COLOURS: Final = {

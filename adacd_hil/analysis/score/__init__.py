@@ -1,1 +1,1 @@
-"""Whether a contact was found, how late, and whether an alarm was false: the one judge."""
+"""What a run came to: contacts, alarms, margins, verdict; the one judge of whether a contact was found, and when."""

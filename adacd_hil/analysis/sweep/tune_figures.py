@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from adacd_hil.analysis.detector_comparison import paper_svg
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
 from adacd_hil.analysis.sweep.tune import Tuning
 from adacd_hil.analysis.sweep.tune_roc import Choice
+from adacd_hil.analysis.thresholds.detector_comparison import paper_svg
 from adacd_hil.log.log_files import LogError
 from adacd_hil.output_files import replace_file
 

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.analysis.histogram import bar_chart, doubling_bins
-from adacd_hil.analysis.timing import QUANTITIES, TimingEvidence, collect_evidence
+from adacd_hil.analysis.score.distribution import bar_chart, doubling_bins
+from adacd_hil.analysis.score.timing import QUANTITIES, TimingEvidence, collect_evidence
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns
@@ -152,8 +152,8 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
     """
     # Here and not above: plots take a second to import, and memory that the test itself has no use for.
     from adacd_hil.analysis.report.page import Heading, render_page
-    from adacd_hil.analysis.report.timing_tables import timing_tables
-    from adacd_hil.analysis.timing_figures import draw_timing
+    from adacd_hil.analysis.report.report_tables import timing_tables
+    from adacd_hil.analysis.report.timing_figures import draw_timing
 
     if not len(report.columns):
         return []

@@ -16,8 +16,7 @@ from adacd_hil.records import Location
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.replay.log_comparison import LogComparison
-    from adacd_hil.analysis.replay.run_digest import Detection
+    from adacd_hil.analysis.replay.log_comparison import Detection, LogComparison
     from adacd_hil.log.time_window import TimeWindow
 
 _EPILOG = (

@@ -47,7 +47,7 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
 def _as_png(found: "History") -> bytes:
     import numpy as np
 
-    from adacd_hil.analysis.history_figure import Panel, history_figure
+    from adacd_hil.analysis.drawing import Panel, history_figure
 
     shown = found.certificates
     joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))

@@ -49,8 +49,7 @@ def identify(
     contacts are looked for in the recordings of --watch.
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
-    from adacd_hil.analysis.foreign.recording_import import read_recording
-    from adacd_hil.analysis.foreign.recording_map import read_map
+    from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
     from adacd_hil.cli.progress import Progress
     from adacd_hil.log.time_window import TimeWindow
 
@@ -79,7 +78,7 @@ def identify(
 
 
 def _write(found: "Identified", out: Path) -> None:
-    from adacd_hil.analysis.foreign.recording_figure import draw_watched
+    from adacd_hil.analysis.foreign.recording_identification import draw_watched
 
     out.mkdir(parents=True, exist_ok=True)
     replace_file(out / "identify.json", json.dumps(found.as_json(), indent=2))

@@ -13,8 +13,8 @@ from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
+    from adacd_hil.analysis.replay.log_source import Source
     from adacd_hil.analysis.replay.replay import Replay
-    from adacd_hil.analysis.replay.source import Source
     from adacd_hil.log.time_window import TimeWindow
     from adacd_hil.settings.configuration import Settings
 
@@ -107,7 +107,7 @@ def _replay_one(
         parse_variations,
         refuse_facts,
     )
-    from adacd_hil.analysis.score.truth_contacts import contacts_beside
+    from adacd_hil.analysis.score.emulator_truth import contacts_beside
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.settings.configuration import load_settings
 
@@ -135,7 +135,7 @@ def _open(
 ) -> "tuple[Source, bool]":
     """Open a log or a recording; also say whether it is a recording alone."""
     from adacd_hil.analysis.replay.can_recording import RecordingAgainstLog, RecordingAlone
-    from adacd_hil.analysis.replay.source import LogSource
+    from adacd_hil.analysis.replay.log_source import LogSource
     from adacd_hil.device.contract import load_contract
     from adacd_hil.settings.configuration import load_settings
     from adacd_hil.wire.codec import load_codec

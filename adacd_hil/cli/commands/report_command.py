@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.analysis.report.index_page import INDEX_NAME, Entry, count_text, index_page
-from adacd_hil.analysis.report.report_files import Report, write_report
+from adacd_hil.analysis.report.report_files import INDEX_NAME, Entry, Report, count_text, index_page, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, log_in

@@ -63,9 +63,8 @@ def sweep(
     A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
     """
     from adacd_hil.analysis.sweep.cluster import TLS, TlsFiles, connect
-    from adacd_hil.analysis.sweep.rows import replay_task
-    from adacd_hil.analysis.sweep.store import SweepStore
-    from adacd_hil.analysis.sweep.sweep import run_sweep
+    from adacd_hil.analysis.sweep.plan import replay_task
+    from adacd_hil.analysis.sweep.sweep import SweepStore, run_sweep
     from adacd_hil.cli.progress import Progress
 
     if bool(logs) == bool(scenarios):

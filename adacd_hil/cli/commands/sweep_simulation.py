@@ -5,8 +5,7 @@ from pathlib import Path
 
 from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.analysis.replay.what_if import apply_settings
-from adacd_hil.analysis.sweep.plan import Row, Task
-from adacd_hil.analysis.sweep.rows import REFUSALS, Values, failed, finished
+from adacd_hil.analysis.sweep.plan import REFUSALS, Row, Task, Values, failed, finished
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.settings.configuration import Settings
 

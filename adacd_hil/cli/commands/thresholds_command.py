@@ -5,9 +5,9 @@ import json
 from contextlib import closing
 from pathlib import Path
 
-from adacd_hil.analysis.detector_comparison import Comparison, compare_detectors
-from adacd_hil.analysis.false_alarms import TooLittleMotionError
-from adacd_hil.analysis.recorded_thresholds import Thresholds, thresholds_of_logs
+from adacd_hil.analysis.thresholds.detector_comparison import Comparison, compare_detectors
+from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
+from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.progress import Progress
 from adacd_hil.cli.table import format_table

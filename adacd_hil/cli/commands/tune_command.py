@@ -53,10 +53,10 @@ def tune(
 
     With --from and --until, motion and contacts of that stretch of each log count. The replays begin with the log.
     """
-    from adacd_hil.analysis.false_alarms import TooLittleMotionError
-    from adacd_hil.analysis.replay.source import LogSource
+    from adacd_hil.analysis.replay.log_source import LogSource
+    from adacd_hil.analysis.sweep.tune import base_of, suggested_toml
     from adacd_hil.analysis.sweep.tune import tune as find
-    from adacd_hil.analysis.sweep.tune_config import base_of, suggested_toml
+    from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
     from adacd_hil.cli.progress import Progress
 
     paths = [log_in(given) for given in logs]
@@ -84,8 +84,7 @@ def tune(
 
 
 def _as_text(found: "Tuning") -> str:
-    from adacd_hil.analysis.sweep.tune import LIMITS, free_hours
-    from adacd_hil.analysis.sweep.tune_config import in_words
+    from adacd_hil.analysis.sweep.tune import LIMITS, free_hours, in_words
     from adacd_hil.cli.table import format_table
 
     hours = sum(map(free_hours, found.logs))
@@ -120,7 +119,7 @@ def _as_text(found: "Tuning") -> str:
 
 def _cells(checked: "Found") -> tuple[str, ...]:
     """Say what thresholds come to in one half, a cell for each figure."""
-    from adacd_hil.analysis.score.score_words import delay_figures
+    from adacd_hil.analysis.score.judge import delay_figures
 
     low, high = checked.share_bounds
     return (
@@ -133,7 +132,7 @@ def _cells(checked: "Found") -> tuple[str, ...]:
 
 
 def _row(candidate: "Candidate") -> tuple[str, ...]:
-    from adacd_hil.analysis.score.score_words import delay_figures
+    from adacd_hil.analysis.score.judge import delay_figures
 
     outcome = candidate.outcome
     median_ms, _, _ = delay_figures(outcome.delays_ms)

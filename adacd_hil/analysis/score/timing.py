@@ -13,8 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.distribution import EXACT, Distribution
-from adacd_hil.analysis.histogram import LogHistogram, log_histogram
+from adacd_hil.analysis.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
 from adacd_hil.log.reader import Series
 from adacd_hil.records import CycleRecord, SchemeState, Vector
 
@@ -177,7 +176,7 @@ class TimingEvidence:
 
 
 class TimingGatherer:
-    """Sums up /cycle piece by piece, in bounded memory; `exact` as in `distribution.Distribution`."""
+    """Sums up /cycle piece by piece, in bounded memory; `exact` as in `Distribution`."""
 
     def __init__(self, period_us: float, is_modelled: bool, exact: int = EXACT) -> None:
         self._period_us = period_us

@@ -1,11 +1,16 @@
-"""What a report needs of the emulator's log: all of its cycles, or of a long one those of contacts.
+"""The truth of a run from the emulator's log: all of its cycles, or of a long one those of contacts; its true contacts.
 
 Of a contact the first cycles and the last second are kept as they are. In between, of every `_BUCKET` cycles those
 with the smallest and largest torque of each joint and the largest force; that many contacts of many seconds fit in
 memory, and what is asked of them (peaks, the filtered torque at their end) stays what it was.
+
+A log of another run is refused, as far as both logs say what was played.
 """
 
-from collections.abc import Mapping
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -13,12 +18,25 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.host_cycles import EmulatorSpan, host_cycles, host_span
-from adacd_hil.analysis.logged_run import Truth
-from adacd_hil.analysis.thinning import extreme_rows
-from adacd_hil.analysis.timing import Cycles
+from adacd_hil.analysis.logged_run import (
+    EmulatorSpan,
+    Truth,
+    extreme_rows,
+    host_cycles,
+    host_span,
+    is_interrupted,
+    whole_rounds,
+)
+from adacd_hil.analysis.score.contacts import contact_rows, forgotten_after_s
+from adacd_hil.analysis.score.judge import TouchWindow
+from adacd_hil.analysis.score.timing import Cycles
+from adacd_hil.log.editing.log_info import attachment, run_metadata
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
 from adacd_hil.log.reader import LogStream, Series
-from adacd_hil.records import PARAMETER_NAMES, Vector
+from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_files import parse_toml
 
 _BEGINNING: Final = (10_000, 1_000)
 """Cycles kept as they are: of a contact at first, and of one once `_PLENTY` rows are kept."""
@@ -241,3 +259,143 @@ def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None
         model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins),
         span=None if rows.span is None else host_span(rows.span, begins),
     )
+
+
+_PLAYED = ("scenario", "seed")
+
+
+def foreign_truth(log: Path, truth: Path) -> str:
+    """Say in one line why a truth is of another run than a log; "" where nothing says so.
+
+    Both name scenario and seed where one process played host and arm, and the truth has a digest of the host's
+    configuration: in lockstep, the same three make the same run. On a bus the host doesn't know what is played.
+    """
+    ours, theirs = run_metadata(log), _played(truth)
+    for key in _PLAYED:
+        if key in ours and key in theirs and ours[key] != theirs[key]:
+            return f"{truth} is of another run: its {key} is {theirs[key]}, the log's {ours[key]}"
+    config = attachment(log, "config.toml")
+    if CONFIG_DIGEST_KEY in theirs and config is not None and theirs[CONFIG_DIGEST_KEY] != _digest(config):
+        return f"{truth} is of another run: its host had another configuration"
+    return ""
+
+
+def config_digest(config: str) -> str:
+    """Give the digest by which a truth names its host's configuration. Raises ConfigError.
+
+    Of `realtime` a session makes what the host grants, so that it doesn't count.
+    """
+    table = {key: value for key, value in parse_toml(config).items() if key != "realtime"}
+    return hashlib.sha256(json.dumps(table, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _digest(config: bytes) -> str | None:
+    try:
+        return config_digest(config.decode("utf-8", "replace"))
+    except ConfigError:
+        return None  # who reads the log says so
+
+
+def _played(truth: Path) -> dict[str, str]:
+    """Give what a truth says of itself: of old, the scenario was attached only."""
+    said = run_metadata(truth)
+    try:
+        table = parse_toml(attachment(truth, "scenario.toml") or b"")
+    except ConfigError:
+        return said
+    attached = {"scenario": table.get("name"), "seed": table.get("seed")}
+    return {key: str(value) for key, value in attached.items() if value is not None} | said
+
+
+@dataclass(frozen=True)
+class TrueContact:
+    """A true contact. onset, end: its first cycle and the first one without it. tau_ext (k, 2), cycle (k,): of both.
+
+    number: of the truth, from 1. Cycles are the emulator's, in the `attempt` of the run, from 0; `counted_from` makes
+    them the host's.
+    """
+
+    number: int
+    attempt: int
+    link: int
+    onset: int
+    end: int
+    tau_ext: Vector
+    cycle: Cycles
+
+    def counted_from(self, first_cycle: int) -> "TrueContact":
+        """Return it with the cycles of the host, for which the attempt begins with the given one."""
+        shift = int(whole_rounds(np.array(first_cycle)))
+        return replace(self, onset=self.onset + shift, end=self.end + shift, cycle=self.cycle + shift)
+
+
+class TrueContacts(NamedTuple):
+    """The true contacts of a run, in order, and of which cycles they are known."""
+
+    contacts: tuple[TrueContact, ...]
+    span: EmulatorSpan
+
+
+class HostCycles(NamedTuple):
+    """Cycles of the host (k,): number, time, state of the cycle before, and threshold (k, 2)."""
+
+    cycle: Cycles
+    t_ns: Cycles
+    before: NDArray[np.uint8]
+    threshold: Vector
+
+
+def windows_of(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TouchWindow]:
+    """Give those contacts, on the host's cycles, that begin before these end, as they are judged.
+
+    host: has the cycles that each onset and each end lies between.
+    """
+    contacts = [contact for contact in contacts if len(host.cycle) and contact.onset <= host.cycle[-1]]
+    if not contacts:
+        return []
+    is_certified = settings.scheme == "certified"
+    a_rad_s = settings.certified.cutoffs_rad_s[0] if is_certified else settings.filter.a_rad_s
+    instants = [(contact.onset, contact.end) for contact in contacts]
+    since_ns = np.rint(np.interp(instants, host.cycle, host.t_ns - host.t_ns[0])).astype(np.int64)
+    rows = np.searchsorted(host.cycle, [contact.onset for contact in contacts]).tolist()
+    windows = []
+    for contact, row, (onset_ns, end_ns) in zip(contacts, rows, (since_ns + host.t_ns[0]).tolist(), strict=True):
+        threshold = np.where(np.isfinite(host.threshold[row]), host.threshold[row], settings.detector.threshold_Nm)
+        after_s = forgotten_after_s(contact.tau_ext, contact.cycle, settings.bus.period_s, a_rad_s, threshold)
+        before = host.before[row]
+        windows.append(
+            TouchWindow(
+                number=contact.number,
+                link=contact.link,
+                onset_ns=onset_ns,
+                forgotten_ns=end_ns + round(after_s * 1e9),
+                is_armed=bool(before == SchemeState.MONITOR),
+                is_reacting=bool(is_interrupted(before)),
+            )
+        )
+    return windows
+
+
+def contacts_beside(path: Path, progress: Callable[[str], None] = lambda _: None) -> TrueContacts | None:
+    """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError.
+
+    That of another run is left out, and `progress` is told why.
+    """
+    truth = path.with_name(TRUTH_NAME)
+    if not truth.exists():
+        return None
+    if problem := foreign_truth(path, truth):
+        progress(f"{problem}; it is left out")
+        return None
+    rows = read_truth(truth, 0)
+    return None if rows.span is None else TrueContacts(_contacts(rows), rows.span)
+
+
+def _contacts(rows: TruthRows) -> tuple[TrueContact, ...]:
+    found = []
+    for number, (start, end) in enumerate(contact_rows(rows.contact_index, rows.attempt), start=1):
+        stop = end + int(end < len(rows.cycle) and rows.attempt[end] == rows.attempt[start])  # the row after it
+        cycle = rows.cycle[start:stop]
+        link, tau_ext = int(rows.contact_link[start]), rows.tau_ext[start:stop]
+        found.append(TrueContact(number, int(rows.attempt[start]), link, int(cycle[0]), int(cycle[-1]), tau_ext, cycle))
+    return tuple(found)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adacd_hil.analysis.distribution import Distribution
+from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sight, tail

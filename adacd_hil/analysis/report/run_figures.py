@@ -25,13 +25,11 @@ from adacd_hil.analysis.drawing import (
     plot,
     style,
 )
-from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.metrics import Metrics
-from adacd_hil.analysis.report.bounds import ADAPTATIONS
-from adacd_hil.analysis.score.contacts import Contact
-from adacd_hil.analysis.score.score_words import why_not_found
-from adacd_hil.analysis.score.touches import filtered, row_at
-from adacd_hil.analysis.sections import Section
+from adacd_hil.analysis.logged_run import Run, Section
+from adacd_hil.analysis.report.page import ADAPTATIONS
+from adacd_hil.analysis.score.contacts import Contact, filtered, row_at
+from adacd_hil.analysis.score.judge import why_not_found
+from adacd_hil.analysis.score.metrics import Metrics
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
 from adacd_hil.scheme.model.bank import channels_of
 

@@ -1,6 +1,6 @@
 """Thresholds from logs: the recorded motion that nobody touched, each detector's statistics on it, what they allow.
 
-Which motion counts: see `adacd_hil.analysis.motion`. A touch that no detector flagged counts, and raises thresholds.
+Which motion counts: see `free_motion`. A touch that no detector flagged counts, and raises thresholds.
 
 The detectors run over all of it, and thresholds come from all that they show. The velocity's lag (what the filtered
 slope of the torque explains of the stream), the stream's covariance and the sources of a threshold are found from the
@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.analysis.false_alarms import (
+from adacd_hil.analysis.thresholds.false_alarms import (
     Limits,
     Prediction,
     Sensing,
@@ -29,7 +29,7 @@ from adacd_hil.analysis.false_alarms import (
     resolution,
     white_noise,
 )
-from adacd_hil.analysis.motion import (
+from adacd_hil.analysis.thresholds.free_motion import (
     LoggedMotion,
     Mask,
     Motion,

@@ -9,8 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from adacd_hil.analysis.drawing import COLOURS, Drawing, label_below, label_decades, legend_above, note, style
-from adacd_hil.analysis.histogram import BINS_PER_DECADE
-from adacd_hil.analysis.timing import (
+from adacd_hil.analysis.score.distribution import BINS_PER_DECADE
+from adacd_hil.analysis.score.timing import (
     COMPUTE,
     LATENESS,
     QUEUES,

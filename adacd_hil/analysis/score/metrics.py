@@ -4,7 +4,7 @@ Pure functions from a run's arrays to frozen results. Times in s count from *mot
 Torques in Nm, joint arrays (2,), histories time-first (n, 2); `tau_ext_hat` has the filter's DC gain taken out, so
 that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
 
-**Sections** are lettered A, B, C, … in order, see `adacd_hil.analysis.sections`. An adaptation's time is that of its
+**Sections** are lettered A, B, C, … in order, see `adacd_hil.analysis.logged_run`. An adaptation's time is that of its
 section: up to MONITOR, the test of the frozen model and what a contact on the way costs included.
 
 **Frozen residual**: largest |tau_ext_hat| of each joint where nobody touches the arm. A cycle counts unless it lies in
@@ -14,30 +14,31 @@ model's residual is given, because theta_hat still moves. Without the truth, [de
 stands for the contact. After the request to finish the arm parks and stands, where friction may hold any torque up
 to F_c: those cycles don't count.
 
-**A detection** is an alarm of `adacd_hil.analysis.score.alarms`. Which contacts were found or missed, and which
+**A detection** is an alarm of `adacd_hil.analysis.score.judge`. Which contacts were found or missed, and which
 detections are false alarms: `adacd_hil.analysis.score.judge`; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
-those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.margin_evidence`; the paper's
-scheme that ran beside it on the same stream: `adacd_hil.analysis.score.paper_beside`.
+those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.score.margins`; the paper's
+scheme that ran beside it on the same stream: `adacd_hil.analysis.score.margins`.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from adacd_hil.analysis.cyclic_data import CyclicData, gather_data
-from adacd_hil.analysis.endings import find_causes, find_faults
-from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.margin_evidence import Evidence, evaluate_certified, last_row
-from adacd_hil.analysis.paper_comparison import PaperRow, compare_with_paper
-from adacd_hil.analysis.score.alarms import find_detections
-from adacd_hil.analysis.score.confidence_bounds import rate_bound_per_h
-from adacd_hil.analysis.score.contacts import Contact, list_contacts
-from adacd_hil.analysis.score.touches import judge_run, true_contacts
-from adacd_hil.analysis.sections import Section, rows_of, split_sections
-from adacd_hil.analysis.timing import TimingEvidence, collect_evidence, find_reactions
-from adacd_hil.analysis.untouched import Residual, Untouched, gather_untouched
-from adacd_hil.analysis.verdict import give_verdict, is_margin_below_1, is_revoked
+from adacd_hil.analysis.logged_run import Run, Section, rows_of, split_sections
+from adacd_hil.analysis.score.contacts import Contact, judge_run, list_contacts, true_contacts
+from adacd_hil.analysis.score.judge import find_detections, rate_bound_per_h
+from adacd_hil.analysis.score.margins import (
+    Evidence,
+    Residual,
+    Untouched,
+    evaluate_certified,
+    gather_untouched,
+    last_row,
+)
+from adacd_hil.analysis.score.run_faults import CyclicData, find_causes, find_faults, gather_data
+from adacd_hil.analysis.score.timing import TimingEvidence, collect_evidence, find_reactions
+from adacd_hil.analysis.score.verdict import PaperRow, compare_with_paper, give_verdict, is_margin_below_1, is_revoked
 from adacd_hil.records import PARAMETER_NAMES
 
 

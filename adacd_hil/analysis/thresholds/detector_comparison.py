@@ -18,8 +18,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
-from adacd_hil.analysis.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
-from adacd_hil.analysis.recorded_thresholds import BLOCK_S, Statistics
+from adacd_hil.analysis.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
+from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S, Statistics
 from adacd_hil.log.log_files import LogError
 from adacd_hil.output_files import replace_file
 from adacd_hil.records import JOINTS, Vector

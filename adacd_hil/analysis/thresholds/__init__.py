@@ -1,0 +1,1 @@
+"""Thresholds for a wanted rate of false alarms, from recorded motion that nobody touched."""
