@@ -9,7 +9,7 @@ from lab import PERIOD_S, Motion, Recording, paper_motion
 from adacd_hil.control.motion.excitation import Excitation
 from adacd_hil.records import JOINTS, SchemeState
 from adacd_hil.scheme.kernel import certified_memory, loop
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
 
 WIDE_FILTER = 1
@@ -75,7 +75,7 @@ class CertifiedScheme:
 
     @staticmethod
     def _undo(y: np.ndarray, cutoff_rad_s: float) -> np.ndarray:
-        """Undo a filter, as `adacd_hil.scheme.contact.contact_estimate.undo_filter` does."""
+        """Undo a filter, as `adacd_hil.scheme.detect.external_torque.undo_filter` does."""
         decay = np.exp(-cutoff_rad_s * PERIOD_S)
         sharp = y.copy()
         sharp[1:] = (y[1:] - decay * y[:-1]) / (1.0 - decay)

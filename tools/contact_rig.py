@@ -23,9 +23,9 @@ from adacd_hil.records import (
     Vector,
 )
 from adacd_hil.scheme.kernel import paper_kernel
-from adacd_hil.scheme.pipeline.contact_course import Touch
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.pipeline.contact_course import ContactCourse
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings, load_settings, merge
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.sensing import DriveMode
@@ -81,7 +81,7 @@ class Rig:
         paper_kernel.begin_adaptation(self._constants, self._memory, self._block)
         self._block[0]["theta_hat"][:] = self._theta
         self._collision_Nm = np.array(settings.detector.collision_Nm)
-        self._touch = Touch(settings)
+        self._touch = ContactCourse(settings)
         self._q_d, self._dq_d, self._ddq_d = np.zeros(2), np.zeros(2), np.zeros(2)
         self._tau_d, self._tau_c = np.zeros(2), np.zeros(2)
         self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)

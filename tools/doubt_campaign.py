@@ -22,7 +22,7 @@ from campaign_loop import Figure, add_jobs, add_seeds, exit_status, play_trials,
 from touch_trials import PERIOD_S, HandLoop
 
 from adacd_hil.records import SchemeState, Vector
-from adacd_hil.scheme.identify.belief import payload_direction
+from adacd_hil.scheme.model.regressor import payload_direction
 
 SIZES_KG = (0.05, 0.1, 0.2, 0.5, 1.0)
 ERRORS = ("Coulomb friction", "viscous friction", "torque offset")

@@ -30,8 +30,8 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.kernel import certified_memory, loop
-from adacd_hil.scheme.model.bank import channels_of, step_response
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.model.filter_bank import channels_of, step_response
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings, load_settings
 from firmware_sim.arm.arms import ArmProfile
 from firmware_sim.arm.device_settings import SensorSettings

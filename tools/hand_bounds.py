@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from adacd_hil.cli.table import format_table
 from adacd_hil.control.motion.quintic import evaluate, to_rest
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.model import bank
+from adacd_hil.scheme.model import filter_bank
 from adacd_hil.settings.configuration import Settings, load_settings
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ def hands_of(settings: Settings, q: Array, dq: Array) -> dict[str, Array]:
 
 def smallest(settings: Settings, rows: Array, torque: Array) -> float:
     """Return the size at which a hand (n, 2) of size 1 comes to SIGMAS deviations."""
-    cutoff, smoothing = settings.certified.cutoffs_rad_s[bank.LEARNT], settings.certified.smoothing_rad_s
+    cutoff, smoothing = settings.certified.cutoffs_rad_s[filter_bank.LEARNT], settings.certified.smoothing_rad_s
     for rate in (cutoff, smoothing):
         decay = np.exp(-rate * PERIOD_S)
         torque = lfilter([1.0 - decay], [1.0, -decay], torque, axis=0)

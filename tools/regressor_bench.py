@@ -15,7 +15,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.scheme.identify import estimator, offline
-from adacd_hil.scheme.model import chain, filters, regressor
+from adacd_hil.scheme.model import chain, filter_bank, regressor
 from adacd_hil.scheme.model.urdf import read_urdf
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -43,7 +43,7 @@ def by_chain(arm, place, first_friction, q, dq, scratch, Y_p, Y_h):
 def filtered(count, decay, old, new, cutoff, Y_p, Y_h, input_old, S, W_f):
     """Filter the regressor `count` times."""
     for _ in range(count):
-        filters.advance_regressor(decay, old, new, cutoff, cutoff, Y_p, Y_h, input_old, S, W_f)
+        filter_bank.advance_regressor(decay, old, new, cutoff, cutoff, Y_p, Y_h, input_old, S, W_f)
 
 
 @compiled
@@ -76,7 +76,7 @@ def show(name: str, block: Callable[[], object], steps: int) -> None:
 def show_rest(named: str, Y_p: np.ndarray, Y_h: np.ndarray) -> None:
     """Print what follows the regressor: one filter, the uncertainty, one correction."""
     n, p = Y_p.shape
-    hold = filters.first_order_hold(CUTOFF_RAD_S, CUTOFF_RAD_S, PERIOD_S)
+    hold = filter_bank.first_order_hold(CUTOFF_RAD_S, CUTOFF_RAD_S, PERIOD_S)
     input_old, S, W_f, WP = (np.zeros((n, p)) for _ in range(4))
     P, noise = np.eye(p), np.full(n, 0.02)
     show(f"{named}: one filter of it", lambda: filtered(BLOCK, *hold, CUTOFF_RAD_S, Y_p, Y_h, input_old, S, W_f), BLOCK)

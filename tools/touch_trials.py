@@ -20,9 +20,9 @@ from planar_arm import THETA
 
 from adacd_hil.compiled import Structured
 from adacd_hil.records import Request, SchemeOutput, SchemeState, Vector
-from adacd_hil.scheme.identify import earlier, fit_samples
-from adacd_hil.scheme.identify.belief import payload_direction
+from adacd_hil.scheme.identify import earlier, fit_check
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
+from adacd_hil.scheme.model.regressor import payload_direction
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
 
 FREE = replace(
@@ -193,7 +193,7 @@ def rule_shares(constants: Structured, memory: Structured) -> tuple[float, ...]:
     steps = range(min(int(m["steps_used"]), earlier.STEPS))
     places = [(s, i) for s in range(int(m["samples_kept"])) for i in range(2)]
     changed = max((earlier.changed_share(m, s) for s in steps), default=0.0)
-    explained = max((abs(fit_samples.residual(m, *place)) for place in places), default=0.0) / fit_samples.limit_Nm(m)
+    explained = max((abs(fit_check.residual(m, *place)) for place in places), default=0.0) / fit_check.limit_Nm(m)
     later = max((earlier.later_share(k, m, s) for s in steps), default=0.0)
     earlier.forget(m)
     earlier.keep(m)

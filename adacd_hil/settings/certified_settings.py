@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from adacd_hil.settings.schema import ConfigError, setting
 
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
-"""Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.friction`."""
+"""Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.model.regressor`."""
 CROSS_TALK = "cross_talk"
 """What each torque sensor shows of the other joint's torque, Nm/Nm."""
 

@@ -24,7 +24,7 @@ from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, comput
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.detect.detectors import DetectorSettings
+from adacd_hil.scheme.detect.detectors import DetectorBankSettings
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import read_toml
 
@@ -35,7 +35,7 @@ T = 1e-3
 THETA = np.array([0.3841, 0.06825, 0.04035, 0.12, 0.06, 0.15, 0.08])
 LAG_S = 1.5e-3
 RATES = np.array([1.7, 2.9])
-SETTINGS = DetectorSettings()
+SETTINGS = DetectorBankSettings()
 
 
 def positions(t_s):

@@ -10,7 +10,7 @@ from long_cases import long_but
 from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme.detect import sight, tail
+from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.identify import anchor
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
@@ -85,7 +85,7 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
     constants, memory = loop.pipeline._constants[0], loop.pipeline._memory[0]
     assert loop.said("certificate") == [
         f"torque offsets anchored: joint 1 {NOT_AT_ALL}; joint 2 {NOT_AT_ALL}; "
-        f"{sight.describe(memory)}; {tail.describe(constants, memory)}; {THIS_RUN_ONLY}"
+        f"{margin.describe_sight(memory)}; {margin.describe_false_alarms(constants, memory)}; {THIS_RUN_ONLY}"
     ]
     assert loop.levels("certificate") == ["warning"]
 

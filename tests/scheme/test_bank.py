@@ -1,10 +1,10 @@
-"""The bank of filters against scipy and against `filters` alone."""
+"""The bank of filters against scipy and against one filter alone."""
 
 import numpy as np
 import pytest
 import scipy.signal
 
-from adacd_hil.scheme.model import bank, filters
+from adacd_hil.scheme.model import filter_bank
 
 T = 1e-3
 CUTOFF = np.array([10.0, 50.0, 200.0])
@@ -16,15 +16,17 @@ class Bank:
 
     def __init__(self):
         self.rates = np.zeros((3, 3))
-        bank.discretise(CUTOFF, T, *self.rates)
+        filter_bank.discretise(CUTOFF, T, *self.rates)
         self.tau_old, self.tau_f = np.zeros((3, 2)), np.zeros((3, 2))
         self.input_old, self.S, self.W_f = (np.zeros((3, 2, COLUMNS)) for _ in range(3))
 
     def resume(self, Y_p, Y_h, tau_J):
-        bank.resume(CUTOFF, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.W_f)
+        filter_bank.resume_bank(CUTOFF, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.W_f)
 
     def advance(self, Y_p, Y_h, tau_J):
-        bank.advance(CUTOFF, *self.rates, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.tau_f, self.W_f)
+        filter_bank.advance_bank(
+            CUTOFF, *self.rates, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.tau_f, self.W_f
+        )
 
     def run(self, Y_p, Y_h, tau_J):
         """Go over samples (n, ...), the first of them after a gap; return tau_f (n, C, 2) and W_f (n, C, 2, p)."""
@@ -70,13 +72,13 @@ def test_the_filters_do_not_know_of_each_other():
     Y_p, Y_h, tau_J = signals()
     tau_f, W_f = Bank().run(Y_p, Y_h, tau_J)
     for c, a in enumerate(CUTOFF):
-        hold = filters.first_order_hold(a, a, T)
+        hold = filter_bank.first_order_hold(a, a, T)
         tau_old, alone_f = tau_J[0].copy(), np.zeros(2)
         input_old, S, W_alone = (np.zeros((2, COLUMNS)) for _ in range(3))
-        filters.resume(a, a, Y_p[0], Y_h[0], tau_J[0], input_old, tau_old, S, W_alone)
+        filter_bank.resume(a, a, Y_p[0], Y_h[0], tau_J[0], input_old, tau_old, S, W_alone)
         for k in range(1, len(tau_J)):
-            filters.advance_torque(*hold, tau_old, tau_J[k], alone_f)
-            filters.advance_regressor(*hold, a, a, Y_p[k], Y_h[k], input_old, S, W_alone)
+            filter_bank.advance_torque(*hold, tau_old, tau_J[k], alone_f)
+            filter_bank.advance_regressor(*hold, a, a, Y_p[k], Y_h[k], input_old, S, W_alone)
         np.testing.assert_array_equal(tau_f[-1, c], alone_f)
         np.testing.assert_array_equal(W_f[-1, c], W_alone)
 
@@ -89,7 +91,7 @@ def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
     for k, torque in enumerate(tau_J):
         (filtered.advance if k else filtered.resume)(none, none, torque)
         W_f = np.zeros((3, 2, COLUMNS))
-        bank.fill_lag(CUTOFF, torque, filtered.tau_f, 3, W_f)
+        filter_bank.fill_lag(CUTOFF, torque, filtered.tau_f, 3, W_f)
         got.append(W_f)
     rate = np.concatenate([np.zeros((1, 2)), np.diff(tau_J, axis=0) / T])
     for c, a in enumerate(CUTOFF):
@@ -103,7 +105,7 @@ def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
 
 def test_the_cross_talk_column_is_the_other_joint_s_filtered_torque():
     tau_f, W_f = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.zeros((3, 2, COLUMNS))
-    bank.fill_cross_talk(tau_f, 1, W_f)
+    filter_bank.fill_cross_talk(tau_f, 1, W_f)
     np.testing.assert_array_equal(W_f[:, 0, 1], tau_f[:, 1])
     np.testing.assert_array_equal(W_f[:, 1, 2], tau_f[:, 0])
     assert np.count_nonzero(W_f) == 6
@@ -114,7 +116,7 @@ def test_a_push_toward_positive_q_is_a_positive_external_torque():
     random = np.random.default_rng(2)
     W_f, theta = random.standard_normal((3, 2, COLUMNS)), random.standard_normal(COLUMNS)
     tau_ext, tau_ext_hat = np.array([[0.5, 0.1], [0.6, 0.2], [0.7, 0.3]]), np.zeros((3, 2))
-    bank.estimate_external(W_f @ theta - tau_ext, W_f, theta, tau_ext_hat)
+    filter_bank.estimate_external(W_f @ theta - tau_ext, W_f, theta, tau_ext_hat)
     np.testing.assert_allclose(tau_ext_hat, tau_ext, atol=1e-12)
 
 
@@ -122,7 +124,7 @@ def test_smoothed_channels_come_first_and_all_but_the_slowest_are_there_bare_too
     r = np.random.default_rng(3).standard_normal((100, 3, 2))
     y, got, smoothing = np.zeros((5, 2)), [], np.exp(-0.2)
     for row in r:
-        bank.smooth(smoothing, row, y)
+        filter_bank.smooth(smoothing, row, y)
         got.append(y.copy())
     smoothed = scipy.signal.lfilter([1.0 - smoothing], [1.0, -smoothing], r, axis=0)
     np.testing.assert_allclose(np.array(got)[:, :3], smoothed, rtol=1e-9, atol=1e-12)
@@ -150,5 +152,5 @@ def test_after_a_gap_the_residual_of_the_true_parameters_stays_zero():
     filtered, residual = Bank(), np.zeros((3, 2))
     for offset in (0.0, 8.0):
         filtered.run(Y_p + offset, Y_h, tau_J)
-        bank.estimate_external(filtered.tau_f, filtered.W_f, theta, residual)
+        filter_bank.estimate_external(filtered.tau_f, filtered.W_f, theta, residual)
         np.testing.assert_allclose(residual, 0.0, atol=1e-12)

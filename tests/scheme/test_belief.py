@@ -10,7 +10,7 @@ from planar_arm import PAYLOAD_1KG
 
 from adacd_hil.scheme.identify import belief
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.model import bank
+from adacd_hil.scheme.model import filter_bank, regressor
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
@@ -32,7 +32,7 @@ def samples(count=400, seed=1):
 def learn(m, W_f, tau_f, held=0.0):
     """Learn a sample in which friction may hold a torque, Nm."""
     m["W_learnt"], m["tau_learnt"] = W_f, tau_f
-    m["hold"], m["still_smooth"][bank.LEARNT] = 10.0 * np.asarray(held), 0.1
+    m["hold"], m["still_smooth"][filter_bank.LEARNT] = 10.0 * np.asarray(held), 0.1
     return belief.learn(K, m)
 
 
@@ -125,7 +125,7 @@ def test_samples_that_wait_are_thrown_away_when_they_turn_out_to_be_a_touch():
 
 def test_a_payload_widens_the_belief_along_one_direction():
     P = np.zeros((COUNT, COUNT))
-    direction = belief.payload_direction((0.35, 0.30), COUNT)
+    direction = regressor.payload_direction((0.35, 0.30), COUNT)
     belief.add_payload(direction, 3.0, 0.0, P)
     np.testing.assert_allclose(direction[:7], PAYLOAD_1KG)
     np.testing.assert_allclose(P, 9.0 * np.outer(direction, direction))
@@ -133,7 +133,7 @@ def test_a_payload_widens_the_belief_along_one_direction():
 
 
 def test_a_payload_that_is_no_point_mass_touches_the_inertia_only():
-    P, direction = np.zeros((COUNT, COUNT)), belief.payload_direction((0.35, 0.30), COUNT)
+    P, direction = np.zeros((COUNT, COUNT)), regressor.payload_direction((0.35, 0.30), COUNT)
     belief.add_payload(direction, 0.0, 0.02, P)
     np.testing.assert_allclose(np.diag(P), np.where(np.arange(COUNT) < 3, 0.02**2, 0.0))
 

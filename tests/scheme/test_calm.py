@@ -6,9 +6,8 @@ from smooth_motion import settings_with
 
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState
 from adacd_hil.scheme.pipeline.batch import arm_at
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
-from adacd_hil.scheme.supervisor.skip_conditions import ArmFinding, is_calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, ArmFinding, Observation, is_calm
 
 SETTINGS = settings_with(
     safety={"commission_s": 0.012, "phase_timeout_s": 0.15},

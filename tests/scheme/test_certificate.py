@@ -5,7 +5,7 @@ import pytest
 from excited_arm import NAMES, SETTINGS
 
 from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.scheme.identify import certificate
+from adacd_hil.scheme.identify import termination
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
@@ -28,7 +28,7 @@ def fitted_arm(**changes):
 
 
 def missing(m):
-    return certificate.describe_missing(K, m, NAMES, PARAMETER_UNITS)
+    return termination.describe_missing(K, m, NAMES, PARAMETER_UNITS)
 
 
 def uncertain(name, times):
@@ -39,7 +39,7 @@ def uncertain(name, times):
 
 
 def test_an_arm_with_all_the_evidence_is_fitted():
-    assert certificate.is_complete(K, fitted_arm())
+    assert termination.is_complete(K, fitted_arm())
     assert missing(fitted_arm()) == []
 
 
@@ -63,15 +63,15 @@ def test_an_arm_with_all_the_evidence_is_fitted():
     ids=str,
 )
 def test_with_any_part_missing_it_is_not(changes):
-    assert not certificate.is_complete(K, fitted_arm(**changes))
+    assert not termination.is_complete(K, fitted_arm(**changes))
 
 
 def test_a_payload_needs_neither_travel_nor_excitation_but_certain_parameters():
     unmoved = {"is_payload": 1.0, "q_high": [-np.inf] * 2, "excitation": 0.0, "condition": np.inf}
     samples = round(FIT[1] * 1e3)
-    assert certificate.is_complete(K, fitted_arm(**unmoved, samples=samples))
-    assert not certificate.is_complete(K, fitted_arm(**unmoved, samples=samples - 1))
-    assert not certificate.is_complete(K, fitted_arm(**unmoved, samples=samples, P_belief=uncertain("a1", 1.01)))
+    assert termination.is_complete(K, fitted_arm(**unmoved, samples=samples))
+    assert not termination.is_complete(K, fitted_arm(**unmoved, samples=samples - 1))
+    assert not termination.is_complete(K, fitted_arm(**unmoved, samples=samples, P_belief=uncertain("a1", 1.01)))
 
 
 def test_before_its_first_sample_an_arm_has_not_travelled_at_all():

@@ -13,10 +13,10 @@ from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
-from adacd_hil.scheme.detect import lost_samples
-from adacd_hil.scheme.identify import certificate
+from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.identify import termination
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 
 COUNT = len(NAMES)
 OFFSETS = [NAMES.index("offset1"), NAMES.index("offset2")]
@@ -128,7 +128,7 @@ def test_what_was_lost_is_a_gap_for_the_sample_after_it(smooth):
     before = kernel.m["r"].copy()
     kernel.step(q[299] + 9.0, dq[299], tau_J[299] + 9.0, is_complete=0)
     np.testing.assert_array_equal(kernel.m["r"], before)
-    kernel.step(q[309], dq[309], tau_J[309], periods=lost_samples.MOST_FILLED + 2)
+    kernel.step(q[309], dq[309], tau_J[309], periods=sensitivity.MOST_FILLED + 2)
     np.testing.assert_allclose(kernel.m["r"], before, atol=1e-12)
 
 
@@ -353,7 +353,7 @@ def test_an_arm_that_stands_still_gets_no_certificate_and_the_reason_names_it():
     standing = record(THETA["P"], 4.0, motion=(np.tile(q_d[0], (4000, 1)), 0.0 * dq_d))
     played = play(standing)
     assert np.all(played.state == SchemeState.ADAPT)
-    lines = certificate.describe_missing(played.constants[0], played.memory[0], NAMES, PARAMETER_UNITS)
+    lines = termination.describe_missing(played.constants[0], played.memory[0], NAMES, PARAMETER_UNITS)
     assert sum("has travelled 0.0 deg of 20: move it further" in line for line in lines) == 2
     assert any(line.startswith("a1 is known to ") and "kg m², 0.02 needed" in line for line in lines)
 
@@ -363,7 +363,7 @@ def test_one_joint_that_stands_still_is_the_one_that_is_named():
     q_d[:, 1], dq_d[:, 1] = q_d[0, 1], 0.0
     played = play(record(THETA["P"], 4.0, motion=(q_d, dq_d)))
     assert SchemeState.MONITOR not in played.state
-    lines = certificate.describe_missing(played.constants[0], played.memory[0], NAMES, PARAMETER_UNITS)
+    lines = termination.describe_missing(played.constants[0], played.memory[0], NAMES, PARAMETER_UNITS)
     assert not any(line.startswith("joint 1") for line in lines)
     assert any(line.startswith("joint 2 has travelled") for line in lines)
 

@@ -14,7 +14,7 @@ from adacd_hil.scheme.detect.margin import MarginWatch
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 
 PLACES = certified_layout(7, SETTINGS.further_count, SETTINGS.channel_count).slices
 BEFORE = 12

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.records import ContactKind
-from adacd_hil.scheme.contact.classification import WINDOW_S, classify, share_left
+from adacd_hil.scheme.contact.contact_report import WINDOW_S, classify, share_left
 
 SIGMA = np.array([0.03, 0.015])
 PERIOD_S = 1e-3

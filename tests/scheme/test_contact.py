@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from smooth_motion import PLACES, run_kernel, settings_with
 
-from adacd_hil.scheme.contact.contact_estimate import Isolation, follow_contact
+from adacd_hil.scheme.contact.contact_report import Isolation
+from adacd_hil.scheme.detect.external_torque import follow_contact
 from adacd_hil.scheme.kernel import paper_kernel
 
 T = 1e-3

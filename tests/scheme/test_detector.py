@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from smooth_motion import PLACES, run_kernel, settings_with
 
-from adacd_hil.scheme.detect.detector import follow_standstill, joints_over
+from adacd_hil.scheme.detect.external_torque import follow_standstill, joints_over
 from adacd_hil.scheme.kernel import paper_kernel
 
 T = 1e-3

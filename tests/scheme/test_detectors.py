@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 from adacd_hil.scheme.detect.detectors import (
-    DetectorSettings,
+    DetectorBankSettings,
     autocovariance,
     constants_of,
     likelihood_weights,
@@ -20,7 +20,7 @@ from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.schema import ConfigError
 
 T = 1e-3
-SETTINGS = DetectorSettings(onset_samples=(4, 16))
+SETTINGS = DetectorBankSettings(onset_samples=(4, 16))
 CHANNELS = SETTINGS.channels
 WEIGHTS = np.random.default_rng(4).standard_normal((2, 2, 24))
 
@@ -112,7 +112,7 @@ def test_white_noise_makes_the_average_the_best_window_and_a_sigma_of_one():
 def test_a_whitened_window_has_a_sigma_of_one_on_coloured_noise():
     white = np.random.default_rng(5).standard_normal((200_000, 2))
     coloured = scipy.signal.lfilter([0.02, -0.015], [1.0, -0.5], white, axis=0)
-    weights = likelihood_weights(coloured, DetectorSettings(onset_samples=(4, 16)), 1.5e-3, T)
+    weights = likelihood_weights(coloured, DetectorBankSettings(onset_samples=(4, 16)), 1.5e-3, T)
     for window in weights.reshape(-1, weights.shape[-1]):
         through = scipy.signal.lfilter(window, [1.0], coloured[:, 0])
         assert 0.88 < through.std() <= 1.02
@@ -129,8 +129,8 @@ def test_the_covariance_of_a_moving_average_is_found():
         (lambda: autocovariance(np.zeros(90), 10), "90 samples"),
         (lambda: likelihood_windows(np.zeros(8), (4,), 0.0, T), "variance"),
         (lambda: likelihood_windows(np.ones(8), (9,), 0.0, T), "8 samples"),
-        (lambda: DetectorSettings(band_rad_s=(50.0, 20.0)), "band_rad_s"),
-        (lambda: DetectorSettings(observer_rad_s=()), "observer_rad_s"),
+        (lambda: DetectorBankSettings(band_rad_s=(50.0, 20.0)), "band_rad_s"),
+        (lambda: DetectorBankSettings(observer_rad_s=()), "observer_rad_s"),
     ],
 )
 def test_what_cannot_be_designed_is_refused(call, words):

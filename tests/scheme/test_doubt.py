@@ -13,7 +13,7 @@ from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme.identify import doubt
 from adacd_hil.scheme.identify.doubt import Doubt
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.model import bank
+from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
 
 PAYLOAD, COULOMB1 = range(2)
@@ -124,7 +124,7 @@ def test_who_touches_the_arm_again_and_again_takes_nothing_back():
 
 def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD, others=5):
     """The sums of a contact that one cause explains to this share, with this sigma of its size."""
-    correlated = 2.0 / (SETTINGS.certified.cutoffs_rad_s[bank.LEARNT] * PERIOD_S)
+    correlated = 2.0 / (SETTINGS.certified.cutoffs_rad_s[filter_bank.LEARNT] * PERIOD_S)
     ww = correlated * (doubt.RESIDUAL_NM / sigma) ** 2
     rw = np.zeros(others)
     rw[cause] = size * ww

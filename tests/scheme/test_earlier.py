@@ -10,7 +10,7 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme.identify import anchor, earlier, later_samples
+from adacd_hil.scheme.identify import anchor, earlier, fit_check
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD
 
@@ -48,7 +48,7 @@ class HeldLoop(TouchedLoop):
 
 
 def distance_to_step(m, s):
-    return later_samples.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
+    return fit_check.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
 
 
 def states(outputs):
@@ -231,7 +231,7 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     m["has_kept"], m["kept"], m["steps_used"], m["steps_theta"][:2] = 0.0, 0.0, 2.0, 0.1
     m["steps_P"][:2] = 0.02**2 * np.eye(len(NAMES))
     m["steps_square"][:2], m["steps_rows"][:2], m["fit_square"], m["fit_rows"] = 0.0, 50.0, 0.0, 100.0
-    added_variance = (1.0 + later_samples.REGULAR) * 0.02**2 - 0.01**2
+    added_variance = (1.0 + fit_check.REGULAR) * 0.02**2 - 0.01**2
     m["belief"][INERTIA] += share * np.sqrt(earlier.STEADY * earlier.SMALLEST_SQUARE * added_variance)
     assert earlier.is_steady(m) is is_steady
     assert bool(m["has_kept"]) is not is_steady
@@ -257,7 +257,7 @@ class Halves:
     def differ(self, step, change):
         """Let a step have had other parameters; return how far its later samples then are from the belief (p,)."""
         self.m["steps_theta"][step] -= change
-        P, P_0 = self.m["P_belief"], (1.0 + later_samples.REGULAR) * self.m["steps_P"][step]
+        P, P_0 = self.m["P_belief"], (1.0 + fit_check.REGULAR) * self.m["steps_P"][step]
         alone = np.linalg.solve(
             np.linalg.inv(P) - np.linalg.inv(P_0),
             np.linalg.solve(P, self.m["belief"]) - np.linalg.solve(P_0, self.m["steps_theta"][step]),
@@ -271,7 +271,7 @@ def test_the_model_of_the_later_samples_is_that_of_their_own_information():
     fit.m["steps_P"][0] += root @ root.T
     alone = fit.differ(0, np.linspace(-0.02, 0.03, len(NAMES)))
     m = fit.m
-    assert later_samples.find(m, m["steps_theta"][0], m["steps_P"][0], m["belief"], m["P_belief"])
+    assert fit_check.find_later(m, m["steps_theta"][0], m["steps_P"][0], m["belief"], m["P_belief"])
     assert m["later"] == pytest.approx(alone, rel=1e-6)
 
 
@@ -363,11 +363,11 @@ def test_beliefs_that_a_touch_has_come_into_are_forgotten_and_the_others_go_on_j
 def test_a_difference_that_is_small_or_not_known_forgets_nothing():
     kept = Kept()
     kept.m["P_kept"] *= 1e-4  # well known
-    kept.m["kept"][3, 1] += 0.2 * later_samples.APART_NM
+    kept.m["kept"][3, 1] += 0.2 * fit_check.APART_NM
     assert kept.compared() == [0, 1, 2, 3]
     kept = Kept()
     kept.m["P_kept"] *= 1e4  # hardly known
-    kept.m["kept"][3, 1] += 2.0 * later_samples.APART_NM
+    kept.m["kept"][3, 1] += 2.0 * fit_check.APART_NM
     assert kept.compared() == [0, 1, 2, 3]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from adacd_hil.scheme.model.filters import advance_regressor, advance_torque, first_order_hold, resume
+from adacd_hil.scheme.model.filter_bank import advance_regressor, advance_torque, first_order_hold, resume
 
 T = 1e-3
 

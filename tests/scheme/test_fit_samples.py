@@ -7,7 +7,7 @@ from planar_arm import THETA
 from test_earlier import FREE, HeldLoop, states
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.identify import fit_samples
+from adacd_hil.scheme.identify import fit_check
 from adacd_hil.scheme.kernel import certified_memory
 
 
@@ -16,7 +16,7 @@ class Fit:
 
     def __init__(self, learnt=300):
         self.m = certified_memory.new_memory(FREE)[0]
-        fit_samples.begin(self.m)
+        fit_check.begin(self.m)
         random = np.random.default_rng(1)
         self.W = random.standard_normal((learnt, 2, len(NAMES)))
         self.tau = self.W @ self.m["belief"] + 0.01 * random.standard_normal((learnt, 2))
@@ -24,8 +24,8 @@ class Fit:
     @property
     def first(self):
         for W, tau in zip(self.W, self.tau, strict=True):
-            fit_samples.keep(self.m, W, tau)
-        return fit_samples.first_unexplained(self.m)
+            fit_check.keep(self.m, W, tau)
+        return fit_check.first_unexplained(self.m)
 
 
 def test_a_fit_that_explains_its_samples_has_none_that_stands_out():
@@ -35,7 +35,7 @@ def test_a_fit_that_explains_its_samples_has_none_that_stands_out():
 @pytest.mark.parametrize(("share", "is_explained"), [(0.9, True), (1.15, False)])
 def test_a_sample_stands_out_by_the_residual_of_the_better_half(share, is_explained):
     fit = Fit()
-    limit_Nm = fit_samples.LIMIT_NM + fit_samples.LIMIT_SHARE * 0.01
+    limit_Nm = fit_check.LIMIT_NM + fit_check.LIMIT_SHARE * 0.01
     fit.tau[29, 1] = fit.W[29, 1] @ fit.m["belief"] - share * limit_Nm
     assert (fit.first == -1) is is_explained
 
@@ -43,7 +43,7 @@ def test_a_sample_stands_out_by_the_residual_of_the_better_half(share, is_explai
 def test_the_first_of_a_touchs_samples_is_named():
     fit = Fit()
     fit.tau[100:150] += 1.0
-    assert fit.first == pytest.approx(100, abs=fit_samples.FIRST_EVERY)
+    assert fit.first == pytest.approx(100, abs=fit_check.FIRST_EVERY)
 
 
 def test_a_long_fit_is_kept_in_the_same_room_from_its_beginning_to_its_end():
@@ -51,7 +51,7 @@ def test_a_long_fit_is_kept_in_the_same_room_from_its_beginning_to_its_end():
     fit.tau[:90] += 1.0
     assert fit.first == 0
     kept, every = int(fit.m["samples_kept"]), fit.m["samples_every"]
-    assert fit_samples.ROOM // 2 <= kept <= fit_samples.ROOM
+    assert fit_check.ROOM // 2 <= kept <= fit_check.ROOM
     assert kept * every == pytest.approx(3000, abs=2 * every)
     fit = Fit(learnt=3000)
     fit.tau[2900:] += 1.0

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.model.friction import (
+from adacd_hil.scheme.model.regressor import (
     ASYMMETRIC,
     DAHL_LONG,
     DAHL_SHORT,
     LOAD,
     STRIBECK,
     WIDTH,
-    bend,
+    bend_bristles,
     fill_terms,
     smooth_sign,
 )
@@ -115,7 +115,7 @@ def seen_columns(fastest_rad_s, samples):
     """Return the sign and the columns of both lengths (n, 3) of the same swing, sampled."""
     bent, rows = np.full((2, 1), -1.0), []
     for dq in swing(fastest_rad_s, np.arange(samples) * PERIOD_S)[:, None]:
-        bend(dq, PERIOD_S, STILL, LENGTHS_RAD, bent)
+        bend_bristles(dq, PERIOD_S, STILL, LENGTHS_RAD, bent)
         both = np.zeros((1, 2))
         fill_terms(dq, np.zeros(1), np.array([DAHL_SHORT, DAHL_LONG], float), (STILL, NO_WIDTH, V_S), bent, 0, both)
         rows.append([smooth_sign(dq[0], STILL, NO_WIDTH), *both[0]])
@@ -153,13 +153,13 @@ def test_bristles_bend_over_the_way_not_the_time_and_in_steady_sliding_the_colum
     by_steps, at_once = np.full((2, 2), -np.sign(dq)), np.full((2, 2), -np.sign(dq))
     way_s = LENGTHS_RAD[1] / abs(dq)
     for _ in range(8):
-        bend(np.full(2, dq), way_s / 8.0, STILL, LENGTHS_RAD, by_steps)
-    bend(np.full(2, dq), way_s, STILL, LENGTHS_RAD, at_once)
+        bend_bristles(np.full(2, dq), way_s / 8.0, STILL, LENGTHS_RAD, by_steps)
+    bend_bristles(np.full(2, dq), way_s, STILL, LENGTHS_RAD, at_once)
     np.testing.assert_allclose(by_steps, at_once, rtol=1e-12)
     both = columns([DAHL_SHORT, DAHL_LONG], dq=np.full(2, dq), bent=at_once)
     left = -2.0 * np.sign(dq) * np.exp([-4.0, -1.0])
     np.testing.assert_allclose(both, np.hstack([left[0] * np.eye(2), left[1] * np.eye(2)]), rtol=1e-12)
-    bend(np.full(2, dq), 40.0 * way_s, STILL, LENGTHS_RAD, at_once)
+    bend_bristles(np.full(2, dq), 40.0 * way_s, STILL, LENGTHS_RAD, at_once)
     np.testing.assert_allclose(columns([DAHL_SHORT, DAHL_LONG], dq=np.full(2, dq), bent=at_once), 0.0, atol=1e-15)
 
 
@@ -167,10 +167,10 @@ def test_nothing_bends_while_a_joint_stands_still_and_the_column_is_what_is_bent
     bent = BENT.copy()
     for dq in (0.9 * STILL, -0.9 * STILL, 0.0):
         for _ in range(100):
-            bend(np.array([dq, -dq]), PERIOD_S, STILL, LENGTHS_RAD, bent)
+            bend_bristles(np.array([dq, -dq]), PERIOD_S, STILL, LENGTHS_RAD, bent)
     np.testing.assert_array_equal(bent, BENT)
     both = columns([DAHL_SHORT, DAHL_LONG], dq=np.array([0.0, 0.9 * STILL]), bent=bent)
     np.testing.assert_array_equal(both, np.hstack([np.diag(BENT[0]), np.diag(BENT[1])]))
-    bend(np.array([1.1 * STILL, 0.0]), PERIOD_S, STILL, LENGTHS_RAD, bent)
+    bend_bristles(np.array([1.1 * STILL, 0.0]), PERIOD_S, STILL, LENGTHS_RAD, bent)
     assert np.all(bent[:, 0] > BENT[:, 0])
     np.testing.assert_array_equal(bent[:, 1], BENT[:, 1])

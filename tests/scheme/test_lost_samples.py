@@ -5,9 +5,9 @@ import pytest
 from excited_arm import PERIOD_S, SETTINGS, record
 from planar_arm import THETA
 
-from adacd_hil.scheme.detect import lost_samples
+from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.supervisor.observation import Observation
+from adacd_hil.scheme.supervisor.transitions import Observation
 
 K = certified_memory.constants_of(SETTINGS)[0]
 MODE = certified_kernel.WATCH | certified_kernel.REFINE
@@ -20,7 +20,7 @@ def followed(steps, dq=(0.3, 0.3), is_seen=True, lost_Nm2=0.0):
     m["hold"][:] = 0.1
     m["M"][:] = np.eye(2)
     m["lost"][:] = lost_Nm2
-    lost_samples.follow(K, m, np.array(dq), steps, steps * PERIOD_S, is_seen)
+    sensitivity.follow_lost(K, m, np.array(dq), steps, steps * PERIOD_S, is_seen)
     return m["lost"].copy()
 
 
@@ -34,7 +34,7 @@ def test_a_sample_after_a_sample_leaves_nothing_open_and_what_was_open_is_forgot
 def test_a_line_leaves_open_the_noise_of_its_ends_the_torque_s_bend_and_friction_where_the_joint_turned(steps):
     turn = K["cutoff"] * steps * PERIOD_S
     noise = (K["noise_sigmas"] * K["torque_noise_Nm"] * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
-    bend = lost_samples.CURVATURE_NM_S2 * (steps * PERIOD_S) ** 2 / 12.0
+    bend = sensitivity.CURVATURE_NM_S2 * (steps * PERIOD_S) ** 2 / 12.0
     expected = np.array([noise + (turn * bend) ** 2, noise + (turn * (bend + 0.1)) ** 2]).T
     np.testing.assert_allclose(followed(steps, dq=(0.3, -0.3)), expected, rtol=1e-12)
 

@@ -16,7 +16,7 @@ from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, schem
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.model.regressor import is_positive_definite
 from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
-from adacd_hil.scheme.supervisor.observation import Observation
+from adacd_hil.scheme.supervisor.transitions import Observation
 from adacd_hil.settings.configuration import load_settings
 
 NEVER_ALARM = {"detector": {"threshold_Nm": [50.0, 50.0]}}

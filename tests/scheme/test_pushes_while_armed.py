@@ -7,8 +7,8 @@ from planar_arm import THETA
 
 from adacd_hil.analysis.score.smallest_push import PushGatherer
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.detect.sight import WITHIN_S
-from adacd_hil.scheme.supervisor.observation import Observation
+from adacd_hil.scheme.detect.margin import WITHIN_S
+from adacd_hil.scheme.supervisor.transitions import Observation
 
 SECONDS = 9.0
 

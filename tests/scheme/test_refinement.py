@@ -5,7 +5,7 @@ import pytest
 from excited_arm import NAMES, SETTINGS
 
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.identify import anchor, refinement
+from adacd_hil.scheme.identify import anchor, belief
 from adacd_hil.scheme.kernel import certified_memory
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
@@ -24,7 +24,7 @@ class Refined:
         self.m["belief"][:] = candidate
         self.m["P_belief"][:] = 0.25 * np.eye(COUNT)
         self.m["h"][:] = 0.5
-        refinement.restart(self.m)
+        belief.restart_candidate(self.m)
         self.m["candidate_cycles"] = K["refine_cycles"] - CYCLES
         self.random = np.random.default_rng(1)
 
@@ -33,7 +33,7 @@ class Refined:
         m["W_f"][:] = 0.3 * self.random.standard_normal(m["W_f"].shape)
         m["tau_f"][:] = m["W_f"] @ TRUE - tau_ext
         m["r"][:] = m["W_f"] @ m["theta"] - m["tau_f"]
-        return refinement.test_candidate(K, m)
+        return belief.test_candidate(K, m)
 
     def run(self):
         """Return whether it is against an anchor, by sample."""
@@ -117,7 +117,7 @@ def test_a_joint_that_rests_has_no_say_in_which_model_is_better():
 def test_a_better_candidate_that_an_anchor_excludes_is_said_once_and_does_not_take_over(off_Nm, is_excluded):
     refined = Refined(off_by(0.05), off_by(0.2))
     refined.m["P_belief"][:] = 1e-6 * np.eye(COUNT)
-    refinement.restart(refined.m)
+    belief.restart_candidate(refined.m)
     refined.m["candidate_cycles"] = K["refine_cycles"] - CYCLES
     refined.m["anchor_Nm"][anchor.TARE] = TRUE[[7, 8]] + [off_Nm, 0.0]
     refined.m["anchor_std"][anchor.TARE] = 0.001

@@ -5,7 +5,7 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ContactLevel, Reaction
-from adacd_hil.scheme.contact.response import BLIND_S, TURNED_CYCLES, Response
+from adacd_hil.scheme.contact.reaction import BLIND_S, TURNED_CYCLES, ReactionChoice
 
 SETTINGS = settings_with(
     reaction={"contact": ["slow_down", "stop"], "collision": ["admittance", "withdraw"]},
@@ -19,7 +19,7 @@ class Contact:
     """A contact followed cycle by cycle."""
 
     def __init__(self, level, link, is_model_valid=True, settings=SETTINGS):
-        self.response = Response(settings)
+        self.response = ReactionChoice(settings)
         self.is_model_valid = is_model_valid
         self.response.begin(level, link, PUSH, is_model_valid)
         self.level, self.link = level, link
@@ -106,7 +106,7 @@ def test_without_a_model_an_arm_stops_instead_of_floating():
 
 
 def test_a_late_host_stops_the_arm_and_the_end_of_it_asks_for_nothing():
-    response = Response(SETTINGS)
+    response = ReactionChoice(SETTINGS)
     response.hold()
     assert response.reaction is Reaction.STOP
     response.end()

@@ -7,16 +7,18 @@ import pytest
 from excited_arm import SETTINGS, TouchedLoop
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme.detect import sensitivity, sight, tail
+from adacd_hil.scheme.detect import margin, sensitivity
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.model import bank
+from adacd_hil.scheme.model import filter_bank
 
 FILTERS = SETTINGS.filter_count
 
 
 def pushes(y, h):
     """The definition, by numpy, of samples (k, channels, 2)."""
-    shown = np.array([bank.step_response(0.1, *channel) for channel in bank.channels_of(SETTINGS)])[:, None]
+    shown = np.array([filter_bank.step_response(0.1, *channel) for channel in filter_bank.channels_of(SETTINGS)])[
+        :, None
+    ]
     found = (h + np.abs(y)) / shown
     agreed = (sensitivity.AGREES * h + np.abs(y)) / shown
     bare = np.maximum(found[:, FILTERS:], agreed[:, 1:FILTERS])
@@ -45,8 +47,8 @@ def test_a_certificate_states_the_smallest_push_and_the_thresholds_of_its_test(t
     in_force = h.min(axis=1)
     assert len(y) == round(SETTINGS.certified.test_s[0] / SETTINGS.bus.period_s)
     assert said[0] == pytest.approx(pushes(y, h).max(axis=0), abs=5.1e-4)
-    assert said[1] == pytest.approx(np.median(in_force, axis=0), rel=sight.WIDTH + 0.01, abs=1e-3)
-    assert said[2] == pytest.approx(np.percentile(in_force, 99.0, axis=0), rel=sight.WIDTH + 0.01, abs=1e-3)
+    assert said[1] == pytest.approx(np.median(in_force, axis=0), rel=margin.WIDTH + 0.01, abs=1e-3)
+    assert said[2] == pytest.approx(np.percentile(in_force, 99.0, axis=0), rel=margin.WIDTH + 0.01, abs=1e-3)
     assert said[3] == pytest.approx(in_force.max(axis=0), abs=5.1e-4)
     assert said[1] < said[2] <= said[3]
 
@@ -56,17 +58,17 @@ def test_a_threshold_that_is_always_the_same_is_said_as_it_is(value_Nm):
     m = certified_memory.new_memory(SETTINGS)[0]
     m["wide_threshold"], m["h"] = value_Nm, value_Nm
     for _ in range(10):
-        sight.follow_test(certified_memory.constants_of(SETTINGS)[0], m)
+        margin.follow_test(certified_memory.constants_of(SETTINGS)[0], m)
     pair = f"{value_Nm:.3f} / {value_Nm:.3f}"
-    assert f"thresholds {pair} Nm in the middle, {pair} in 99 %, {pair} at worst" in sight.describe(m)
+    assert f"thresholds {pair} Nm in the middle, {pair} in 99 %, {pair} at worst" in margin.describe_sight(m)
 
 
 def test_the_next_test_begins_with_nothing_seen(tested):
     m = tested[0].pipeline._memory.copy()[0]
-    sight.follow(certified_memory.constants_of(SETTINGS)[0], m)
+    margin.follow_sight(certified_memory.constants_of(SETTINGS)[0], m)
     for name in ("seen", "seen_push_Nm", "sum_cycles"):
         assert m[name].any()
-    sight.begin(m)
+    margin.begin_sight(m)
     for name in ("seen", "seen_push_Nm", "seen_worst_Nm", "sum_push_Nm", "sum_cycles"):
         assert not m[name].any()
 
@@ -85,7 +87,7 @@ def test_a_monitor_that_sees_less_than_was_certified_says_so_once():
         r"in the test from ([\d.]+) Nm on at worst",
         text,
     )
-    assert float(found[1]) > sight.LESS * float(found[2])
+    assert float(found[1]) > margin.LESS * float(found[2])
     assert float(found[2]) == pytest.approx(m["seen_push_Nm"][1], abs=0.005)
     m["roughness"][1] = 1.0
     loop.run(2000)
@@ -99,22 +101,22 @@ def test_a_joint_that_rests_is_not_asked_what_it_sees():
     k, m = certified_memory.constants_of(SETTINGS)[0], certified_memory.new_memory(SETTINGS)[0]
     m["h"], m["seen_push_Nm"] = 1.0, 0.1
     m["still"][:, 0] = 1.0
-    for _ in range(sight.FEWEST):
-        sight.follow(k, m)
-    assert sight.take_warning(m).startswith("joint 2 sees less")
-    assert sight.take_warning(m) == ""
-    for _ in range(sight.FEWEST - 1):  # too little motion to tell
-        sight.follow(k, m)
-    assert sight.take_warning(m) == ""
+    for _ in range(margin.FEWEST):
+        margin.follow_sight(k, m)
+    assert margin.take_warning(m).startswith("joint 2 sees less")
+    assert margin.take_warning(m) == ""
+    for _ in range(margin.FEWEST - 1):  # too little motion to tell
+        margin.follow_sight(k, m)
+    assert margin.take_warning(m) == ""
 
 
 def test_the_rate_under_a_gaussian_tail_is_that_of_the_floor():
     """A threshold of m(T) times the largest residual of T seconds is exceeded RATE times a second."""
     for nu_Hz, seen_s in ((3.2, 50.0), (64.0, 600.0)):
-        share = 1.0 / tail._factor(nu_Hz, seen_s)
-        assert tail.rate_per_h(nu_Hz, seen_s, share) == pytest.approx(3600.0 * tail.RATE_HZ)
-        assert tail.rate_per_h(nu_Hz, seen_s, 0.5 * share) < 1e-6
-    assert tail.rate_per_h(3.2, 50.0, 0.0) == 0.0
+        share = 1.0 / margin._factor(nu_Hz, seen_s)
+        assert margin.rate_per_h(nu_Hz, seen_s, share) == pytest.approx(3600.0 * margin.RATE_HZ)
+        assert margin.rate_per_h(nu_Hz, seen_s, 0.5 * share) < 1e-6
+    assert margin.rate_per_h(3.2, 50.0, 0.0) == 0.0
 
 
 def test_a_new_certificate_that_sees_less_again_is_told_again():

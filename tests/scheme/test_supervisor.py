@@ -7,9 +7,8 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
 from adacd_hil.scheme.supervisor.supervisor import REST_HOLD_S, UNREST_S, Supervisor
-from adacd_hil.scheme.supervisor.transitions import TRANSITIONS, SchemeEvent, next_state
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, TRANSITIONS, Observation, SchemeEvent, next_state
 
 # What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens, "back"
 # the state from which REACT was entered.

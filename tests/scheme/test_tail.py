@@ -6,16 +6,16 @@ import scipy.signal
 from excited_arm import SETTINGS
 from test_certified_kernel import COUNT, RECOVER, Kernel
 
-from adacd_hil.scheme.detect import sensitivity, tail
+from adacd_hil.scheme.detect import margin, sensitivity
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.supervisor.observation import Observation
+from adacd_hil.scheme.supervisor.transitions import Observation
 
 CONSTANTS = certified_memory.constants_of(SETTINGS)
 K = CONSTANTS[0]
 PERIOD_S = SETTINGS.bus.period_s
 CUTOFFS = np.array(SETTINGS.certified.cutoffs_rad_s)
 NU_HZ = np.concatenate([CUTOFFS, CUTOFFS[1:]]) / np.pi
-BLOCK = round(tail.BLOCK_S / PERIOD_S)
+BLOCK = round(margin.BLOCK_S / PERIOD_S)
 HOUR_S = 3600.0
 MODEL_NM = 0.5
 
@@ -35,7 +35,7 @@ class Tailed:
     def see(self, y, samples):
         self.m["y"][:] = y
         for _ in range(samples):
-            tail.follow(K, self.m)
+            margin.follow_tail(K, self.m)
 
     def skip(self, blocks, y=0.0):
         """See as much as these blocks at once, each by its last sample."""
@@ -48,7 +48,7 @@ class Tailed:
 def test_the_floor_is_the_largest_residual_times_the_formula_s_factor(seen_s):
     tailed = Tailed()
     largest = np.random.default_rng(1).uniform(-0.3, 0.3, (5, 2))
-    tailed.m["tail_s"] = seen_s - tail.BLOCK_S
+    tailed.m["tail_s"] = seen_s - margin.BLOCK_S
     tailed.see(largest, BLOCK)
     tailed.see(0.5 * largest, BLOCK)
     expected = factor(NU_HZ, seen_s)[:, None] * np.abs(largest)
@@ -56,8 +56,8 @@ def test_the_floor_is_the_largest_residual_times_the_formula_s_factor(seen_s):
 
 
 def test_the_factor_falls_from_its_bound_to_one_after_an_hour():
-    factors = [tail._factor(4.0 / np.pi, seen_s) for seen_s in (0.0, 1.0, 60.0, 600.0, HOUR_S, 1e6)]
-    assert factors[:2] == [tail.LARGEST] * 2
+    factors = [margin._factor(4.0 / np.pi, seen_s) for seen_s in (0.0, 1.0, 60.0, 600.0, HOUR_S, 1e6)]
+    assert factors[:2] == [margin.LARGEST] * 2
     assert np.all(np.diff(factors[1:5]) < 0.0)
     assert factors[4:] == [1.0, 1.0]
 
@@ -72,7 +72,7 @@ def test_the_largest_filtered_noise_of_an_hour_is_below_what_a_short_time_lets_e
     fall = np.exp(-cutoff * PERIOD_S)
     noise = np.abs(scipy.signal.lfilter([1.0 - fall], [1.0, -fall], white))
     seen = noise.reshape(-1, round(seen_s / PERIOD_S)).max(1).mean()
-    assert noise.max() < tail._factor(cutoff / np.pi, seen_s) * seen < 1.25 * noise.max()
+    assert noise.max() < margin._factor(cutoff / np.pi, seen_s) * seen < 1.25 * noise.max()
 
 
 def test_a_residual_counts_when_its_block_and_the_one_after_it_are_over():
@@ -121,7 +121,7 @@ def test_near_a_contact_its_block_and_the_one_before_do_not_count():
     tailed.see(0.1, BLOCK)
     tailed.see(0.3, BLOCK)
     tailed.see(0.4, BLOCK // 2)
-    tail.discard(tailed.m)
+    margin.discard_tail(tailed.m)
     tailed.see(0.05, 3 * BLOCK)
     np.testing.assert_allclose(tailed.m["peak"], 0.1, rtol=1e-3)
     tailed.see(0.2, 2 * BLOCK)
@@ -133,7 +133,7 @@ def test_the_largest_is_forgotten_over_ten_minutes_of_motion():
     tailed.skip(1, 0.4)
     tailed.skip(1)
     first = tailed.m["tail_Nm"].copy()
-    tailed.skip(round(tail.FORGOTTEN_S / tail.BLOCK_S))
+    tailed.skip(round(margin.FORGOTTEN_S / margin.BLOCK_S))
     np.testing.assert_allclose(tailed.m["peak"], 0.4 / np.e, rtol=1e-3)
     np.testing.assert_allclose(tailed.m["tail_Nm"], first / np.e, rtol=1e-3)
 
@@ -142,9 +142,9 @@ def test_only_time_in_which_something_was_seen_counts():
     tailed = Tailed()
     tailed.skip(1, 0.4)
     tailed.skip(50)
-    assert float(tailed.m["tail_s"]) == pytest.approx(tail.BLOCK_S)
+    assert float(tailed.m["tail_s"]) == pytest.approx(margin.BLOCK_S)
     tailed.skip(50, 0.1)
-    assert float(tailed.m["tail_s"]) == pytest.approx(50 * tail.BLOCK_S)
+    assert float(tailed.m["tail_s"]) == pytest.approx(50 * margin.BLOCK_S)
 
 
 def test_a_fit_of_another_model_begins_without_a_floor():
@@ -196,10 +196,10 @@ def test_a_certificate_says_what_counting_and_what_a_gaussian_tail_let_expect_of
     memory["tail_s"] = 0.5
     memory["h_model"][:] = MODEL_NM
     memory["peak"][:] = 0.0
-    nothing_seen = tail.describe(K, memory)
+    nothing_seen = margin.describe_false_alarms(K, memory)
     memory["peak"][1] = 0.4 * MODEL_NM, 0.5 * MODEL_NM
     memory["tail_Nm"][1, 1] = 1.25 * MODEL_NM  # where the floor is the threshold in force, it is what counts
-    expected = 2.0 * tail.rate_per_h(NU_HZ[1], 0.5, 0.4)
+    expected = 2.0 * margin.rate_per_h(NU_HZ[1], 0.5, 0.4)
     said = "false alarms per hour: at most 21569 by counting the 0.50 s of the test alone, at 95 %, "
     assert nothing_seen == said + "0 if residuals have the tail of a Gaussian"
-    assert tail.describe(K, memory) == said + f"{expected:.1g} if residuals have the tail of a Gaussian"
+    assert margin.describe_false_alarms(K, memory) == said + f"{expected:.1g} if residuals have the tail of a Gaussian"

@@ -19,7 +19,7 @@ from adacd_hil.analysis.score.judge import explained_until, owners
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 from adacd_hil.scheme.identify import offline
-from adacd_hil.scheme.identify.offline import Certificate, Estimate, OfflineSettings
+from adacd_hil.scheme.identify.offline import ModelEstimate, OfflineCertificate, OfflineSettings
 
 FIT_SHARE = 0.6
 """Of a recording that is both fitted and tested: the part that is fitted."""
@@ -59,8 +59,8 @@ class Identified:
     model: offline.ArmModel
     settings: OfflineSettings
     joint_names: tuple[str, ...]
-    estimate: Estimate
-    certificate: Certificate
+    estimate: ModelEstimate
+    certificate: OfflineCertificate
     explained: Vector
     fit_s: float
     test: Watched
@@ -151,11 +151,11 @@ def identify(
     )
 
 
-def _joined(parts: list[Certificate], tested: Recording) -> Certificate:
+def _joined(parts: list[OfflineCertificate], tested: Recording) -> OfflineCertificate:
     """Join the certificates of all stretches, each by its length."""
     weights = np.array([len(stretch.record.q) for stretch in tested.stretches], np.float64)
     weights /= weights.sum()
-    return Certificate(
+    return OfflineCertificate(
         residual_rms_Nm=np.sqrt(sum(w * part.residual_rms_Nm**2 for w, part in zip(weights, parts, strict=True))),
         residual_max_Nm=np.max([part.residual_max_Nm for part in parts], axis=0),
         lack_Nm=np.sqrt(sum(w * part.lack_Nm**2 for w, part in zip(weights, parts, strict=True))),
@@ -171,7 +171,7 @@ def _explained(test: Watched) -> Vector:
 
 
 def watch(
-    model: offline.ArmModel, settings: OfflineSettings, estimate: Estimate, lack_Nm: Vector, recording: Recording
+    model: offline.ArmModel, settings: OfflineSettings, estimate: ModelEstimate, lack_Nm: Vector, recording: Recording
 ) -> Watched:
     """Look for contacts in a recording, and compare them with its touches where these are known."""
     detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]

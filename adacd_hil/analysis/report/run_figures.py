@@ -31,7 +31,7 @@ from adacd_hil.analysis.score.contacts import Contact, filtered, row_at
 from adacd_hil.analysis.score.judge import why_not_found
 from adacd_hil.analysis.score.metrics import Metrics
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
-from adacd_hil.scheme.model.bank import channels_of
+from adacd_hil.scheme.model.filter_bank import channels_of
 
 CLOSE_UPS: Final = 24
 """Contacts shown close up; six rows of four are a page."""

@@ -20,7 +20,7 @@ from adacd_hil.analysis.logged_run import CertifiedStream, Run
 from adacd_hil.analysis.report.timeline import STATE_COLOURS, notices_of, stays_of
 from adacd_hil.analysis.score.metrics import Metrics
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, Vector
-from adacd_hil.scheme.model.bank import channels_of
+from adacd_hil.scheme.model.filter_bank import channels_of
 
 FINEST: Final = {
     "rad": 2e-5,

@@ -18,8 +18,8 @@ from adacd_hil.analysis.logged_run import Mask, Run, Section, section_at
 from adacd_hil.analysis.score.judge import Detection, JudgedContact, Score, TouchWindow, judge
 from adacd_hil.analysis.score.timing import Cycles
 from adacd_hil.records import JOINTS, ContactReport, Location, SchemeState, Vector
-from adacd_hil.scheme.contact.classification import WINDOW_S
-from adacd_hil.scheme.model.bank import channels_of, step_response
+from adacd_hil.scheme.contact.contact_report import WINDOW_S
+from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 
 
 class Touch(NamedTuple):

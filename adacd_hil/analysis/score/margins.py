@@ -26,7 +26,7 @@ from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.analysis.score.judge import Detection, StreamJudge, find_detections
 from adacd_hil.analysis.score.smallest_push import PushGatherer, SmallestPush
 from adacd_hil.records import JOINTS, SchemeState, Vector
-from adacd_hil.scheme.model.bank import channels_of
+from adacd_hil.scheme.model.filter_bank import channels_of
 from adacd_hil.settings.configuration import Settings
 
 SETTLING_TIME_CONSTANTS = 10.0

@@ -1,4 +1,4 @@
-"""The smallest push that the certified scheme finds in time (`scheme.sight`), over the cycles of a run.
+"""The smallest push that the certified scheme finds in time (`scheme.detect.margin`), over the cycles of a run.
 
 Of the cycles in MONITOR in which nothing touches the arm. What a moment says is an estimate, since threshold and
 residual change meanwhile: of 300 pushes 2 % larger than at their moment 247 were found in 100 ms, the others as the
@@ -12,7 +12,7 @@ import numpy as np
 from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.detect import sight, tail
+from adacd_hil.scheme.detect import margin
 from adacd_hil.settings.configuration import Settings
 
 
@@ -33,9 +33,9 @@ class PushGatherer:
     """Gathers the cycles of MONITOR in which nothing touches the arm."""
 
     def __init__(self, settings: Settings) -> None:
-        self._shown = sight.constants_of(settings)["shown"]
+        self._shown = margin.sight_constants(settings)["shown"]
         self._period_s = settings.bus.period_s
-        self._excursions_Hz = tail.constants_of(settings)["excursions_Hz"]
+        self._excursions_Hz = margin.tail_constants(settings)["excursions_Hz"]
         self._share = np.zeros((self._shown.size, JOINTS))  # largest of residual over threshold
         self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
 
@@ -59,7 +59,7 @@ class PushGatherer:
             threshold_Nm=tuple(each.percentiles() for each in self._threshold),
             hours=seen_s / 3600.0,
             tail_rate_per_h=sum(
-                tail.rate_per_h(float(nu), seen_s, float(share))
+                margin.rate_per_h(float(nu), seen_s, float(share))
                 for nu, shares in zip(self._excursions_Hz, self._share, strict=True)
                 for share in shares
             ),
@@ -70,4 +70,4 @@ class PushGatherer:
 def _fill(tau_ext: Vector, threshold: Vector, shown: Vector, push: Vector) -> None:
     for k in range(push.shape[0]):
         for i in range(push.shape[1]):
-            push[k, i] = sight.smallest_push(tau_ext[k], threshold[k], shown, i)
+            push[k, i] = margin.smallest_push(tau_ext[k], threshold[k], shown, i)

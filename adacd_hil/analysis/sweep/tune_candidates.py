@@ -208,7 +208,7 @@ WARM_UP_S: Final = 0.6
 
 def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
     """Run all detectors over logs. Raises LogError, TooLittleMotionError."""
-    settings = detectors.DetectorSettings()
+    settings = detectors.DetectorBankSettings()
     statistics = run_detectors([log.motion for log in logs], settings, progress)
     starts = np.cumsum([0, *(len(log.motion.is_free) for log in logs)])
     places = np.minimum(np.arange(len(statistics.peaks)) * logs[0].block, starts[-1] - 1)

@@ -83,7 +83,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
 class Statistics:
     """The detectors' statistics on contact-free motion, and N samples of it with the stream that they come from."""
 
-    settings: detectors.DetectorSettings
+    settings: detectors.DetectorBankSettings
     weights: Vector  # (n, ages, L), of the likelihood channels
     peaks: Vector  # (B, channels, n), of all motion; NaN where not all samples of a block are free
     z: Vector  # (N, n), 0 where not free
@@ -100,7 +100,7 @@ class Statistics:
 
 
 def run_detectors(
-    logs: Sequence[LoggedMotion], settings: detectors.DetectorSettings, progress: Progress = lambda _: None
+    logs: Sequence[LoggedMotion], settings: detectors.DetectorBankSettings, progress: Progress = lambda _: None
 ) -> Statistics:
     """Run every detector over the motion of logs. Raises LogError, TooLittleMotionError."""
     motion = sample_of(logs)
@@ -122,7 +122,7 @@ def _peaks(
     logs: Sequence[LoggedMotion],
     constants: Structured,
     lag_s: float,
-    settings: detectors.DetectorSettings,
+    settings: detectors.DetectorBankSettings,
     progress: Progress,
 ) -> Vector:
     """Run the detectors over all motion, the logs one after the other (B, channels, n); NaN unless a block is free."""
@@ -323,5 +323,5 @@ def thresholds_of_logs(
         if log.parameters < len(PARAMETER_NAMES):
             raise LogError(f"log {path} has {log.parameters} parameters")
         logs.append(log)
-    statistics = run_detectors(logs, detectors.DetectorSettings(), progress)
+    statistics = run_detectors(logs, detectors.DetectorBankSettings(), progress)
     return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics

@@ -49,7 +49,7 @@ the interval and not a straight line over it."""
 
 
 @dataclass(frozen=True)
-class DetectorSettings:
+class DetectorBankSettings:
     """What the detectors of one stream are."""
 
     cutoff_rad_s: tuple[float, ...] = setting(
@@ -144,7 +144,7 @@ def autocovariance(z: Vector, length: int) -> Vector:
     return np.asarray(np.fft.irfft(spectrum, size)[:length] / z.shape[0])
 
 
-def constants_of(settings: DetectorSettings, weights: Vector, period_s: float) -> Structured:
+def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: float) -> Structured:
     """Put settings and the joints' likelihood weights (n, N, L) into the form that the compiled step reads."""
     values: dict[str, Any] = {
         "period_s": period_s,
@@ -302,7 +302,7 @@ def make_stream(
     return z, held_Nm
 
 
-def likelihood_weights(z: Vector, settings: DetectorSettings, lag_s: float, period_s: float) -> Vector:
+def likelihood_weights(z: Vector, settings: DetectorBankSettings, lag_s: float, period_s: float) -> Vector:
     """Design the likelihood weights (n, N, L) of all joints from a contact-free stream z (n_samples, n)."""
     length = max(settings.onset_samples) + 16
     return np.array(

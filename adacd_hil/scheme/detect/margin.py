@@ -1,14 +1,52 @@
-"""The margin of a running detector: how far the residuals of contact-free motion stay below their thresholds.
+"""What thresholds leave: floor by the largest residual seen, smallest push that is found, and how both change.
+
+**Tail.** The tail of the residuals: no threshold is below what the largest residual seen lets expect for an hour.
+
+A threshold follows from noise and from what the belief leaves open. What is neither, a friction that sticks at one
+place or a sensor that errs, shows as a residual that comes near. With excursions above a level that die out like a
+Gaussian's, nu of them a second that are independent, and the largest of T seconds known, the largest of 1 / RATE is
+
+    m(T) = sqrt(ln(nu / RATE) / ln(nu T)) times that,    nu = cut-off / pi,    T >= 1 s, m <= LARGEST
+
+The largest counts when its block is over and the one after it: what is held back from a contact is no residual. It
+counts as no more than the threshold without this floor at that moment, so who pushes a little below the threshold again
+and again raises it to m times the largest of those, and no further. It is forgotten over FORGOTTEN_S without contact.
+
+Shapes: peak, peak_now, peak_last, tail_Nm (2 C - 1, n). Units: Nm.
+
+**Sight.** What detection can see: thresholds in force, and the smallest push that is found in time.
+
+A channel whose response to a step of 1 is g after WITHIN_S is then over its threshold h, whatever the sign, if
+
+    |tau_ext| > (h + |y|) / g
+
+with y what it shows without the push. A bare channel counts only if the smoothed one of its filter is over AGREES h as
+well (`sensitivity`). Of all channels the least counts. The threshold *in force* is the least h.
+
+Both are an estimate: they assume that thresholds and residuals stay as they are meanwhile. A certificate states them
+over its test. While the arm monitors, a second in which a joint moves and the mean of the smallest push is more than
+LESS times the worst of that test is said.
+
+Shapes: C filters, n joints; y, h (2 C - 1, n); shown (2 C - 1,): g; seen (bins, n): cycles by threshold in force;
+seen_worst_Nm, seen_push_Nm, sum_push_Nm, sum_cycles (n,). Units: Nm.
+
+**Watch.** The margin of a running detector: how far the residuals of contact-free motion stay below their thresholds.
 
 Source of the law of block maxima: E. J. Gumbel, "Statistics of Extremes", 1958.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.records import Vector
+from adacd_hil.compiled import compiled
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.detect.sensitivity import AGREES, MOVING
+from adacd_hil.scheme.model import filter_bank
+from adacd_hil.settings.configuration import Settings
 
 
 class MarginWatch:
@@ -69,3 +107,217 @@ class MarginWatch:
         return "; ".join(
             f"joint {i + 1}: margin {margin[i]:.1f} x, was {self.reference[i]:.1f} x" for i in np.flatnonzero(shrunk)
         )
+
+
+HOUR_S = 3600.0
+RATE_HZ = 1.0 / HOUR_S
+"""Excursions over the floor that are expected: one an hour."""
+NONE_SEEN = -math.log(0.05)
+"""What comes to none in T seconds has at most this many over T, at 95 %: Poisson's, as the report has it."""
+LARGEST = 3.0
+FORGOTTEN_S = 600.0
+BLOCK_S = 0.064
+"""Longer than a touch is held back before it is seen."""
+
+
+def tail_constants(settings: Settings) -> dict[str, Vector]:
+    """Return `excursions_Hz` (2 C - 1,) and `block_cycles`."""
+    a = np.array(settings.certified.cutoffs_rad_s)
+    return {
+        "excursions_Hz": np.concatenate([a, a[1:]]) / np.pi,
+        "block_cycles": np.array(max(round(BLOCK_S / settings.bus.period_s), 1)),
+    }
+
+
+def tail_shapes(channels: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    each = (channels, JOINTS)
+    return {"peak": each, "peak_now": each, "peak_last": each, "tail_Nm": each, "block_used": (), "tail_s": ()}
+
+
+@compiled
+def begin_tail(m: Any) -> None:
+    """Begin with a model that no residual has been seen of."""
+    m["peak"][:] = 0.0
+    m["tail_Nm"][:] = 0.0
+    m["tail_s"] = 0.0
+    discard_tail(m)
+
+
+@compiled
+def discard_tail(m: Any) -> None:
+    """Throw away the residuals of the last block and the one under way: a contact is near."""
+    m["peak_now"][:] = 0.0
+    m["peak_last"][:] = 0.0
+    m["block_used"] = 0.0
+
+
+@compiled
+def follow_tail(k: Any, m: Any) -> None:
+    """Take in one sample without contact."""
+    filters = m["r"].shape[0]
+    for c in range(m["y"].shape[0]):
+        still = m["still_smooth"][c] if c < filters else m["still"][filter_bank.filter_of(c, filters)]
+        for i in range(m["y"].shape[1]):
+            if still[i] < sensitivity.MOVING:
+                seen = min(abs(m["y"][c, i]), m["h_model"][c, i])
+                m["peak_now"][c, i] = max(m["peak_now"][c, i], seen)
+    m["block_used"] += 1.0
+    if m["block_used"] < k["block_cycles"]:
+        return
+    block_s = m["block_used"] * k["period_s"]
+    m["block_used"] = 0.0
+    if np.max(m["peak_last"]) > 0.0:
+        m["tail_s"] += block_s
+    for c in range(m["y"].shape[0]):
+        factor = _factor(k["excursions_Hz"][c], m["tail_s"])
+        for i in range(m["y"].shape[1]):
+            m["peak"][c, i] = max(m["peak"][c, i] * (1.0 - block_s / FORGOTTEN_S), m["peak_last"][c, i])
+            m["tail_Nm"][c, i] = factor * m["peak"][c, i]
+            m["peak_last"][c, i] = m["peak_now"][c, i]
+            m["peak_now"][c, i] = 0.0
+
+
+def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> float:
+    """Return how many excursions over a threshold an hour has if the tail is a Gaussian's: 3600 nu (nu T)^(-1 / s²).
+
+    largest_share: s, of its threshold that the residual has come to in seen_s, T; 1 / s = m(T) comes to RATE.
+    """
+    if not largest_share > 0.0:
+        return 0.0
+    seen = max(excursions_Hz * max(seen_s, 1.0), 1.01)
+    return float(HOUR_S * excursions_Hz * seen ** (-1.0 / largest_share**2))
+
+
+def describe_false_alarms(k: Any, m: Any) -> str:
+    """Say what the residuals seen so far let expect of false alarms: by counting alone, and by a Gaussian tail."""
+    seen_s = max(float(m["tail_s"]), float(k["block_cycles"] * k["period_s"]))
+    shares = m["peak"] / np.maximum(np.maximum(m["h_model"], m["tail_Nm"]), 1e-12)
+    rates_per_h = [
+        rate_per_h(float(nu_Hz), seen_s, share)
+        for nu_Hz, joints in zip(k["excursions_Hz"], shares.tolist(), strict=True)
+        for share in joints
+    ]
+    return (
+        f"false alarms per hour: at most {NONE_SEEN * HOUR_S / seen_s:.0f} by counting the {seen_s:.2f} s of the "
+        f"test alone, at 95 %, {sum(rates_per_h):.1g} if residuals have the tail of a Gaussian"
+    )
+
+
+@compiled
+def _factor(excursions_Hz: float, seen_s: float) -> float:
+    """Return m(T)."""
+    share = math.log(excursions_Hz / RATE_HZ) / math.log(max(excursions_Hz * max(seen_s, 1.0), 1.01))
+    return float(min(np.sqrt(max(share, 1.0)), LARGEST))
+
+
+WITHIN_S = 0.1
+"""The slowest filter is at 0.63 of a step by then, without its smoothing."""
+LESS = 2.0
+"""How many times the smallest push of the certificate it may be without a word."""
+LOWEST_NM, WIDTH, BINS = 1e-3, 0.02, 512
+"""Thresholds are counted in bins that are 2 % wide, from 1 mNm to 28 Nm."""
+FEWEST = 100
+"""Cycles of motion in a second from which on its mean says something."""
+
+
+def sight_constants(settings: Settings) -> dict[str, Vector]:
+    """Return `shown` (2 C - 1,)."""
+    return {
+        "shown": np.array(
+            [filter_bank.step_response(WITHIN_S, *channel) for channel in filter_bank.channels_of(settings)]
+        )
+    }
+
+
+def sight_shapes() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    each = (JOINTS,)
+    return {
+        "seen": (BINS, JOINTS),
+        **dict.fromkeys(("seen_worst_Nm", "seen_push_Nm", "sum_push_Nm", "sum_cycles"), each),
+    }
+
+
+@compiled
+def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
+    """Return the smallest push on a joint that is found within WITHIN_S if all stays as it is now."""
+    filters = (y.shape[0] + 1) // 2
+    least = np.inf
+    for c in range(y.shape[0]):
+        push = (h[c, joint] + abs(y[c, joint])) / shown[c]
+        if c >= filters:
+            smoothed = filter_bank.filter_of(c, filters)
+            push = max(push, (AGREES * h[smoothed, joint] + abs(y[smoothed, joint])) / shown[smoothed])
+        least = min(least, push)
+    return float(least)
+
+
+@compiled
+def begin_sight(m: Any) -> None:
+    """Begin a test."""
+    m["seen"][:] = 0.0
+    m["seen_worst_Nm"][:] = 0.0
+    m["seen_push_Nm"][:] = 0.0
+    m["sum_push_Nm"][:] = 0.0
+    m["sum_cycles"][:] = 0.0
+
+
+@compiled
+def follow_test(k: Any, m: Any) -> None:
+    """Take in one sample of a test, without contact."""
+    for i in range(m["seen"].shape[1]):
+        h = m["wide_threshold"][i]
+        place = int(math.log(max(h / LOWEST_NM, 1.0)) / WIDTH)
+        m["seen"][min(place, BINS - 1), i] += 1.0
+        m["seen_worst_Nm"][i] = max(m["seen_worst_Nm"][i], h)
+        m["seen_push_Nm"][i] = max(m["seen_push_Nm"][i], smallest_push(m["y"], m["h"], k["shown"], i))
+
+
+@compiled
+def follow_sight(k: Any, m: Any) -> None:
+    """Take in one sample of monitoring, without contact."""
+    for i in range(m["seen"].shape[1]):
+        if m["still"][filter_bank.LEARNT, i] < MOVING:
+            m["sum_push_Nm"][i] += smallest_push(m["y"], m["h"], k["shown"], i)
+            m["sum_cycles"][i] += 1.0
+
+
+def describe_sight(m: Any) -> str:
+    """Say what the last test has seen, joints separated by strokes."""
+    seen = np.cumsum(m["seen"], axis=0)
+    worst_Nm = m["seen_worst_Nm"]
+    median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
+    return (
+        f"a push of {_by_joint(m['seen_push_Nm'])} Nm would be found within {1e3 * WITHIN_S:g} ms at the worst moment "
+        f"of the test, thresholds {_by_joint(median)} Nm in the middle, {_by_joint(most)} in 99 %, "
+        f"{_by_joint(worst_Nm)} at worst"
+    )
+
+
+def take_warning(m: Any) -> str:
+    """Say which joints have seen less since the last call than in the test; empty if none."""
+    lines = []
+    for i in range(JOINTS):
+        if m["sum_cycles"][i] >= FEWEST:
+            push_Nm = m["sum_push_Nm"][i] / m["sum_cycles"][i]
+            if push_Nm > LESS * m["seen_push_Nm"][i]:
+                lines.append(
+                    f"joint {i + 1} sees less than was certified: within {1e3 * WITHIN_S:g} ms it finds pushes from "
+                    f"{push_Nm:.2f} Nm on, a second's mean; in the test from {m['seen_push_Nm'][i]:.2f} Nm on at worst"
+                )
+    for name in ("sum_push_Nm", "sum_cycles"):
+        m[name] = 0.0
+    return "; ".join(lines)
+
+
+def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
+    """Return the upper end of the bin up to which this share of the cycles is; the worst where that is less."""
+    place = int(np.searchsorted(seen, share * seen[-1]))
+    if place == BINS - 1:
+        return float(worst_Nm)
+    return min(LOWEST_NM * float(math.exp(WIDTH * (place + 1))), float(worst_Nm))
+
+
+def _by_joint(values_Nm: Any) -> str:
+    return " / ".join(f"{value:.3f}" for value in values_Nm)

@@ -14,12 +14,24 @@
   too: a bound, since |F x| <= F |x|.
 - R: by how much the velocity's noise exceeds that of the settings, seen in its second difference.
 - e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`strain`).
-- G: what lost samples leave open (`lost_samples`). tail: floor by the largest residual seen (`tail`).
+- G: what lost samples leave open, see below. tail: floor by the largest residual seen (`margin`).
 - s: how much of the filter's memory is of standstill, where friction may hold any torque up to F_c, static friction
   where it is in the model, and as much more as these are uncertain.
 
 Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C, n); y, h (2 C - 1, n); W_f (C, n, p);
 M (n, n). Units: Nm.
+
+**Lost samples.** What lost samples leave open: where they are put on a straight line, or cut out of time, the
+thresholds widen.
+
+Of n periods, n - 1 of them on the line between their neighbours, dt in all, a filter of cut-off a sees up to
+
+    G += (k_tau sigma a dt)² (1 - 1 / n) / 2 + (a dt (CURVATURE dt² / 12 + F_c [sgn dq has changed]))²
+
+more: the noise of two samples in the place of n, and what the line leaves out of torque and friction. After a gap that
+is cut out the velocity's noise stands in S for good, G += (2 a nu)² (M R M')_ii. The filters forget it: G e^(-2 a t).
+
+Shapes: C filters, n joints; lost (C, n), Nm².
 """
 
 import math
@@ -28,9 +40,9 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
-from adacd_hil.scheme.contact import contact_estimate
-from adacd_hil.scheme.model import bank, friction
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.detect import external_torque
+from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.certified_settings import CertifiedSettings
 
 SECOND_DIFFERENCE = 0.36
@@ -64,8 +76,6 @@ UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
 UNIT_TEST_S = 0.3
 """The same while a frozen model is tested: begun with a unit of 1 it ends near a quarter of it if all is well."""
-VELOCITY_STD_SHARE = 0.12
-"""Standard deviation of the velocity's noise over its largest value: 4e-4 of 3.3e-3 rad/s, measured as above."""
 
 _SMOOTHED_SHARE = 0.335 / 200.0
 _SMOOTHED_FALL_RAD_S = 600.0
@@ -89,7 +99,7 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> dict[str, 
         "strain_share": np.array(period_s / STRAIN_S),
         "unit_share": np.array(period_s / UNIT_S),
         "unit_test_share": np.array(period_s / UNIT_TEST_S),
-        "velocity_std_rad_s": np.array(VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
+        "velocity_std_rad_s": np.array(filter_bank.VELOCITY_STD_SHARE * certified.velocity_noise_rad_s),
     }
 
 
@@ -167,7 +177,7 @@ def keep_velocity_noise(k: Any, m: Any) -> None:
     """
     for i in range(m["roughness_kept"].shape[0]):
         now, kept = m["roughness_now"][i], m["roughness_kept"][i]
-        if abs(m["dq_old"][i]) > friction.SLOW_RAD_S:
+        if abs(m["dq_old"][i]) > regressor.SLOW_RAD_S:
             kept -= k["roughness_loss"] * (kept - now)
         m["roughness_kept"][i] = max(kept, now)
 
@@ -269,7 +279,7 @@ def _static_friction(k: Any, m: Any, joint: int) -> float:
     coulomb = int(k["first_coulomb"]) + joint
     total = max(m["theta"][coulomb], 0.0) + np.sqrt(max(m["P"][coulomb, coulomb], 0.0))
     for position in range(k["terms"].shape[0]):
-        if k["terms"][position] == friction.STRIBECK:
+        if k["terms"][position] == regressor.STRIBECK:
             term = int(k["first_term"]) + position * m["r"].shape[1] + joint
             total += max(m["theta"][term], 0.0) + np.sqrt(max(m["P"][term, term], 0.0))
     return float(total)
@@ -278,7 +288,7 @@ def _static_friction(k: Any, m: Any, joint: int) -> float:
 @compiled
 def _threshold(k: Any, m: Any, channel: int, joint: int, momentum: float, g: float) -> float:
     """Return a channel's threshold but for standstill, and keep what it is without the floor."""
-    lost = m["lost"][bank.filter_of(channel, m["lost"].shape[0]), joint]
+    lost = m["lost"][filter_bank.filter_of(channel, m["lost"].shape[0]), joint]
     noise = k["torque_variance"][channel] * m["roughness"][joint] + k["velocity_variance"][channel] * momentum
     noise += k["torque_gain"][channel] * m["torque_step_Nm"][joint] ** 2 / 12.0 + lost
     m["h_model"][channel, joint] = m["strain"][joint] * np.sqrt(noise + g * g) + m["torque_pull_Nm"][joint]
@@ -293,7 +303,7 @@ def fill_wide(k: Any, m: Any, c: int) -> None:
     of the velocity its change over five samples. A slow push is seen in the slow filters first: the threshold is the
     least of all channels'.
     """
-    samples = float(contact_estimate.WIDE_SAMPLES)
+    samples = float(external_torque.WIDE_SAMPLES)
     span_s = samples * k["period_s"]
     for i in range(m["r"].shape[1]):
         momentum = momentum_noise(m, i)
@@ -329,8 +339,38 @@ def joints_over(y: Vector, h: Vector) -> int:
         for i in range(y.shape[1]):
             is_over = not (abs(y[c, i]) <= h[c, i])
             if is_over and c >= filters and np.isfinite(y[c, i]):
-                smoothed = bank.filter_of(c, filters)
+                smoothed = filter_bank.filter_of(c, filters)
                 is_over = not (abs(y[smoothed, i]) <= AGREES * h[smoothed, i])
             if is_over:
                 joints |= 1 << i
     return joints
+
+
+CURVATURE_NM_S2 = 500.0
+"""Second derivative of the torque: 2.5 Nm at 2.2 Hz, or 0.5 Nm at 5 Hz."""
+
+MOST_FILLED = 8
+"""Missing samples that are put on the line between their neighbours."""
+
+
+def shapes_of(filters: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    return {"lost": (filters, JOINTS)}
+
+
+@compiled
+def follow_lost(k: Any, m: Any, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
+    """Take in a sample that came `steps` periods, `period_s`, after the one before; is_seen: the line was filled in."""
+    lost, before = m["lost"], m["last"][1]
+    for c in range(lost.shape[0]):
+        turn = k["cutoff"][c] * period_s
+        decay = math.exp(-2.0 * turn)
+        noise = (k["noise_sigmas"] * k["torque_noise_Nm"] * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
+        for i in range(lost.shape[1]):
+            lost[c, i] *= decay
+            if is_seen and steps > 1:
+                has_turned = np.sign(dq[i]) != np.sign(before[i])
+                left_out = CURVATURE_NM_S2 * period_s**2 / 12.0 + (m["hold"][i] if has_turned else 0.0)
+                lost[c, i] += noise * m["roughness"][i] + (turn * left_out) ** 2
+            elif not is_seen:
+                lost[c, i] += (2.0 * k["cutoff"][c] * k["velocity_noise_rad_s"]) ** 2 * momentum_noise(m, i)

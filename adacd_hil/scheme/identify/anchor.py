@@ -19,6 +19,15 @@ direction looks like an offset. Before the drives are enabled the reading at res
 
 Shapes: anchor_Nm, anchor_std, bound_Nm (4, n), inf where there is none; judged_Nm (n,): what was compared last with
 them; holding_Nm (n,), inf where not known.
+
+**Torque by place.** Its columns (`regressor`) are in the model only where `arm.position_torque_Nm` says that the arm
+has one, and how much at most. A hand's spring that is held from before the start looks the same, and so does a lean to
+some extent: over a short way a cosine is a constant. So a fit gets no certificate while the torque that it gives to its
+place is more than that anywhere on its own samples. The torque is what stays of it when the joint's offset is put where
+its anchor says, with what goes with it by the belief's covariance. Where the model has no such columns `missing_torque`
+tells whether it should.
+
+Shapes: by_place_Nm (n,): the largest torque by place of the fit.
 """
 
 from typing import Any
@@ -27,6 +36,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.model.regressor import PLACE_TERMS
 from adacd_hil.settings.configuration import Settings
 
 REST, TARE, ACCEPTED, LAST = range(4)
@@ -217,3 +227,63 @@ def describe_refused(m: Any, is_reading: bool) -> list[str]:
                     f"somebody leans on it, {_HELD if kind == REST and not is_reading else _MOVED}"
                 )
     return lines
+
+
+LARGEST_OF_STD = 2.5
+"""The largest torque, over the standard deviation that each coefficient is expected to have."""
+
+
+def place_shapes() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    return {"by_place_Nm": (JOINTS,)}
+
+
+@compiled
+def is_place_bounded(k: Any, m: Any) -> bool:
+    """Tell whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `by_place_Nm`."""
+    if k["position_torque_Nm"] == 0.0:
+        return True
+    is_place_bounded = True
+    for i in range(m["by_place_Nm"].shape[0]):
+        m["by_place_Nm"][i] = _largest_Nm(k, m, i)
+        is_place_bounded = is_place_bounded and m["by_place_Nm"][i] <= k["position_torque_Nm"]
+    return bool(is_place_bounded)
+
+
+@compiled
+def _largest_Nm(k: Any, m: Any, joint: int) -> float:
+    """Return the largest torque by place of a joint over the fit's samples, its offset where the anchor says."""
+    joints, first = m["by_place_Nm"].shape[0], int(k["first_position"])
+    offset, largest = int(k["base"]) + joint, 0.0
+    P, theta = m["P_belief"], m["belief"]
+    off = innovation(k, m, joint, theta[offset], P[offset, offset])
+    for s in range(int(m["samples_kept"])):
+        torque = 0.0
+        for term in range(PLACE_TERMS):
+            j = first + term * joints + joint
+            torque += m["samples_W"][s, joint, j] * (theta[j] - P[j, offset] * off)
+        largest = max(largest, abs(torque))
+    return float(largest)
+
+
+def describe_place(k: Any, m: Any) -> str:
+    """Say how much of a torque by place the certified model has, Nm; empty where it has none."""
+    if k["position_torque_Nm"] == 0.0:
+        return ""
+    return (
+        f"; torque by place up to {_by_joint(m['by_place_Nm'])}, believed up to {float(k['position_torque_Nm']):g} Nm"
+    )
+
+
+def describe_place_refused(k: Any, m: Any) -> list[str]:
+    """Say of each joint whose torque by place is too large how large it is, a line each."""
+    limit = float(k["position_torque_Nm"])
+    return [
+        f"joint {i + 1} has a torque of up to {torque:.3f} Nm that depends on where the arm is, bound {limit:g} Nm"
+        for i, torque in enumerate(m["by_place_Nm"].tolist())
+        if not torque <= limit
+    ]
+
+
+def _by_joint(values: Vector) -> str:
+    return ", ".join(f"{value:.3f} Nm (joint {i + 1})" for i, value in enumerate(values.tolist()))

@@ -19,6 +19,14 @@ are learnt on the excitation, and *held* after it (`hold_lags`).
 **Hold-back.** A sample waits in a ring until the ring has come round. `discard` empties it.
 
 Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_still (h, n).
+
+**Refinement.** Refinement of a certified model while it detects: a candidate, its own test, and its promotion.
+
+The belief goes on learning where nothing touches the arm. Every so often its mean is frozen as a candidate and runs
+beside the model in use on motion that neither was fitted to. It takes over if it explains that motion better and would
+have raised no alarm. So friction that warms up, and a model that was armed early, are followed, but a touch is not:
+a contact pauses the test, and what is left below the thresholds can't move a candidate by more than that. An offset
+that has left its anchor (`anchor`), by somebody who leans lightly or a sensor that moves, takes the certificate back.
 """
 
 from typing import Any
@@ -28,8 +36,9 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.identify import estimator, missing_torque
-from adacd_hil.scheme.model import bank, friction
+from adacd_hil.scheme.identify import anchor, estimator, missing_torque
+from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.model.regressor import is_positive_definite
 
 _SWEEPS = 200
 """Most sweeps over the parameters that must not be negative; a handful will do unless P ties them together closely."""
@@ -77,7 +86,7 @@ def learn(k: Any, m: Any) -> bool:
 
     It is corrected by the sample that has waited long enough, if one has.
     """
-    W, tau_J, still = m["W_learnt"], m["tau_learnt"], m["still_smooth"][bank.LEARNT]
+    W, tau_J, still = m["W_learnt"], m["tau_learnt"], m["still_smooth"][filter_bank.LEARNT]
     m["since_learnt"] += 1.0
     if m["since_learnt"] < k["learn_every"]:
         return False
@@ -99,7 +108,7 @@ def learn(k: Any, m: Any) -> bool:
     m["ring_W"][place] = W
     missing_torque.keep(k, m, place)
     for i in range(still.shape[0]):
-        m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > friction.SLOW_RAD_S else 1.0
+        m["ring_still"][place, i] = still[i] if abs(m["dq_old"][i]) > regressor.SLOW_RAD_S else 1.0
     m["ring_tau"][place] = tau_J
     if m["are_lags_held"] != 0.0:
         _take_out_lags(k, m, place)
@@ -164,9 +173,41 @@ def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
         theta[j] = max(theta[j], 0.0)
 
 
-def payload_direction(link_length_m: tuple[float, float], count: int) -> Vector:
-    """Return what 1 kg at the tip of a 2R arm adds to its parameters (count,)."""
-    l1, l2 = link_length_m
-    direction = np.zeros(count)
-    direction[:3] = l1**2 + l2**2, l1 * l2, l2**2
-    return direction
+@compiled
+def restart_candidate(m: Any) -> None:
+    """Begin the next test with the belief as it is now."""
+    m["candidate_cycles"] = 0.0
+    m["candidate_square"] = 0.0
+    m["frozen_square"] = 0.0
+    m["candidate_worst"] = 0.0
+    m["candidate"][:] = m["belief"]
+    m["P_candidate"][:] = m["P_belief"]
+
+
+@compiled
+def test_candidate(k: Any, m: Any) -> bool:
+    """Take one sample into the test; tell whether a candidate that passes it is excluded by an anchor alone."""
+    m["candidate_cycles"] += 1.0
+    for c in range(m["W_f"].shape[0]):
+        for i in range(m["W_f"].shape[1]):
+            residual = -m["tau_f"][c, i]
+            for j in range(m["candidate"].shape[0]):
+                residual += m["W_f"][c, i, j] * m["candidate"][j]
+            if c == filter_bank.SLOW and m["still"][c, i] < sensitivity.MOVING:
+                m["candidate_square"] += residual * residual
+                m["frozen_square"] += m["r"][c, i] ** 2
+            bare = max(m["r"].shape[0] + c - 1, 0) if c > 0 else 0
+            m["candidate_worst"] = max(m["candidate_worst"], abs(residual) / m["h"][bare, i])
+    if m["candidate_cycles"] < k["refine_cycles"]:
+        return False
+    is_better = m["candidate_square"] < m["frozen_square"] and m["candidate_worst"] < 1.0
+    is_fit = is_better and is_positive_definite(m["candidate"])
+    is_anchored = is_fit and anchor.is_within(k, m, m["candidate"], m["P_candidate"])
+    if is_anchored:
+        m["theta"][:] = m["candidate"]
+        m["P"][:] = m["P_candidate"]
+        m["certified"][:] = m["theta"]
+        m["P_certified"][:] = m["P"]
+        m["promotions"] += 1.0
+    restart_candidate(m)
+    return bool(is_fit and not is_anchored)

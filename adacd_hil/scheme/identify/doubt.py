@@ -30,8 +30,7 @@ import numpy as np
 from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.identify import belief
-from adacd_hil.scheme.model import bank, friction
+from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.configuration import Settings
 
 WITHIN_S = 60.0
@@ -69,7 +68,7 @@ def constants_of(settings: Settings, count: int) -> dict[str, Vector]:
     """Return `causes` (h, p): a payload of 1 kg, then by joint Coulomb and viscous friction."""
     unit = np.eye(count)
     first = PARAMETER_NAMES.index("F_c1"), PARAMETER_NAMES.index("F_v1")
-    rows = [belief.payload_direction(settings.arm.link_length_m, count)]
+    rows = [regressor.payload_direction(settings.arm.link_length_m, count)]
     rows += [unit[place + i] for i in range(JOINTS) for place in first]
     return {"causes": np.array(rows)}
 
@@ -125,8 +124,8 @@ def weigh(k: Any, m: Any) -> None:
     """Take in one sample of a contact; of a joint that rests, friction may hold anything."""
     _follow_peak(m)
     for i in range(m["tau_f"].shape[1]):
-        if m["still_smooth"][bank.LEARNT, i] < TOLD_NOTHING and abs(m["dq_old"][i]) > friction.SLOW_RAD_S:
-            _add(k, m, i, m["W_learnt"][i], m["tau_learnt"][i], m["still_smooth"][bank.LEARNT, i], 1.0)
+        if m["still_smooth"][filter_bank.LEARNT, i] < TOLD_NOTHING and abs(m["dq_old"][i]) > regressor.SLOW_RAD_S:
+            _add(k, m, i, m["W_learnt"][i], m["tau_learnt"][i], m["still_smooth"][filter_bank.LEARNT, i], 1.0)
 
 
 @compiled
@@ -155,7 +154,7 @@ def _add(k: Any, m: Any, i: int, w: Vector, tau: float, still: float, weight: fl
         m["cause_ws"][h, i] += weight * left * still
 
 
-class Verdict(NamedTuple):
+class CommonCause(NamedTuple):
     """What contacts look like. text: in words; is_payload: something was picked up, or put down."""
 
     text: str
@@ -181,13 +180,13 @@ class Doubt:
 
     def __init__(self, settings: Settings, constants: Structured, memory: Structured) -> None:
         self._constants, self._memory = constants[0], memory
-        self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[bank.LEARNT] * settings.bus.period_s)
+        self._correlated = 2.0 / (settings.certified.cutoffs_rad_s[filter_bank.LEARNT] * settings.bus.period_s)
         self._period_s = settings.bus.period_s
         self._contacts: deque[_Weighed] = deque(maxlen=MANY)
         self._monitored_s = 0.0
         self._waited_s = 0.0
         self._log_odds, self._weak = 0.0, 0
-        self._contradiction: Verdict | None = None
+        self._contradiction: CommonCause | None = None
 
     def compile(self) -> None:
         """Call what is compiled once, on a copy, so that nothing compiles later."""
@@ -202,7 +201,7 @@ class Doubt:
         """Take in that the arm monitors from this cycle on."""
         self._monitored_s = cycle * self._period_s
 
-    def begin(self, cycle: int, is_touched: bool, contradiction: Verdict | None = None) -> None:
+    def begin(self, cycle: int, is_touched: bool, contradiction: CommonCause | None = None) -> None:
         """Take in that the arm reacts: to a touch or, as where the host is late, to none.
 
         contradiction: what contradicts the certificate, if it reacts to that.
@@ -214,7 +213,7 @@ class Doubt:
         self._weak = self._weak if self._log_odds > 0.0 else 0
         react(self._memory, is_touched, self._waited_s < AT_REST_S)
 
-    def end(self, cycle: int) -> Verdict | None:
+    def end(self, cycle: int) -> CommonCause | None:
         """Take in that it has ended; return what the last ones look like, if they have one cause."""
         if self._contradiction is not None:
             return self._contradiction
@@ -228,7 +227,7 @@ class Doubt:
             self._contacts.popleft()
         return self._payload() or self._other() or self._unexplained()
 
-    def _payload(self) -> Verdict | None:
+    def _payload(self) -> CommonCause | None:
         for count in range(FEWEST_LOADED, len(self._contacts) + 1):
             last = list(self._contacts)[-count:]
             rw, ww, rr = (sum(column) for column in zip(*((c.rw[0], c.ww[0], c.rr) for c in last), strict=True))
@@ -236,10 +235,10 @@ class Doubt:
             if kg is not None and rw * rw > SHARE_OF_ALL * ww * rr and abs(kg) > SURE * self._sigma(ww):
                 kg, sigma = self._size(last, 0)
                 what = "picked up" if kg > 0.0 else "put down"
-                return Verdict(f"{count} contacts look like {abs(kg):.2f} ± {sigma:.2f} kg {what}", is_payload=True)
+                return CommonCause(f"{count} contacts look like {abs(kg):.2f} ± {sigma:.2f} kg {what}", is_payload=True)
         return None
 
-    def _other(self) -> Verdict | None:
+    def _other(self) -> CommonCause | None:
         last = list(self._contacts)[-FEWEST:]
         if len(last) < FEWEST or max(contact.waited_s for contact in last[1:]) > AT_ONCE_S:
             return None
@@ -249,10 +248,10 @@ class Doubt:
             if size is not None and abs(size) > SURE * self._sigma(ww) and self._can_be(h, size):
                 joint, kind = divmod(h - 1, len(_FRICTIONS))
                 text = _words(kind, joint, *self._size(last, h))
-                return Verdict(f"{len(last)} contacts look like {text}", is_payload=False)
+                return CommonCause(f"{len(last)} contacts look like {text}", is_payload=False)
         return None
 
-    def _unexplained(self) -> Verdict | None:
+    def _unexplained(self) -> CommonCause | None:
         """Return what is to be said if no person is likely to touch so."""
         last = list(self._contacts)[-MANY:]
         text = ""
@@ -262,7 +261,7 @@ class Doubt:
             text = f"{self._weak} contacts came to less than {WEAK:g} times their threshold"
         if not text:
             return None
-        return Verdict(
+        return CommonCause(
             f"{text}, and no one error explains them: a light touch, or the arm has changed", is_payload=False
         )
 

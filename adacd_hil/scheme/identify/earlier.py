@@ -8,8 +8,8 @@ What tells it apart is that the arm was known without it before.
     (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' <= STEADY u
 
 u: mean square of its residuals over that of the settings. More, and something has touched the arm or let go meanwhile;
-likewise if the model doesn't explain each of its samples (`fit_samples`). And what came later must come to the same
-torque by itself, on all samples (`later_samples`, rms as in `fit_samples`):
+likewise if the model doesn't explain each of its samples (`fit_check`). And what came later must come to the same
+torque by itself, on all samples (`fit_check`, rms as in `fit_check`):
 
     |W_f (theta_late - theta)| <= LATER_NM + RMS_SHARE rms + LEARNT_SHARE sqrt(u) residual_Nm
 
@@ -24,7 +24,7 @@ some speed, an inertia, an offset that nothing anchors:
     c (theta - theta_0) <= max(floor, SIGMAS sqrt(c (P_0 + P) c'))
 
 The first ones know little and bound little. The last ones may have been touched, and say anything. So one that is
-apart from an earlier one (`later_samples`) is forgotten: with each of the last samples that the next fit learns, one
+apart from an earlier one (`fit_check`) is forgotten: with each of the last samples that the next fit learns, one
 pair is compared.
 
 A hand that doesn't help the arm only adds friction and inertia. So **less is the arm's**, and more is a touch that has
@@ -45,7 +45,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect.sensitivity import LARGEST_UNIT
-from adacd_hil.scheme.identify import anchor, fit_samples, later_samples
+from adacd_hil.scheme.identify import anchor, fit_check
 from adacd_hil.settings.configuration import Settings
 
 STEADY = 400.0
@@ -242,7 +242,7 @@ def is_steady(m: Any) -> bool:
 @compiled
 def changed_share(m: Any, s: int) -> float:
     """Return how much of its limit the distance of step s from the whole fit is."""
-    distance = later_samples.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
+    distance = fit_check.distance(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"])
     return float(distance / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
 
 
@@ -257,7 +257,7 @@ def _better_square(m: Any, s: int) -> float:
 @compiled
 def is_explained(k: Any, m: Any) -> bool:
     """Tell whether the fit's model explains each of its samples; if not, keep what it had come to before the first."""
-    first = fit_samples.first_unexplained(m)
+    first = fit_check.first_unexplained(m)
     if first >= 0 and m["has_kept"] == 0.0:
         _keep_steps(m, int(first // k["step_samples"]) - 1)
     return first < 0
@@ -283,11 +283,11 @@ def is_borne_out(k: Any, m: Any) -> bool:
 @compiled
 def later_share(k: Any, m: Any, s: int) -> float:
     """Return how much of its limit the torque is by which what came after step s differs from the fit."""
-    if not later_samples.find(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"]):
+    if not fit_check.find_later(m, m["steps_theta"][s], m["steps_P"][s], m["belief"], m["P_belief"]):
         return np.inf
-    limit_Nm = LATER_NM + later_samples.RMS_SHARE * fit_samples.better_rms(m)
+    limit_Nm = LATER_NM + fit_check.RMS_SHARE * fit_check.better_rms(m)
     limit_Nm += LEARNT_SHARE * k["residual_Nm"] * np.sqrt(_better_square(m, s))
-    return float(fit_samples.largest_torque(m, m["later"]) / limit_Nm)
+    return float(fit_check.largest_torque(m, m["later"]) / limit_Nm)
 
 
 @compiled
@@ -297,7 +297,7 @@ def _compare_kept(m: Any) -> None:
     if n >= m["kept_count"]:
         return
     is_judged = s < n and m["kept_unit"][s] > 0.0 and m["kept_unit"][n] > 0.0
-    if is_judged and later_samples.is_apart(
+    if is_judged and fit_check.is_apart(
         m, m["kept"][s], m["P_kept"][s], m["kept"][n], m["P_kept"][n], m["kept_unit"][n]
     ):
         m["kept_unit"][n] = 0.0

@@ -4,7 +4,7 @@ Each sample that the belief learns, a row w of the regressor with its torque and
 
     L = Σ v v'/R,   b = Σ v r/R,   r = tau_f - w prior,   v = (w, x, e)
 
-with x the columns of `position` behind the filter that is learnt from, and e those of elastic joints: encoders on the
+with x the columns of `regressor` behind the filter that is learnt from, and e those of elastic joints: encoders on the
 motors see q + tau_J/K in place of q, which leaves M d²tau_J/dt² / K, filtered as the rest. From a prior N(0, S²) of the
 parameters less their mean, with x, with e, or without, each sum says how likely the samples are:
 
@@ -24,8 +24,8 @@ the first 2 s, the next 4, 8, 16 s and then of each 16 s of learnt samples. Not 
 over a minute looks like this. There one stretch is not enough, since on one way much depends on the place: what it says
 must explain AGREES of the squares that the basic model leaves in a later one.
 
-Shapes: p parameters, n joints, f = p + n TERMS + n; evidence_L (n, f, f): by the joint of the row, lower half;
-evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n TERMS,): coefficients of the last
+Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t + n; evidence_L (n, f, f): by the joint of the row, lower
+half; evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n t,): coefficients of the last
 stretch that came to a torque by place, all 0 if none did; missing_rms_Nm (n,): what was found last, 0 where nothing
 was; is_elastic: whether that was elasticity.
 """
@@ -37,9 +37,8 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.identify.position import TERMS, fill
-from adacd_hil.scheme.model import bank
+from adacd_hil.scheme.model import filter_bank
+from adacd_hil.scheme.model.regressor import PLACE_TERMS, fill_position
 from adacd_hil.settings.configuration import Settings
 
 EXPECTED_NM = 0.06
@@ -64,7 +63,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
     learn_s = settings.bus.period_s * settings.certified.learn_every
     return {
         "evidence_std": np.concatenate(
-            [prior_std, np.full(JOINTS * TERMS, EXPECTED_NM), np.full(JOINTS, EXPECTED_RAD_NM)]
+            [prior_std, np.full(JOINTS * PLACE_TERMS, EXPECTED_NM), np.full(JOINTS, EXPECTED_RAD_NM)]
         ),
         "smoothing_rad_s": np.array(settings.certified.smoothing_rad_s),
         "evidence_first": np.array(round(FIRST_S / learn_s)),
@@ -74,15 +73,15 @@ def constants_of(settings: Settings, prior_std: Vector) -> dict[str, Vector]:
 
 def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name, of a model with this many parameters and a ring so long."""
-    full = count + JOINTS * TERMS + JOINTS
-    columns = (JOINTS, TERMS)
+    full = count + JOINTS * PLACE_TERMS + JOINTS
+    columns = (JOINTS, PLACE_TERMS)
     return {
         "X": columns, "X_old": columns, "X_f": columns, "X_learnt": columns, "ring_X": (waiting, *columns),
         "ring_E": (waiting, JOINTS, JOINTS),
         "evidence_L": (JOINTS, full, full), "evidence_M": (full, full),
         "evidence_b": (full,), "evidence_basic": (full,), "evidence_full": (full,), "evidence_row": (full,),
         "evidence_scale": (full,),
-        "evidence_said": (JOINTS * TERMS,),
+        "evidence_said": (JOINTS * PLACE_TERMS,),
         "evidence_yy": (), "evidence_weight": (JOINTS,), "evidence_ways": (JOINTS, 2),
         "evidence_samples": (), "evidence_wanted": (),
         "missing_rms_Nm": (JOINTS,), "is_elastic": (),
@@ -91,15 +90,15 @@ def shapes_of(count: int, waiting: int) -> dict[str, tuple[int, ...]]:
 
 @compiled
 def follow(m: Any, q: Vector, rates: Vector, smoothing: float, is_seen: bool) -> None:
-    """Take the columns (n, TERMS) over one period to what is learnt from; after a gap the filter resumes.
+    """Take the columns (n, PLACE_TERMS) over one period to what is learnt from; after a gap the filter resumes.
 
-    rates (3,): what one period does to the filter, see `filters.FirstOrderHold`; smoothing: to the pole behind it.
+    rates (3,): what one period does to the filter, see `filter_bank.FirstOrderHold`; smoothing: to the pole behind it.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m["X"], m["X_old"], m["X_f"], m["X_learnt"]
-    fill(q, X)
+    fill_position(q, X)
     for i in range(q.shape[0]):
-        for term in range(TERMS):
+        for term in range(PLACE_TERMS):
             if is_seen:
                 X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
             X_old[i, term] = X[i, term]
@@ -117,7 +116,7 @@ def keep(k: Any, m: Any, slot: int) -> None:
     first_lag = int(k["base"]) + joints
     for i in range(joints):
         lag = first_lag + i
-        ddtau_J = k["smoothing_rad_s"] * (m["W_f"][bank.LEARNT, i, lag] - m["W_learnt"][i, lag])
+        ddtau_J = k["smoothing_rad_s"] * (m["W_f"][filter_bank.LEARNT, i, lag] - m["W_learnt"][i, lag])
         for joint in range(joints):
             m["ring_E"][slot, joint, i] = m["M"][joint, i] * ddtau_J
 
@@ -156,7 +155,7 @@ def add(k: Any, m: Any, slot: int, joint: int) -> None:
     R = m["ring_R"][slot, joint] + k["correlated"] * _rough_variance(k, m, joint)
     v[:] = 0.0
     v[:count] = m["ring_W"][slot, joint]
-    v[count + TERMS * joint : count + TERMS * (joint + 1)] = m["ring_X"][slot, joint]
+    v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = m["ring_X"][slot, joint]
     v[_first_elastic(m) :] = m["ring_E"][slot, joint]
     r = m["ring_tau"][slot, joint]
     for j in range(count):
@@ -181,7 +180,7 @@ def _rough_variance(k: Any, m: Any, joint: int) -> float:
     total = 0.0
     for j in range(m["M"].shape[1]):
         total += (m["velocity_roughness"][j] - 1.0) * m["M"][joint, j] ** 2
-    return float(sensitivity.VELOCITY_STD_SHARE**2 * k["velocity_variance"][bank.LEARNT] * total)
+    return float(filter_bank.VELOCITY_STD_SHARE**2 * k["velocity_variance"][filter_bank.LEARNT] * total)
 
 
 @compiled

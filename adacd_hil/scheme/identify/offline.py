@@ -38,9 +38,9 @@ import scipy.linalg
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme.detect import detector
+from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator
-from adacd_hil.scheme.model import chain, filters
+from adacd_hil.scheme.model import chain, filter_bank
 from adacd_hil.scheme.model.chain import BaseParameters, Chain, Indices, Scratch
 from adacd_hil.settings.schema import setting
 
@@ -125,7 +125,7 @@ def model_of(arm: Chain, has_rotors: bool = False) -> ArmModel:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ModelEstimate:
     """Parameters theta (p,) and their covariance P (p, p)."""
 
     theta: Vector
@@ -140,7 +140,7 @@ def prior(
     F_c: float = 10.0,
     offset_Nm: float = 1.0,
     rotor_kg_m2: float = 2.0,
-) -> Estimate:
+) -> ModelEstimate:
     """Return what is known before any motion.
 
     theta_full (10 n,): the designer's parameters, zero if unknown. deviation_full (10 n,): their standard deviations;
@@ -153,10 +153,12 @@ def prior(
     if theta_full is not None:
         theta[model.place_of("base")] = model.base.map @ theta_full
     links = (model.base.map * deviation**2) @ model.base.map.T
-    return Estimate(theta, scipy.linalg.block_diag(links, np.diag(rest)))
+    return ModelEstimate(theta, scipy.linalg.block_diag(links, np.diag(rest)))
 
 
-def with_payload(model: ArmModel, estimate: Estimate, mass_kg: float, at_m: tuple[float, float, float]) -> Estimate:
+def with_payload(
+    model: ArmModel, estimate: ModelEstimate, mass_kg: float, at_m: tuple[float, float, float]
+) -> ModelEstimate:
     """Return the estimate after an unknown mass was fitted at a known place: one unknown, a rank-one increase of P.
 
     mass_kg: standard deviation of the mass, from zero. at_m: in the frame of the last link.
@@ -165,11 +167,11 @@ def with_payload(model: ArmModel, estimate: Estimate, mass_kg: float, at_m: tupl
     change[-chain.PER_LINK :] = chain.point_mass(mass_kg, at_m)
     in_base = np.zeros(estimate.theta.size)
     in_base[model.place_of("base")] = model.base.map @ change
-    return Estimate(estimate.theta, estimate.P + np.outer(in_base, in_base))
+    return ModelEstimate(estimate.theta, estimate.P + np.outer(in_base, in_base))
 
 
 @dataclass(frozen=True)
-class Certificate:
+class OfflineCertificate:
     """The frozen model on motion that was not used for the fit."""
 
     residual_rms_Nm: Vector  # (n,)
@@ -179,7 +181,7 @@ class Certificate:
 
 
 @dataclass(frozen=True)
-class Contact:
+class OfflineContact:
     """One contact; joints and links are counted from 0."""
 
     sample: int  # of detection
@@ -189,22 +191,22 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Detection:
+class OfflineDetection:
     """External torque and threshold of each sample and joint (k, n), Nm, and the contacts in order."""
 
     tau_ext_hat: Vector
     threshold: Vector
-    contacts: tuple[Contact, ...]
+    contacts: tuple[OfflineContact, ...]
 
 
-def identify(model: ArmModel, record: Record, before: Estimate, settings: OfflineSettings) -> Estimate:
+def identify(model: ArmModel, record: Record, before: ModelEstimate, settings: OfflineSettings) -> ModelEstimate:
     """Correct an estimate by a record of free motion. Raises ValueError if record and model differ in joints."""
     theta, P = before.theta.copy(), before.P.copy()
     _trace(model, record, theta, P, settings, settings.fit_cutoff_rad_s, is_learning=True)
-    return Estimate(theta, P)
+    return ModelEstimate(theta, P)
 
 
-def certify(model: ArmModel, record: Record, estimate: Estimate, settings: OfflineSettings) -> Certificate:
+def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> OfflineCertificate:
     """Test a frozen estimate on a record of free motion that `identify` has not seen. Raises as `identify`."""
     trace = _trace(model, record, estimate.theta, estimate.P, settings, settings.detection_cutoff_rad_s)
     residual = np.abs(trace.tau_ext_hat)
@@ -212,24 +214,24 @@ def certify(model: ArmModel, record: Record, estimate: Estimate, settings: Offli
     lack = np.sqrt(np.maximum(mean_square - np.mean(trace.deviation**2, axis=0), 0.0))
     with np.errstate(divide="ignore"):
         margin = float(np.min(_threshold(trace, settings, np.zeros(model.joints)) / residual))
-    return Certificate(np.sqrt(mean_square), np.max(residual, axis=0), lack, margin)
+    return OfflineCertificate(np.sqrt(mean_square), np.max(residual, axis=0), lack, margin)
 
 
 def detect(
     model: ArmModel,
     record: Record,
-    estimate: Estimate,
+    estimate: ModelEstimate,
     settings: OfflineSettings,
     lack_Nm: Vector | None = None,
-) -> Detection:
+) -> OfflineDetection:
     """Find the contacts in a record. lack_Nm (n,): of `certify`, zero if not given. Raises as `identify`."""
     trace = _trace(model, record, estimate.theta, estimate.P, settings, settings.detection_cutoff_rad_s)
     threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
     window = round(settings.isolation_s / settings.period_s)
-    return Detection(trace.tau_ext_hat, threshold, _contacts(trace.tau_ext_hat, threshold, window))
+    return OfflineDetection(trace.tau_ext_hat, threshold, _contacts(trace.tau_ext_hat, threshold, window))
 
 
-def _contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[Contact, ...]:
+def _contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[OfflineContact, ...]:
     """Split the samples over the threshold into contacts: one ends when a whole window is quiet."""
     over = ~(np.abs(tau_ext_hat) <= threshold)
     loud = np.flatnonzero(np.any(over, axis=1))
@@ -243,7 +245,7 @@ def _contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[Cont
             value = tau_ext_hat[crossings[joint], joint]
             direction[joint] = int(value > 0.0) - int(value < 0.0)
         first = int(joints[np.argmin(crossings[joints])])
-        contacts.append(Contact(int(begin), int(joints[-1]), first, tuple(direction)))
+        contacts.append(OfflineContact(int(begin), int(joints[-1]), first, tuple(direction)))
     return tuple(contacts)
 
 
@@ -305,7 +307,7 @@ def _trace(
         raise ValueError(
             f"the arm has {n} joints, the record {record.q.shape[1]}, noise_Nm {len(settings.noise_Nm)} values"
         )
-    hold = filters.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
+    hold = filter_bank.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
     after_one = hold.decay * hold.weight_new + hold.weight_old
     gain = math.sqrt(hold.weight_new**2 + after_one**2 / (1.0 - hold.decay**2))
     kept = hold.decay**settings.fit_every
@@ -346,7 +348,7 @@ def _run(
     q: Vector,
     dq: Vector,
     tau_J: Vector,
-    hold: filters.FirstOrderHold,
+    hold: filter_bank.FirstOrderHold,
     cutoff_rad_s: float,
     noise_Nm: Vector,
     R: float,
@@ -372,12 +374,12 @@ def _run(
         chain.fill_friction(dq[k], friction_column, m.Y_h)
         _fill_rotors(dq[k], rotor_column, m.Y_p)
         if k == 0:
-            filters.resume(
+            filter_bank.resume(
                 cutoff_rad_s, cutoff_rad_s, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f
             )  # fmt: skip
         else:
-            filters.advance_torque(hold.decay, hold.weight_old, hold.weight_new, m.tau_old, tau_J[k], m.tau_f)
-            filters.advance_regressor(
+            filter_bank.advance_torque(hold.decay, hold.weight_old, hold.weight_new, m.tau_old, tau_J[k], m.tau_f)
+            filter_bank.advance_regressor(
                 hold.decay,
                 hold.weight_old,
                 hold.weight_new,
@@ -389,9 +391,9 @@ def _run(
                 m.S,
                 m.W_f,
             )
-        detector.follow_standstill(dq[k], standstill_rad_s, hold.decay, m.standstill)
-        detector.predict(m.W_f, theta, m.tau_f_hat)
-        detector.estimate_external(m.tau_f, m.tau_f_hat, 1.0, trace.tau_ext_hat[k])
+        external_torque.follow_standstill(dq[k], standstill_rad_s, hold.decay, m.standstill)
+        external_torque.predict(m.W_f, theta, m.tau_f_hat)
+        external_torque.estimate_external(m.tau_f, m.tau_f_hat, 1.0, trace.tau_ext_hat[k])
         if passed_rad_s2 > 0.0 and k % fit_every == 0:
             _fill_mass(arm, place, rotor_column, q[k], theta, scratch, m.unit, m.Y_unit, m.Y_rest, m.through)
         for i in range(n):

@@ -9,8 +9,8 @@ of an adaptation P is large and nothing can be told; a fraction of a second late
 the ring is thrown away, so nothing of the touch, from its beginning on, is learnt. What was known before judges what is
 learnt after (`earlier`), and what is known from elsewhere judges the offsets (`anchor`).
 
-**A certificate** is a test of the frozen model on motion that was not used for the fit (`certificate`). While detection
-is armed the belief goes on learning; its mean takes the place of the frozen one after a test (`refinement`).
+**A certificate** is a test of the frozen model on motion that was not used for the fit (`termination`). While detection
+is armed the belief goes on learning; its mean takes the place of the frozen one after a test (`belief`).
 
 Constants, memory and block: `certified_memory`.
 """
@@ -21,24 +21,20 @@ import numpy as np
 
 from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.contact import contact_estimate
-from adacd_hil.scheme.detect import detector, lost_samples, sensitivity, sight, tail
+from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
     anchor,
     belief,
-    certificate,
     doubt,
     earlier,
-    fit_samples,
+    fit_check,
     last_certificate,
     missing_torque,
-    position,
-    refinement,
     termination,
 )
 from adacd_hil.scheme.kernel.paper_kernel import is_filled, keep_sample, put_between
-from adacd_hil.scheme.model import bank, friction, regressor
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 
 # What a cycle does, as bits.
 MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero
@@ -100,8 +96,8 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     belief.discard(m)
     m["are_lags_held"] = 0.0
     earlier.begin(m)
-    fit_samples.begin(m)
-    tail.begin(m)
+    fit_check.begin(m)
+    margin.begin_tail(m)
     m["unit"][:] = 1.0
     m["samples"] = 0.0
     m["recovering_cycles"] = 0.0
@@ -123,8 +119,8 @@ def begin_test(constants: Structured, memory: Structured) -> None:
     _use_belief(m)
     belief.discard(m)
     m["tested"] = 0.0
-    sight.begin(m)
-    m["test_limit_Nm"] = certificate.test_limit_Nm(k, earlier.late_square(m))
+    margin.begin_sight(m)
+    m["test_limit_Nm"] = termination.test_limit_Nm(k, earlier.late_square(m))
     m["dq_low"][:] = np.inf
     m["dq_high"][:] = -np.inf
 
@@ -139,7 +135,7 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
     belief.hold_lags(k, m)
     earlier.forget(m)
     missing_torque.clear(k, m)
-    refinement.restart(m)
+    belief.restart_candidate(m)
 
 
 @compiled
@@ -227,7 +223,7 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
     """
     nominal_s: float = k["period_s"]
     period_s: float = out["period_s"][0]
-    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, lost_samples.MOST_FILLED)
+    is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
     each_s = period_s / steps if is_seen else period_s
     if is_seen:
         _choose_rates(k, m, each_s)
@@ -236,19 +232,19 @@ def _filter(k: Any, m: Any, out: Any, steps: int) -> bool:
             m["is_steady"] = 0.0
             q, dq, tau_J = m["between"][0], m["between"][1], m["between"][2]
             _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out["tau_ext_wide_hat"])
-    lost_samples.follow(k, m, out["dq"], max(steps, 1), period_s, is_seen)
+    sensitivity.follow_lost(k, m, out["dq"], max(steps, 1), period_s, is_seen)
     sensitivity.follow_torque_step(k, m, out["tau_J"])
-    if not is_seen and np.max(np.abs(out["dq"])) > friction.SLOW_RAD_S:
+    if not is_seen and np.max(np.abs(out["dq"])) > regressor.SLOW_RAD_S:
         m["recovering_cycles"] = max(m["recovering_cycles"], k["settle_cycles"])
     m["is_steady"] = 1.0 if is_seen and steps == 1 else 0.0
     _take_sample(k, m, out["q"], out["dq"], out["tau_J"], each_s, is_seen, out["tau_ext_wide_hat"])
     m["has_gap"] = 0.0
     keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
-    out["tau_f"][:] = m["tau_f"][bank.SLOW]
-    detector.predict(m["W_f"][bank.SLOW], k["theta_cad"], out["tau_f_cad"])
+    out["tau_f"][:] = m["tau_f"][filter_bank.SLOW]
+    external_torque.predict(m["W_f"][filter_bank.SLOW], k["theta_cad"], out["tau_f_cad"])
     for i in range(out["q"].shape[0]):
-        out["tau_ext_hat"][i] = m["r"][bank.SLOW, i]
-        out["tau_f_hat"][i] = m["r"][bank.SLOW, i] + out["tau_f"][i]
+        out["tau_ext_hat"][i] = m["r"][filter_bank.SLOW, i]
+        out["tau_f_hat"][i] = m["r"][filter_bank.SLOW, i] + out["tau_f"][i]
         out["tau_ext_hat_cad"][i] = out["tau_f_cad"][i] - out["tau_f"][i]
     return bool(is_seen)
 
@@ -262,7 +258,7 @@ def _choose_rates(k: Any, m: Any, period_s: float) -> None:
         old[:] = k["weight_old"]
         new[:] = k["weight_new"]
     else:
-        bank.discretise(k["cutoff"], period_s, decay, old, new)
+        filter_bank.discretise(k["cutoff"], period_s, decay, old, new)
 
 
 @compiled
@@ -278,28 +274,28 @@ def _take_sample(
 ) -> None:
     """Take the bank over one period to a sample, or let it resume from there, and compare with the model in use."""
     cutoff = k["cutoff"]
-    friction.bend(dq, period_s, k["still_rad_s"], k["dahl_rad"], m["bent"])
+    regressor.bend_bristles(dq, period_s, k["still_rad_s"], k["dahl_rad"], m["bent"])
     _fill_regressor(k, m, q, dq, tau_J)
     if is_seen:
         decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
-        bank.advance(
+        filter_bank.advance_bank(
             cutoff, decay, old, new, m["Y_p"], m["Y_h"], tau_J,
             m["tau_old"], m["input_old"], m["S"], m["tau_f"], m["W_f"],
         )  # fmt: skip
     else:
-        bank.resume(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
-    missing_torque.follow(m, q, m["rates"][:, bank.LEARNT], k["smoothing"], is_seen)
-    bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
+        filter_bank.resume_bank(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
+    missing_torque.follow(m, q, m["rates"][:, filter_bank.LEARNT], k["smoothing"], is_seen)
+    filter_bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     if k["has_cross_talk"] != 0.0:
-        bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
-    bank.smooth_learnt(k["smoothing"], m["W_f"], m["tau_f"], m["W_learnt"], m["tau_learnt"])
-    bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
-    bank.smooth(k["smoothing"], m["r"], m["y"])
+        filter_bank.fill_cross_talk(m["tau_f"], int(k["first_cross_talk"]), m["W_f"])
+    filter_bank.smooth_learnt(k["smoothing"], m["W_f"], m["tau_f"], m["W_learnt"], m["tau_learnt"])
+    filter_bank.estimate_external(m["tau_f"], m["W_f"], m["theta"], m["r"])
+    filter_bank.smooth(k["smoothing"], m["r"], m["y"])
     still_rad_s, decay, smoothing = k["still_rad_s"], k["decay"], k["smoothing"]
     sensitivity.follow_standstill(dq, m["dq_old"], still_rad_s, decay, smoothing, m["still"], m["still_smooth"])
     sensitivity.follow_velocity_noise(k, m, dq, m["is_steady"] != 0.0)
     sensitivity.follow_friction(k, m)
-    contact_estimate.undo_filter(m["r"][bank.WIDE], k["decay"][bank.WIDE], m["history"], tau_ext_wide_hat)
+    external_torque.undo_filter(m["r"][filter_bank.WIDE], k["decay"][filter_bank.WIDE], m["history"], tau_ext_wide_hat)
 
 
 @compiled
@@ -309,13 +305,13 @@ def _fill_regressor(k: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector) -> Non
     regressor.fill_momentum(q, dq, m["Y_p"][:, :base])
     regressor.fill_remainder(q, dq, m["Y_h"][:, :base])
     for i in range(count):
-        m["Y_h"][i, first_coulomb + i] = friction.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
+        m["Y_h"][i, first_coulomb + i] = regressor.smooth_sign(dq[i], k["still_rad_s"], k["width_rad_s"])
         m["Y_h"][i, base + i] = 1.0
     speeds = k["still_rad_s"], k["width_rad_s"], k["stribeck_rad_s"]
-    friction.fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
+    regressor.fill_terms(dq, tau_J, k["terms"], speeds, m["bent"], base + 2 * count, m["Y_h"])
     if k["position_torque_Nm"] != 0.0:
-        position.fill(q, m["X"])
-        position.put_columns(m["X"], int(k["first_position"]), m["Y_h"])
+        regressor.fill_position(q, m["X"])
+        regressor.put_position_columns(m["X"], int(k["first_position"]), m["Y_h"])
     regressor.fill_mass_matrix(q, m["theta"], m["M"])
 
 
@@ -324,8 +320,8 @@ def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
     """Compare with the thresholds; return CONTACT, COLLISION and the joints that are over, if any."""
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m["h"])
-        out["threshold"][:] = m["h"][bank.SLOW]
-        sensitivity.fill_wide(k, m, bank.WIDE)
+        out["threshold"][:] = m["h"][filter_bank.SLOW]
+        sensitivity.fill_wide(k, m, filter_bank.WIDE)
     joints = sensitivity.joints_over(m["y"], m["h"])
     if not joints:
         return 0
@@ -362,7 +358,7 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
     if is_free and belief.learn(k, m):
         _use_belief(m)
         earlier.follow(k, m)
-        fit_samples.keep(m, m["W_f"][bank.SLOW], m["tau_f"][bank.SLOW])
+        fit_check.keep(m, m["W_f"][filter_bank.SLOW], m["tau_f"][filter_bank.SLOW])
     if not (is_free and _gather_evidence(k, m, out)):
         return 0
     m["withheld_by"] = _contradicted_by(k, m)
@@ -374,11 +370,11 @@ def _follow_noise(k: Any, m: Any, is_free: bool, mode: int) -> None:
     """Take in the noise of a sample that nothing touches, or throw away what waits to be told from a contact."""
     if not is_free:
         belief.discard(m)
-        tail.discard(m)
+        margin.discard_tail(m)
         return
     sensitivity.keep_velocity_noise(k, m)
     if mode & (TEST | REFINE):
-        tail.follow(k, m)
+        margin.follow_tail(k, m)
 
 
 @compiled
@@ -394,7 +390,7 @@ def _contradicted_by(k: Any, m: Any) -> int:
     if cause != NOTHING:
         missing = _missing(k, m)
         return missing if missing != NOTHING and cause == CHANGED else cause
-    if not position.is_bounded(k, m):
+    if not anchor.is_place_bounded(k, m):
         return TOO_MUCH_BY_PLACE
     return NOTHING if last_certificate.is_no_more(k, m) else MORE_THAN_LAST
 
@@ -415,11 +411,11 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     """
     m["tested"] += 1.0
     termination.widen(dq, m["dq_low"], m["dq_high"])
-    sensitivity.follow_unit(k, m, bank.SLOW, k["unit_test_share"])
-    sight.follow_test(k, m)
+    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_test_share"])
+    margin.follow_test(k, m)
     has_moved = True
     for i in range(dq.shape[0]):
-        if not (abs(m["r"][bank.SLOW, i]) <= m["test_limit_Nm"]):
+        if not (abs(m["r"][filter_bank.SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
             m["withheld_by"] = _missing(k, m)
             return _REFUTED if m["withheld_by"] == NOTHING else _REFUTED | _WITHHELD
@@ -438,15 +434,15 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
 @compiled
 def _refine(k: Any, m: Any) -> int:
     """Learn on beside the model in use, and let what was learnt take over after its test; return what is against it."""
-    sensitivity.follow_unit(k, m, bank.SLOW, k["unit_share"])
+    sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_share"])
     sensitivity.relax(k, m)
-    sight.follow(k, m)
+    margin.follow_sight(k, m)
     m["withheld_by"] = NOTHING
     if belief.learn(k, m):
         belief.wander(k["drift_std"], m["W_learnt"], k["period_s"] * k["learn_every"], m["P_belief"])
         if missing_torque.is_found_in_time(k, m):
             m["withheld_by"] = BY_PLACE
-    if refinement.test_candidate(k, m):
+    if belief.test_candidate(k, m):
         m["withheld_by"] = ANCHOR
     return 0 if m["withheld_by"] == NOTHING else _WITHHELD
 
@@ -456,13 +452,13 @@ def _gather_evidence(k: Any, m: Any, out: Any) -> bool:
     """Take this sample into the evidence and tell whether it is complete and the model can be an arm's."""
     termination.widen(out["q"], m["q_low"], m["q_high"])
     termination.widen(out["dq"], m["dq_low"], m["dq_high"])
-    termination.add_information(m["W_f"][bank.SLOW], k["period_s"], m["information"])
+    termination.add_information(m["W_f"][filter_bank.SLOW], k["period_s"], m["information"])
     if m["samples"] % _EIGENVALUE_EVERY == _EIGENVALUE_EVERY - 1:
         smallest, largest = termination.eigenvalue_range(m["information"], k["scale"], m["scratch"])
         m["excitation"] = smallest
         m["condition"] = largest / smallest if smallest > 0.0 else np.inf
     m["samples"] += 1.0
-    return bool(certificate.is_complete(k, m) and regressor.is_positive_definite(m["belief"]))
+    return bool(termination.is_complete(k, m) and regressor.is_positive_definite(m["belief"]))
 
 
 @compiled

@@ -11,20 +11,10 @@ import numpy as np
 
 from adacd_hil.compiled import Structured, packed, zeroed
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector, certified_layout
-from adacd_hil.scheme.contact import contact_estimate
-from adacd_hil.scheme.detect import lost_samples, sensitivity, sight, tail
-from adacd_hil.scheme.identify import (
-    anchor,
-    belief,
-    doubt,
-    earlier,
-    fit_samples,
-    last_certificate,
-    missing_torque,
-    position,
-)
+from adacd_hil.scheme.detect import external_torque, margin, sensitivity
+from adacd_hil.scheme.identify import anchor, belief, doubt, earlier, fit_check, last_certificate, missing_torque
 from adacd_hil.scheme.kernel.paper_kernel import block_dtype, limits_of
-from adacd_hil.scheme.model import bank, friction
+from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.certified_settings import CROSS_TALK, FRICTION_TERMS
 from adacd_hil.settings.configuration import Settings
 
@@ -60,9 +50,9 @@ def prior_std_of(settings: Settings) -> Vector:
         if name.startswith(CROSS_TALK):
             std[j] = settings.certified.cross_talk_std
         elif name.startswith(POSITION_TERMS):
-            std[j] = settings.arm.position_torque_Nm / position.LARGEST_OF_STD
+            std[j] = settings.arm.position_torque_Nm / anchor.LARGEST_OF_STD
         else:
-            std[j] *= next((share for term, share in friction.SHARES.items() if name.startswith(term)), 1.0)
+            std[j] *= next((share for term, share in regressor.SHARES.items() if name.startswith(term)), 1.0)
     return std
 
 
@@ -94,12 +84,12 @@ def constants_of(settings: Settings) -> Structured:
     period_s = settings.bus.period_s
     cutoff = np.array(certified.cutoffs_rad_s)
     decay, weight_old, weight_new = np.zeros_like(cutoff), np.zeros_like(cutoff), np.zeros_like(cutoff)
-    bank.discretise(cutoff, period_s, decay, weight_old, weight_new)
+    filter_bank.discretise(cutoff, period_s, decay, weight_old, weight_new)
     base = len(settings.estimator.parameter_names)
     theta_cad = np.zeros(len(names))
     theta_cad[: len(settings.arm.cad_theta)] = settings.arm.cad_theta
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
-    correlated = 2.0 / (cutoff[bank.LEARNT] * period_s * certified.learn_every)
+    correlated = 2.0 / (cutoff[filter_bank.LEARNT] * period_s * certified.learn_every)
     values: dict[str, Any] = {
         "period_s": period_s,
         "cutoff": cutoff,
@@ -123,14 +113,14 @@ def constants_of(settings: Settings) -> Structured:
         "enough_std": _enough_std_of(settings),
         "drift_std": _drift_std_of(settings),
         "model_error": _by_kind(certified.model_error, names),
-        "payload_direction": belief.payload_direction(settings.arm.link_length_m, len(names)),
+        "payload_direction": regressor.payload_direction(settings.arm.link_length_m, len(names)),
         "payload_std_kg": certified.payload_std_kg,
         "payload_inertia_std": certified.payload_inertia_std,
         "correlated": max(correlated, 1.0),
         "residual_Nm": certified.residual_Nm,
         "learn_every": certified.learn_every,
         "recover_cycles": round(certified.recover_s / period_s),
-        "settle_cycles": round(SETTLED / (cutoff[bank.LEARNT] * period_s)),
+        "settle_cycles": round(SETTLED / (cutoff[filter_bank.LEARNT] * period_s)),
         "fit_cycles": [round(fit_s / period_s) for fit_s in certified.fit_s],
         "test_cycles": [round(test_s / period_s) for test_s in certified.test_s],
         "beta_Nm": certified.beta_Nm,
@@ -146,8 +136,8 @@ def constants_of(settings: Settings) -> Structured:
         **doubt.constants_of(settings, len(names)),
         **earlier.constants_of(settings, prior_std_of(settings)),
         **last_certificate.constants_of(settings),
-        **tail.constants_of(settings),
-        **sight.constants_of(settings),
+        **margin.tail_constants(settings),
+        **margin.sight_constants(settings),
         **missing_torque.constants_of(settings, prior_std_of(settings)),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
@@ -252,14 +242,14 @@ def new_memory(settings: Settings) -> Structured:
         "judged_Nm": joint,
         # what was known earlier
         **earlier.shapes_of(count),
-        **fit_samples.shapes_of(count),
+        **fit_check.shapes_of(count),
         **last_certificate.shapes_of(),
         **doubt.shapes_of(),
-        **tail.shapes_of(channel_count),
-        **sight.shapes_of(),
-        **position.shapes_of(),
+        **margin.tail_shapes(channel_count),
+        **margin.sight_shapes(),
+        **anchor.place_shapes(),
         **missing_torque.shapes_of(count, waiting),
-        **lost_samples.shapes_of(filter_count),
+        **sensitivity.shapes_of(filter_count),
         "withheld_by": (),
         "dq_old": joint,
         "ddq_old": joint,
@@ -273,7 +263,7 @@ def new_memory(settings: Settings) -> Structured:
         "hold": joint,
         "held": (filter_count, JOINTS),
         # contact
-        "history": (contact_estimate.WIDE_SAMPLES + 1, JOINTS),
+        "history": (external_torque.WIDE_SAMPLES + 1, JOINTS),
         "wide_sigma": joint,
         "wide_threshold": joint,
     }

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import Structured, compiled, released
 from adacd_hil.records import ArmBatch, SchemeState, Vector
 from adacd_hil.scheme.contact import contact_report
-from adacd_hil.scheme.kernel import certified_kernel, paper_kernel, paper_shadow
-from adacd_hil.scheme.model import bank
-from adacd_hil.scheme.supervisor.observation import Observation
-from adacd_hil.scheme.supervisor.skip_conditions import Calm, is_calm
+from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
+from adacd_hil.scheme.model import filter_bank
+from adacd_hil.scheme.supervisor.transitions import Calm, Observation, is_calm
 
 _ADAPT = int(SchemeState.ADAPT)
 _CERTIFY = int(SchemeState.CERTIFY)
@@ -64,8 +63,8 @@ class Recorded(NamedTuple):
 class TouchWatch(NamedTuple):
     """What of a contact goes on in every cycle.
 
-    rows: of `report.ContactHistory`; written: how many have been. least_Nm: of the filtered external torque along the
-    way of a withdrawal, below which that has to be judged.
+    rows: of `contact_report.ContactHistory`; written: how many have been. least_Nm: of the filtered external torque
+    along the way of a withdrawal, below which that has to be judged.
     """
 
     rows: Vector
@@ -137,12 +136,12 @@ def run_certified(
         is_complete, steps = samples.is_complete[k], samples.steps[k]
         _put(block, samples, k)
         observation = certified_kernel.step(constants, memory, block, is_complete, steps, mode)
-        paper_mode = paper_shadow.step(paper[0], paper[1], paper[2], paper_mode, block, is_complete, steps)
+        paper_mode = paper_kernel.step_shadow(paper[0], paper[1], paper[2], paper_mode, block, is_complete, steps)
         recorded.observations[k] = observation
         for j in range(values.size):
             recorded.blocks[k, j] = values[j]
         passed += samples.periods[k]
-        y = m["y"][bank.WIDE]
+        y = m["y"][filter_bank.WIDE]
         along_Nm = y[0] * touch.way[0] + y[1] * touch.way[1]
         if (
             not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k])

@@ -10,11 +10,16 @@ Three structured arrays of one element each carry everything, so that fields hav
 A cycle without a fresh sample leaves filters and estimate as they were. Up to `MOST_FILLED` samples that are missing
 before one are taken to lie on the straight line between their neighbours, so that a lost frame leaves nothing unseen. A
 longer gap, a value that is not a number, or an interval that is not near the nominal one makes a gap from which the
-filters resume as `filters` says. The step says whether they took a sample in.
+filters resume as `filter_bank` says. The step says whether they took a sample in.
 
 The measured interval goes into what integrates: filters, estimator, information, impulse. It does not go into what only
 counts: T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period. Nor does it into
-`contact.undo_filter`: of the mean of five derivatives only the ends count, and the five periods between them.
+`external_torque.undo_filter`: of the mean of five derivatives only the ends count, and the five periods between them.
+
+**Shadow.** The paper's scheme beside the certified one: it adapts until eq. (15) holds, then compares with its
+thresholds.
+
+It decides nothing; what it comes to is in the block of the scheme in charge.
 """
 
 from typing import Any
@@ -23,11 +28,10 @@ import numpy as np
 
 from adacd_hil.compiled import Structured, compiled, packed, zeroed
 from adacd_hil.records import JOINTS, Layout, Vector, scheme_layout
-from adacd_hil.scheme.contact import contact_estimate
-from adacd_hil.scheme.detect import detector
+from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator, termination
-from adacd_hil.scheme.model import filters, regressor
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings
 
 # What a cycle does, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
@@ -88,7 +92,7 @@ def constants_of(settings: Settings) -> Structured:
     """Put the settings into the form that the compiled step reads."""
     count = len(settings.estimator.parameter_names)
     period_s = settings.bus.period_s
-    hold = filters.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
+    hold = filter_bank.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
     scale = (inertia,) * 3 + (viscous,) * 2 + (coulomb,) * 2 + (gravity,) * 2
     values: dict[str, Any] = {
@@ -155,7 +159,7 @@ def new_memory(parameter_count: int) -> Structured:
         "quiet_cycles": (),
         # contact
         "standstill": joint,
-        "history": (contact_estimate.WIDE_SAMPLES + 1, JOINTS),
+        "history": (external_torque.WIDE_SAMPLES + 1, JOINTS),
         "integral": joint,
         "peak": joint,
     }
@@ -256,7 +260,7 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
         step_s = period_s / steps
         decay, old, new = c["decay"], c["weight_old"], c["weight_new"]
         if step_s != nominal_s:
-            decay, old, new = filters.first_order_hold(a, b, step_s)
+            decay, old, new = filter_bank.first_order_hold(a, b, step_s)
         for k in range(1, steps):
             put_between(m["last"], out["q"], out["dq"], out["tau_J"], k / steps, m["between"])
             _advance(m, m["between"][0], m["between"][1], m["between"][2], a, b, decay, old, new, out["tau_f"])
@@ -267,7 +271,7 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
         period_s = nominal_s
         regressor.fill_momentum(out["q"], out["dq"], m["Y_p"])
         regressor.fill_remainder(out["q"], out["dq"], m["Y_h"])
-        filters.resume(a, b, m["Y_p"], m["Y_h"], out["tau_J"], m["input_old"], m["tau_old"], m["S"], m["W_f"])
+        filter_bank.resume(a, b, m["Y_p"], m["Y_h"], out["tau_J"], m["input_old"], m["tau_old"], m["S"], m["W_f"])
         m["has_gap"] = 0.0
         _compare(c, m, out["dq"], c["decay"], out)
     keep_sample(out["q"], out["dq"], out["tau_J"], m["last"])
@@ -290,19 +294,21 @@ def _advance(
     """Take the filters over one period to a sample."""
     regressor.fill_momentum(q, dq, m["Y_p"])
     regressor.fill_remainder(q, dq, m["Y_h"])
-    filters.advance_torque(decay, weight_old, weight_new, m["tau_old"], tau_J, tau_f)
-    filters.advance_regressor(decay, weight_old, weight_new, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
+    filter_bank.advance_torque(decay, weight_old, weight_new, m["tau_old"], tau_J, tau_f)
+    filter_bank.advance_regressor(
+        decay, weight_old, weight_new, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"]
+    )
 
 
 @compiled
 def _compare(c: Any, m: Any, dq: Vector, decay: float, out: Any) -> None:
     """Compare the filtered torque with both predictions."""
-    detector.follow_standstill(dq, c["standstill_rad_s"], decay, m["standstill"])
-    detector.predict(m["W_f"], out["theta_hat"], out["tau_f_hat"])
-    detector.predict(m["W_f"], c["theta_cad"], out["tau_f_cad"])
-    detector.estimate_external(out["tau_f"], out["tau_f_hat"], c["dc_gain"], out["tau_ext_hat"])
-    detector.estimate_external(out["tau_f"], out["tau_f_cad"], c["dc_gain"], out["tau_ext_hat_cad"])
-    contact_estimate.undo_filter(out["tau_ext_hat"], c["decay"], m["history"], out["tau_ext_wide_hat"])
+    external_torque.follow_standstill(dq, c["standstill_rad_s"], decay, m["standstill"])
+    external_torque.predict(m["W_f"], out["theta_hat"], out["tau_f_hat"])
+    external_torque.predict(m["W_f"], c["theta_cad"], out["tau_f_cad"])
+    external_torque.estimate_external(out["tau_f"], out["tau_f_hat"], c["dc_gain"], out["tau_ext_hat"])
+    external_torque.estimate_external(out["tau_f"], out["tau_f_cad"], c["dc_gain"], out["tau_ext_hat_cad"])
+    external_torque.undo_filter(out["tau_ext_hat"], c["decay"], m["history"], out["tau_ext_wide_hat"])
 
 
 @compiled
@@ -332,9 +338,9 @@ def _learn(c: Any, m: Any, out: Any, period_s: float) -> int:
 def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporting: bool) -> int:
     """Compare with the thresholds; return the joints that are over, and that any of it is a collision."""
     F_c = out["theta_hat"][regressor.F_C1 : regressor.F_C2 + 1]
-    detector.fill_threshold(c["threshold_Nm"], m["standstill"], F_c, out["threshold"])
+    external_torque.fill_threshold(c["threshold_Nm"], m["standstill"], F_c, out["threshold"])
     if is_fresh:
-        contact_estimate.follow_contact(
+        external_torque.follow_contact(
             out["tau_ext_hat"],
             out["tau_ext_wide_hat"],
             out["threshold"],
@@ -343,7 +349,7 @@ def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
             m["integral"],
             m["peak"],
         )
-    joints = detector.joints_over(out["tau_ext_hat"], out["threshold"])
+    joints = external_torque.joints_over(out["tau_ext_hat"], out["threshold"])
     return _COLLISION | joints << CONTACT_SHIFT if joints else 0
 
 
@@ -375,3 +381,64 @@ def step_record(
         block[0]["tau_J"][:] = tau_J[k]
         block[0]["period_s"][0] = period_s[k]
         step(constants, memory, block, is_complete[k], steps[k], mode)
+
+
+@compiled
+def step_shadow(
+    constants: Structured,
+    memory: Structured,
+    block: Structured,
+    mode: int,
+    main: Structured,
+    is_complete: int,
+    steps: int,
+) -> int:
+    """Take in the sample that the main scheme's block has, fill that block's fields, and return the next mode.
+
+    constants, memory, block: of the paper's kernel. main: after the main kernel's step.
+    """
+    own, out = block[0], main[0]
+    for i in range(JOINTS):
+        own["q"][i], own["dq"][i], own["tau_J"][i] = out["q"][i], out["dq"][i], out["tau_J"][i]
+    own["period_s"][0] = out["period_s"][0]
+    observation = step(constants, memory, block, is_complete, steps, mode)
+    if observation & _ADAPTED:
+        mode = ARMED
+    out["paper_is_armed"][0] = 1.0 if mode == ARMED else 0.0
+    for i in range(JOINTS):
+        out["paper_tau_ext_hat"][i] = own["tau_ext_hat"][i]
+        out["paper_threshold"][i] = own["threshold"][i]
+    for j in range(own["theta_hat"].size):
+        out["paper_theta_hat"][j] = own["theta_hat"][j]
+    return mode
+
+
+class PaperShadow:
+    """The paper's scheme on the same stream."""
+
+    def __init__(self, settings: Settings) -> None:
+        count = len(settings.estimator.parameter_names)
+        self.constants = constants_of(settings)
+        self.memory = new_memory(count)
+        self.block = new_block(count)
+        self.mode = 0
+
+    @property
+    def numbers(self) -> tuple[Structured, Structured, Structured]:
+        """What its kernel works on: constants, memory, block."""
+        return self.constants, self.memory, self.block
+
+    def compile(self, main: Structured) -> None:
+        """Run every compiled function once, on copies. main: the block of the scheme in charge."""
+        memory, block = self.memory.copy(), self.block.copy()
+        begin_adaptation(self.constants, memory, block)
+        step_shadow(self.constants, memory, block, LEARN, main.copy(), 1, 1)
+
+    def begin_adaptation(self) -> None:
+        """Forget the past, as the scheme does whenever it adapts."""
+        begin_adaptation(self.constants, self.memory, self.block)
+        self.mode = LEARN
+
+    def step(self, main: Structured, is_complete: int, steps: int) -> None:
+        """Take in one cycle, and put what it comes to into the block of the scheme in charge."""
+        self.mode = step_shadow(self.constants, self.memory, self.block, self.mode, main, is_complete, steps)

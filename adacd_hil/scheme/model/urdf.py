@@ -32,15 +32,15 @@ class UrdfError(ValueError):
     """A URDF that can't be used; the message is one line that names the link, joint or attribute."""
 
 
-class Pose(NamedTuple):
+class FramePose(NamedTuple):
     """Where a frame is in another."""
 
     rotation: Vector  # (3, 3)
     translation: Vector  # (3,), m
 
-    def then(self, other: "Pose") -> "Pose":
+    def then(self, other: "FramePose") -> "FramePose":
         """Return where a frame is that `other` places in this one."""
-        return Pose(self.rotation @ other.rotation, self.translation + self.rotation @ other.translation)
+        return FramePose(self.rotation @ other.rotation, self.translation + self.rotation @ other.translation)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,9 @@ class SerialArm:
     theta_full: Vector  # (10 n,), of the links with all that is fixed to them
     joint_names: tuple[str, ...]  # (n,)
     link_names: tuple[str, ...]  # (n,), the link that each joint moves
-    places: dict[str, tuple[int, Pose]]  # of every link: the index of the joint that carries it, or BASE, and where
+    places: dict[
+        str, tuple[int, FramePose]
+    ]  # of every link: the index of the joint that carries it, or BASE, and where
     position_low: Vector  # (n,), rad or m; -inf where there is no limit, as of every continuous joint
     position_high: Vector  # (n,)
     velocity_limit: Vector  # (n,), rad/s or m/s
@@ -65,7 +67,7 @@ class _Joint:
     kind: str
     parent: str
     child: str
-    origin: Pose
+    origin: FramePose
     axis: Vector
     low: float
     high: float
@@ -115,10 +117,10 @@ def _assemble(
     if len(roots) != 1:
         raise UrdfError("no root: the joints are a loop" if not roots else f"more than one root link: {_list(roots)}")
     moving: list[_Joint] = []
-    placed: list[Pose] = []
+    placed: list[FramePose] = []
     parameters: list[Vector] = []
-    places: dict[str, tuple[int, Pose]] = {}
-    here = Pose(np.eye(3), np.zeros(3))
+    places: dict[str, tuple[int, FramePose]] = {}
+    here = FramePose(np.eye(3), np.zeros(3))
     following: str | None = roots[0]
     while following is not None:
         index = len(moving) - 1
@@ -167,12 +169,12 @@ def _merge(
     link: str,
     index: int,
     children: dict[str, list[_Joint]],
-    places: dict[str, tuple[int, Pose]],
+    places: dict[str, tuple[int, FramePose]],
     locked: Collection[str],
 ) -> list[_Joint]:
     """Place `link` and all that is fixed to it; return the joints that move on it."""
     outward = []
-    places[link] = (index, Pose(np.eye(3), np.zeros(3)))
+    places[link] = (index, FramePose(np.eye(3), np.zeros(3)))
     waiting = [link]
     while waiting:
         at = waiting.pop()
@@ -185,7 +187,7 @@ def _merge(
     return outward
 
 
-def _moved(parameters: Vector, pose: Pose) -> Vector:
+def _moved(parameters: Vector, pose: FramePose) -> Vector:
     """Return the parameters (10,) of a body seen from the frame in which `pose` places the body's own."""
     mass, moment, inertia = parameters[0], parameters[1:4], _symmetric(parameters[4:])
     at, turned = pose.translation, pose.rotation @ moment
@@ -259,11 +261,11 @@ def _read_joint(joint: Element, name: str, links: Collection[str]) -> _Joint:
     )
 
 
-def _read_origin(element: Element, where: str) -> Pose:
+def _read_origin(element: Element, where: str) -> FramePose:
     """Read <origin>, the identity if there is none."""
     origin = _only(element, "origin", where)
     if origin is None:
-        return Pose(np.eye(3), np.zeros(3))
+        return FramePose(np.eye(3), np.zeros(3))
     xyz, (roll, pitch, yaw) = _numbers(origin, "xyz", where, 0.0), _numbers(origin, "rpy", where, 0.0)
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     rotation = np.array(
@@ -273,7 +275,7 @@ def _read_origin(element: Element, where: str) -> Pose:
             [-sp, cp * sr, cp * cr],
         ]
     )
-    return Pose(rotation, xyz)
+    return FramePose(rotation, xyz)
 
 
 def _named(robot: Element, tag: str) -> dict[str, Element]:

@@ -22,9 +22,8 @@ from adacd_hil.records import (
 )
 from adacd_hil.scheme.kernel.loop import Recorded, Samples, samples_of
 from adacd_hil.scheme.pipeline.intervals import Intervals
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
-from adacd_hil.scheme.supervisor.skip_conditions import Calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm
 
 
 class SchemeBatch(NamedTuple):

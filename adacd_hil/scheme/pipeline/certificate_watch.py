@@ -7,9 +7,9 @@ import numpy as np
 
 from adacd_hil.compiled import Structured
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
-from adacd_hil.scheme.detect import sight, tail
-from adacd_hil.scheme.identify import anchor, earlier, last_certificate, missing_torque, position
-from adacd_hil.scheme.identify.doubt import Verdict
+from adacd_hil.scheme.detect import margin
+from adacd_hil.scheme.identify import anchor, earlier, last_certificate, missing_torque
+from adacd_hil.scheme.identify.doubt import CommonCause
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.scheme.kernel import certified_kernel
 
@@ -102,8 +102,9 @@ class CertificateWatch:
         known_by, self._vouched_against = self._known_by(), ""
         k, m = self._constants, self._memory
         level = "info" if anchor.is_anchored(k, m) else "warning"
-        by_place = position.describe(k, m)
-        text = f"{anchor.describe(k, m)}; {sight.describe(m)}; {tail.describe(k, m)}; {known_by}{by_place}"
+        by_place = anchor.describe_place(k, m)
+        seen = f"{margin.describe_sight(m)}; {margin.describe_false_alarms(k, m)}"
+        text = f"{anchor.describe(k, m)}; {seen}; {known_by}{by_place}"
         self._is_standing = True
         self._certified.append(_Certified(m["theta"].copy(), m["P"].copy(), bool(m["is_payload"]), text))
         return Event(level, "certificate", text)
@@ -131,7 +132,7 @@ class CertificateWatch:
         name, what, remedy = cause.value
         return Event("warning", name, "; ".join((*self._refusal.lines, what, remedy)))
 
-    def doubt(self, verdict: Verdict) -> Event:
+    def doubt(self, verdict: CommonCause) -> Event:
         """Say that contacts have taken the certificate back, and why."""
         self._take_back()
         remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
@@ -156,10 +157,10 @@ class CertificateWatch:
         remedy = "if nobody touches it the model is wrong, and `relearn` learns it anew"
         return Event("warning", "touch", f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}")
 
-    def contradiction(self) -> Verdict:
+    def contradiction(self) -> CommonCause:
         """Return what contradicts the certificate while the arm monitors: an offset that drifts, a torque by place."""
         cause = _CAUSES[int(self._memory["withheld_by"])]
-        return Verdict("; ".join(self._describe(cause)), is_payload=False)
+        return CommonCause("; ".join(self._describe(cause)), is_payload=False)
 
     def _describe(self, cause: _Cause) -> list[str]:
         k, m = self._constants, self._memory
@@ -175,7 +176,7 @@ class CertificateWatch:
             case _Cause.BY_PLACE | _Cause.ELASTIC:
                 lines = missing_torque.describe(m)
             case _Cause.TOO_MUCH_BY_PLACE:
-                lines = position.describe_refused(k, m)
+                lines = anchor.describe_place_refused(k, m)
             case _Cause.MORE_THAN_LAST:
                 lines = last_certificate.describe_more(m, self._last_utc)
         return lines

@@ -17,24 +17,22 @@ from adacd_hil.records import (
     SchemeState,
     certified_layout,
 )
-from adacd_hil.scheme.detect import sight
+from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.identify import certificate, earlier
+from adacd_hil.scheme.identify import earlier, termination
 from adacd_hil.scheme.identify.doubt import Doubt
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.kernel.loop import Numbers, Recorded, Samples, run_certified
-from adacd_hil.scheme.kernel.paper_shadow import PaperShadow
-from adacd_hil.scheme.model import bank
+from adacd_hil.scheme.kernel.paper_kernel import PaperShadow
+from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.scheme.pipeline.batch import RunsBatches
 from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
-from adacd_hil.scheme.pipeline.contact_course import Touch
+from adacd_hil.scheme.pipeline.contact_course import ContactCourse
 from adacd_hil.scheme.pipeline.intervals import Intervals
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
-from adacd_hil.scheme.supervisor.skip_conditions import Calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
-from adacd_hil.scheme.supervisor.transitions import SchemeEvent
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm, Observation, SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
 _WATCH = certified_kernel.WATCH
@@ -70,13 +68,13 @@ class CertifiedPipeline(RunsBatches):
         self._promotions = self._values[places["promotions"]]
         self._intervals = Intervals(settings)
         self._theta_hat = places["theta_hat"]
-        self._tau_ext_hat = self._memory[0]["y"][bank.WIDE]  # what a reaction goes by: fast, and smooth
+        self._tau_ext_hat = self._memory[0]["y"][filter_bank.WIDE]  # what a reaction goes by: fast, and smooth
         self._tau_ext_wide_hat = self._values[places["tau_ext_wide_hat"]]
         self._sigma = self._memory[0]["wide_sigma"]
         self._threshold = self._memory[0]["wide_threshold"]
         self._paper = PaperShadow(settings)
         self._supervisor = Supervisor(settings)
-        self._touch = Touch(settings)
+        self._touch = ContactCourse(settings)
         self._theta_ff = np.zeros(base)
         self._has_certificate = False
         self._is_payload = False
@@ -106,7 +104,7 @@ class CertifiedPipeline(RunsBatches):
 
     def describe_missing(self) -> list[str]:
         """Say what an adaptation that takes too long is waiting for, a line each."""
-        missing = certificate.describe_missing(self._constants[0], self._memory[0], self._names, PARAMETER_UNITS)
+        missing = termination.describe_missing(self._constants[0], self._memory[0], self._names, PARAMETER_UNITS)
         return [*self._watch.describe(), *missing]
 
     def describe_withheld(self) -> list[str]:
@@ -199,7 +197,7 @@ class CertifiedPipeline(RunsBatches):
         self._monitored = 0
         self._margin.add(self._peak_share.copy())
         self._peak_share[:] = 0.0
-        for name, warning in (("margin", self._margin.warning), ("sight", sight.take_warning(self._memory[0]))):
+        for name, warning in (("margin", self._margin.warning), ("sight", margin.take_warning(self._memory[0]))):
             if warning and name not in self._warned:
                 self._events.append(Event("warning", name, warning))
             self._warned = self._warned | {name} if warning else self._warned - {name}

@@ -5,23 +5,22 @@ Per cycle, after the kernel and the supervisor: `step`. It looks at the state re
 
 from adacd_hil.records import ContactLevel, ContactReport, Reaction, SchemeState, Vector
 from adacd_hil.scheme.contact.contact_report import ContactReporter
-from adacd_hil.scheme.contact.response import Response
+from adacd_hil.scheme.contact.reaction import ReactionChoice
 from adacd_hil.scheme.kernel.loop import TouchWatch
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT, Observation
-from adacd_hil.scheme.supervisor.skip_conditions import Calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm, Observation
 from adacd_hil.settings.configuration import Settings
 
 _COLLISION = int(Observation.COLLISION)
 _REACTING = (SchemeState.REACT, SchemeState.STOPPED)
 
 
-class Touch:
+class ContactCourse:
     """The contact that the arm is about, if there is one."""
 
     def __init__(self, settings: Settings) -> None:
         self._reporter = ContactReporter(settings)
-        self._response = Response(settings)
+        self._response = ReactionChoice(settings)
         self._is_reacting = False
         self._link = 0
 

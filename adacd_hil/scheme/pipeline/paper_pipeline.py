@@ -20,17 +20,15 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
-from adacd_hil.scheme.contact.contact_estimate import Isolation
+from adacd_hil.scheme.contact.contact_report import Isolation
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.kernel.loop import Numbers, Recorded, Samples, run_paper
 from adacd_hil.scheme.model.regressor import inverse_dynamics, is_positive_definite
 from adacd_hil.scheme.pipeline.batch import RunsBatches
 from adacd_hil.scheme.pipeline.intervals import Intervals
-from adacd_hil.scheme.supervisor.observation import CONTACT_SHIFT
-from adacd_hil.scheme.supervisor.skip_conditions import Calm
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
-from adacd_hil.scheme.supervisor.transitions import SchemeEvent
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm, SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
 _MODES = {

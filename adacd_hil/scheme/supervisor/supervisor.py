@@ -20,9 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.records import ArmBatch, ArmState, FaultReason, Request, SchemeState
-from adacd_hil.scheme.supervisor.observation import Observation
-from adacd_hil.scheme.supervisor.skip_conditions import NEVER, ArmFinding, Calm, findings_of
-from adacd_hil.scheme.supervisor.transitions import TRANSITIONS, SchemeEvent, next_state
+from adacd_hil.scheme.supervisor.transitions import (
+    NEVER,
+    TRANSITIONS,
+    ArmFinding,
+    Calm,
+    Observation,
+    SchemeEvent,
+    findings_of,
+    next_state,
+)
 from adacd_hil.settings.configuration import Settings
 
 REST_HOLD_S = 0.05

@@ -1,12 +1,27 @@
-"""The table of the scheme's state machine: where each event leads from each state.
+"""What the scheme's state machine goes by: a cycle's findings, the table of its states, and when nothing can change.
+
+**Findings.** What one cycle's numbers say, as far as the supervisor needs it: bits that compiled code sets.
+
+Any kernel of the scheme sets them, and only those that it knows: the paper's never certifies.
+
+**Table.** The table of the scheme's state machine: where each event leads from each state.
 
 A pair that is not in it leaves the state as it is. What raises the events: `adacd_hil.scheme.supervisor.supervisor`.
+
+**Calm.** Conditions under which the supervisor's state cannot change; replay uses them to skip cycles.
+
+A cycle's findings are the kernel's bits of `Observation` and those of the arm, `ArmFinding`, in one number.
 """
 
-from enum import Enum, IntEnum
+from enum import Enum, IntEnum, IntFlag
 from types import MappingProxyType
+from typing import NamedTuple
 
-from adacd_hil.records import SchemeState
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.compiled import compiled
+from adacd_hil.records import ArmBatch, FaultReason, SchemeState
 
 
 class SchemeEvent(IntEnum):
@@ -124,3 +139,75 @@ def next_state(state: SchemeState, event: SchemeEvent, origin: SchemeState) -> S
     """
     following = TRANSITIONS[state].get(event, state)
     return origin if following is Back.TO_ORIGIN else following
+
+
+CONTACT_SHIFT = 16
+"""The joints over their lower threshold are the bits of an observation from here on."""
+
+
+class Observation(IntFlag):
+    """One cycle's findings. Numbers are not logged."""
+
+    NONE = 0
+    NOT_A_NUMBER = 1  # a measurement is not finite
+    OVER_LIMIT = 2  # beyond the arm's limits: |q|, or |dq| where OVER_SPEED is not told apart
+    AT_REST = 4  # every |dq| below the rest velocity
+    UNLOADED = 8  # every |tau_J| below the rest torque
+    ADAPTED = 16  # eq. (15) holds with the evidence for it
+    CONTACT = 32  # a joint is over its lower threshold
+    FITTED = 64  # the evidence for the estimate is complete; it is to be tested
+    CERTIFIED = 128  # the frozen model has passed its test
+    REFUTED = 256  # the frozen model has failed its test
+    COLLISION = 512  # a joint is over its upper threshold
+    OVER_SPEED = 1024  # |dq| beyond the arm's limit, which a blow may do for a moment
+    UNSEEN = 2048  # the filters took no sample in: the residual is not of now
+    WITHHELD = 4096  # an anchor, a touch or a torque by place excludes what would be certified, or what is
+
+
+NEVER = 1 << 60
+"""More cycles or periods than any run has."""
+
+
+class ArmFinding(IntFlag):
+    """What an ArmState says beside its measurements; bits that neither `Observation` nor its joints use."""
+
+    ENABLED = 1 << 40
+    COMPLETE = 1 << 41
+    LATE = 1 << 42
+    FAULTY = 1 << 43
+    OLD = 1 << 44  # a value older than a cycle, which is too old if it stays so or exceeds its budget
+
+
+class Calm(NamedTuple):
+    """Bounds within which a cycle only counts; a cycle outside one of them has to be looked at.
+
+    watched, expected: findings & watched is expected. cycles: so many may pass. periods: fewer than these may pass.
+    due: the cycle's number is below.
+    """
+
+    watched: int
+    expected: int
+    cycles: int = NEVER
+    periods: int = NEVER
+    due: int = NEVER
+
+
+def findings_of(arms: ArmBatch) -> NDArray[np.int64]:
+    """Return the bits of `ArmFinding` of each cycle (n,)."""
+    oldest = np.maximum(arms.age_q.max(axis=1, initial=0), arms.age_tau_J.max(axis=1, initial=0))
+    findings = np.zeros(arms.cycle.size, dtype=np.int64)
+    for bit, holds in (
+        (ArmFinding.ENABLED, arms.is_enabled),
+        (ArmFinding.COMPLETE, arms.is_complete),
+        (ArmFinding.LATE, arms.is_late),
+        (ArmFinding.FAULTY, arms.fault != FaultReason.NONE),
+        (ArmFinding.OLD, oldest > 1),
+    ):
+        findings[holds] |= int(bit)
+    return findings
+
+
+@compiled
+def is_calm(calm: Calm, findings: int, periods: int, cycle: int) -> bool:
+    """Tell whether a cycle is within the bounds. periods: that have passed since they were drawn, its own included."""
+    return findings & calm.watched == calm.expected and periods < calm.periods and cycle < calm.due
