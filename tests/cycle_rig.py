@@ -9,7 +9,7 @@ from queued_bus import QueuedBus
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.realtime import GridPacer
+from adacd_hil.control.pacing import GridPacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log

@@ -12,7 +12,7 @@ from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.realtime import GridPacer
+from adacd_hil.control.pacing import GridPacer
 from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError

@@ -19,7 +19,7 @@ from hang import HANG_S
 from long_cases import long_but
 
 from adacd_hil.cli.commands.monitor_command import Screen
-from adacd_hil.cli.progress import Progress
+from adacd_hil.cli.output import Progress
 from adacd_hil.log.reader import read_log
 from adacd_hil.terminal import fit_table, in_line, one_line, plain, terminal_columns
 from firmware_sim.bench.truth_log import TruthLog

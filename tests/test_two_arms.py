@@ -15,7 +15,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.realtime import Tick, make_pacer
+from adacd_hil.control.pacing import Tick, make_pacer
 from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.contract import load_contract

@@ -32,7 +32,7 @@ from attacked_run import Finding, play_attack
 from attacks import ATTACKS, find_attack
 from campaign_loop import add_jobs, play_trials
 
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 
 NOTHING = "nothing"
 """The run without an attacker, for comparison."""

@@ -31,7 +31,7 @@ from side_by_side import BIN, CHANNEL, ENVIRONMENT, ROOT, TimingError, as_text, 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.realtime import GridPacer, Tick
+from adacd_hil.control.pacing import GridPacer, Tick
 from adacd_hil.control.session import Session
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
@@ -223,7 +223,7 @@ def bench_embedded() -> None:
         bench.boot()
         bus = model_time(embedded, clock, codec, settings)
         operator = ScriptedOperator(settings.operator)
-        with patch("adacd_hil.control.realtime.GridPacer", StampedPacer):
+        with patch("adacd_hil.control.pacing.GridPacer", StampedPacer):
             summary = Session(settings, codec, bus, clock, operator, Path(folder), "embedded").run()
         assert summary.result is not None
         show("devices: 1 ms of plant, sensors and drives", np.array(counted.period_ns[WARM_UP:]) * 1e-3)

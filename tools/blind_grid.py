@@ -31,7 +31,7 @@ from random_run import CONFIGURATION, quick_paper
 from run_rules import Case, judge
 from witnessed_run import Played, play_witnessed
 
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings

@@ -24,7 +24,7 @@ from typing import Any
 
 from campaign_loop import play_trials
 
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.scenario.expectation import deviations
@@ -55,8 +55,7 @@ class Row:
 
 def play(task: tuple[str, str], seed: int | None, keep: Path | None) -> Row:
     """Play one scenario, or its file, with one configuration, its logs in a folder of `keep` or nowhere."""
-    from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-    from adacd_hil.cli.run_outcome import outcome_of
+    from adacd_hil.cli.commands.demo_command import outcome_of, resolve, run_embedded
 
     name_or_file, config = task
     scenario = load_scenario(name_or_file)

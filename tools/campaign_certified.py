@@ -6,7 +6,7 @@ import numpy as np
 from campaign_schemes import ADAPTING, ARMED, TESTING, Outcome
 from lab import PERIOD_S, Motion, Recording, paper_motion
 
-from adacd_hil.control.motion.excitation import Excitation
+from adacd_hil.control.motion_laws import Excitation
 from adacd_hil.records import JOINTS, SchemeState
 from adacd_hil.scheme.kernel import certified_memory, loop
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT

@@ -8,7 +8,7 @@ import numpy as np
 from campaign_bound import Bound
 from campaign_trials import STEPS_NM, Row
 
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 
 Rows = dict[str, list[Row]]
 Bounds = dict[tuple[str, bool], Bound]

@@ -8,7 +8,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import NamedTuple, TypeVar
 
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 
 TrialT = TypeVar("TrialT")
 ResultT = TypeVar("ResultT")

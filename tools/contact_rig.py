@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from adacd_hil.control.controller import Controller
+from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.motion.floating import Floating
-from adacd_hil.control.motion.reference import Reference
+from adacd_hil.control.reference import Reference
 from adacd_hil.records import (
     TRUTH_LAYOUT,
     ArmState,

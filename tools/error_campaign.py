@@ -25,7 +25,7 @@ from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record,
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.score.judge import begins_of
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES

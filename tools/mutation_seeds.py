@@ -8,8 +8,8 @@ import can
 import numpy as np
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.control.history_file import FORMAT, CertificateRecord, History, devices_digest
+from adacd_hil.control.tare_file import DeviceRecord
 from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import read_frames

@@ -29,7 +29,7 @@ from run_rules import Case, Violation, clear_contacts, judge
 from wire_record import write_candump
 from witnessed_run import Played, play_witnessed
 
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 from adacd_hil.records import SchemeState
 
 ROOT = Path(__file__).resolve().parent.parent

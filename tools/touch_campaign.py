@@ -18,7 +18,7 @@ import numpy as np
 from campaign_loop import Figure, add_jobs, add_seeds, exit_status, play_trials, print_figures
 from touch_trials import AFTER_S, KINDS, RULES, Trial, play
 
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import format_table
 
 LARGE_NM, WRONG_NM = 0.1, 0.05
 WRONG_SHARE = 0.01

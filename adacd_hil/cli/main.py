@@ -17,20 +17,21 @@ from adacd_hil.cli.commands.replay_command import replay
 from adacd_hil.cli.commands.sweep_command import sweep
 from adacd_hil.cli.commands.tune_command import tune
 from adacd_hil.cli.exit_codes import EPILOG, ExitCode
-from adacd_hil.cli.live_options import live_options, require_extra
 from adacd_hil.cli.options import (
     clock_option,
     complain,
     config_option,
     explained,
     json_option,
+    live_options,
     on_bus,
     on_bus_or_url,
     profile_option,
+    require_extra,
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.result_file import tell, tried
+from adacd_hil.cli.output import tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.terminal import is_interrupted, open_terminals

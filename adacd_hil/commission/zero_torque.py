@@ -1,4 +1,4 @@
-"""A loop of zero torque on the fixed grid: SYNC, receive, write zero; for tests of the connection."""
+"""Cycles at zero torque on the fixed grid: SYNC out, feedback and torque in, zero torque out; for tests and tares."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,10 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.clock import Clock
-from adacd_hil.control.cycle_evidence import Evidence
-from adacd_hil.control.exchange import Exchange
+from adacd_hil.control.exchange import Evidence, Exchange
 from adacd_hil.control.gate import Gate
-from adacd_hil.control.realtime import make_pacer
+from adacd_hil.control.pacing import make_pacer
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import Recurrence
 from adacd_hil.device.network import Master
@@ -97,3 +96,25 @@ class ZeroTorqueLoop:
         if self._heartbeats.is_due(tick.cycle):
             self._master.send_heartbeat()
         return ZeroTorqueCycle(state, record, bus.take())
+
+
+class IdleCycle:
+    """Keeps an arm at zero torque and reads it; in lockstep with a VirtualClock, else on the grid."""
+
+    def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, clock: Clock) -> None:
+        self._bus, self._arm, self._master = bus, arm, master
+        self._pacer = make_pacer(settings, clock, bus, arm.sync_id)
+        self._exchange = Exchange(settings, bus, arm, master, clock)
+        self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
+        self._off = ArmCommand(np.zeros(JOINTS), enable=False, quick_stop=False)
+
+    def step(self) -> ArmState:
+        """Do one cycle and return what the arm reported. Raises BusError, of it SilenceError in lockstep."""
+        tick = self._pacer.next()
+        state = self._exchange.read(tick)
+        self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
+        self._arm.write(self._off)
+        if self._heartbeats.is_due(tick.cycle):
+            self._master.send_heartbeat()
+        self._bus.take()  # nobody logs them
+        return state

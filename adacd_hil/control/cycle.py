@@ -11,17 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from adacd_hil.clock import Clock
-from adacd_hil.control.controller import Controller
-from adacd_hil.control.cycle_evidence import Evidence
-from adacd_hil.control.exchange import Exchange
+from adacd_hil.control.controller import Controller, Floating
+from adacd_hil.control.exchange import Evidence, Exchange
 from adacd_hil.control.fault_report import FaultReport
 from adacd_hil.control.gate import Gate, GateFlag
-from adacd_hil.control.motion.floating import Floating
-from adacd_hil.control.motion.reference import Reference
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.realtime import Pacer, Tick
+from adacd_hil.control.pacing import Pacer, Tick
+from adacd_hil.control.recovery import StopEscalation
+from adacd_hil.control.reference import Reference
 from adacd_hil.control.self_checks import SelfChecks
-from adacd_hil.control.stop_escalation import StopEscalation
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
 from adacd_hil.device.arm_watch import ArmWatch, Recurrence

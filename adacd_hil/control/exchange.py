@@ -1,18 +1,18 @@
 """One exchange with the arm: SYNC out, feedback and torque in. The first half of every cycle, torque or no torque.
 
-SYNC comes in, too, where another host sends it.
+SYNC comes in, too, where another host sends it. With it: commands that missed their SYNC and trouble of the bus, as
+events, and the record of how a cycle went.
 """
 
 from adacd_hil.clock import Clock
-from adacd_hil.control.late_commands import LateCommands
-from adacd_hil.control.realtime import Tick
-from adacd_hil.control.trouble_report import TroubleReport
+from adacd_hil.control.pacing import Tick
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_watch import Recurrence
+from adacd_hil.device.arm_watch import Notices, Recurrence
 from adacd_hil.device.network import Master
-from adacd_hil.records import ArmState
+from adacd_hil.records import ArmState, CycleRecord, Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError, Tap
+from adacd_hil.wire.error_frames import TroubleKind, decode_error
 
 FEEDBACK_SHARE = 0.7
 """Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
@@ -107,3 +107,96 @@ class Exchange:
             self.troubles.accept(frame)
         elif not self._arm.accept(frame, is_late):
             self._master.accept(frame)
+
+
+class LateCommands(Notices):
+    """Commands that missed their SYNC, as events.
+
+    The commands of cycle k act at SYNC k + 1, pipelined ones at k + 2. Those that are not on the bus when that SYNC
+    goes out act one later.
+    """
+
+    def __init__(self, is_pipelined: bool = False) -> None:
+        super().__init__()
+        self._cycles = 2 if is_pipelined else 1  # from a command to the SYNC at which it acts
+        self.count = 0
+        """Of the present cycle."""
+
+    def note(self, cycle: int, count: int, t_ns: int) -> None:
+        """Take note of the commands that still wait as SYNC of `cycle` goes out, at `t_ns`."""
+        self.count = count
+        if count == 0:
+            return
+        from_cycle = cycle - self._cycles
+        what = f"1 command of cycle {from_cycle}" if count == 1 else f"{count} commands of cycle {from_cycle}"
+        text = f"{what} missed SYNC {cycle}, so acting one later"
+        self.say(t_ns, "late", Event("warning", "late commands", text), count)
+
+
+class TroubleReport(Notices):
+    """What the bus's controller reports in error frames, as events.
+
+    A controller that nobody answers reports thousands of times a second; every frame is in the log anyway.
+    """
+
+    def accept(self, frame: Frame) -> None:
+        """Take an error frame."""
+        trouble = decode_error(frame)
+        level = "info" if trouble.kind is TroubleKind.ERROR_ACTIVE else "warning"
+        self.say(frame.t_ns, trouble.kind, Event(level, "bus", trouble.text))
+
+
+_REPEAT_NS = 1_000_000_000
+
+
+class Evidence:
+    """How each cycle went, for the log: lateness, ages, what the work took, what was left of the period, what waits."""
+
+    def __init__(self, settings: Settings, bus: Tap, arm: Arm, exchange: Exchange, clock: Clock) -> None:
+        self._bus, self._arm, self._exchange = bus, arm, exchange
+        self._clock = clock
+        self._period_ns = settings.bus.period_ns
+        self._is_following = settings.bus.follows
+        self._said_lost = bus.frames_lost
+        self._silent_until_ns = 0
+        self._events: list[Event] = []
+
+    def record(self, tick: Tick, arm: ArmState, overruns: int, log_queue_bytes: int) -> CycleRecord:
+        """Sum up the cycle that began with `tick`, whose commands have just been handed to the bus.
+
+        `overruns`: periods skipped since the run began. `log_queue_bytes`: what waits for the log's writer.
+        """
+        exchange = self._exchange
+        command_ns = self._clock.now_ns()
+        frames_lost = self._bus.frames_lost
+        if frames_lost != self._said_lost and command_ns >= self._silent_until_ns:
+            self._tell(frames_lost, command_ns)
+        # Where SYNC is followed, it is the grid point itself, however late this host woke up for it.
+        late_ns = 0 if self._is_following else tick.lateness_ns
+        return CycleRecord(
+            cycle=tick.cycle,
+            lateness_ns=tick.lateness_ns,
+            feedback_ns=exchange.feedback_ns - exchange.sync_ns,
+            command_ns=command_ns - exchange.sync_ns,
+            compute_ns=command_ns - exchange.feedback_ns,
+            slack_ns=exchange.sync_ns - late_ns + self._period_ns - command_ns,
+            data_age=max(*arm.age_q, *arm.age_tau_J),
+            overruns=overruns,
+            frames_missing=self._arm.missing_frames,
+            commands_late=exchange.late_commands.count,
+            frames_lost=frames_lost,
+            receive_queue_bytes=exchange.queues.received,
+            transmit_queue_bytes=exchange.queues.sent,
+            log_queue_bytes=log_queue_bytes,
+        )
+
+    def _tell(self, frames_lost: int, t_ns: int) -> None:
+        count, self._said_lost = frames_lost - self._said_lost, frames_lost
+        self._silent_until_ns = t_ns + _REPEAT_NS
+        what = "1 received frame" if count == 1 else f"{count} received frames"
+        self._events.append(Event("warning", "bus", f"{what} dropped by the kernel: this host reads too late"))
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call: frames that were lost, at most once a second."""
+        events, self._events = self._events, []
+        return events

@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.clock import date_ns
-from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.control.tare_file import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
-from adacd_hil.input_files import read_input
-from adacd_hil.output_files import dangling_link, replacing
+from adacd_hil.file_access import dangling_link, read_input, replacing
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.last_certificate import Certificate
 from adacd_hil.settings.commission_settings import HistorySettings

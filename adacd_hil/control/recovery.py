@@ -1,4 +1,4 @@
-"""The way out of a latched fault: the user acknowledges, the bus is emptied, and everything begins again.
+"""A latched fault: drives that go on are stopped, and the user's way out of it.
 
 Nothing of before the fault survives: what waits in the socket and in the interface's transmit queue is dropped, so that
 no old command reaches a drive when the bus comes back; then the devices are booted anew, fresh feedback is awaited, and
@@ -9,8 +9,12 @@ from collections.abc import Callable
 
 from adacd_hil.clock import Clock
 from adacd_hil.control.operator import FaultAnswer, Operator
+from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_watch import Notices
+from adacd_hil.device.drive import Cia402State
+from adacd_hil.device.network import Master
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.records import Event
+from adacd_hil.records import Event, FaultReason
 from adacd_hil.wire.bus import BusError, Tap
 
 _LOOK_NS = 10_000_000
@@ -22,7 +26,7 @@ _MOST_FRAMES = 1000
 
 
 class Recovery:
-    """Waits for the user and for the bus."""
+    """The way out: the user acknowledges, the bus is emptied, and everything begins again."""
 
     def __init__(
         self,
@@ -86,3 +90,37 @@ class Recovery:
     def _say(self, level: str, line: str) -> None:
         self._recorder.event(self._clock.now_ns(), Event(level, "recovery", line))
         self._progress(line)
+
+
+PATIENCE_CYCLES = 10
+"""Cycles in which a quick stop by command shows in a drive's status: it acts at the next SYNC, and the status comes
+with that one; eight more for lost frames."""
+
+
+class StopEscalation(Notices):
+    """The second stage of a stop: NMT takes a drive out of Operation enabled that is still in it after FAULT.
+
+    The first stage is a quick stop by command. Where somebody else commands the drive, too, or where it doesn't hear,
+    that is not enough: in Pre-operational it takes no command from anybody, and by its own watchdog it faults and
+    brakes.
+    """
+
+    def __init__(self, arm: Arm, master: Master) -> None:
+        super().__init__()
+        self._arm, self._master = arm, master
+        self._due = 0
+
+    def step(self, cycles: int, t_ns: int, fault: FaultReason) -> None:
+        """Send NMT pre-operational where it is due; `cycles`: since FAULT. Raises BusError.
+
+        Without patience where somebody else is heard: who would command a drive against a quick stop.
+        """
+        patience = 1 if fault is FaultReason.FOREIGN_FRAMES else PATIENCE_CYCLES
+        if cycles < max(self._due, patience):
+            return
+        for drive in self._arm.drives:
+            if drive.state is Cia402State.OPERATION_ENABLED:
+                self._due = cycles + PATIENCE_CYCLES
+                self._master.leave_operational(drive.node_id)
+                text = f"{drive.name} is in Operation enabled {cycles} cycles after FAULT: NMT pre-operational"
+                self.say(t_ns, drive.name, Event("error", "stop", text))

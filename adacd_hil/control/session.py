@@ -11,7 +11,7 @@ from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.history_file import HISTORY_NAME, UsedHistory
 from adacd_hil.control.operator import Operator, ScriptedOperator
-from adacd_hil.control.realtime import Pacer, make_pacer, prepare_spin
+from adacd_hil.control.pacing import Pacer, make_pacer, prepare_spin
 from adacd_hil.control.recovery import Recovery
 from adacd_hil.control.tare_file import TARE_NAME, UsedTare
 from adacd_hil.device.arm import Arm
@@ -20,12 +20,12 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import write_contract
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.strangers import refuse_company
+from adacd_hil.file_access import place_file
 from adacd_hil.log.log_files import LOG_NAME, arithmetic
 from adacd_hil.log.recording.processes import MOST_VIEWERS, LiveSetup
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
-from adacd_hil.output_files import place_file
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
 from adacd_hil.scheme.identify.last_certificate import Certificate

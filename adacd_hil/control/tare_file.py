@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adacd_hil.clock import date_ns
-from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
-from adacd_hil.input_files import read_input
-from adacd_hil.output_files import replacing
+from adacd_hil.file_access import read_input, replacing
 from adacd_hil.records import JOINTS, Event
 from adacd_hil.settings.commission_settings import TareSettings
 from adacd_hil.settings.configuration import Settings
@@ -29,6 +27,29 @@ SMALLEST_STD_NM = 0.001
 """No zero is known better than this, however long it was measured."""
 _NS_PER_H = 3_600_000_000_000
 _CLOCK_TOLERANCE_H = 0.1
+
+
+@dataclass(frozen=True)
+class DeviceRecord:
+    """A device of the arm in a file that outlives the run: what it was by object 0x1018."""
+
+    name: str = setting(meaning="name in the DBC")
+    node_id: int = setting(low=1, high=127, meaning="CANopen node id")
+    vendor: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:1")
+    product: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:2")
+    revision: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:3")
+    serial: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:4")
+
+    def difference(self, found: Identity) -> str:
+        """Say why a device is not this one; "" where it is. Firmware, and with it the revision, may have changed."""
+        for what, known, present in (
+            ("vendor", self.vendor, found.vendor),
+            ("product code", self.product, found.product),
+            ("serial number", self.serial, found.serial),
+        ):
+            if known != present:
+                return f"{found.name} (node {found.node_id}): {what} {present} is not the {known}"
+        return ""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import canopen
 from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
-from adacd_hil.input_files import read_input
+from adacd_hil.file_access import read_input
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, BusError, Frame
 from adacd_hil.wire.contract_frames import NMT_ID, SDO_REQUEST_ID

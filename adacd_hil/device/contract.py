@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, HEADER_SIGNALS, PdoSettings, PlacedDevice, place_devices
-from adacd_hil.nearest_name import nearest_name
-from adacd_hil.output_files import place_file
+from adacd_hil.file_access import place_file
+from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS

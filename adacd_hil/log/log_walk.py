@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import (
     CONTINUED,
     ENDING_KEY,

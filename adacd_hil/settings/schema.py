@@ -10,7 +10,7 @@ import typing
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
-from adacd_hil.nearest_name import nearest_name
+from adacd_hil.remedies import nearest_name
 
 
 class ConfigError(ValueError):

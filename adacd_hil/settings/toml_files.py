@@ -7,8 +7,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.input_files import exists, read_input
-from adacd_hil.nearest_name import nearest_name
+from adacd_hil.file_access import exists, read_input
+from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 

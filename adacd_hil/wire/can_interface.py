@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.nearest_name import nearest_name
+from adacd_hil.remedies import nearest_name
 from adacd_hil.wire.bus import BusError, InterfaceDownError
 
 CANFD_MTU = 72

@@ -19,7 +19,7 @@ import cantools
 from cantools.database.can import Database, Message, Signal
 from cantools.database.errors import Error as DatabaseError
 
-from adacd_hil.input_files import read_input
+from adacd_hil.file_access import read_input
 from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.e2e import (
     E2eReceiver,

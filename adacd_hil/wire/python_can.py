@@ -6,7 +6,7 @@ from typing import Any
 import can
 
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.nearest_name import nearest_name
+from adacd_hil.remedies import nearest_name
 from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID, Bus, BusError, BusMissingError, Frame
 
 _ECHOING_INTERFACES = ("udp_multicast",)

@@ -12,11 +12,11 @@ from typing import Any, NoReturn, get_args
 import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.file_access import in_words, tidied
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.editing.log_info import run_metadata
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.recording.run_folder import check_free
-from adacd_hil.output_files import in_words, tidied
 from adacd_hil.records import Vector
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.schema import ConfigError

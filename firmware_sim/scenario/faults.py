@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple, TypeVar
 
-from adacd_hil.nearest_name import nearest_name
+from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError, setting
 
 DRIVES = ("drive1", "drive2")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from experiment_runs import BIN, PAPER, adacd_hil
 
-from adacd_hil.cli import new_run_folder as run_folder_module
-from adacd_hil.cli.new_run_folder import run_folder
+from adacd_hil.cli import output as run_folder_module
+from adacd_hil.cli.output import run_folder
 from adacd_hil.log.log_files import LogExistsError
 from adacd_hil.log.reader import read_log
 from firmware_sim.bench.truth_log import TruthLog

@@ -9,8 +9,8 @@ from click.testing import CliRunner
 
 from adacd_hil.cli.exit_codes import CommandError
 from adacd_hil.cli.main import cli
-from adacd_hil.cli.result_file import tell, tried
-from adacd_hil.output_files import is_disk_full
+from adacd_hil.cli.output import tell, tried
+from adacd_hil.file_access import is_disk_full
 from adacd_hil.settings.control_settings import ExcitationSettings
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import parse_toml
@@ -58,7 +58,7 @@ def fill(path: Path, content: str) -> None:
 def test_what_was_found_is_told_where_it_can_not_be_written(
     has_all: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("adacd_hil.cli.result_file.replace_file", fill)
+    monkeypatch.setattr("adacd_hil.cli.output.replace_file", fill)
     out = tmp_path / "x.toml"
     with pytest.raises(CommandError) as raised:
         tell("the table", out, "a = 1\n", has_all)
@@ -81,7 +81,7 @@ def test_each_search_tries_its_place(words: tuple[str, ...], tmp_path: Path) -> 
 def test_an_excitation_that_has_no_room_is_not_lost(
     json_words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("adacd_hil.cli.result_file.replace_file", fill)
+    monkeypatch.setattr("adacd_hil.cli.output.replace_file", fill)
     monkeypatch.chdir(tmp_path)
     Path("small.toml").write_text(SMALL)
     words = ["excitation", "--config", "small.toml", "--seconds", "0", "--out", "found.toml", *json_words]

@@ -3,9 +3,8 @@
 import pytest
 from bench_bus import CODEC, PERIOD_NS, BenchBus
 
-from adacd_hil.control.cycle_evidence import Evidence
-from adacd_hil.control.exchange import Exchange
-from adacd_hil.control.realtime import Tick
+from adacd_hil.control.exchange import Evidence, Exchange
+from adacd_hil.control.pacing import Tick
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.records import ArmState
 from adacd_hil.wire.bus import EmbeddedBus, Frame

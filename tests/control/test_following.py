@@ -5,7 +5,7 @@ from collections import deque
 import pytest
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.control.realtime import FollowingPacer
+from adacd_hil.control.pacing import FollowingPacer
 from adacd_hil.wire.bus import Bus, BusError, Frame, Tap
 
 SYNC, FEEDBACK = 0x080, 0x185

@@ -1,6 +1,6 @@
 """Error frames as events."""
 
-from adacd_hil.control.trouble_report import TroubleReport
+from adacd_hil.control.exchange import TroubleReport
 from adacd_hil.wire.bus import Frame
 
 

@@ -14,10 +14,9 @@ from live_rig import Feed, receive_until_last
 from recorded_run import make_run
 
 from adacd_hil.cli.commands.live_monitor import TOPICS, LiveMonitor, as_text
-from adacd_hil.cli.live_options import live_options
 from adacd_hil.cli.main import cli
+from adacd_hil.cli.options import live_options
 from adacd_hil.control.session import LiveAddress
-from adacd_hil.extras import install_command
 from adacd_hil.log.types.message_types import payload_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.log.viewer.client import LiveMessage, live_client
@@ -32,6 +31,7 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
+from adacd_hil.remedies import install_command
 
 PUSH = ContactReport(
     5,

@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from adacd_hil.input_files import open_input, read_input
+from adacd_hil.file_access import open_input, read_input
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import TimeWindow
-from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import Vector
+from adacd_hil.remedies import nearest_name
 from adacd_hil.scheme.identify.offline import OfflineSettings, Record
 from adacd_hil.scheme.model.urdf import SerialArm, UrdfError, read_urdf
 from adacd_hil.settings.schema import ConfigError, parse, setting

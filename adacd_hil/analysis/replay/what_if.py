@@ -15,8 +15,8 @@ from typing import Any, Final
 
 from adacd_hil.analysis.replay.replay import Replay
 from adacd_hil.analysis.score.judge import found_text, why_not_found
-from adacd_hil.nearest_name import nearest_name
 from adacd_hil.records import PARAMETER_UNITS, SchemeState
+from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml, to_toml

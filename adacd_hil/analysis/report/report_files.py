@@ -45,9 +45,9 @@ from adacd_hil.analysis.report.timing_figures import draw_timing
 from adacd_hil.analysis.score.contacts import Contact
 from adacd_hil.analysis.score.margins import Evidence
 from adacd_hil.analysis.score.metrics import Gathered, Metrics, evaluate
+from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import WHOLE, TimeWindow
-from adacd_hil.output_files import replace_file
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.terminal import fit_table, in_line, terminal_columns
 

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 from adacd_hil.analysis.sweep.plan import Plan, Task, Values, failed
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.extras import install_command
+from adacd_hil.file_access import replace_file, replacing
 from adacd_hil.log.log_files import LogError
-from adacd_hil.output_files import replace_file, replacing
+from adacd_hil.remedies import install_command
 
 TABLE_NAME = "sweep.parquet"
 PLAN_NAME = "plan.json"

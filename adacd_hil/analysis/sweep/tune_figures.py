@@ -12,8 +12,8 @@ from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
 from adacd_hil.analysis.sweep.tune import Tuning
 from adacd_hil.analysis.sweep.tune_roc import Choice
 from adacd_hil.analysis.thresholds.detector_comparison import paper_svg
+from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LogError
-from adacd_hil.output_files import replace_file
 
 _LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "queue_log", "beside", "queue_receive", "muted")
 

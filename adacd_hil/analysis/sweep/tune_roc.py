@@ -41,7 +41,7 @@ from adacd_hil.analysis.thresholds.false_alarms import (
 )
 from adacd_hil.analysis.thresholds.free_motion import APART_S, LoggedMotion, Progress, read_motion, schemes
 from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import Series
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
 from adacd_hil.analysis.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
 from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S, Statistics
+from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LogError
-from adacd_hil.output_files import replace_file
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import detectors
 

@@ -12,17 +12,17 @@ from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
-from adacd_hil.control.realtime import prepare_spin
+from adacd_hil.control.pacing import prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
+from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
-from adacd_hil.output_files import replace_file
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.configuration import Settings

@@ -9,7 +9,7 @@ import click
 
 from adacd_hil.cli.exit_codes import ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
-from adacd_hil.cli.progress import Progress
+from adacd_hil.cli.output import Progress
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.records import Location
@@ -50,7 +50,7 @@ def compare(first: Path, second: Path, as_json: bool, stretch: "TimeWindow") -> 
 
 
 def _as_text(found: "LogComparison") -> str:
-    from adacd_hil.cli.table import format_table
+    from adacd_hil.cli.output import format_table
 
     names = [str(found.first.path), str(found.second.path)]
     lines = [in_line(line) for line in (f"1: {names[0]}", f"2: {names[1]}", "", *found.notes)]

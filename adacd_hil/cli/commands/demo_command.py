@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, NamedTuple
 from adacd_hil.analysis.score.emulator_truth import config_digest
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
-from adacd_hil.cli.new_run_folder import run_folder
-from adacd_hil.cli.progress import Progress
+from adacd_hil.cli.output import Progress, run_folder
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
+from adacd_hil.file_access import in_words
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, LOG_NAME, TRUTH_NAME, LogError
-from adacd_hil.output_files import in_words
-from adacd_hil.records import SchemeState
+from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.toml_files import to_toml
@@ -26,6 +25,7 @@ from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.canopen.contracts import playable_contract
+from firmware_sim.scenario.expectation import ScenarioOutcome
 from firmware_sim.scenario.scenario import Scenario, load_scenario, named_profile
 
 if TYPE_CHECKING:
@@ -167,3 +167,36 @@ def _ending(summary: SessionSummary) -> str:
     if result.state is SchemeState.FAULT:
         return f"the run ended in FAULT ({result.fault.name})"
     return f"log {summary.log.path} lacks something"
+
+
+def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
+    """Read the logs of a run that has ended, to be compared with its scenario's `expect`. Raises LogError."""
+    from adacd_hil.analysis.report.run_reading import read_run
+    from adacd_hil.analysis.score.metrics import evaluate
+
+    run, gathered, _ = read_run(summary.log.path, truth_path)
+    metrics = evaluate(run, gathered)
+    force_N = None if run.truth is None else run.truth.force_N
+    took_s = list(metrics.adaptation_s.values())
+    found = [contact for contact in metrics.contacts if contact.delay_ms is not None]
+    return ScenarioOutcome(
+        end=_end(summary),
+        fault=metrics.fault,
+        fault_s=metrics.fault_s,
+        adaptations=sum(time_s is not None for time_s in took_s),
+        adaptation_s=took_s[0] if took_s else None,
+        contacts=len(found),
+        false_alarms=metrics.false_alarms or 0,
+        missed=metrics.missed or 0,
+        delay_ms=max((contact.delay_ms for contact in found if contact.delay_ms is not None), default=None),
+        force_N=0.0 if force_N is None else float(force_N.max(initial=0.0)),
+    )
+
+
+def _end(summary: SessionSummary) -> str:
+    """Say how the run ended, by the names of `firmware_sim.scenario.expectation`."""
+    if not summary.has_started:
+        return "refused"
+    if summary.result is None:
+        return "lost"
+    return "finished" if summary.result.fault is FaultReason.NONE else "fault"

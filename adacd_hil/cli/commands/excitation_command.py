@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 from adacd_hil.analysis.excitation_search import Figures, Limits, NoExcitationError, Search
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.progress import Progress
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import Progress, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.settings.configuration import builtin_names, load_settings
 from adacd_hil.settings.control_settings import ExcitationSettings

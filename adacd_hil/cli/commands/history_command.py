@@ -9,8 +9,8 @@ import click
 
 from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.file_access import is_anothers, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.output_files import is_anothers, replace_file
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _as_png(found: "History") -> bytes:
 
 
 def _as_text(found: "History") -> str:
-    from adacd_hil.cli.table import format_table
+    from adacd_hil.cli.output import format_table
 
     devices = ", ".join(f"{device.name} {device.serial}" for device in found.devices)
     head = ("certified", "F1 Nm", "F2 Nm", "a1 kg m²", "a2 kg m²", "a3 kg m²", "offset Nm", "payload", "known by")

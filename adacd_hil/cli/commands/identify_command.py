@@ -9,8 +9,8 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
+from adacd_hil.file_access import replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.output_files import replace_file
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def identify(
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
     from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
-    from adacd_hil.cli.progress import Progress
+    from adacd_hil.cli.output import Progress
     from adacd_hil.log.time_window import TimeWindow
 
     if not start_s < end_s:
@@ -88,7 +88,7 @@ def _write(found: "Identified", out: Path) -> None:
 
 
 def _as_text(found: "Identified") -> str:
-    from adacd_hil.cli.table import format_table
+    from adacd_hil.cli.output import format_table
 
     certificate = found.certificate
     deviation = found.estimate.P.diagonal() ** 0.5

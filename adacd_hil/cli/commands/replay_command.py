@@ -66,7 +66,7 @@ def replay(
     With --from and --until, only that stretch is compared and told. The replay begins with the log all the same: its
     filters and its model know what came before.
     """
-    from adacd_hil.cli.progress import Progress
+    from adacd_hil.cli.output import Progress
 
     progress = Progress()
     try:
@@ -178,7 +178,7 @@ def _verdict(own: "Replay") -> str:
 
 def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow") -> str:
     from adacd_hil.analysis.replay.what_if import NOTE, side_by_side
-    from adacd_hil.cli.table import format_table
+    from adacd_hil.cli.output import format_table
 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 from adacd_hil.analysis.report.report_files import INDEX_NAME, Entry, Report, count_text, index_page, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.progress import Progress
+from adacd_hil.cli.output import Progress
+from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, log_in
 from adacd_hil.log.time_window import TimeWindow
-from adacd_hil.output_files import replace_file
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +16,11 @@ from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.sweep.plan import Plan
+    from adacd_hil.analysis.sweep.plan import Plan, Row, Task, Values
 
 _FILE = GivenPath(dir_okay=False)
+_SIMULATED_CONFIG = "certified"
+"""Of simulated runs where no --config is given."""
 
 
 @click.command(
@@ -65,17 +68,12 @@ def sweep(
     from adacd_hil.analysis.sweep.cluster import TLS, TlsFiles, connect
     from adacd_hil.analysis.sweep.plan import replay_task
     from adacd_hil.analysis.sweep.sweep import SweepStore, run_sweep
-    from adacd_hil.cli.progress import Progress
+    from adacd_hil.cli.output import Progress
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
     plan = _plan(logs, scenarios, seeds, vary, config, profile or "")
-    if logs:
-        work = replay_task
-    else:
-        from adacd_hil.cli.commands.sweep_simulation import simulate_task
-
-        work = simulate_task
+    work = replay_task if logs else simulate_task
     store = SweepStore(out)
     progress = Progress()
     progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
@@ -147,3 +145,27 @@ def _seeds(text: str) -> range:
     if not 0 <= low <= high:
         raise CommandError(f"--seeds {text!r} is neither a number nor A:B with 0 <= A <= B", ExitCode.USAGE)
     return range(low, high + 1)
+
+
+def simulate_task(task: "Task") -> "list[Values]":
+    """Play the scenario of a task with the settings of each row: in a folder of its own, replayed, and forgotten."""
+    return [_simulate(task, row) for row in task.rows]
+
+
+def _simulate(task: "Task", row: "Row") -> "Values":
+    from adacd_hil.analysis.replay.replay import replay
+    from adacd_hil.analysis.replay.what_if import apply_settings
+    from adacd_hil.analysis.sweep.plan import REFUSALS, failed, finished
+    from adacd_hil.cli.commands.demo_command import resolve, run_embedded
+
+    subject = task.subject
+    try:
+        cast = resolve(task.config or _SIMULATED_CONFIG, subject.scenario, task.profile or None, subject.seed)
+        settings = apply_settings(cast.settings, dict(row.changes))
+        with tempfile.TemporaryDirectory(prefix="adacd-hil-sweep-") as name:
+            summary, _ = run_embedded(cast._replace(settings=settings), "lockstep", Path(name))
+            if summary.result is None:
+                return failed(subject, row, summary.error)
+            return finished(subject, row, replay(summary.log.path))
+    except REFUSALS as refusal:
+        return failed(subject, row, str(refusal))

@@ -9,8 +9,7 @@ from adacd_hil.analysis.thresholds.detector_comparison import Comparison, compar
 from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.progress import Progress
-from adacd_hil.cli.table import format_table
+from adacd_hil.cli.output import Progress, format_table
 from adacd_hil.log.log_files import log_in
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 

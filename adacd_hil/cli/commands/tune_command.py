@@ -8,7 +8,7 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, stretch_options
-from adacd_hil.cli.result_file import tell, tried
+from adacd_hil.cli.output import tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
@@ -57,7 +57,7 @@ def tune(
     from adacd_hil.analysis.sweep.tune import base_of, suggested_toml
     from adacd_hil.analysis.sweep.tune import tune as find
     from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
-    from adacd_hil.cli.progress import Progress
+    from adacd_hil.cli.output import Progress
 
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
@@ -85,7 +85,7 @@ def tune(
 
 def _as_text(found: "Tuning") -> str:
     from adacd_hil.analysis.sweep.tune import LIMITS, free_hours, in_words
-    from adacd_hil.cli.table import format_table
+    from adacd_hil.cli.output import format_table
 
     hours = sum(map(free_hours, found.logs))
     lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of motion that nobody touched", ""]

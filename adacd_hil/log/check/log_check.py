@@ -13,7 +13,7 @@ from typing import IO, NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Header, Metadata
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.check.chunk_checks import ChunkCheck
 from adacd_hil.log.check.content_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings, LogFinding, Severity

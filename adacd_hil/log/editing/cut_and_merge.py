@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.editing.log_copy import CopySource, LogCopy, Messages
 from adacd_hil.log.log_files import (
     CUT,

@@ -14,13 +14,12 @@ import numpy as np
 from mcap.records import Attachment, Channel, Header, Schema
 from numpy.typing import NDArray
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import Replacement, open_input
 from adacd_hil.log.editing.log_info import read_info
 from adacd_hil.log.log_files import COPY_ENDINGS, PRODUCT, ROS_PROFILE, SUMMARY_METADATA, LogError, is_part_name
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.records import CHANNEL_NUMBERS, read_end, read_header
-from adacd_hil.output_files import Replacement
 
 _CHANNEL = 9
 """Where the number of the channel is in a message record, bytes."""

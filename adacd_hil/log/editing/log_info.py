@@ -14,7 +14,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Statistics
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.check.content_checks import payload_size
 from adacd_hil.log.editing.salvage import Salvage
 from adacd_hil.log.log_files import (

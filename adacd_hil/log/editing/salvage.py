@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Chunk, Metadata, Statistics
 from numpy.typing import NDArray
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
 from adacd_hil.log.mcap.records import (

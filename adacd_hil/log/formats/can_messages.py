@@ -27,7 +27,7 @@ from can.io.generic import TextIOMessageReader
 from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import MOST_BYTES, Opening
 from adacd_hil.log.types.message_types import MAX_DATA

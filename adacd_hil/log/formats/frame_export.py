@@ -15,10 +15,10 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.file_access import placing
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import FrameSource, candump_channel, candump_line
 from adacd_hil.log.log_files import LogError
-from adacd_hil.output_files import placing
 from adacd_hil.wire.codec import Codec
 
 _MS_NS = 1_000_000

@@ -28,12 +28,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.extras import install_command
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.formats.mcap_frames import McapFrames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE, FrameLog
-from adacd_hil.nearest_name import nearest_name
+from adacd_hil.remedies import install_command, nearest_name
 
 PYTHON_CAN_SUFFIXES = (".blf", ".asc", ".mf4", ".trc", ".csv")
 SUFFIXES = (".mcap", ".log", *PYTHON_CAN_SUFFIXES)

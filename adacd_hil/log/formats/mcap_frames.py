@@ -23,7 +23,7 @@ from mcap.records import Channel, Metadata, Schema
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import (
     ENDING_KEY,
     EPOCH_KEY,

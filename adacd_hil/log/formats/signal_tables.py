@@ -21,8 +21,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from adacd_hil.extras import install_command
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import is_anothers, open_input, replacing
 from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
@@ -30,8 +29,7 @@ from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
 from adacd_hil.log.types.decoded_messages import ColumnDecoder
 from adacd_hil.log.types.topics import DECODED, EVENTS_TOPIC
-from adacd_hil.nearest_name import nearest_name
-from adacd_hil.output_files import is_anothers, replacing
+from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.wire.codec import Codec
 
 _LONGEST_STEM = 60

@@ -35,7 +35,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from adacd_hil.input_files import open_input
+from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
 
 _TEXT = _TABLE = -4  # a length of 4 bytes, then so many bytes

@@ -19,10 +19,10 @@ from typing import NamedTuple
 from mcap.records import Attachment, Schema
 from mcap.records import Channel as ChannelRecord
 
+from adacd_hil.file_access import create_file
 from adacd_hil.log.log_files import FIELDS_KEY, QOS_KEY, ROS_PROFILE, RUN_METADATA, SUMMARY_METADATA
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.types.topics import LogChannel
-from adacd_hil.output_files import create_file
 
 WAITING_BYTES = 32 * 1024 * 1024
 """What may wait for the disk: about 45 s of a run at 1 kHz, compressed."""

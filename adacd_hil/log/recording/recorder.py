@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+from adacd_hil.file_access import create_file
 from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
 from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveSetup, WriterSetup, start_module
@@ -23,7 +24,6 @@ from adacd_hil.log.recording.run_folder import check_free, make_room
 from adacd_hil.log.types.decoded_messages import MessageLike, plain_messages
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME
 from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
-from adacd_hil.output_files import create_file
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame

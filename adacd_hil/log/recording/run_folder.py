@@ -6,8 +6,8 @@ That one is moved aside, so that the same command can be given again once the ca
 import itertools
 from pathlib import Path
 
+from adacd_hil.file_access import InUseError, check_unused
 from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
-from adacd_hil.output_files import InUseError, check_unused
 
 _FAILED_NAME = "failed-start-{}.mcap"
 

@@ -1,7 +1,8 @@
-"""Files that are written: new ones that replace nothing, and replacements in one step.
+"""Files that are read, and files that are written: new ones that replace nothing, and replacements in one step.
 
-Neither follows a link nor writes into a FIFO or a device, so that nothing is changed but what was named. A replacement
-is written beside and renamed: at no moment is there half a file, or none where there was one.
+Only regular files are read, and whole ones up to a size: a device never ends, a FIFO without a writer never begins.
+Writing neither follows a link nor goes into a FIFO or a device, so that nothing is changed but what was named. A
+replacement is written beside and renamed: at no moment is there half a file, or none where there was one.
 """
 
 import contextlib
@@ -12,14 +13,54 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 
+MOST_TEXT_BYTES = 4 << 20
+"""Of a configuration, a scenario, a contract, an EDS, a URDF; the largest that comes with the package has 0.1 MB."""
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _LOG_MAGIC = b"\x89MCAP0\r\n"
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCKS = Path("/proc/locks")
 _PIECE = 1 << 20
 _ANOTHER = "another one is there already, which is left as it is"
+
+
+def open_input(path: Path) -> BufferedReader:
+    """Open a regular file for reading. Raises OSError that names it."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except ValueError as error:  # a NUL in the name
+        raise OSError(0, str(error), str(path)) from None
+    try:
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(0, "it is a folder", str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(0, "it is no regular file", str(path))
+        return open(descriptor, "rb")  # noqa: PTH123 (it is a descriptor)
+    except OSError:
+        os.close(descriptor)
+        raise
+
+
+def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
+    """Read a whole regular file of at most so many bytes. Raises OSError that names it."""
+    with open_input(path) as file:
+        data = file.read(most_bytes + 1)
+    if data is None:  # as of /proc/kmsg, which is a regular file
+        raise OSError(0, "it has nothing to read at present", str(path))
+    if len(data) > most_bytes:
+        raise OSError(0, f"it has more than {most_bytes} bytes", str(path))
+    return data
+
+
+def exists(path: Path) -> bool:
+    """Tell whether there is a file or folder of that name; one that no file can have is not there."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
 
 
 class InUseError(Exception):

@@ -11,9 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from adacd_hil.control.motion.admittance import Admittance
-from adacd_hil.control.motion.excitation import Excitation
-from adacd_hil.control.motion.quintic import PEAK_SPEED_FACTOR, corner_to_corner, evaluate, to_rest
+from adacd_hil.control.motion_laws import PEAK_SPEED_FACTOR, Admittance, Excitation, corner_to_corner, evaluate, to_rest
 from adacd_hil.records import JOINTS, ArmState, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
 from adacd_hil.settings.configuration import Settings

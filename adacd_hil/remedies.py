@@ -1,6 +1,8 @@
-"""The known name that somebody may have meant: a slip of the pen, never merely the least different one."""
+"""Remedies that error messages name: the known name that was meant, the command that installs an extra."""
 
+import sys
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 
 _LONGEST = 64
 _SLIPS = ((3, 0), (8, 1), (12, 2))
@@ -68,3 +70,27 @@ def _distance(word: str, name: str) -> int:
             this.append(cost)
         before, last = last, this
     return last[-1]
+
+
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+def install_command(extra: str) -> str:
+    """Write the command that installs an extra: into this interpreter's environment, from the source tree if it is one.
+
+    This package is in no registry: without a source tree the command names the package, and its file has to be given.
+    """
+    is_source = (_ROOT / "pyproject.toml").is_file()
+    source = "adacd-hil" if not is_source else "." if Path.cwd() == _ROOT else str(_ROOT)
+    return f"{_pip()} install {'-e ' if is_source else ''}'{source}[{extra}]'"
+
+
+def _pip() -> str:
+    """Name pip of this interpreter, as short as it can be from here."""
+    executable = Path(sys.executable)
+    pip = executable.with_name("pip")
+    try:
+        name = str((pip if pip.exists() else executable).relative_to(Path.cwd()))
+    except ValueError:
+        name = str(pip if pip.exists() else executable)
+    return name if pip.exists() else f"{name} -m pip"

@@ -1,1 +1,0 @@
-"""The desired motion of each state."""
