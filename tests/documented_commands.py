@@ -42,7 +42,7 @@ OTHERS = {"apt-get", "candump", "canbusload", "canplayer", "dask", "duckdb", "ip
 """Programs that aren't ours: known to be meant, their arguments are not looked at."""
 PREFIXES = {"chrt": 3, "nice": 3}
 """Programs that run another one, with the words before it."""
-TOOL = re.compile(r"tools/[\w-]+(\.py|\.sh)?|tests/[\w/-]+\.py")
+TOOL = re.compile(r"tools/(studies/)?[\w-]+(\.py|\.sh)?|tests/[\w/-]+\.py")
 PLACEHOLDER = re.compile(r"[A-Z][A-Z0-9_]*(=[A-Z,.…]+)?|\.\.\.|…")
 PACKAGES = ("", "adacd_hil", "firmware_sim", "dbc", "docs", "tests")
 """Folders that paths in documents count from."""
@@ -313,7 +313,8 @@ def environment_names() -> frozenset[str]:
 
 def tools() -> list[Path]:
     """List the instruments."""
-    return [path for path in sorted((ROOT / "tools").iterdir()) if path.suffix in (".py", "") and path.is_file()]
+    found = (*(ROOT / "tools").iterdir(), *(ROOT / "tools" / "studies").iterdir())
+    return [path for path in sorted(found) if path.suffix in (".py", "") and path.is_file()]
 
 
 @functools.cache
@@ -323,12 +324,23 @@ def flags(tool: Path) -> frozenset[str]:
     if "import argparse" not in text:
         return frozenset()
     nodes = list(ast.walk(ast.parse(text)))
+    nodes += [inner for node in nodes if isinstance(node, ast.ImportFrom) for inner in _shared_options(node)]
     calls = [node for node in nodes if isinstance(node, ast.Call)]
     added = [call for call in calls if getattr(call.func, "attr", "") == "add_argument"]
     found = {argument.value for call in added for argument in call.args if isinstance(argument, ast.Constant)}
     if any(getattr(call.func, "attr", "") == "add_parser" for call in calls):  # whose names may come from a table
         found |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     return frozenset(found)
+
+
+def _shared_options(imported: ast.ImportFrom) -> Iterator[ast.AST]:
+    """Give what is in the functions that a tool imports from another: some add options that several tools have."""
+    source = ROOT / "tools" / f"{imported.module}.py"
+    names = {alias.name for alias in imported.names}
+    if source.is_file():
+        for node in ast.parse(source.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.FunctionDef) and node.name in names:
+                yield from ast.walk(node)
 
 
 def _tool_complaints(tool: str, words: list[str]) -> Complaints:
