@@ -237,11 +237,11 @@ def play(seed: int, is_touched: bool, is_foreign: bool = False) -> Trial:
         output, before = loop.step(), state
         state = output.state
         if state is SchemeState.CERTIFY and before is SchemeState.ADAPT:
-            shares.append(rule_shares(loop.pipeline._constants, loop.pipeline._memory))
+            shares.append(rule_shares(*loop.kernel))
         is_reported |= state is SchemeState.REACT and before is not state and at_s >= begins_s
         if state is SchemeState.MONITOR and before is SchemeState.CERTIFY and (hand is None or at_s > begins_s):
             certified_s = at_s if certified_s is None else certified_s
-            error_Nm = float(np.abs(paper_rows() @ (loop.pipeline._memory[0]["theta"] - loop.truth)).max())
+            error_Nm = float(np.abs(paper_rows() @ (loop.model_theta - loop.truth)).max())
             (by_word if BY_WORD in loop.said("certificate")[-1] else errors).append(error_Nm)
         if hand is not None and at_s > ends_s and state is SchemeState.MONITOR:
             back_after_s = at_s - ends_s

@@ -233,9 +233,19 @@ class TouchedLoop(ExcitedLoop):
         return outputs
 
     @property
+    def kernel(self):
+        """The kernel's constants and memory, as its functions take them."""
+        return self.pipeline._constants, self.pipeline._memory
+
+    @property
+    def model_theta(self):
+        """The parameters of the model in use (p,)."""
+        return self.pipeline._memory[0]["theta"]
+
+    @property
     def offset_error_Nm(self):
         """Of the model in use: how far its offsets are off (2,)."""
-        return self.pipeline._memory[0]["theta"][OFFSETS] - self.offset_Nm
+        return self.model_theta[OFFSETS] - self.offset_Nm
 
     def recover(self):
         """Run until it monitors; the user acknowledges a release that was a collision."""
