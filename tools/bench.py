@@ -95,7 +95,7 @@ def main() -> int:
     if not chosen.side_by_side:
         print(f"{'µs':44} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}")
         bench_in_process()
-        regressor_bench.main()
+        regressor_bench.print_table()
         sys.stdout.flush()
     again = [sys.executable, __file__, "--vcan", *sys.argv[1:]]
     return subprocess.run([ROOT / "tools/with-vcan", "--", *again], check=False).returncode

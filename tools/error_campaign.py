@@ -281,7 +281,7 @@ def main() -> int:
     """Play the arms that were asked for."""
     parser = argparse.ArgumentParser(description="Arms with errors that the certified scheme may lack.")
     parser.add_argument("--profiles", default="P,S,M", metavar="NAMES")
-    parser.add_argument("--only", default="*", metavar="PATTERNS", help=f"of {', '.join(ERRORS)}")
+    parser.add_argument("--only", default="*", metavar="PATTERNS", help=f"of {', '.join(ERRORS)}".replace("%", "%%"))
     parser.add_argument("--kg", default="0", metavar="MASSES", help="0, or a payload that is announced")
     parser.add_argument("--seeds", default="1", metavar="NUMBERS")
     parser.add_argument("--minutes", type=float, default=3.0, help="of random motion; default 3")

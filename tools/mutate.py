@@ -3,7 +3,7 @@
     python tools/mutate.py                                       all targets, as the release check does
     python tools/mutate.py --sample 50 --seed 3                  a seeded sample of them, for a quick look
     python tools/mutate.py adacd_hil/control/gate.py             one target
-    python tools/mutate.py some/module.py --tests tests/x.py     any other module
+    python tools/mutate.py some/module.py --tests some/test.py   any other module
 
 Changes (one per mutant): comparisons, and/or/not, arithmetic and bit operators, integers and floats by one and in sign,
 booleans, conditions negated, operands of and/or left out, return values dropped, statements dropped, min/max and

@@ -6,6 +6,7 @@ Compiled: a loop in machine code, percentiles over blocks of 100 steps. From Pyt
 this machine's; compare ratios of one run.
 """
 
+import argparse
 import sys
 import time
 from collections.abc import Callable
@@ -93,7 +94,14 @@ def planar_arm() -> chain.Chain:
 
 
 def main() -> int:
-    """Print the table."""
+    """Run the command line."""
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args()
+    print_table()
+    return 0
+
+
+def print_table() -> None:
+    """Print what each step costs."""
     print(f"{'µs per step':44} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}")
     random = np.random.default_rng(0)
     q, dq = random.uniform(-1.0, 1.0, (2, BLOCK, 2))
@@ -104,7 +112,6 @@ def main() -> int:
     seven = read_urdf((ROOT / "tests/scheme/seven_joint_arm.urdf").read_text()).chain
     for arm in (planar_arm(), seven):
         bench_chain(arm)
-    return 0
 
 
 def bench_chain(arm: chain.Chain) -> None:

@@ -1,15 +1,20 @@
 """The smallest hand that one run can tell from the arm, by the motion it is asked on.
 
-    python tools/hand_bounds.py
+    python tools/studies/hand_bounds.py
+    python tools/studies/hand_bounds.py --profiles P
 
 Of the certified scheme's regressor on recorded motion, and the columns of some hands behind the same filter. What of a
 hand is outside the columns of the arm, as far as the prior leaves them open, is found when it comes to SIGMAS
 deviations of the fit; the rest is learnt as the arm's. Asked of the excitation alone, of more of it, and of as much of
 a question: joint 1 back and forth at two values of q2. Drag on joint 1 is a column of the arm: what tells it apart here
-is the rest between, not the motion. Table on stdout.
+is the rest between, not the motion. Table on stdout. Exit status: 0 printed, 2 wrong usage.
 """
 
+import argparse
 import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from campaign_certified import CertifiedScheme
@@ -100,10 +105,15 @@ def smallest(settings: Settings, rows: Array, torque: Array) -> float:
 
 
 def main() -> int:
-    """Print the table."""
+    """Print the table of the profiles that were asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--profiles", default="PSM", help="letters; default %(default)s")
+    profiles = parser.parse_args().profiles
+    if set(profiles) - set("PSM"):
+        parser.error(f"--profiles {profiles}: of P, S, M")
     rows: dict[str, list[str]] = {}
     head = ["hand"]
-    for profile in "PSM":
+    for profile in profiles:
         settings = load_settings("certified", profile)
         arm = profile_arm(profile)
         excitation = CertifiedScheme("certified", settings).adaptation_motion(is_payload=False)
