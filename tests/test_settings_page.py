@@ -1,0 +1,56 @@
+"""Each setting stands on the page of settings, is named where what it does is told or tested, and is read."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+import settings_page
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "settings.md"
+KEYS = [key for name, section, _ in settings_page.sections() for key, *_ in settings_page.rows_of(section, f"{name}.")]
+NAMED_IN = ("tests/**/*.py", "docs/**/*.md", "README.md", "adacd_hil/configs/*.toml", "docs/examples/**/*.toml")
+
+
+@pytest.fixture(scope="module")
+def read_names() -> set[str]:
+    """Names of all attributes that the product reads, but for what it declares."""
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "adacd_hil").rglob("*.py"))
+    return {
+        node.attr
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
+    }
+
+
+@pytest.fixture(scope="module")
+def texts() -> str:
+    """Tests, documents and configurations, without the page that lists every setting."""
+    files = {path for pattern in NAMED_IN for path in ROOT.glob(pattern)} - {PAGE, Path(__file__)}
+    return "\n".join(path.read_text(encoding="utf-8") for path in sorted(files))
+
+
+def test_the_page_is_what_the_declarations_say() -> None:
+    assert PAGE.read_text(encoding="utf-8") == settings_page.page()
+
+
+def test_the_tool_prints_the_page() -> None:
+    done = subprocess.run([sys.executable, settings_page.__file__], capture_output=True, check=True)
+    assert done.stdout.decode() == settings_page.page()
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_setting_is_read_by_the_product(key: str, read_names: set[str]) -> None:
+    assert key.rpartition(".")[2] in read_names
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_setting_is_named_by_a_test_a_document_or_a_configuration(key: str, texts: str) -> None:
+    name = key.rpartition(".")[2]
+    assert re.search(rf"(?<![A-Za-z0-9_]){name}(?![A-Za-z0-9_])", texts)
