@@ -84,12 +84,20 @@ DROPPED_KEY = "dropped"
 _FRAME_TOPICS = {"/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd"}
 
 
+def parts_of(path: Path) -> dict[int, Path]:
+    """Find the parts of the log `path` by their numbers; `path` alone where none can be found: opening it says why."""
+    try:
+        return find_parts(path) or {0: path}
+    except OSError:
+        return {0: path}
+
+
 def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
     """Count the frames in a file by its channels' topics and their counts of messages."""
     return sum(count for channel, count in counts.items() if topics.get(channel) in _FRAME_TOPICS)
 
 
-def number(texts: Mapping[str, str], key: str) -> int:
+def summary_count(texts: Mapping[str, str], key: str) -> int:
     """Read a count; what isn't one counts as 0."""
     text = texts.get(key, "0")
     return int(text) if text.isdecimal() else 0

@@ -17,7 +17,7 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import DROPPED_KEY, EPOCH_KEY, FIELDS_KEY, LOST_KEY, LogError, log_in
-from adacd_hil.log.log_walk import LogWalk, RawPiece
+from adacd_hil.log.log_walk import LogWalk
 from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
@@ -30,7 +30,15 @@ from adacd_hil.log.types.message_types import (
     MessageType,
     unpack_log,
 )
-from adacd_hil.log.types.record_arrays import FRAME_DTYPE, LONG_FRAME_DTYPE, Payload, Topic, is_of_frames, joined_frames
+from adacd_hil.log.types.record_arrays import (
+    FRAME_DTYPE,
+    LONG_FRAME_DTYPE,
+    Payload,
+    RawPiece,
+    Topic,
+    is_of_frames,
+    joined_frames,
+)
 from adacd_hil.log.types.topics import DECODED, run_channels, truth_channels
 from adacd_hil.records import (
     PARAMETER_NAMES,
@@ -352,7 +360,7 @@ class LogStream:
     What is damaged or missing is left out; `problem` says so.
     """
 
-    def __init__(self, path: str | Path, topics: Collection[str] | None = None, cycles_per_piece: int = 20_000) -> None:
+    def __init__(self, path: str | Path, topics: Collection[str] | None = None, cycles_per_piece: int = 5_000) -> None:
         """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
 
         A folder stands for the run's log in it. Raises LogError when nothing of it can be read.

@@ -1,6 +1,7 @@
 """Messages found by the indexes behind chunks: the same as found record by record, whatever an index says."""
 
 import functools
+import itertools
 import struct
 
 import pytest
@@ -57,6 +58,12 @@ def path(tmp_path, monkeypatch):
     return take_apart(make_log(topics=("/joint_states", "/cycle"), chunks=CHUNKS, run=None))
 
 
+def read_chunks(chunks, indexes):
+    """Read chunks that follow each other in memory."""
+    ends = list(itertools.accumulate(map(len, chunks)))
+    return chunks_module.read_chunks(b"".join(chunks) + bytes(chunks_module.PADDING), ends, indexes)
+
+
 @pytest.mark.parametrize("spoil", INDEXES.values(), ids=INDEXES)
 def test_a_wrong_index_changes_nothing(spoil, path):
     def parts_of():
@@ -81,9 +88,9 @@ def test_chunks_whose_indexes_are_right_are_not_walked_through(monkeypatch):
     chunks = [b"".join(records[:2]), b"".join(records[2:])]
     size = len(records[0])
     indexes = [b"".join(struct.pack("<QQ", 0, size * place) for place in range(count)) for count in (2, 4)]
-    walked = chunks_module.read_chunks(chunks, [b"", b""], bytearray())
+    walked = read_chunks(chunks, [b"", b""])
     monkeypatch.setattr(chunks_module, "_walk_through", None)
-    indexed = chunks_module.read_chunks(chunks, indexes, bytearray(4))
+    indexed = read_chunks(chunks, indexes)
     assert indexed.starts.tolist() == walked.starts.tolist() == [size * place for place in range(6)]
     assert indexed.ends.tolist() == walked.ends.tolist()
     assert indexed.log_times.tolist() == walked.log_times.tolist() == list(range(6))
@@ -96,6 +103,6 @@ def test_a_record_that_goes_on_in_the_next_chunk_is_none():
     data, size = b"".join(records), len(records[0])
     chunks = [data[: size + 40], data[size + 40 :]]
     indexes = [struct.pack("<QQQQ", 0, 0, 1, size), struct.pack("<QQ", 2, size - 40)]
-    contents = chunks_module.read_chunks(chunks, indexes, bytearray())
+    contents = read_chunks(chunks, indexes)
     assert contents.breaks[0] == size
     assert size not in contents.starts

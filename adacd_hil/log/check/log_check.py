@@ -31,6 +31,7 @@ from adacd_hil.log.log_files import (
     count_frames,
     find_parts,
     part_path,
+    parts_of,
 )
 from adacd_hil.log.mcap.records import (
     HEAD,
@@ -255,10 +256,7 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
 
 def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> LogCheck:
     """Check the log whose first part is `path`, with all its parts. Raises LogError when a file can't be read."""
-    try:
-        parts = find_parts(path) or {0: path}
-    except OSError:
-        parts = {0: path}
+    parts = parts_of(path)
     checked = {}
     for number, part in parts.items():
         progress(f"checking {part.name}")

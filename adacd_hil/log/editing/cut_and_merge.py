@@ -1,6 +1,8 @@
 """Logs made of sound logs: a stretch of one, or several in one. At the first damage both commands say so and stop.
 
 Cut: of our own logs whole cycles are taken, by their publish_time; of others messages, by their log_time. Times count
+from adacd_hil.log.log_files import parts_of
+from adacd_hil.log.log_files import parts_of
 from the first of them in the log.
 
 Merge: several logs by log_time, of several hosts, or of a run and the emulator beside it. Each log keeps the order of
@@ -33,8 +35,9 @@ from adacd_hil.log.log_files import (
     LogError,
     count_frames,
     find_parts,
-    number,
     part_path,
+    parts_of,
+    summary_count,
 )
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
 from adacd_hil.log.mcap.records import (
@@ -68,10 +71,7 @@ class IntactLog:
         """Packets that the parts say are not in them."""
 
     def __iter__(self) -> Iterator[Attachment | Contents]:
-        try:
-            parts = find_parts(self.path) or {0: self.path}
-        except OSError:
-            parts = {0: self.path}
+        parts = parts_of(self.path)
         for before, after in pairwise((-1, *parts)):
             if after != before + 1:
                 raise LogError(f"{part_path(self.path, before + 1)} is missing: recover the log first")
@@ -122,7 +122,7 @@ class IntactLog:
 
     def _take_metadata(self, item: Metadata) -> None:
         if item.name == SUMMARY_METADATA:
-            self.dropped += number(item.metadata, DROPPED_KEY)
+            self.dropped += summary_count(item.metadata, DROPPED_KEY)
             return
         table = dict(item.metadata)
         if item.name == RUN_METADATA:

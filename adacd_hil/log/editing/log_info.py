@@ -27,9 +27,9 @@ from adacd_hil.log.log_files import (
     SUMMARY_METADATA,
     LogError,
     count_frames,
-    find_parts,
-    number,
     part_path,
+    parts_of,
+    summary_count,
 )
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
 from adacd_hil.log.mcap.records import (
@@ -96,10 +96,7 @@ def read_info(path: Path) -> LogInfo:
 
     Raises LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
     """
-    try:
-        parts = find_parts(path) or {0: path}
-    except OSError:
-        parts = {0: path}
+    parts = parts_of(path)
     info = LogInfo(path, files=len(parts))
     view = _InfoView(info)
     is_mcap = False
@@ -215,7 +212,7 @@ class _InfoView:
             info.metadata = {key: text for key, text in item.metadata.items() if key != PART_KEY}
         elif item.name == SUMMARY_METADATA:
             info.summary = item.metadata
-            info.dropped += number(item.metadata, DROPPED_KEY)
+            info.dropped += summary_count(item.metadata, DROPPED_KEY)
             info.ending = item.metadata.get(ENDING_KEY, "")
 
     def _read(self, contents: Contents, definitions: Definitions) -> None:

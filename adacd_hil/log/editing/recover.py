@@ -25,9 +25,9 @@ from adacd_hil.log.log_files import (
     SUMMARY_METADATA,
     LogError,
     count_frames,
-    find_parts,
-    number,
     part_path,
+    parts_of,
+    summary_count,
 )
 
 
@@ -80,10 +80,7 @@ def recover(path: Path, out: Path | None = None, progress: Callable[[str], None]
     Raises LogError when there is nothing, when a file can't be read, or when `out` is the log itself.
     """
     out = out or default_out(path)
-    try:
-        parts = find_parts(path) or {0: path}
-    except OSError:
-        parts = {0: path}
+    parts = parts_of(path)
     if out.exists() and any(part.exists() and out.samefile(part) for part in parts.values()):
         raise LogError(f"{out} is the log itself; --out names another file")
     with LogCopy(out, parts.values()) as copy:
@@ -146,7 +143,7 @@ class _Work:
 
     def _take_metadata(self, item: Metadata, is_vouched: bool) -> None:
         if item.name == SUMMARY_METADATA:
-            self._dropped += number(item.metadata, DROPPED_KEY)
+            self._dropped += summary_count(item.metadata, DROPPED_KEY)
             self._ending = item.metadata.get(ENDING_KEY, "")
         elif item.name not in self._metadata:
             self._metadata[item.name] = item.metadata

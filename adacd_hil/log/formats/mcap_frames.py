@@ -32,7 +32,7 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
-    find_parts,
+    parts_of,
 )
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS, LIBRARY
 from adacd_hil.log.mcap.chunks import Block, Contents, read_blocks
@@ -102,7 +102,7 @@ class McapFrames:
         self._bus = ""
         self._schemas: dict[int, Schema] = {}
         self._sources: dict[int, _Source | None] = {}
-        self._files = _parts(source) if isinstance(source, Path) else [source]
+        self._files = list(parts_of(source).values()) if isinstance(source, Path) else [source]
         first = self._files[0]
         try:
             if isinstance(first, Path):
@@ -213,13 +213,6 @@ class McapFrames:
             return _NO_FRAMES
         frames: NDArray[Any] = np.concatenate(found)[np.argsort(np.concatenate(places))]
         return frames
-
-
-def _parts(path: Path) -> list[Path | IO[bytes]]:
-    try:
-        return list(find_parts(path).values()) or [path]
-    except OSError:
-        return [path]
 
 
 def _check_magic(file: IO[bytes], name: str) -> None:

@@ -12,8 +12,10 @@ import struct
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import accumulate, pairwise
-from typing import IO, Any, NamedTuple, TypeAlias
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import IO, Any, NamedTuple, TypeAlias, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -45,6 +47,7 @@ FREE_BYTES = 64 << 20
 """What may be opened of a file whatever its size."""
 _PIECE_BYTES = 1 << 20
 _KINDS = ("", "zstd", "lz4")
+AnyBytes = TypeVar("AnyBytes", bytes, memoryview)
 
 
 class ChunkError(ValueError):
@@ -77,13 +80,25 @@ class Opening:
         return _checked(chunk, self.open(chunk), is_size_certain=bool(chunk.uncompressed_crc))
 
 
-def open_as_claimed(chunk: Chunk) -> bytes:
-    """Return what a chunk holds, whose size has been allowed. Raises ChunkError when that isn't as it says."""
-    data = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
-    return _checked(chunk, data, is_size_certain=False)
+def open_into(chunk: Chunk, memory: memoryview, decompressor: zstandard.ZstdDecompressor) -> None:
+    """Write what a chunk holds, whose size has been allowed, to `memory`, which has room for one byte more.
+
+    Raises ChunkError when that isn't as it says.
+    """
+    size = chunk.uncompressed_size
+    try:
+        is_direct = chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) == size
+        if not is_direct or not chunk.uncompressed_crc:
+            memory[:size] = _checked(chunk, decompress(chunk.compression, chunk.data, size), is_size_certain=False)
+            return
+        with decompressor.stream_reader(chunk.data) as reader:
+            count = reader.readinto(memory)
+    except zstandard.ZstdError as error:
+        raise ChunkError(f"can't be decompressed: {error}") from None
+    _checked(chunk, memory[:count], is_size_certain=False)
 
 
-def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
+def _checked(chunk: Chunk, data: AnyBytes, is_size_certain: bool) -> AnyBytes:
     if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
         raise ChunkError("fails its CRC")
     if not is_size_certain and len(data) != chunk.uncompressed_size:
@@ -116,9 +131,13 @@ def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
     return opened
 
 
+def _decompressor() -> zstandard.ZstdDecompressor:
+    return zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
+
+
 def _unzstd(data: bytes, most_bytes: int) -> bytes:
     size = zstandard.frame_content_size(data)
-    decompressor = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
+    decompressor = _decompressor()
     if size > most_bytes:
         raise ChunkError(f"claims {size} bytes, more than {most_bytes}")
     if size >= 0:
@@ -141,25 +160,48 @@ _MESSAGE = np.dtype(
         "itemsize": MESSAGE_HEAD,
     }
 )
-_PADDING = 128
+PADDING = 128
 """Behind chunks: a record whose size varies is taken as if it were the longest, which has 64 bytes of data."""
 
 
 Data: TypeAlias = bytes | bytearray
 
 
-class Contents(NamedTuple):
-    """The records of chunks. Messages as columns (n,): their numbers of channels, times, and where they are."""
+@dataclass
+class Contents:
+    """The records of chunks. Messages as columns (n,), which are read once they are asked for."""
 
     data: Data
-    definitions: list[RawRecord]  # schemas and channels; `offset`: where they are in the data
-    strangers: list[int]  # opcodes of what has no place in a chunk; Message: one that is too short to be one
-    breaks: list[int]  # where what follows is no record, up to the end of the chunk
     starts: NDArray[np.int64]
-    ends: NDArray[np.int64]
-    channels: NDArray[np.uint16]
-    log_times: NDArray[np.uint64]
-    publish_times: NDArray[np.uint64]
+    definitions: list[RawRecord] = field(default_factory=list)  # schemas and channels; `offset`: where in the data
+    strangers: list[int] = field(default_factory=list)
+    """Opcodes of what has no place in a chunk; Message: one that is too short to be one."""
+    breaks: list[int] = field(default_factory=list)  # where what follows is no record, up to the end of the chunk
+
+    @cached_property
+    def heads(self) -> NDArray[Any]:
+        """What each message begins with (n,): opcode, length, channel, times."""
+        return _windows(self.data, MESSAGE_HEAD)[self.starts].view(_MESSAGE)
+
+    @cached_property
+    def ends(self) -> NDArray[np.int64]:
+        """Where the messages end."""
+        return np.asarray(self.starts + self.heads["length"] + HEAD.size)
+
+    @cached_property
+    def channels(self) -> NDArray[np.uint16]:
+        """The numbers of their channels."""
+        return self.heads["channel"].copy()
+
+    @cached_property
+    def log_times(self) -> NDArray[np.uint64]:
+        """Their log times, ns."""
+        return self.heads["log_time"].copy()
+
+    @cached_property
+    def publish_times(self) -> NDArray[np.uint64]:
+        """Their publish times, ns."""
+        return self.heads["publish_time"].copy()
 
     @property
     def entries(self) -> NDArray[Any]:
@@ -183,20 +225,14 @@ def read_contents(data: bytes) -> Contents:
     return _walk_through(data, (len(data),))
 
 
-def read_chunks(chunks: Sequence[bytes], indexes: Sequence[bytes], memory: bytearray) -> Contents:
-    """Find the records of opened chunks, one after the other; bytes of no meaning follow the last.
+def read_chunks(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents:
+    """Find the records of opened chunks that follow each other in `data`; PADDING bytes of no meaning follow the last.
 
-    indexes: the entries of all message indexes of each chunk; without them, and where they are wrong, each record
-    takes a step. memory: holds the chunks from now on, unless it is too small.
+    ends: of the chunks; indexes: the entries of all message indexes of each chunk; without them, and where they are
+    wrong, each record takes a step.
     """
-    ends = list(accumulate(map(len, chunks)))
-    size = (ends[-1] if ends else 0) + _PADDING
-    if len(memory) < size:
-        memory = bytearray(size)
-    for end, chunk in zip(ends, chunks, strict=True):
-        memory[end - len(chunk) : end] = chunk
-    indexed = _indexed(memory, ends, indexes)
-    return _walk_through(memory, ends) if indexed is None else indexed
+    indexed = _indexed(data, ends, indexes)
+    return _walk_through(data, ends) if indexed is None else indexed
 
 
 def _indexed(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
@@ -205,11 +241,11 @@ def _indexed(data: Data, ends: Sequence[int], indexes: Sequence[bytes]) -> Conte
         return None
     pairs = zip(indexes, (0, *ends[:-1]), strict=True)
     offsets = [np.frombuffer(index, INDEX_ENTRY)["offset"] + first for index, first in pairs]
-    starts = np.sort(np.concatenate(offsets).view(np.int64), kind="stable")
+    starts = np.sort(np.concatenate(offsets).view(np.int64))
     if starts[0] != 0 or starts[-1] > ends[-1] - MESSAGE_HEAD:
         return None
-    heads = _windows(data, MESSAGE_HEAD)[starts].view(_MESSAGE)
-    contents = _contents(data, [], [], [], starts, heads)
+    contents = Contents(data, starts)
+    heads = contents.heads
     is_message = (heads["opcode"] == Opcode.MESSAGE) & (heads["length"] >= _LEAST_LENGTH)
     is_filled = np.array_equal(contents.ends[:-1], starts[1:]) and contents.ends[-1] == ends[-1]
     if not is_filled or not is_message.all():
@@ -242,37 +278,13 @@ def _walk_through(data: Data, ends: Sequence[int]) -> Contents:
             position = end
         if position < size:
             breaks.append(position)
-    return _found(data, definitions, strangers, breaks, np.array(starts, np.int64))
+    return Contents(data, np.array(starts, np.int64), definitions, strangers, breaks)
 
 
 def message_contents(record: RawRecord) -> Contents:
     """Take a message outside of chunks as a chunk of its own."""
     data = HEAD.pack(record.opcode, len(record.body)) + record.body
-    return _found(data, [], [], [], np.zeros(1, np.int64))
-
-
-def _found(
-    data: Data,
-    definitions: list[RawRecord],
-    strangers: list[int],
-    breaks: list[int],
-    starts: NDArray[np.int64],
-) -> Contents:
-    heads = _windows(data, MESSAGE_HEAD)[starts].view(_MESSAGE) if len(starts) else np.empty(0, _MESSAGE)
-    return _contents(data, definitions, strangers, breaks, starts, heads)
-
-
-def _contents(
-    data: Data,
-    definitions: list[RawRecord],
-    strangers: list[int],
-    breaks: list[int],
-    starts: NDArray[np.int64],
-    heads: NDArray[Any],
-) -> Contents:
-    ends = starts + heads["length"] + HEAD.size
-    channels, log_times, publish_times = (heads[name].copy() for name in ("channel", "log_time", "publish_time"))
-    return Contents(data, definitions, strangers, breaks, starts, ends, channels, log_times, publish_times)
+    return Contents(data, np.zeros(1, np.int64))
 
 
 def _windows(data: Data, size: int) -> NDArray[Any]:
@@ -281,8 +293,8 @@ def _windows(data: Data, size: int) -> NDArray[Any]:
     return windows
 
 
-BLOCK_BYTES = 1 << 21
-AHEAD = 6
+BLOCK_BYTES = 1 << 20
+AHEAD = 3
 """Blocks that may wait or be in work."""
 _OUTSIDE = (Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA)
 _OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
@@ -396,14 +408,25 @@ def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
 
 
 def _open(packed: list[_Packed], memory: bytearray) -> Block:
-    chunks, indexes, problem = [], [], ""
+    size = sum(one.size for one in packed) + PADDING
+    if len(memory) < size:
+        memory = bytearray(size)
+    view, decompressor = memoryview(memory), _decompressor()
+    ends: list[int] = []
+    indexes, problem = [], ""
     for one in packed:
+        start = ends[-1] if ends else 0
+        end = start + one.size
         try:
-            chunks.append(one.chunk if isinstance(one.chunk, bytes) else open_as_claimed(one.chunk))
+            if isinstance(one.chunk, bytes):
+                view[start:end] = one.chunk
+            else:
+                open_into(one.chunk, view[start : end + 1], decompressor)
         except ChunkError:
             problem = problem or f"damaged at byte {one.position}"
         else:
+            ends.append(end)
             indexes.append(b"".join(one.entries))
-    contents = read_chunks(chunks, indexes, memory)
-    memory = contents.data if isinstance(contents.data, bytearray) else memory
+    contents = read_chunks(memory, ends, indexes)
+    _ = contents.channels, contents.publish_times  # here, where two processors can share the work
     return Block(contents, memory, packed[0].position, problem)

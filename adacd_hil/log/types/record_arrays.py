@@ -2,18 +2,34 @@
 
 The fields of `LONG_FRAME_DTYPE` come first in `RECORDED_FRAME_DTYPE` and mean the same; what is beyond them is what our
 own bus never has: remote frames, 29-bit identifiers below 0x800, FD frames without bit rate switch, several channels.
+
+Messages are gathered by topic, piece by piece. A piece ends before the first message whose publish time, which is its
+cycle's, is higher than any before.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from adacd_hil.log.mcap.records import MESSAGE_HEAD
-from adacd_hil.log.types.message_types import CAN_FRAME, FD_FRAME, MAX_DATA
+from adacd_hil.log.types.message_types import CAN_FRAME, FD_FRAME, LOG, MAX_DATA, is_log
 from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
+
+if TYPE_CHECKING:
+    from adacd_hil.log.mcap.chunks import Contents
+
+
+_SPARE = 16
+_LARGE = 1 << 22
+"""Bytes from which numpy asks for large pages, which cost less; of them no more is used than is written to."""
+_MOST_SMALL = 1 << 15
+"""Topics whose slots go into 16 bits."""
+UNKNOWN, UNWANTED = -1, -2
+"""Slots of channels that aren't gathered."""
 
 
 class Payload(NamedTuple):
@@ -192,3 +208,167 @@ def as_logged(frames: NDArray[Any]) -> NDArray[Any]:
     for name in LONG_FRAME_DTYPE.names or ():
         logged[name] = chosen[name]
     return logged
+
+
+Numbers = NDArray[np.int64]
+
+
+class RawPiece(NamedTuple):
+    """What a piece of a log holds, by topic."""
+
+    records: dict[str, NDArray[np.uint8]]  # (n, size of a record): numpy would not copy what no field covers
+    frames: NDArray[Any]  # (n,) of FRAME_DTYPE, or of LONG_FRAME_DTYPE where a frame is FD
+    payloads: dict[str, list[bytes]]
+
+
+class _Rows:
+    """Rows of one size, in memory that has room for as many as were there before."""
+
+    def __init__(self, size: int) -> None:
+        self._memory = np.empty((0, size), np.uint8)
+        self.count = 0
+
+    def make_room(self, count: int) -> None:
+        """Have room for `count` rows in all."""
+        if count > len(self._memory):
+            size = self._memory.shape[1]
+            least = _LARGE // size + 1 if count * size > _LARGE // 4 else 0
+            memory = np.empty((max(count, len(self._memory) * 3 // 2, least), size), np.uint8)
+            memory[: self.count] = self._memory[: self.count]
+            self._memory = memory
+
+    def add(self, rows: NDArray[np.uint8]) -> None:
+        """Add rows."""
+        count = self.count + len(rows)
+        self.make_room(count)
+        self._memory[self.count : count] = rows
+        self.count = count
+
+    def end(self) -> NDArray[np.uint8]:
+        """Return all rows, and begin anew."""
+        rows = self._memory[: self.count]
+        self._memory = np.empty((self.count + self.count // _SPARE, rows.shape[1]), np.uint8)
+        self.count = 0
+        return rows
+
+
+class PieceBuilder:
+    """Gathers messages; a topic's place in `topics` is its slot."""
+
+    def __init__(self, cycles: int, epoch_ns: int, has_frame_records: bool) -> None:
+        """Gather at most so many cycles at a time; of frames also the records if `has_frame_records`."""
+        self.topics: list[Topic] = []
+        self.wrong = 0
+        """Messages that weren't as long as their schema says."""
+        self._most_cycles = cycles
+        self._epoch_ns = epoch_ns
+        self._has_frame_records = has_frame_records
+        self._cycles = 0  # of the piece: how often the publish time has risen
+        self._latest_ns = np.iinfo(np.int64).min
+        self._rows: list[_Rows] = []
+        self._payloads: list[list[bytes]] = []
+        self._frames: list[NDArray[Any]] = []
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has been gathered since the latest piece."""
+        return not (self._frames or any(rows.count for rows in self._rows) or any(self._payloads))
+
+    def add_topic(self, topic: Topic) -> int:
+        """Gather one more topic; return its slot."""
+        self.topics.append(topic)
+        self._rows.append(_Rows(topic.dtype.itemsize if topic.dtype is not None else 0))
+        self._payloads.append([])
+        return len(self.topics) - 1
+
+    def expect(self, slot: int, messages: int) -> None:
+        """Make room for so many messages of a topic, as far as they go into one piece: growing is dear."""
+        rows = self._rows[slot]
+        with contextlib.suppress(MemoryError):  # the file may lie
+            rows.make_room(min(rows.count + messages, self._most_cycles + self._most_cycles // _SPARE))
+
+    def add(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
+        """Gather some messages of chunks, and give the pieces that are whole with them. slots (n,): of each message."""
+        publish_ns = contents.publish_times[messages].view(np.int64)
+        if not len(publish_ns):
+            return
+        latest_ns = np.maximum.accumulate(np.concatenate(([self._latest_ns], publish_ns)))
+        self._latest_ns = int(latest_ns[-1])
+        cycles = self._cycles + np.cumsum(publish_ns > latest_ns[:-1])
+        start = 0
+        while cycles[-1] > self._most_cycles:
+            stop = int(np.searchsorted(cycles, self._most_cycles, side="right"))
+            self._gather(contents, messages.start + start, slots[start:stop])
+            yield self.end()
+            cycles -= self._most_cycles
+            start = stop
+        self._gather(contents, messages.start + start, slots[start:])
+        self._cycles = int(cycles[-1])
+
+    def end(self) -> RawPiece:
+        """Return what has been gathered, and begin anew."""
+        records, payloads = {}, {}
+        for topic, rows, texts in zip(self.topics, self._rows, self._payloads, strict=True):
+            if topic.dtype is None:
+                payloads[topic.name] = texts
+            elif self._has_frame_records or not is_of_frames(topic):
+                records[topic.name] = rows.end()
+        piece = RawPiece(records, joined_frames(self._frames), payloads)
+        self._payloads = [[] for _ in self.topics]
+        self._frames = []
+        return piece
+
+    def _gather(self, contents: "Contents", first: int, slots: NDArray[np.int32]) -> None:
+        """Gather consecutive messages, of which the first has the number `first`."""
+        small = slots.astype(np.int16) if len(self.topics) < _MOST_SMALL else slots
+        order = np.argsort(small, kind="stable")  # of 16 bits a radix sort
+        messages = order + first
+        starts, ends = contents.starts[messages], contents.ends[messages]
+        bounds = np.cumsum(np.bincount(slots - UNWANTED, minlength=-UNWANTED)[: -UNWANTED + len(self.topics)])
+        frames = []
+        for slot in np.flatnonzero(np.diff(bounds[-UNWANTED - 1 :])).tolist():
+            own = slice(*bounds[slot - UNWANTED - 1 : slot - UNWANTED + 1])
+            topic = self.topics[slot]
+            if topic.dtype is None:
+                self._take_payloads(contents, messages[own], slot)
+                continue
+            is_right, rows = _rows_of(contents, starts[own], ends[own] - starts[own], topic)
+            self.wrong += own.stop - own.start - len(rows)
+            if is_of_frames(topic) and len(rows):
+                places = order[own] if is_right is None else order[own][is_right]
+                frames.append((places, frames_of(rows.view(topic.dtype)[:, 0], topic, self._epoch_ns)))
+            if self._has_frame_records or not is_of_frames(topic):
+                self._rows[slot].add(rows)
+        if frames:
+            sequence = np.argsort(np.concatenate([places for places, _ in frames]))
+            self._frames.append(reordered_frames(joined_frames([part for _, part in frames]), sequence))
+
+    def _take_payloads(self, contents: "Contents", messages: Numbers, slot: int) -> None:
+        is_event = self.topics[slot].type_name == LOG.name
+        for message in messages.tolist():
+            payload = contents.payload(message)
+            if is_event and not is_log(payload):
+                self.wrong += 1
+            else:
+                self._payloads[slot].append(payload)
+
+
+def _rows_of(
+    contents: "Contents", starts: Numbers, sizes: Numbers, topic: Topic
+) -> tuple[NDArray[np.bool_] | None, NDArray[np.uint8]]:
+    """Copy the records of a topic, of those messages that are as long as they must be, and say which; None: of all."""
+    assert topic.dtype is not None
+    most = topic.dtype.itemsize
+    is_right = sizes == most
+    if topic.has_tail:
+        fields: Any = topic.dtype.fields
+        tails = sizes - fields["data"][1]
+        counts = contents.rows(starts + fields["count"][1], 4).view("<u4")[:, 0]
+        is_right = (tails >= 0) & (sizes <= most) & (counts == tails)
+    if is_all := bool(is_right.all()):
+        rows = contents.rows(starts, most)
+    else:
+        rows, sizes = contents.rows(starts[is_right], most), sizes[is_right]
+    if topic.has_tail:
+        rows[np.arange(most) >= sizes[:, np.newaxis]] = 0
+    return None if is_all else is_right, rows
