@@ -167,4 +167,9 @@ def packed(values: Mapping[str, ArrayLike]) -> Structured:
 
 def zeroed(shapes: Mapping[str, tuple[int, ...]]) -> Structured:
     """Return one element (1,) of zeros, float64, with a field of each shape."""
-    return np.zeros(1, np.dtype([(name, np.float64, shape) for name, shape in shapes.items()]))
+    return np.zeros(1, float_fields(shapes))
+
+
+def float_fields(shapes: Mapping[str, tuple[int, ...]]) -> np.dtype[np.void]:
+    """Describe an element with float64 fields of these shapes."""
+    return np.dtype([(name, np.float64, shape) for name, shape in shapes.items()])

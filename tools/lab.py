@@ -19,16 +19,16 @@ from lab_arm import LabArm, profile_arm, random_arm
 from lab_motion import PERIOD_S, Motion, cut, join, multisine, paper_motion, random_motion, random_moves, still
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import Structured, compiled
 from adacd_hil.control.controller import HANDOVER_S, _torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
 from firmware_sim.arm.arms import ARMS, ArmProfile
-from firmware_sim.arm.plant import COULOMB, DQ, JOINT_TORQUE, TAU, TORQUE_LIMIT, VISCOUS, Q, external_torque
-from firmware_sim.arm.scripted_contact import ONSET_TICK, TICK_S, ContactSettings, ticks
+from firmware_sim.arm.plant import external_torque
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, ticks
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
-from firmware_sim.body.body import Body, _advance, _contact_in_force, _sample
-from firmware_sim.body.motor import PEAK
+from firmware_sim.body.body import Body
+from firmware_sim.body.body_ticks import BODY_NUMBERS, BODY_STATE, advance_body, find_contact, sample_body
 from firmware_sim.scenario.scenario import PayloadSettings, Scenario
 
 __all__ = [
@@ -115,16 +115,13 @@ def _limit(tau_d: Vector, limit_Nm: Vector, step_Nm: Vector, quantum_Nm: Vector,
 
 @compiled
 def _play(
-    state: Vector,
-    arm: Vector,
-    mechanics: Vector | None,
-    contacts: NDArray[np.float64],
-    touch_numbers: NDArray[np.float64],
+    state_vector: Vector,
+    number_vector: Vector,
+    mechanics: Structured | None,
+    contacts: Structured,
+    things: Structured,
     touch_state: Vector,
-    payloads: NDArray[np.float64],
-    motor: Vector,
-    encoder: Vector,
-    transducer: Vector,
+    payloads: Structured,
     encoder_noise: NDArray[np.float64],
     substeps: int,
     work: Vector,
@@ -151,21 +148,23 @@ def _play(
     counts = np.zeros(3 * JOINTS, np.int64)
     none, tau_d, command, latched = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS)
     theta = np.zeros(theta_ff.shape[1])
-    viscous, coulomb = arm[VISCOUS : VISCOUS + JOINTS].copy(), arm[COULOMB : COULOMB + JOINTS].copy()
+    state, arm = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]["arm"]
+    now, course = state["arm"], state["course"]
+    viscous, coulomb = arm["viscous_Nm_s"].copy(), arm["coulomb_Nm"].copy()
     for k in range(q.shape[0]):
         tick = float(k * TICKS)
-        contact = _contact_in_force(state, contacts)
-        elapsed_s = (tick - contact[ONSET_TICK]) * TICK_S if contact.size != 0 else 0.0
-        ext1, ext2 = external_torque(arm, contact, elapsed_s, state[Q], state[Q + 1], state[DQ], state[DQ + 1])
+        contact = find_contact(course, contacts)
+        elapsed_s = (tick - contact[0]["onset_tick"]) * TICK_S if contact.size != 0 else 0.0
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, now["q"][0], now["q"][1], now["dq"][0], now["dq"][1])
         push1, push2 = _push_torque(pushes, tick)
         tau_ext[k, 0], tau_ext[k, 1] = ext1 + push1, ext2 + push2
-        _sample(state, transducer, torque_noise[k], none, counts)
+        sample_body(state_vector, number_vector, torque_noise[k], none, counts)
         for i in range(JOINTS):
             q[k, i] = counts[i] * POSITION_LSB_RAD
             dq[k, i] = counts[JOINTS + i] * VELOCITY_LSB_RAD_S
             tau_J[k, i] = np.rint(counts[2 * JOINTS + i] * TORQUE_LSB_NM * 1e6) * 1e-6
-            arm[VISCOUS + i] = viscous[i] * drift[k, 0]
-            arm[COULOMB + i] = coulomb[i] * drift[k, 1]
+            arm["viscous_Nm_s"][i] = viscous[i] * drift[k, 0]
+            arm["coulomb_Nm"][i] = coulomb[i] * drift[k, 1]
         _lead_over(theta_ff, theta_cycles, k, handover, theta)
         _torque(q[k], dq[k], q_d[k], dq_d[k], ddq_d[k], theta, Kp, Kd, tau_d)
         latched[:] = command
@@ -181,18 +180,18 @@ def _play(
             push1, push2 = _push_torque(pushes, tick + index) if is_pushed else (0.0, 0.0)
             if asymmetry != 0.0:
                 for i in range(JOINTS):
-                    arm[COULOMB + i] = coulomb[i] * drift[k, 1] * (1.0 + asymmetry * np.sign(state[DQ + i]))
-            state[TAU] += push1
-            state[TAU + 1] += push2
-            _advance(
-                state, arm, mechanics, contacts, touch_numbers, touch_state, payloads, motor, encoder, transducer,
+                    arm["coulomb_Nm"][i] = coulomb[i] * drift[k, 1] * (1.0 + asymmetry * np.sign(now["dq"][i]))
+            now["tau_m"][0] += push1
+            now["tau_m"][1] += push2
+            advance_body(
+                state_vector, number_vector, mechanics, contacts, things, touch_state, payloads,
                 encoder_noise, latched[0] + push1, latched[1] + push2, _POWERED, _POWERED, 1 if is_fine else TICKS,
                 substeps, work,
             )  # fmt: skip
-            state[TAU] -= push1
-            state[TAU + 1] -= push2
-            state[JOINT_TORQUE] -= push1
-            state[JOINT_TORQUE + 1] -= push2
+            now["tau_m"][0] -= push1
+            now["tau_m"][1] -= push2
+            now["tau_J"][0] -= push1
+            now["tau_J"][1] -= push2
 
 
 def record(
@@ -227,15 +226,15 @@ def record(
         raise ValueError("encoder noise and a walk of the torque offset are drawn outside the compiled loop")
     body = Body(scenario, PERIOD_S)
     body.start_scenario()
-    body._arm[TORQUE_LIMIT : TORQUE_LIMIT + JOINTS] = body._motor[PEAK : PEAK + JOINTS] = _UNLIMITED_NM
+    body._numbers["arm"]["torque_limit_Nm"][:] = body._numbers["motor"]["peak_Nm"][:] = _UNLIMITED_NM
     rated_Nm = np.array(arm.arm.rated_torque_Nm)
     rate_share = np.array(ArmSettings().torque_rate_limit_Nm_s) / ArmSettings().rated_torque_Nm
     noise = np.random.default_rng(seed).standard_normal((count, JOINTS)) * arm.sensors.torque_noise_Nm
     drift = arm.drift(seed, count)
     q, dq, tau_J, tau_c, tau_ext = (np.zeros((count, JOINTS)) for _ in range(5))
     _play(
-        body._state, body._arm, body._mechanics, body._contacts, body._touch_numbers, body._touch_state,
-        body._payloads, body._motor, body._encoder, body._transducer, body._encoder_noise.table, body._substeps,
+        body._state_vector, body._number_vector, body._mechanics, body._contacts, body._things, body._touch_state,
+        body._payloads, body._encoder_noise.table, body._substeps,
         body._work, _push_table(pushes), drift, arm.asymmetry, noise, motion.q_d, motion.dq_d, motion.ddq_d,
         np.array(arm.Kp), np.array(arm.Kd),
         np.stack((rated_Nm, rate_share * rated_Nm * PERIOD_S, 1e-3 * rated_Nm)),

@@ -21,24 +21,7 @@ from typing import Final
 import numpy as np
 
 from adacd_hil.records import Vector
-from firmware_sim.arm.plant import (
-    ALPHA,
-    ARM_NUMBERS,
-    BETA,
-    BRAKE_DAMPING,
-    COULOMB,
-    CURRENT_LOOP,
-    CURRENT_LOOP_RAD_S,
-    GAMMA,
-    LENGTH,
-    MOMENT,
-    STOP_DAMPING,
-    STOP_HIGH,
-    STOP_LOW,
-    STOP_STIFFNESS,
-    TORQUE_LIMIT,
-    VISCOUS,
-)
+from firmware_sim.arm.plant import ARM_NUMBERS, CURRENT_LOOP_RAD_S
 
 STOP_STIFFNESS_NM_RAD: Final = (3000.0, 1000.0)
 STOP_DAMPING_NM_S: Final = (10.0, 2.0)
@@ -86,22 +69,22 @@ class ArmProfile:
         alpha, beta, gamma = self.inertia(payload_kg)
         return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
 
-    def numbers(self) -> Vector:
-        """Pack the empty arm for compiled functions (ARM_NUMBERS,), by the places named in `firmware_sim.arm.plant`."""
-        numbers = np.zeros(ARM_NUMBERS)
-        numbers[[ALPHA, BETA, GAMMA]] = self.inertia()
-        numbers[LENGTH : LENGTH + 2] = self.link_length_m
-        numbers[VISCOUS : VISCOUS + 2] = self.viscous_Nm_s
-        numbers[COULOMB : COULOMB + 2] = self.coulomb_Nm
-        numbers[TORQUE_LIMIT : TORQUE_LIMIT + 2] = self.rated_torque_Nm
-        numbers[BRAKE_DAMPING : BRAKE_DAMPING + 2] = self.brake_damping_Nm_s
-        numbers[CURRENT_LOOP : CURRENT_LOOP + 2] = CURRENT_LOOP_RAD_S
-        numbers[STOP_HIGH : STOP_HIGH + 2] = np.radians(self.stop_deg)
-        numbers[STOP_LOW : STOP_LOW + 2] = -numbers[STOP_HIGH : STOP_HIGH + 2]
-        numbers[STOP_STIFFNESS : STOP_STIFFNESS + 2] = STOP_STIFFNESS_NM_RAD
-        numbers[STOP_DAMPING : STOP_DAMPING + 2] = STOP_DAMPING_NM_S
+    def numbers(self) -> np.void:
+        """Pack the empty arm for compiled functions, one element of ARM_NUMBERS."""
+        numbers: np.void = np.zeros(1, ARM_NUMBERS)[0]
+        numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
+        numbers["length_m"][:] = self.link_length_m
+        numbers["viscous_Nm_s"][:] = self.viscous_Nm_s
+        numbers["coulomb_Nm"][:] = self.coulomb_Nm
+        numbers["torque_limit_Nm"][:] = self.rated_torque_Nm
+        numbers["brake_damping_Nm_s"][:] = self.brake_damping_Nm_s
+        numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
+        numbers["stop_high_rad"][:] = np.radians(self.stop_deg)
+        numbers["stop_low_rad"][:] = -numbers["stop_high_rad"]
+        numbers["stop_stiffness_Nm_rad"][:] = STOP_STIFFNESS_NM_RAD
+        numbers["stop_damping_Nm_s"][:] = STOP_DAMPING_NM_S
         first, second = self.links
-        numbers[MOMENT] = first.mass_kg * first.center_m + second.mass_kg * first.length_m
+        numbers["moment_kg_m"] = first.mass_kg * first.center_m + second.mass_kg * first.length_m
         return numbers
 
 

@@ -28,39 +28,60 @@ pull, the flanks have parted and τ_s is 0. Ripple is (amplitude + share · |τ_
 import math
 from typing import Final
 
-from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+import numpy as np
+
+from adacd_hil.compiled import compiled, float_fields
 
 REFERENCE_C: Final = 25.0
 """Temperature for which the profiles' friction holds."""
 
-# Places in the vector that stands for the mechanics, two joints each; see `MechanicsSettings.numbers`.
-SURPLUS: Final = 0  # F_s − F_c, Nm
-STRIBECK: Final = 2  # v_s, rad/s
-SIGMA0: Final = 4  # Nm/rad; 0: no bristles
-SIGMA1: Final = 6  # Nm s/rad
-SIGMA2: Final = 8  # Nm s/rad
-LOAD: Final = 10  # k_load
-VISCOUS_DROP: Final = 12  # k_v, 1/K
-COULOMB_DROP: Final = 14  # k_c, 1/K
-CAPACITY: Final = 16  # C, J/K; 0: the temperature stays
-COOLING: Final = 18  # t_cool, s
-AMBIENT: Final = 20  # T_ambient, °C
-FREE: Final = 22  # 1: nothing dry in this joint, it never sticks
-FRICTION_NUMBERS: Final = 24
+PAIR: Final = (2,)
+"""Shape of what both joints have."""
+
+MECHANICS_NUMBERS: Final = float_fields(
+    {
+        "surplus_Nm": PAIR,  # F_s − F_c, Nm
+        "stribeck_rad_s": PAIR,  # v_s, rad/s
+        "sigma0_Nm_rad": PAIR,  # Nm/rad; 0: no bristles
+        "sigma1_Nm_s": PAIR,
+        "sigma2_Nm_s": PAIR,
+        "load_friction": PAIR,  # k_load
+        "viscous_drop_per_K": PAIR,  # k_v, 1/K
+        "coulomb_drop_per_K": PAIR,  # k_c, 1/K
+        "capacity_J_K": PAIR,  # C, J/K; 0: the temperature stays
+        "cooling_s": PAIR,  # t_cool, s
+        "ambient_C": PAIR,  # T_ambient, °C
+        "is_free": PAIR,  # nothing dry in this joint, it never sticks
+        "stiffness_Nm_rad": PAIR,  # K, Nm/rad; 0: the joint is stiff
+        "damping_Nm_s": PAIR,  # D, Nm s/rad
+        "rotor_inertia_kg_m2": PAIR,  # J, kg m²
+        "backlash_rad": PAIR,  # b, rad
+        "ripple_Nm": PAIR,
+        "ripple_share": PAIR,
+        "ripple_periods": PAIR,  # n, per revolution of the joint
+        "ripple_phase_rad": PAIR,
+        "motor_viscous_Nm_s": PAIR,  # F_vm, Nm s/rad
+        "motor_coulomb_Nm": PAIR,
+        "is_encoder_on_link": PAIR,  # the encoder is on the link side
+        "gravity_m_s2": (),  # g', m/s²
+        "downhill_rad": (),  # δ, rad
+        "holding_brake_Nm": PAIR,  # motor side, while the drive is off
+    }
+)
+"""What `MechanicsSettings.numbers` fills in: friction, transmission, gravity and the holding brakes."""
 
 
 @compiled
 def dry_level(
-    mechanics: Vector, joint: int, coulomb_Nm: float, velocity_rad_s: float, transmitted_Nm: float, drift: float
+    mechanics: np.void, joint: int, coulomb_Nm: float, velocity_rad_s: float, transmitted_Nm: float, drift: float
 ) -> float:
     """Give g(v) in Nm of joint 0 or 1; drift is the factor of `drift_factor` for Coulomb friction."""
     level = coulomb_Nm
-    surplus = mechanics[SURPLUS + joint]
+    surplus = mechanics["surplus_Nm"][joint]
     if surplus != 0.0:
-        ratio = velocity_rad_s / mechanics[STRIBECK + joint]
+        ratio = velocity_rad_s / mechanics["stribeck_rad_s"][joint]
         level += surplus * math.exp(-ratio * ratio)
-    return float(level * drift + mechanics[LOAD + joint] * abs(transmitted_Nm))
+    return float(level * drift + mechanics["load_friction"][joint] * abs(transmitted_Nm))
 
 
 @compiled
@@ -88,37 +109,22 @@ def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, l
 
 
 @compiled
-def warm(mechanics: Vector, joint: int, temperature_C: float, power_W: float, step_s: float) -> float:
+def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, step_s: float) -> float:
     """Give the lubricant's temperature after a step of constant friction power, °C."""
-    capacity_J_K = mechanics[CAPACITY + joint]
+    capacity_J_K = mechanics["capacity_J_K"][joint]
     if capacity_J_K == 0.0:
         return temperature_C
-    cooling_s = mechanics[COOLING + joint]
-    settled_C = mechanics[AMBIENT + joint] + power_W * cooling_s / capacity_J_K
+    cooling_s = mechanics["cooling_s"][joint]
+    settled_C = mechanics["ambient_C"][joint] + power_W * cooling_s / capacity_J_K
     return float(temperature_C - (settled_C - temperature_C) * math.expm1(-step_s / cooling_s))
 
 
-# Places in the vector that stands for the mechanics, two joints each.
-STIFFNESS: Final = FRICTION_NUMBERS  # K, Nm/rad; 0: the joint is stiff
-DAMPING: Final = FRICTION_NUMBERS + 2  # D, Nm s/rad
-ROTOR_INERTIA: Final = FRICTION_NUMBERS + 4  # J, kg m²
-BACKLASH: Final = FRICTION_NUMBERS + 6  # b, rad
-RIPPLE: Final = FRICTION_NUMBERS + 8  # Nm
-RIPPLE_SHARE: Final = FRICTION_NUMBERS + 10
-RIPPLE_PERIODS: Final = FRICTION_NUMBERS + 12  # n, per revolution of the joint
-RIPPLE_PHASE: Final = FRICTION_NUMBERS + 14  # rad
-MOTOR_VISCOUS: Final = FRICTION_NUMBERS + 16  # F_vm, Nm s/rad
-MOTOR_COULOMB: Final = FRICTION_NUMBERS + 18  # Nm
-ENCODER_ON_LINK: Final = FRICTION_NUMBERS + 20  # 1: the encoder is on the link side
-TRANSMISSION_NUMBERS: Final = FRICTION_NUMBERS + 22
-
-
 @compiled
-def spring_torque(mechanics: Vector, joint: int, twist_rad: float, twist_rad_s: float) -> float:
+def spring_torque(mechanics: np.void, joint: int, twist_rad: float, twist_rad_s: float) -> float:
     """Give τ_s in Nm of an elastic joint, twist = motor side minus link side."""
-    stiffness = mechanics[STIFFNESS + joint]
-    damping = mechanics[DAMPING + joint]
-    half_rad = 0.5 * mechanics[BACKLASH + joint]
+    stiffness = mechanics["stiffness_Nm_rad"][joint]
+    damping = mechanics["damping_Nm_s"][joint]
+    half_rad = 0.5 * mechanics["backlash_rad"][joint]
     if half_rad == 0.0:
         return float(stiffness * twist_rad + damping * twist_rad_s)
     if twist_rad > half_rad:
@@ -129,9 +135,11 @@ def spring_torque(mechanics: Vector, joint: int, twist_rad: float, twist_rad_s: 
 
 
 @compiled
-def ripple_torque(mechanics: Vector, joint: int, shaft_rad: float, motor_Nm: float) -> float:
+def ripple_torque(mechanics: np.void, joint: int, shaft_rad: float, motor_Nm: float) -> float:
     """Give the ripple in Nm that adds to the motor torque."""
-    amplitude = mechanics[RIPPLE + joint] + mechanics[RIPPLE_SHARE + joint] * abs(motor_Nm)
+    amplitude = mechanics["ripple_Nm"][joint] + mechanics["ripple_share"][joint] * abs(motor_Nm)
     if amplitude == 0.0:
         return 0.0
-    return float(amplitude * math.sin(mechanics[RIPPLE_PERIODS + joint] * shaft_rad + mechanics[RIPPLE_PHASE + joint]))
+    return float(
+        amplitude * math.sin(mechanics["ripple_periods"][joint] * shaft_rad + mechanics["ripple_phase_rad"][joint])
+    )

@@ -11,54 +11,14 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, ArmProfile
-from firmware_sim.arm.joint_mechanics import (
-    AMBIENT,
-    BACKLASH,
-    CAPACITY,
-    COOLING,
-    COULOMB_DROP,
-    DAMPING,
-    ENCODER_ON_LINK,
-    FREE,
-    LOAD,
-    MOTOR_COULOMB,
-    MOTOR_VISCOUS,
-    REFERENCE_C,
-    RIPPLE,
-    RIPPLE_PERIODS,
-    RIPPLE_PHASE,
-    RIPPLE_SHARE,
-    ROTOR_INERTIA,
-    SIGMA0,
-    SIGMA1,
-    SIGMA2,
-    STIFFNESS,
-    STRIBECK,
-    SURPLUS,
-    VISCOUS_DROP,
-)
-from firmware_sim.arm.mechanics import (
-    DOWNHILL,
-    GRAVITY,
-    HOLDING_BRAKE,
-    MECHANICS_NUMBERS,
-    STANDARD_GRAVITY_M_S2,
-)
-from firmware_sim.arm.plant import (
-    MECHANICAL_STATE,
-    ROTOR,
-    STOP_DAMPING,
-    STOP_HIGH,
-    STOP_LOW,
-    STOP_STIFFNESS,
-    fit_payload,
-    mass_matrix,
-)
+from firmware_sim.arm.joint_mechanics import MECHANICS_NUMBERS, REFERENCE_C
+from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.scripted_contact import TICK_S
 
+STANDARD_GRAVITY_M_S2: Final = 9.80665
+"""Standard gravity, CGPM 1901."""
 ENCODER_SIDES: Final = ("motor", "link")
 
 LARGEST_OSCILLATION: Final = 0.05
@@ -205,17 +165,13 @@ class MechanicsSettings:
                 "less stiffness or damping, or more inertia"
             )
 
-    def arm_numbers(self, arm: ArmProfile) -> Vector:
-        """Pack the arm with its stops for compiled functions (ARM_NUMBERS,)."""
+    def arm_numbers(self, arm: ArmProfile) -> np.void:
+        """Pack the arm with its stops for compiled functions, one element of ARM_NUMBERS."""
         numbers = arm.numbers()
         low_deg, high_deg = self._stops_deg(arm)
-        for place, pair in (
-            (STOP_LOW, np.radians(low_deg)),
-            (STOP_HIGH, np.radians(high_deg)),
-            (STOP_STIFFNESS, self.stop_stiffness_Nm_rad),
-            (STOP_DAMPING, self.stop_damping_Nm_s),
-        ):
-            numbers[place : place + 2] = pair
+        numbers["stop_low_rad"], numbers["stop_high_rad"] = np.radians(low_deg), np.radians(high_deg)
+        numbers["stop_stiffness_Nm_rad"] = self.stop_stiffness_Nm_rad
+        numbers["stop_damping_Nm_s"] = self.stop_damping_Nm_s
         return numbers
 
     def _stops_deg(self, arm: ArmProfile) -> tuple[Pair, Pair]:
@@ -223,45 +179,42 @@ class MechanicsSettings:
             return (-arm.stop_deg[0], -arm.stop_deg[1]), arm.stop_deg
         return self.stop_low_deg, self.stop_high_deg
 
-    def numbers(self, arm: ArmProfile) -> Vector:
-        """Pack for compiled functions (MECHANICS_NUMBERS,), by the places of friction, transmission and mechanics."""
-        numbers = np.zeros(MECHANICS_NUMBERS)
-
-        def put(place: int, pair: Sequence[float]) -> None:
-            numbers[place : place + 2] = pair
+    def numbers(self, arm: ArmProfile) -> np.void:
+        """Pack for compiled functions, one element of MECHANICS_NUMBERS."""
+        numbers: np.void = np.zeros(1, MECHANICS_NUMBERS)[0]
 
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
-        put(SURPLUS, surplus)
-        put(STRIBECK, self.stribeck_velocity_rad_s)
-        put(SIGMA0, self.sigma0_Nm_rad)
-        put(SIGMA1, self.sigma1_Nm_s)
-        put(SIGMA2, self._sigma2(arm))
-        put(LOAD, self.load_friction)
-        put(VISCOUS_DROP, self.viscous_drop_per_K)
-        put(COULOMB_DROP, self.coulomb_drop_per_K)
-        put(CAPACITY, self.heat_capacity_J_K)
-        put(COOLING, self.cooling_s)
-        put(AMBIENT, (self.ambient_C, self.ambient_C))
-        put(STIFFNESS, self.stiffness_Nm_rad)
-        put(DAMPING, self.damping_Nm_s)
-        put(ROTOR_INERTIA, self.rotor_inertia_kg_m2)
-        put(BACKLASH, self.backlash_rad)
-        put(RIPPLE, self.ripple_Nm)
-        put(RIPPLE_SHARE, self.ripple_share)
-        put(RIPPLE_PERIODS, self.ripple_periods)
-        put(RIPPLE_PHASE, np.radians(self.ripple_phase_deg).tolist())
-        put(MOTOR_VISCOUS, self.motor_viscous_Nm_s)
-        put(MOTOR_COULOMB, self.motor_coulomb_Nm)
-        put(HOLDING_BRAKE, self.holding_brake_Nm)
-        numbers[ENCODER_ON_LINK : ENCODER_ON_LINK + 2] = self.encoder_side == "link"
-        numbers[GRAVITY] = STANDARD_GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
-        numbers[DOWNHILL] = math.radians(self.tilt_direction_deg)
+        numbers["surplus_Nm"] = surplus
+        numbers["stribeck_rad_s"] = self.stribeck_velocity_rad_s
+        numbers["sigma0_Nm_rad"] = self.sigma0_Nm_rad
+        numbers["sigma1_Nm_s"] = self.sigma1_Nm_s
+        numbers["sigma2_Nm_s"] = self._sigma2(arm)
+        numbers["load_friction"] = self.load_friction
+        numbers["viscous_drop_per_K"] = self.viscous_drop_per_K
+        numbers["coulomb_drop_per_K"] = self.coulomb_drop_per_K
+        numbers["capacity_J_K"] = self.heat_capacity_J_K
+        numbers["cooling_s"] = self.cooling_s
+        numbers["ambient_C"] = self.ambient_C
+        numbers["stiffness_Nm_rad"] = self.stiffness_Nm_rad
+        numbers["damping_Nm_s"] = self.damping_Nm_s
+        numbers["rotor_inertia_kg_m2"] = self.rotor_inertia_kg_m2
+        numbers["backlash_rad"] = self.backlash_rad
+        numbers["ripple_Nm"] = self.ripple_Nm
+        numbers["ripple_share"] = self.ripple_share
+        numbers["ripple_periods"] = self.ripple_periods
+        numbers["ripple_phase_rad"] = np.radians(self.ripple_phase_deg)
+        numbers["motor_viscous_Nm_s"] = self.motor_viscous_Nm_s
+        numbers["motor_coulomb_Nm"] = self.motor_coulomb_Nm
+        numbers["holding_brake_Nm"] = self.holding_brake_Nm
+        numbers["is_encoder_on_link"] = self.encoder_side == "link"
+        numbers["gravity_m_s2"] = STANDARD_GRAVITY_M_S2 * math.sin(math.radians(self.tilt_deg))
+        numbers["downhill_rad"] = math.radians(self.tilt_direction_deg)
         for joint in range(2):
             is_dry = arm.coulomb_Nm[joint] + surplus[joint] + self.load_friction[joint] > 0.0
             is_stiff = self.stiffness_Nm_rad[joint] == 0.0
             on_link = is_dry and self.sigma0_Nm_rad[joint] == 0.0
             on_motor = is_stiff and self.motor_coulomb_Nm[joint] > 0.0
-            numbers[FREE + joint] = not (on_link or on_motor)
+            numbers["is_free"][joint] = not (on_link or on_motor)
         return numbers
 
     def _sigma2(self, arm: ArmProfile) -> Pair:
@@ -290,10 +243,10 @@ class MechanicsSettings:
                 damping += self.damping_Nm_s[joint] * np.outer(spring, spring)
         oscillation, largest = 0.0, 0.0
         for mass_kg, center_m, inertia_kg_m2 in payloads:
-            state = np.zeros(MECHANICAL_STATE)
+            state = np.zeros(1, MECHANICAL_STATE)[0]
             fit_payload(state, arm.numbers(), mass_kg, center_m[0], center_m[1], inertia_kg_m2)
             for joint in range(2):
-                state[ROTOR + joint] = 0.0 if joint in elastic else self.rotor_inertia_kg_m2[joint]
+                state["rotor_kg_m2"][joint] = 0.0 if joint in elastic else self.rotor_inertia_kg_m2[joint]
             for elbow_rad in np.linspace(0.0, math.pi, 5):
                 mass = np.zeros((size, size))
                 m11, m12, m22 = mass_matrix(state, float(elbow_rad))

@@ -28,47 +28,55 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.compiled import Structured, compiled, float_fields
+from firmware_sim.arm.joint_mechanics import PAIR
 from firmware_sim.arm.scripted_contact import contact_force, contact_torque
 
 CURRENT_LOOP_RAD_S: Final = 2.0 * math.pi * 1000.0
 """Bandwidth of the drive's torque loop; 1 kHz is usual for servo drives."""
 
-# Places in the vector that stands for an arm, see `firmware_sim.arm.arms.ArmProfile.numbers`. They are here and not
-# there because compiled code contains them, and the cache of compiled code is keyed by the modules that compile.
-ALPHA: Final = 0  # kg m², without payload, as BETA and GAMMA
-BETA: Final = 1
-GAMMA: Final = 2
-LENGTH: Final = 3  # 3, 4: m
-VISCOUS: Final = 5  # 5, 6: Nm s/rad
-COULOMB: Final = 7  # 7, 8: Nm
-TORQUE_LIMIT: Final = 9  # 9, 10: Nm
-BRAKE_DAMPING: Final = 11  # 11, 12: Nm s/rad
-CURRENT_LOOP: Final = 13  # 13, 14: rad/s, bandwidth of the drives' torque loops
-MOMENT: Final = 15  # kg m, first moment of all masses about joint 1 with link 2 folded into joint 2; without payload
-STOP_LOW: Final = 16  # 16, 17: rad
-STOP_HIGH: Final = 18  # 18, 19: rad
-STOP_STIFFNESS: Final = 20  # 20, 21: Nm/rad
-STOP_DAMPING: Final = 22  # 22, 23: Nm s/rad
-ARM_NUMBERS: Final = 24
+ARM_NUMBERS: Final = float_fields(
+    {
+        "alpha": (),  # kg m², without payload, as β and γ
+        "beta": (),
+        "gamma": (),
+        "length_m": PAIR,
+        "viscous_Nm_s": PAIR,
+        "coulomb_Nm": PAIR,
+        "torque_limit_Nm": PAIR,
+        "brake_damping_Nm_s": PAIR,
+        "current_loop_rad_s": PAIR,  # rad/s, bandwidth of the drives' torque loops
+        "moment_kg_m": (),  # first moment of all masses about joint 1 with link 2 folded into joint 2; no payload
+        "stop_low_rad": PAIR,
+        "stop_high_rad": PAIR,
+        "stop_stiffness_Nm_rad": PAIR,
+        "stop_damping_Nm_s": PAIR,
+    }
+)
+"""What `firmware_sim.arm.arms.ArmProfile.numbers` fills in. It is here and not there because compiled code contains it,
+and the cache of compiled code is keyed by the modules that compile."""
 
-# Places in the vector of the mechanical state.
-Q: Final = 0  # 0, 1: joint position, rad
-DQ: Final = 2  # 2, 3: joint velocity, rad/s
-TAU: Final = 4  # 4, 5: motor torque = joint torque, Nm
-PAYLOAD: Final = 6  # kg, part of the inertia below
-INERTIA: Final = 7  # 7, 8, 9: α, β, γ with payload, kg m²
-SKEW: Final = 10  # σ, kg m²
-ROTOR: Final = 11  # 11, 12: inertia of rotors that turn rigidly with their joints, kg m²
-SHAFT: Final = 13  # 13, 14: position of the motor side, rad; as q where the joint is stiff
-DSHAFT: Final = 15  # 15, 16: its velocity, rad/s
-JOINT_TORQUE: Final = 17  # 17, 18: torque through the sensor, Nm
-ENCODED: Final = 19  # 19, 20: position of the shaft that carries the encoder, rad
-BRISTLE: Final = 21  # 21, 22: deflection of LuGre's bristles, rad
-WARMTH: Final = 23  # 23, 24: temperature of the joint's lubricant, °C
-BRAKE: Final = 25  # 25, 26: torque of the holding brake that is closed, Nm
-MECHANICAL_STATE: Final = 27
+MECHANICAL_STATE: Final = float_fields(
+    {
+        "q": PAIR,  # joint position, rad
+        "dq": PAIR,  # joint velocity, rad/s
+        "tau_m": PAIR,  # motor torque = joint torque, Nm
+        "payload_kg": (),  # part of the inertia below
+        "alpha": (),  # kg m², with payload, as β and γ
+        "beta": (),
+        "gamma": (),
+        "sigma": (),  # σ, kg m²
+        "rotor_kg_m2": PAIR,  # inertia of rotors that turn rigidly with their joints, kg m²
+        "q_m": PAIR,  # position of the motor side, rad; as q where the joint is stiff
+        "dq_m": PAIR,  # its velocity, rad/s
+        "tau_J": PAIR,  # torque through the sensor, Nm
+        "q_encoder": PAIR,  # position of the shaft that carries the encoder, rad
+        "bristle_rad": PAIR,  # deflection of LuGre's bristles, rad
+        "temperature_C": PAIR,  # temperature of the joint's lubricant, °C
+        "brake_Nm": PAIR,  # torque of the holding brake that is closed, Nm
+    }
+)
+"""The arm in motion, as the integrators carry it on."""
 
 # A step is cut at most this often; a slip lasts much longer than a step, so three are never needed in practice.
 _LARGEST_CUTS: Final = 8
@@ -78,8 +86,8 @@ _BISECTIONS: Final = 40
 
 @compiled
 def fit_payload(
-    state: Vector,
-    arm: Vector,
+    state: np.void,
+    arm: np.void,
     payload_kg: float,
     along_m: float = 0.0,
     beside_m: float = 0.0,
@@ -90,39 +98,43 @@ def fit_payload(
     What is added was at rest: the momentum of the moving arm is shared with it, M q̇ stays. What is taken off leaves
     with the speed that it has: q̇ stays. At rest both change nothing but the inertia.
     """
-    added_kg = payload_kg - state[PAYLOAD]
-    m11, m12, m22 = mass_matrix(state, state[Q + 1])
-    momentum1 = m11 * state[DQ] + m12 * state[DQ + 1]
-    momentum2 = m12 * state[DQ] + m22 * state[DQ + 1]
-    length1_m, length2_m = arm[LENGTH], arm[LENGTH + 1]
-    state[PAYLOAD] = payload_kg
-    state[INERTIA] = arm[ALPHA] + payload_kg * length1_m * length1_m
+    added_kg = payload_kg - state["payload_kg"]
+    m11, m12, m22 = mass_matrix(state, state["q"][1])
+    momentum1 = m11 * state["dq"][0] + m12 * state["dq"][1]
+    momentum2 = m12 * state["dq"][0] + m22 * state["dq"][1]
+    length1_m, length2_m = arm["length_m"][0], arm["length_m"][1]
+    state["payload_kg"] = payload_kg
+    state["alpha"] = arm["alpha"] + payload_kg * length1_m * length1_m
     reach_m = length2_m + along_m
-    state[INERTIA + 1] = arm[BETA] + payload_kg * length1_m * reach_m
-    state[INERTIA + 2] = arm[GAMMA] + payload_kg * reach_m * reach_m
-    state[INERTIA + 2] += payload_kg * beside_m * beside_m + inertia_kg_m2
-    state[SKEW] = payload_kg * length1_m * beside_m
+    state["beta"] = arm["beta"] + payload_kg * length1_m * reach_m
+    state["gamma"] = arm["gamma"] + payload_kg * reach_m * reach_m
+    state["gamma"] += payload_kg * beside_m * beside_m + inertia_kg_m2
+    state["sigma"] = payload_kg * length1_m * beside_m
     if added_kg > 0.0 and (momentum1 != 0.0 or momentum2 != 0.0):
-        m11, m12, m22 = mass_matrix(state, state[Q + 1])
+        m11, m12, m22 = mass_matrix(state, state["q"][1])
         determinant = m11 * m22 - m12 * m12
-        state[DQ] = (m22 * momentum1 - m12 * momentum2) / determinant
-        state[DQ + 1] = (m11 * momentum2 - m12 * momentum1) / determinant
+        state["dq"][0] = (m22 * momentum1 - m12 * momentum2) / determinant
+        state["dq"][1] = (m11 * momentum2 - m12 * momentum1) / determinant
 
 
 @compiled
-def mass_matrix(state: Vector, q2: float) -> tuple[float, float, float]:
+def mass_matrix(state: np.void, q2: float) -> tuple[float, float, float]:
     """Give m11, m12, m22 of Jᵀ N J + R at the elbow angle q2, kg m²."""
-    coupling = state[INERTIA + 1] * math.cos(q2)
-    if state[SKEW] != 0.0:
-        coupling -= state[SKEW] * math.sin(q2)
-    m22 = state[INERTIA + 2]
-    return state[INERTIA] + m22 + 2.0 * coupling + state[ROTOR], m22 + coupling, m22 + state[ROTOR + 1]
+    coupling = state["beta"] * math.cos(q2)
+    if state["sigma"] != 0.0:
+        coupling -= state["sigma"] * math.sin(q2)
+    m22 = state["gamma"]
+    return (
+        state["alpha"] + m22 + 2.0 * coupling + state["rotor_kg_m2"][0],
+        m22 + coupling,
+        m22 + state["rotor_kg_m2"][1],
+    )
 
 
 @compiled
 def accelerate(
-    state: Vector,
-    arm: Vector,
+    state: np.void,
+    arm: np.void,
     slip1: int,
     slip2: int,
     torque1: float,
@@ -136,17 +148,17 @@ def accelerate(
     torque is motor plus external torque. A sticking joint has no acceleration; its friction is what it takes to hold,
     be it more than F_c or not.
     """
-    sine = state[INERTIA + 1] * math.sin(q2)
-    if state[SKEW] != 0.0:
-        sine += state[SKEW] * math.cos(q2)
+    sine = state["beta"] * math.sin(q2)
+    if state["sigma"] != 0.0:
+        sine += state["sigma"] * math.cos(q2)
     m11, m12, m22 = mass_matrix(state, q2)
     rate2 = dq1 + dq2
     # Jᵀ of the centrifugal terms, less viscous friction
     centrifugal2 = -sine * dq1 * dq1
-    drive1 = torque1 + sine * rate2 * rate2 + centrifugal2 - arm[VISCOUS] * dq1
-    drive2 = torque2 + centrifugal2 - arm[VISCOUS + 1] * dq2
-    friction1 = arm[COULOMB] * slip1
-    friction2 = arm[COULOMB + 1] * slip2
+    drive1 = torque1 + sine * rate2 * rate2 + centrifugal2 - arm["viscous_Nm_s"][0] * dq1
+    drive2 = torque2 + centrifugal2 - arm["viscous_Nm_s"][1] * dq2
+    friction1 = arm["coulomb_Nm"][0] * slip1
+    friction2 = arm["coulomb_Nm"][1] * slip2
     if slip1 != 0 and slip2 != 0:
         net1 = drive1 - friction1
         net2 = drive2 - friction2
@@ -163,7 +175,7 @@ def accelerate(
 
 @compiled
 def decide_slips(
-    state: Vector, arm: Vector, torque1: float, torque2: float, q2: float, dq1: float, dq2: float
+    state: np.void, arm: np.void, torque1: float, torque2: float, q2: float, dq1: float, dq2: float
 ) -> tuple[int, int]:
     """Say how each joint goes on: the sign of its velocity, or at standstill whether and which way it breaks away.
 
@@ -183,10 +195,10 @@ def decide_slips(
             ddq1, ddq2, friction1, friction2 = accelerate(state, arm, choice1, choice2, torque1, torque2, q2, dq1, dq2)
             violation = 0.0
             if dq1 == 0.0:
-                excess = -ddq1 * choice1 if choice1 != 0 else abs(friction1) - arm[COULOMB]
+                excess = -ddq1 * choice1 if choice1 != 0 else abs(friction1) - arm["coulomb_Nm"][0]
                 violation = max(violation, excess)
             if dq2 == 0.0:
-                excess = -ddq2 * choice2 if choice2 != 0 else abs(friction2) - arm[COULOMB + 1]
+                excess = -ddq2 * choice2 if choice2 != 0 else abs(friction2) - arm["coulomb_Nm"][1]
                 violation = max(violation, excess)
             if violation < best_violation:
                 best1, best2, best_violation = choice1, choice2, violation
@@ -196,26 +208,32 @@ def decide_slips(
 
 
 @compiled
-def _stop_torque(arm: Vector, joint: int, q: float, dq: float) -> float:
+def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
     """Give the torque of a joint stop, Nm."""
-    if q > arm[STOP_HIGH + joint]:
-        push = -arm[STOP_STIFFNESS + joint] * (q - arm[STOP_HIGH + joint]) - arm[STOP_DAMPING + joint] * dq
+    if q > arm["stop_high_rad"][joint]:
+        push = (
+            -arm["stop_stiffness_Nm_rad"][joint] * (q - arm["stop_high_rad"][joint])
+            - arm["stop_damping_Nm_s"][joint] * dq
+        )
         return float(min(0.0, push))
-    if q < arm[STOP_LOW + joint]:
-        push = -arm[STOP_STIFFNESS + joint] * (q - arm[STOP_LOW + joint]) - arm[STOP_DAMPING + joint] * dq
+    if q < arm["stop_low_rad"][joint]:
+        push = (
+            -arm["stop_stiffness_Nm_rad"][joint] * (q - arm["stop_low_rad"][joint])
+            - arm["stop_damping_Nm_s"][joint] * dq
+        )
         return float(max(0.0, push))
     return 0.0
 
 
 @compiled
 def external_torque(
-    arm: Vector, contact: Vector, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
+    arm: np.void, contact: Structured, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Give the external torque of a contact row and of the joint stops; an empty row: nobody touches the arm."""
+    """Give the external torque of a contact, one row of the table or none, and of the joint stops."""
     stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:
         return stop1, stop2
-    ext1, ext2 = contact_torque(contact, contact_force(contact, elapsed_s), arm[LENGTH], q1, q2)
+    ext1, ext2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s), arm["length_m"][0], q1, q2)
     return ext1 + stop1, ext2 + stop2
 
 
@@ -232,20 +250,20 @@ def follow_target(tau_Nm: float, target_Nm: float, turn: float) -> tuple[float, 
 
 
 @compiled
-def mirror_stiff_joints(state: Vector) -> None:
+def mirror_stiff_joints(state: np.void) -> None:
     """Say what the sensors sit on where the joints are stiff: motor side is link side, joint torque is motor torque."""
     for joint in range(2):
-        state[SHAFT + joint] = state[Q + joint]
-        state[DSHAFT + joint] = state[DQ + joint]
-        state[ENCODED + joint] = state[Q + joint]
-        state[JOINT_TORQUE + joint] = state[TAU + joint]
+        state["q_m"][joint] = state["q"][joint]
+        state["dq_m"][joint] = state["dq"][joint]
+        state["q_encoder"][joint] = state["q"][joint]
+        state["tau_J"][joint] = state["tau_m"][joint]
 
 
 @compiled
 def _runge_kutta(
-    state: Vector,
-    arm: Vector,
-    contact: Vector,
+    state: np.void,
+    arm: np.void,
+    contact: Structured,
     elapsed_s: float,
     slip1: int,
     slip2: int,
@@ -261,8 +279,8 @@ def _runge_kutta(
 ) -> tuple[float, float, float, float, float, float]:
     """Advance q1, q2, dq1, dq2, tau1, tau2 by one step of classical RK4 with constant slips."""
     half_s = 0.5 * step_s
-    mid1, end1 = follow_target(tau1, target1, arm[CURRENT_LOOP] * step_s)
-    mid2, end2 = follow_target(tau2, target2, arm[CURRENT_LOOP + 1] * step_s)
+    mid1, end1 = follow_target(tau1, target1, arm["current_loop_rad_s"][0] * step_s)
+    mid2, end2 = follow_target(tau2, target2, arm["current_loop_rad_s"][1] * step_s)
 
     ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
     a1, a2, _, _ = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
@@ -295,9 +313,9 @@ def _runge_kutta(
 
 @compiled
 def _margin(
-    state: Vector,
-    arm: Vector,
-    contact: Vector,
+    state: np.void,
+    arm: np.void,
+    contact: Structured,
     elapsed_s: float,
     slip1: int,
     slip2: int,
@@ -314,24 +332,25 @@ def _margin(
         ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
         _, _, friction1, friction2 = accelerate(state, arm, slip1, slip2, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
         if slip1 == 0:
-            margin = min(margin, arm[COULOMB] - abs(friction1))
+            margin = min(margin, arm["coulomb_Nm"][0] - abs(friction1))
         if slip2 == 0:
-            margin = min(margin, arm[COULOMB + 1] - abs(friction2))
+            margin = min(margin, arm["coulomb_Nm"][1] - abs(friction2))
     return margin
 
 
 @compiled
 def integrate(
-    state: Vector, arm: Vector, contact: Vector, elapsed_s: float, target1: float, target2: float, step_s: float
+    state: np.void, arm: np.void, contact: Structured, elapsed_s: float, target1: float, target2: float, step_s: float
 ) -> None:
     """Advance the mechanical state by `step_s`, cutting the step where a joint stops, reverses or breaks away.
 
-    contact: row of the contact table, or empty. elapsed_s: time since that contact's onset at the start of the step.
+    contact: one row of the contact table, or none. elapsed_s: time since that contact's onset at the start of the step.
     target: what the drive's torque loops are asked for, Nm, constant over the step.
     """
     left_s = step_s
     for cut in range(_LARGEST_CUTS):
-        q1, q2, dq1, dq2, tau1, tau2 = state[0], state[1], state[2], state[3], state[4], state[5]
+        q1, q2, dq1, dq2 = state["q"][0], state["q"][1], state["dq"][0], state["dq"][1]
+        tau1, tau2 = state["tau_m"][0], state["tau_m"][1]
         ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
         slip1, slip2 = decide_slips(state, arm, tau1 + ext1, tau2 + ext2, q2, dq1, dq2)
         advanced_s = left_s
@@ -352,11 +371,11 @@ def integrate(
                     after = trial
                 else:
                     fits_s = middle_s
-        state[Q], state[Q + 1] = after[0], after[1]
+        state["q"][0], state["q"][1] = after[0], after[1]
         # A velocity that has passed zero is zero: the joint stands, for this instant at least.
-        state[DQ] = after[2] if after[2] * slip1 > 0.0 else 0.0
-        state[DQ + 1] = after[3] if after[3] * slip2 > 0.0 else 0.0
-        state[TAU], state[TAU + 1] = after[4], after[5]
+        state["dq"][0] = after[2] if after[2] * slip1 > 0.0 else 0.0
+        state["dq"][1] = after[3] if after[3] * slip2 > 0.0 else 0.0
+        state["tau_m"][0], state["tau_m"][1] = after[4], after[5]
         elapsed_s += advanced_s
         left_s -= advanced_s
         if left_s <= 0.0:

@@ -16,10 +16,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.settings.schema import ConfigError, setting
 
 TICK_S: Final = 1e-4
@@ -28,18 +26,21 @@ TICK_S: Final = 1e-4
 SHAPES: Final = ("step", "half_sine", "push")
 FRAMES: Final = ("link", "world")
 
-# Columns of a contact table, one row per contact.
-ONSET_TICK: Final = 0
-END_TICK: Final = 1
-DURATION_S: Final = 2
-RAMP_S: Final = 3
-LINK: Final = 4
-POINT_M: Final = 5
-ANGLE_RAD: Final = 6
-FRAME: Final = 7  # index into FRAMES
-SHAPE: Final = 8  # index into SHAPES
-FORCE_N: Final = 9
-COLUMNS: Final = 10
+CONTACT: Final = float_fields(
+    {
+        "onset_tick": (),
+        "end_tick": (),
+        "duration_s": (),
+        "ramp_s": (),
+        "link": (),
+        "point_m": (),
+        "angle_rad": (),
+        "frame": (),  # index into FRAMES
+        "shape": (),  # index into SHAPES
+        "force_N": (),
+    }
+)
+"""One row of a contact table."""
 
 _WORLD: Final = FRAMES.index("world")
 _HALF_SINE: Final = SHAPES.index("half_sine")
@@ -92,54 +93,54 @@ class ContactSettings:
             return self.force_N * (self.duration_s - self._rise_s())
         return self.force_N * self.duration_s
 
-    def row(self) -> list[float]:
-        """Pack the contact for compiled functions, by the columns named above."""
+    def row(self) -> tuple[float, ...]:
+        """Pack the contact for compiled functions, in the order of CONTACT."""
         duration_s = (self.end_tick - self.onset_tick) * TICK_S
-        row = [0.0] * COLUMNS
-        row[ONSET_TICK] = self.onset_tick
-        row[END_TICK] = self.end_tick
-        row[DURATION_S] = duration_s
-        row[RAMP_S] = min(self._rise_s(), 0.5 * duration_s)
-        row[LINK] = self.link
-        row[POINT_M] = self.point_m
-        row[ANGLE_RAD] = math.radians(self.angle_deg)
-        row[FRAME] = FRAMES.index(self.frame)
-        row[SHAPE] = SHAPES.index(self.shape)
-        row[FORCE_N] = self.force_N
-        return row
+        return (
+            self.onset_tick,
+            self.end_tick,
+            duration_s,
+            min(self._rise_s(), 0.5 * duration_s),
+            self.link,
+            self.point_m,
+            math.radians(self.angle_deg),
+            FRAMES.index(self.frame),
+            SHAPES.index(self.shape),
+            self.force_N,
+        )
 
     def _rise_s(self) -> float:
         return 0.25 * self.duration_s if self.ramp_s is None else self.ramp_s
 
 
-def contact_table(contacts: tuple[ContactSettings, ...]) -> NDArray[np.float64]:
-    """Pack contacts (n, COLUMNS)."""
-    return np.array([contact.row() for contact in contacts], dtype=np.float64).reshape(len(contacts), COLUMNS)
+def contact_table(contacts: tuple[ContactSettings, ...]) -> Structured:
+    """Pack contacts (n,), with the fields of CONTACT."""
+    return np.array([contact.row() for contact in contacts], dtype=CONTACT)
 
 
 @compiled
-def contact_force(contact: Vector, elapsed_s: float) -> float:
+def contact_force(contact: np.void, elapsed_s: float) -> float:
     """Give the force in N of a contact, a row of the table, `elapsed_s` after its onset and before its end."""
-    duration_s = contact[DURATION_S]
-    if contact[SHAPE] == _HALF_SINE:
-        return float(contact[FORCE_N] * math.sin(math.pi * elapsed_s / duration_s))
-    if contact[SHAPE] == _PUSH:
+    duration_s = contact["duration_s"]
+    if contact["shape"] == _HALF_SINE:
+        return float(contact["force_N"] * math.sin(math.pi * elapsed_s / duration_s))
+    if contact["shape"] == _PUSH:
         rise_s = min(elapsed_s, duration_s - elapsed_s)
-        return float(contact[FORCE_N] * min(1.0, rise_s / contact[RAMP_S]))
-    return float(contact[FORCE_N])
+        return float(contact["force_N"] * min(1.0, rise_s / contact["ramp_s"]))
+    return float(contact["force_N"])
 
 
 @compiled
-def contact_torque(contact: Vector, force_N: float, length1_m: float, q1: float, q2: float) -> tuple[float, float]:
+def contact_torque(contact: np.void, force_N: float, length1_m: float, q1: float, q2: float) -> tuple[float, float]:
     """Give the external torque of the two joints, J(q)ᵀ F, Nm: moments of the force about the two joint axes.
 
     A force at the angle ψ has the moment p F sin(ψ − φ) about the joint at the other end of the lever p, which
     itself points along φ.
     """
-    link2 = contact[LINK] == 2.0
+    link2 = contact["link"] == 2.0
     phi = q1 + q2 if link2 else q1
-    psi = contact[ANGLE_RAD] if contact[FRAME] == _WORLD else phi + contact[ANGLE_RAD]
-    moment = contact[POINT_M] * force_N * math.sin(psi - phi)
+    psi = contact["angle_rad"] if contact["frame"] == _WORLD else phi + contact["angle_rad"]
+    moment = contact["point_m"] * force_N * math.sin(psi - phi)
     if link2:
         return moment + length1_m * force_N * math.sin(psi - q1), moment
     return moment, 0.0

@@ -1,7 +1,7 @@
 """Forces between the arm and bodies, hands and walls: penalty contacts with state, for the integrator of the arm.
 
 The arm is seen as the axes of its links. Each thing of a scenario is a row of the touch table; together they have one
-state vector: the energy, then THING_STATE places per row. Things never touch each other.
+state vector: the energy, then THING_PLACES places per row. Things never touch each other.
 
     body   F = max(0, K δ + c δ̇) along the normal n from the link to the body, at the point nearest to its centre.
            δ is the penetration. The body moves in its free direction u: m ṡ̇ = F n·u, s = 0 where it stands. Its
@@ -20,63 +20,72 @@ since the arm was last untouched.
 """
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.records import Vector
-from firmware_sim.arm.arms import ArmProfile
-from firmware_sim.arm.scripted_contact import LINK as CONTACT_LINK
-from firmware_sim.arm.scripted_contact import TICK_S, contact_force, contact_torque, ticks
-
-if TYPE_CHECKING:
-    from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
-    from firmware_sim.scenario.scenario import Scenario
+from firmware_sim.arm.scripted_contact import TICK_S, contact_force, contact_torque
 
 BODY: Final = 0
 HAND: Final = 1
 WALL: Final = 2
 
-# Columns of a touch table, one row per thing, in the order bodies, hands, walls.
-KIND: Final = 0  # BODY, HAND, WALL
-INDEX: Final = 1  # in the order contacts, bodies, hands, walls
-ONSET_S: Final = 2  # on the 100 µs grid
-END_S: Final = 3  # inf: never
-LINK: Final = 4
-LENGTH1_M: Final = 5
-LENGTH2_M: Final = 6
-X_M: Final = 7  # body: centre; hand: where it guides to; wall: a point of it
-Y_M: Final = 8
-ANGLE_RAD: Final = 9  # body: free direction, nan for the normal; hand: direction, nan for none; wall: normal
-STIFFNESS: Final = 10  # N/m
-DAMPING: Final = 11  # body, hand: N s/m; wall: s/m
-MASS: Final = 12  # kg, body
-RADIUS_M: Final = 13  # body
-ROOM_M: Final = 14  # body: how far it can recede
-POINT_M: Final = 15  # hand
-FORCE_LIMIT: Final = 16  # N, hand
-SPEED: Final = 17  # m/s, hand
-STIFF_RATE: Final = 18  # rad/s, largest √(K/μ) against the unloaded arm in any pose
-DAMPED_RATE: Final = 19  # 1/s, largest c/μ
-TOUCH_COLUMNS: Final = 20
+THING: Final = float_fields(
+    {
+        "kind": (),  # BODY, HAND, WALL
+        "index": (),  # in the order contacts, bodies, hands, walls
+        "onset_s": (),  # on the 100 µs grid
+        "end_s": (),  # inf: never
+        "link": (),
+        "length1_m": (),
+        "length2_m": (),
+        "x_m": (),  # body: centre; hand: where it guides to; wall: a point of it
+        "y_m": (),
+        "angle_rad": (),  # body: free direction, nan for the normal; hand: direction, nan for none; wall: normal
+        "stiffness": (),  # N/m
+        "damping": (),  # body, hand: N s/m; wall: s/m
+        "mass_kg": (),  # body
+        "radius_m": (),  # body
+        "room_m": (),  # body: how far it can recede
+        "point_m": (),  # hand
+        "force_limit_N": (),  # hand
+        "speed_m_s": (),  # hand
+        "stiff_rate_rad_s": (),  # largest √(K/μ) against the unloaded arm in any pose
+        "damped_rate_1_s": (),  # largest c/μ
+    }
+)
+"""One row of a touch table, in the order bodies, hands, walls."""
 
-# Places in the touch state.
+# Places in the touch state, which an integrator carries on as a whole: the energy, then each thing's part.
 ENERGY: Final = 0  # J
-TOUCH_HEADER: Final = 1  # the first thing's places begin here
-THING_STATE: Final = 6
-PRESENCE: Final = 0  # of a thing: one of the three below
-SHIFT: Final = 1  # body: s, m
-SHIFT_RATE: Final = 2  # body: ṡ, m/s
-FREE_X: Final = 3  # body: u; wall: normal
-FREE_Y: Final = 4
-SIDE: Final = 5  # body: +1 on the side of +q of its link, else −1
-START_X: Final = 1  # hand: where it grasped, m
-START_Y: Final = 2
-PATH_X: Final = 3  # hand: direction of its way; 0, 0 for none
-PATH_Y: Final = 4
-PATH_LENGTH: Final = 5  # hand: m, inf for no end
+TOUCH_HEADER: Final = 1
+
+THING_STATE: Final = float_fields(
+    {
+        "presence": (),  # one of the three below
+        "shift_m": (),  # body: s
+        "shift_rate_m_s": (),  # body: ṡ
+        "free_x": (),  # body: u; wall: normal
+        "free_y": (),
+        "side": (),  # body: +1 on the side of +q of its link, else −1
+    }
+)
+"""A body's or a wall's part of the touch state."""
+
+HAND_STATE: Final = float_fields(
+    {
+        "presence": (),  # one of the three below
+        "start_x_m": (),  # where it grasped, m
+        "start_y_m": (),
+        "path_x": (),  # direction of its way; 0, 0 for none
+        "path_y": (),
+        "path_length_m": (),  # inf for no end
+    }
+)
+"""A hand's part, of the same size."""
+THING_PLACES: Final = THING_STATE.itemsize // 8
 
 Pose = tuple[float, float, float, float]
 """Cosine and sine of the angle of link 1, cosine and sine of the angle of link 2."""
@@ -86,122 +95,32 @@ _PRESENT: Final = 1.0
 _GONE: Final = 2.0
 _HALF_TICK_S: Final = 0.5 * TICK_S
 
-# Places in what `describe_touch` fills.
-FORCE: Final = 0  # N, the strongest force
-STRONGEST_LINK: Final = 1  # 0 for none
-STRONGEST_INDEX: Final = 2  # −1 for none
-POWER: Final = 3  # W
-TRUE_ENERGY: Final = 4  # J
-TOUCH_TRUTH: Final = 5
-
-_POSES: Final = 181
-_POINTS: Final = 61
-"""Grid on which the smallest effective mass of the arm is searched: 1° of the elbow, 1/60 of the link."""
-_LARGEST_TURN_RAD: Final = 0.1
-"""Largest rate times step. RK4 then gets a blow's impulse to 3e-4 and its energy to 8e-4, wherever in a step it begins;
-with a tenth (a third) of critical damping, whose force jumps, its impulse to 3e-3 (6e-3). At 0.17 rad: 6e-4, 2e-3."""
-_FASTEST_BLOW_M_S: Final = 2.0
-"""Fastest blow that `largest_rate_rad_s` covers: the tip of both links, straight, at 180 deg/s."""
+TOUCH_TRUTH: Final = float_fields(
+    {
+        "force_N": (),  # the strongest force
+        "link": (),  # 0 for none
+        "index": (),  # −1 for none
+        "power_W": (),
+        "energy_J": (),
+    }
+)
+"""What `describe_touch` fills."""
 
 
-def _largest_mobility(arm: ArmProfile, link: int, points_m: Vector) -> float:
-    """Give the largest 1/mass, 1/kg, that the unloaded arm shows a force at these points of a link, in any pose."""
-    alpha, beta, gamma = arm.inertia()
-    length1_m = arm.link_length_m[0]
-    elbow_rad, point_m = np.meshgrid(np.linspace(0.0, math.pi, _POSES), points_m)
-    if link == 1:
-        point_m, length1_m = np.zeros_like(point_m), float(points_m.max())
-    # At q₁ = 0. In absolute link angles the point's velocity is l₁ φ̇₁ (0, 1) + p φ̇₂ (−sin q₂, cos q₂), the mass matrix
-    # [[α, β cos q₂], [β cos q₂, γ]]; its inverse lies between two Jacobians.
-    coupling = beta * np.cos(elbow_rad)
-    determinant = alpha * gamma - coupling**2
-    j21, j12, j22 = length1_m, -point_m * np.sin(elbow_rad), point_m * np.cos(elbow_rad)
-    w11 = j12 * j12 * alpha / determinant
-    w12 = (j12 * j22 * alpha - j12 * j21 * coupling) / determinant
-    w22 = (j21 * j21 * gamma - 2.0 * j21 * j22 * coupling + j22 * j22 * alpha) / determinant
-    largest = 0.5 * (w11 + w22) + np.sqrt(0.25 * (w11 - w22) ** 2 + w12**2)
-    return float(largest.max())
+@compiled
+def _own(state: Vector, row: int) -> np.void:
+    """Give a body's or a wall's part of the touch state, or of its rates, to read and to write."""
+    place = TOUCH_HEADER + row * THING_PLACES
+    part: np.void = state[place : place + THING_PLACES].view(THING_STATE)[0]
+    return part
 
 
-def _row(kind: int, arm: ArmProfile, thing: "BodySettings | HandSettings | WallSettings") -> Vector:
-    """Fill the columns that all things have."""
-    row = np.full(TOUCH_COLUMNS, np.nan)
-    row[KIND] = kind
-    row[ONSET_S] = ticks(thing.at_s) * TICK_S
-    row[END_S] = math.inf if thing.duration_s is None else (ticks(thing.at_s) + ticks(thing.duration_s)) * TICK_S
-    row[LENGTH1_M], row[LENGTH2_M] = arm.link_length_m
-    return row
-
-
-def _body_row(arm: ArmProfile, body: "BodySettings") -> Vector:
-    row = _row(BODY, arm, body)
-    row[LINK], row[X_M], row[Y_M] = body.link, body.x_m, body.y_m
-    row[STIFFNESS], row[DAMPING], row[MASS] = body.stiffness, body.damping_N_s_m, body.mass
-    row[RADIUS_M], row[ROOM_M] = body.radius_m, body.room_m
-    row[ANGLE_RAD] = math.nan if body.free_deg is None else math.radians(body.free_deg)
-    points_m = np.linspace(0.0, arm.link_length_m[body.link - 1], _POINTS)
-    mobility = _largest_mobility(arm, body.link, points_m) + 1.0 / body.mass
-    row[STIFF_RATE], row[DAMPED_RATE] = math.sqrt(body.stiffness * mobility), body.damping_N_s_m * mobility
-    return row
-
-
-def _hand_row(arm: ArmProfile, hand: "HandSettings") -> Vector:
-    row = _row(HAND, arm, hand)
-    row[LINK], row[POINT_M], row[FORCE_LIMIT], row[SPEED] = hand.link, hand.point_m, hand.force_limit_N, hand.speed_m_s
-    row[STIFFNESS], row[DAMPING] = hand.stiffness_N_m, hand.damping_N_s_m
-    if hand.move_to_m is not None:
-        row[X_M], row[Y_M] = hand.move_to_m
-    if hand.direction_deg is not None:
-        row[ANGLE_RAD] = math.radians(hand.direction_deg)
-    mobility = _largest_mobility(arm, hand.link, np.array([hand.point_m]))
-    row[STIFF_RATE], row[DAMPED_RATE] = math.sqrt(hand.stiffness_N_m * mobility), hand.damping_N_s_m * mobility
-    return row
-
-
-def _wall_row(arm: ArmProfile, wall: "WallSettings") -> Vector:
-    row = _row(WALL, arm, wall)
-    row[X_M], row[Y_M], row[ANGLE_RAD] = wall.x_m, wall.y_m, math.radians(wall.normal_deg)
-    row[STIFFNESS], row[DAMPING] = wall.stiffness_N_m, wall.damping_s_m
-    mobility = max(_largest_mobility(arm, link, np.array([arm.link_length_m[link - 1]])) for link in (1, 2))
-    row[STIFF_RATE] = math.sqrt(wall.stiffness_N_m * mobility)
-    # ∂F/∂δ̇ = K χ δ is largest at the deepest point of a blow with v, about v/√(K/μ).
-    row[DAMPED_RATE] = row[STIFF_RATE] * wall.damping_s_m * _FASTEST_BLOW_M_S
-    return row
-
-
-def touch_table(scenario: "Scenario") -> NDArray[np.float64]:
-    """Pack a scenario's bodies, hands and walls (n, TOUCH_COLUMNS); n = 0 when it has none."""
-    arm = scenario.arm
-    rows = [_body_row(arm, body) for body in scenario.bodies]
-    rows += [_hand_row(arm, hand) for hand in scenario.hands]
-    rows += [_wall_row(arm, wall) for wall in scenario.walls]
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), TOUCH_COLUMNS)
-    table[:, INDEX] = len(scenario.contacts) + np.arange(len(rows))
-    return table
-
-
-def initial_touch_state(things: NDArray[np.float64]) -> Vector:
-    """Give the state at power-on: nothing is there (TOUCH_HEADER + n THING_STATE,)."""
-    return np.zeros(TOUCH_HEADER + things.shape[0] * THING_STATE)
-
-
-def largest_rate_rad_s(things: NDArray[np.float64]) -> float:
-    """Bound the fastest rate, rad/s, that touching gives the unloaded arm; 0 for an empty table.
-
-    Things that can be there at the same time add up: squares of the springs' rates, and the dampers' rates.
-    """
-    largest = 0.0
-    for onset_s in things[:, ONSET_S]:
-        there = things[(things[:, ONSET_S] <= onset_s) & (things[:, END_S] > onset_s)]
-        largest = max(
-            largest, math.sqrt(float(np.sum(there[:, STIFF_RATE] ** 2))), float(np.sum(there[:, DAMPED_RATE]))
-        )
-    return largest
-
-
-def touch_substeps(things: NDArray[np.float64]) -> int:
-    """Say into how many steps a tick of 100 µs must be cut for classical RK4."""
-    return max(1, math.ceil(largest_rate_rad_s(things) * TICK_S / _LARGEST_TURN_RAD))
+@compiled
+def _hand(state: Vector, row: int) -> np.void:
+    """Give a hand's part of the touch state, to read and to write."""
+    place = TOUCH_HEADER + row * THING_PLACES
+    part: np.void = state[place : place + THING_PLACES].view(HAND_STATE)[0]
+    return part
 
 
 @compiled
@@ -241,91 +160,95 @@ def _joint_torque(
 
 
 @compiled
-def _meet(thing: Vector, own: Vector, pose: Pose) -> tuple[float, float, float, float, float]:
+def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float, float, float]:
     """Say where a body's link meets it: penetration and point along the link in m, normal x, y, distance across in m.
 
     The normal points from the link to the body; the last is the signed distance of its centre from the link's line.
     """
     along_x, along_y, link2_x, link2_y = pose
-    length_m = thing[LENGTH1_M]
-    off_x = thing[X_M] + own[SHIFT] * own[FREE_X]
-    off_y = thing[Y_M] + own[SHIFT] * own[FREE_Y]
-    if thing[LINK] == 2.0:
+    length_m = thing["length1_m"]
+    off_x = thing["x_m"] + own["shift_m"] * own["free_x"]
+    off_y = thing["y_m"] + own["shift_m"] * own["free_y"]
+    if thing["link"] == 2.0:
         off_x -= length_m * along_x
         off_y -= length_m * along_y
-        length_m, along_x, along_y = thing[LENGTH2_M], link2_x, link2_y
+        length_m, along_x, along_y = thing["length2_m"], link2_x, link2_y
     point_m = off_x * along_x + off_y * along_y
     across_m = off_y * along_x - off_x * along_y
     if 0.0 <= point_m <= length_m:
-        side = own[SIDE]
-        return thing[RADIUS_M] - side * across_m, point_m, -side * along_y, side * along_x, across_m
+        side = own["side"]
+        return thing["radius_m"] - side * across_m, point_m, -side * along_y, side * along_x, across_m
     end_m = 0.0 if point_m < 0.0 else length_m
     off_x -= end_m * along_x
     off_y -= end_m * along_y
     distance_m = math.hypot(off_x, off_y)
-    return thing[RADIUS_M] - distance_m, end_m, off_x / distance_m, off_y / distance_m, across_m
+    return thing["radius_m"] - distance_m, end_m, off_x / distance_m, off_y / distance_m, across_m
 
 
 @compiled
-def _recede_rate(thing: Vector, own: Vector) -> float:
+def _recede_rate(thing: np.void, own: np.void) -> float:
     """Give the velocity of a body along its free direction, m/s: none into the wall behind it.
 
     What its speed ṡ gathers against the wall within a tick is taken away between ticks.
     """
-    if own[SHIFT] >= thing[ROOM_M] and own[SHIFT_RATE] > 0.0:
+    if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         return 0.0
-    return float(own[SHIFT_RATE])
+    return float(own["shift_rate_m_s"])
 
 
 @compiled
-def _body_force(thing: Vector, own: Vector, pose: Pose, dq1: float, dq2: float) -> tuple[float, float, float, float]:
+def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float) -> tuple[float, float, float, float]:
     """Give a body's force on the arm, N, as x and y, its point in m, and the penetration in m."""
     depth_m, point_m, normal_x, normal_y, _ = _meet(thing, own, pose)
     if depth_m <= 0.0:
         return 0.0, 0.0, point_m, depth_m
-    _, _, dx, dy = _moved_point(thing[LINK], point_m, thing[LENGTH1_M], pose, dq1, dq2)
+    _, _, dx, dy = _moved_point(thing["link"], point_m, thing["length1_m"], pose, dq1, dq2)
     recede = _recede_rate(thing, own)
-    rate = normal_x * (dx - recede * own[FREE_X]) + normal_y * (dy - recede * own[FREE_Y])
-    force = max(0.0, thing[STIFFNESS] * depth_m + thing[DAMPING] * rate)
+    rate = normal_x * (dx - recede * own["free_x"]) + normal_y * (dy - recede * own["free_y"])
+    force = max(0.0, thing["stiffness"] * depth_m + thing["damping"] * rate)
     return -force * normal_x, -force * normal_y, point_m, depth_m
 
 
 @compiled
-def _hand_force(thing: Vector, own: Vector, time_s: float, pose: Pose, dq1: float, dq2: float) -> tuple[float, float]:
+def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: float, dq2: float) -> tuple[float, float]:
     """Give a hand's force on the arm, N, as x and y."""
-    x, y, dx, dy = _moved_point(thing[LINK], thing[POINT_M], thing[LENGTH1_M], pose, dq1, dq2)
-    way_m = thing[SPEED] * (time_s - thing[ONSET_S])
-    speed = thing[SPEED]
-    if way_m >= own[PATH_LENGTH]:
-        way_m, speed = own[PATH_LENGTH], 0.0
-    force_x = thing[STIFFNESS] * (own[START_X] + way_m * own[PATH_X] - x) + thing[DAMPING] * (speed * own[PATH_X] - dx)
-    force_y = thing[STIFFNESS] * (own[START_Y] + way_m * own[PATH_Y] - y) + thing[DAMPING] * (speed * own[PATH_Y] - dy)
+    x, y, dx, dy = _moved_point(thing["link"], thing["point_m"], thing["length1_m"], pose, dq1, dq2)
+    way_m = thing["speed_m_s"] * (time_s - thing["onset_s"])
+    speed = thing["speed_m_s"]
+    if way_m >= own["path_length_m"]:
+        way_m, speed = own["path_length_m"], 0.0
+    force_x = thing["stiffness"] * (own["start_x_m"] + way_m * own["path_x"] - x) + thing["damping"] * (
+        speed * own["path_x"] - dx
+    )
+    force_y = thing["stiffness"] * (own["start_y_m"] + way_m * own["path_y"] - y) + thing["damping"] * (
+        speed * own["path_y"] - dy
+    )
     size = math.sqrt(force_x * force_x + force_y * force_y)
-    if size > thing[FORCE_LIMIT]:
-        force_x *= thing[FORCE_LIMIT] / size
-        force_y *= thing[FORCE_LIMIT] / size
+    if size > thing["force_limit_N"]:
+        force_x *= thing["force_limit_N"] / size
+        force_y *= thing["force_limit_N"] / size
     return force_x, force_y
 
 
 @compiled
 def _wall_force(
-    thing: Vector, own: Vector, link: float, pose: Pose, dq1: float, dq2: float
+    thing: np.void, own: np.void, link: float, pose: Pose, dq1: float, dq2: float
 ) -> tuple[float, float, float, float]:
     """Give a wall's force on the end of a link, N, as x and y, the end's place on its link and the penetration in m."""
-    point_m = thing[LENGTH2_M] if link == 2.0 else thing[LENGTH1_M]
-    x, y, dx, dy = _moved_point(link, point_m, thing[LENGTH1_M], pose, dq1, dq2)
-    normal_x, normal_y = own[FREE_X], own[FREE_Y]
-    depth_m = -(x - thing[X_M]) * normal_x - (y - thing[Y_M]) * normal_y
+    point_m = thing["length2_m"] if link == 2.0 else thing["length1_m"]
+    x, y, dx, dy = _moved_point(link, point_m, thing["length1_m"], pose, dq1, dq2)
+    normal_x, normal_y = own["free_x"], own["free_y"]
+    depth_m = -(x - thing["x_m"]) * normal_x - (y - thing["y_m"]) * normal_y
     if depth_m <= 0.0:
         return 0.0, 0.0, point_m, depth_m
     rate = -dx * normal_x - dy * normal_y
-    force = thing[STIFFNESS] * depth_m * max(0.0, 1.0 + thing[DAMPING] * rate)
+    force = thing["stiffness"] * depth_m * max(0.0, 1.0 + thing["damping"] * rate)
     return force * normal_x, force * normal_y, point_m, depth_m
 
 
 @compiled
 def touch(
-    things: NDArray[np.float64],
+    things: Structured,
     time_s: float,
     q1: float,
     q2: float,
@@ -345,20 +268,19 @@ def touch(
     rates_out[:] = 0.0
     pose = _cosines(q1, q2)
     for row in range(things.shape[0]):
-        place = TOUCH_HEADER + row * THING_STATE
-        if state[place + PRESENCE] != _PRESENT:
+        thing, own = things[row], _own(state, row)
+        if own["presence"] != _PRESENT:
             continue
-        thing = things[row]
-        own = state[place : place + THING_STATE]
-        length1_m = thing[LENGTH1_M]
-        if thing[KIND] == BODY:
+        length1_m = thing["length1_m"]
+        if thing["kind"] == BODY:
             force_x, force_y, point_m, _ = _body_force(thing, own, pose, dq1, dq2)
-            gain1, gain2 = _joint_torque(thing[LINK], point_m, force_x, force_y, length1_m, pose)
-            rates_out[place + SHIFT] = _recede_rate(thing, own)
-            rates_out[place + SHIFT_RATE] = -(force_x * own[FREE_X] + force_y * own[FREE_Y]) / thing[MASS]
-        elif thing[KIND] == HAND:
-            force_x, force_y = _hand_force(thing, own, time_s, pose, dq1, dq2)
-            gain1, gain2 = _joint_torque(thing[LINK], thing[POINT_M], force_x, force_y, length1_m, pose)
+            gain1, gain2 = _joint_torque(thing["link"], point_m, force_x, force_y, length1_m, pose)
+            rates = _own(rates_out, row)
+            rates["shift_m"] = _recede_rate(thing, own)
+            rates["shift_rate_m_s"] = -(force_x * own["free_x"] + force_y * own["free_y"]) / thing["mass_kg"]
+        elif thing["kind"] == HAND:
+            force_x, force_y = _hand_force(thing, _hand(state, row), time_s, pose, dq1, dq2)
+            gain1, gain2 = _joint_torque(thing["link"], thing["point_m"], force_x, force_y, length1_m, pose)
         else:
             force_x, force_y, point_m, _ = _wall_force(thing, own, 1.0, pose, dq1, dq2)
             gain1, gain2 = _joint_torque(1.0, point_m, force_x, force_y, length1_m, pose)
@@ -372,55 +294,55 @@ def touch(
 
 
 @compiled
-def _appear(thing: Vector, own: Vector, pose: Pose) -> None:
+def _appear(thing: np.void, own: np.void, hand: np.void, pose: Pose) -> None:
     """Put a thing in place, unless the arm is there; a hand remembers where the point is."""
-    if thing[KIND] == HAND:
-        own[START_X], own[START_Y], _, _ = _moved_point(thing[LINK], thing[POINT_M], thing[LENGTH1_M], pose, 0.0, 0.0)
-        own[PATH_X], own[PATH_Y], own[PATH_LENGTH] = 0.0, 0.0, np.inf
-        if not math.isnan(thing[ANGLE_RAD]):
-            own[PATH_X], own[PATH_Y] = math.cos(thing[ANGLE_RAD]), math.sin(thing[ANGLE_RAD])
-        elif not math.isnan(thing[X_M]):
-            way_x, way_y = thing[X_M] - own[START_X], thing[Y_M] - own[START_Y]
-            own[PATH_LENGTH] = math.sqrt(way_x * way_x + way_y * way_y)
-            if own[PATH_LENGTH] > 0.0:
-                own[PATH_X], own[PATH_Y] = way_x / own[PATH_LENGTH], way_y / own[PATH_LENGTH]
-        own[PRESENCE] = _PRESENT
-    elif thing[KIND] == WALL:
-        own[FREE_X], own[FREE_Y] = math.cos(thing[ANGLE_RAD]), math.sin(thing[ANGLE_RAD])
+    if thing["kind"] == HAND:
+        hand["start_x_m"], hand["start_y_m"], _, _ = _moved_point(
+            thing["link"], thing["point_m"], thing["length1_m"], pose, 0.0, 0.0
+        )
+        hand["path_x"], hand["path_y"], hand["path_length_m"] = 0.0, 0.0, np.inf
+        if not math.isnan(thing["angle_rad"]):
+            hand["path_x"], hand["path_y"] = math.cos(thing["angle_rad"]), math.sin(thing["angle_rad"])
+        elif not math.isnan(thing["x_m"]):
+            way_x, way_y = thing["x_m"] - hand["start_x_m"], thing["y_m"] - hand["start_y_m"]
+            hand["path_length_m"] = math.sqrt(way_x * way_x + way_y * way_y)
+            if hand["path_length_m"] > 0.0:
+                hand["path_x"], hand["path_y"] = way_x / hand["path_length_m"], way_y / hand["path_length_m"]
+        hand["presence"] = _PRESENT
+    elif thing["kind"] == WALL:
+        own["free_x"], own["free_y"] = math.cos(thing["angle_rad"]), math.sin(thing["angle_rad"])
         _, _, _, depth1_m = _wall_force(thing, own, 1.0, pose, 0.0, 0.0)
         _, _, _, depth2_m = _wall_force(thing, own, 2.0, pose, 0.0, 0.0)
         if depth1_m <= 0.0 and depth2_m <= 0.0:
-            own[PRESENCE] = _PRESENT
+            own["presence"] = _PRESENT
     else:
         _, _, _, _, across_m = _meet(thing, own, pose)
-        own[SIDE] = 1.0 if across_m >= 0.0 else -1.0
+        own["side"] = 1.0 if across_m >= 0.0 else -1.0
         depth_m, _, _, _, _ = _meet(thing, own, pose)
         if depth_m <= 0.0:
-            own[PRESENCE] = _PRESENT
-            if not math.isnan(thing[ANGLE_RAD]):
-                own[FREE_X], own[FREE_Y] = math.cos(thing[ANGLE_RAD]), math.sin(thing[ANGLE_RAD])
+            own["presence"] = _PRESENT
+            if not math.isnan(thing["angle_rad"]):
+                own["free_x"], own["free_y"] = math.cos(thing["angle_rad"]), math.sin(thing["angle_rad"])
 
 
 @compiled
-def _settle_body(thing: Vector, own: Vector, pose: Pose) -> bool:
+def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
     """Do what happens to a body between ticks; say whether it is touched."""
-    if own[SHIFT] >= thing[ROOM_M] and own[SHIFT_RATE] > 0.0:
-        own[SHIFT_RATE] = 0.0
+    if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
+        own["shift_rate_m_s"] = 0.0
     depth_m, point_m, normal_x, normal_y, across_m = _meet(thing, own, pose)
     if depth_m > 0.0:
         return True
-    length_m = thing[LENGTH2_M] if thing[LINK] == 2.0 else thing[LENGTH1_M]
+    length_m = thing["length2_m"] if thing["link"] == 2.0 else thing["length1_m"]
     if point_m in (0.0, length_m):
-        own[SIDE] = 1.0 if across_m >= 0.0 else -1.0
-    if math.isnan(thing[ANGLE_RAD]) and own[SHIFT] == 0.0 and own[SHIFT_RATE] == 0.0:
-        own[FREE_X], own[FREE_Y] = normal_x, normal_y
+        own["side"] = 1.0 if across_m >= 0.0 else -1.0
+    if math.isnan(thing["angle_rad"]) and own["shift_m"] == 0.0 and own["shift_rate_m_s"] == 0.0:
+        own["free_x"], own["free_y"] = normal_x, normal_y
     return False
 
 
 @compiled
-def change_touch(
-    things: NDArray[np.float64], time_s: float, q1: float, q2: float, state: Vector, is_prescribed: bool
-) -> None:
+def change_touch(things: Structured, time_s: float, q1: float, q2: float, state: Vector, is_prescribed: bool) -> None:
     """Do what changes between ticks: things come and go, hands grasp, a body stops at its wall, the energy restarts.
 
     Call it at the start of each tick and before `describe_touch`; twice at the same instant is once. is_prescribed:
@@ -429,21 +351,19 @@ def change_touch(
     is_touched = is_prescribed
     pose = _cosines(q1, q2)
     for row in range(things.shape[0]):
-        place = TOUCH_HEADER + row * THING_STATE
-        own = state[place : place + THING_STATE]
-        thing = things[row]
-        if own[PRESENCE] == _GONE:
+        thing, own = things[row], _own(state, row)
+        if own["presence"] == _GONE:
             continue
-        if time_s > thing[END_S] - _HALF_TICK_S:
-            own[PRESENCE] = _GONE
+        if time_s > thing["end_s"] - _HALF_TICK_S:
+            own["presence"] = _GONE
             continue
-        if own[PRESENCE] == _WAITING and time_s > thing[ONSET_S] - _HALF_TICK_S:
-            _appear(thing, own, pose)
-        if own[PRESENCE] != _PRESENT:
+        if own["presence"] == _WAITING and time_s > thing["onset_s"] - _HALF_TICK_S:
+            _appear(thing, own, _hand(state, row), pose)
+        if own["presence"] != _PRESENT:
             continue
-        if thing[KIND] == HAND:
+        if thing["kind"] == HAND:
             is_touched = True
-        elif thing[KIND] == BODY:
+        elif thing["kind"] == BODY:
             is_touched = _settle_body(thing, own, pose) or is_touched
         else:
             _, _, _, depth1_m = _wall_force(thing, own, 1.0, pose, 0.0, 0.0)
@@ -454,70 +374,68 @@ def change_touch(
 
 
 @compiled
-def _note(out: Vector, force_x: float, force_y: float, link: float, index: float) -> None:
+def _note(out: np.void, force_x: float, force_y: float, link: float, index: float) -> None:
     """Keep the strongest force."""
     size = math.sqrt(force_x * force_x + force_y * force_y)
-    if out[STRONGEST_INDEX] < 0.0 or size > out[FORCE]:
-        out[FORCE], out[STRONGEST_LINK], out[STRONGEST_INDEX] = size, link, index
+    if out["index"] < 0.0 or size > out["force_N"]:
+        out["force_N"], out["link"], out["index"] = size, link, index
 
 
 @compiled
 def describe_touch(
-    things: NDArray[np.float64],
+    things: Structured,
     time_s: float,
     q1: float,
     q2: float,
     dq1: float,
     dq2: float,
     state: Vector,
-    contact: Vector,
+    contact: Structured,
     contact_index: float,
     elapsed_s: float,
     length1_m: float,
-    out: Vector,
+    out: np.void,
 ) -> tuple[float, float]:
-    """Fill force, link, index, power and energy (TOUCH_TRUTH,); give the external torque of all that touches, Nm.
+    """Fill an element of TOUCH_TRUTH; give the external torque of all that touches, Nm.
 
-    contact, contact_index, elapsed_s: the prescribed contact in force, an empty row for none.
+    contact, contact_index, elapsed_s: the prescribed contact in force, an empty array for none.
     """
-    out[FORCE], out[STRONGEST_LINK], out[STRONGEST_INDEX] = 0.0, 0.0, -1.0
+    out["force_N"], out["link"], out["index"] = 0.0, 0.0, -1.0
     torque1, torque2 = 0.0, 0.0
     if contact.size != 0:
-        force = contact_force(contact, elapsed_s)
-        torque1, torque2 = contact_torque(contact, force, length1_m, q1, q2)
-        _note(out, force, 0.0, contact[CONTACT_LINK], contact_index)
+        force = contact_force(contact[0], elapsed_s)
+        torque1, torque2 = contact_torque(contact[0], force, length1_m, q1, q2)
+        _note(out, force, 0.0, contact[0]["link"], contact_index)
     pose = _cosines(q1, q2)
     for row in range(things.shape[0]):
-        place = TOUCH_HEADER + row * THING_STATE
-        if state[place + PRESENCE] != _PRESENT:
+        thing, own = things[row], _own(state, row)
+        if own["presence"] != _PRESENT:
             continue
-        thing = things[row]
-        own = state[place : place + THING_STATE]
         for end in (1.0, 2.0):
-            link, point_m, depth_m = thing[LINK], thing[POINT_M], 1.0
-            if thing[KIND] == WALL:
+            link, point_m, depth_m = thing["link"], thing["point_m"], 1.0
+            if thing["kind"] == WALL:
                 link = end
                 force_x, force_y, point_m, depth_m = _wall_force(thing, own, link, pose, dq1, dq2)
             elif end == 2.0:
                 continue
-            elif thing[KIND] == BODY:
+            elif thing["kind"] == BODY:
                 force_x, force_y, point_m, depth_m = _body_force(thing, own, pose, dq1, dq2)
             else:
-                force_x, force_y = _hand_force(thing, own, time_s, pose, dq1, dq2)
+                force_x, force_y = _hand_force(thing, _hand(state, row), time_s, pose, dq1, dq2)
             if depth_m <= 0.0:
                 continue
             gain1, gain2 = _joint_torque(link, point_m, force_x, force_y, length1_m, pose)
             torque1 += gain1
             torque2 += gain2
-            _note(out, force_x, force_y, link, thing[INDEX])
-    out[POWER] = -torque1 * dq1 - torque2 * dq2
-    out[TRUE_ENERGY] = state[ENERGY]
+            _note(out, force_x, force_y, link, thing["index"])
+    out["power_W"] = -torque1 * dq1 - torque2 * dq2
+    out["energy_J"] = state[ENERGY]
     return torque1, torque2
 
 
 @compiled
 def add_prescribed_work(
-    contact: Vector,
+    contact: Structured,
     elapsed_s: float,
     step_s: float,
     length1_m: float,
@@ -529,11 +447,11 @@ def add_prescribed_work(
 ) -> None:
     """Add what the arm gave to a prescribed contact in a step: the mean torque along the way of the joints.
 
-    before1, before2: joint positions at the start of the step, at elapsed_s; q1, q2: at its end. An empty row adds
+    before1, before2: joint positions at the start of the step, at elapsed_s; q1, q2: at its end. No contact adds
     nothing.
     """
     if contact.size == 0:
         return
-    torque1, torque2 = contact_torque(contact, contact_force(contact, elapsed_s), length1_m, before1, before2)
-    after1, after2 = contact_torque(contact, contact_force(contact, elapsed_s + step_s), length1_m, q1, q2)
+    torque1, torque2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s), length1_m, before1, before2)
+    after1, after2 = contact_torque(contact[0], contact_force(contact[0], elapsed_s + step_s), length1_m, q1, q2)
     state[ENERGY] -= 0.5 * ((torque1 + after1) * (q1 - before1) + (torque2 + after2) * (q2 - before2))

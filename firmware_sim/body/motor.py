@@ -25,9 +25,9 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.compiled import compiled, float_fields
 from firmware_sim.arm.device_settings import CURRENT_LOOP_HZ, DriveSettings
+from firmware_sim.arm.joint_mechanics import PAIR
 from firmware_sim.arm.scripted_contact import TICK_S
 
 CONTINUOUS_OVER_CURRENT: Final = 0x2310
@@ -35,39 +35,43 @@ EXCESS_TEMPERATURE: Final = 0x4310
 _RELEASE: Final = 0.9
 """Share of I²t's budget at which it lets go: a drive that holds its continuous current must not go to and fro."""
 
-# Places in the vector of numbers; pairs are joint 1, joint 2.
-HASTE: Final = 0  # way of this torque loop in a tick over that of the plant's
-GAIN: Final = 2
-OFFSET: Final = 4  # Nm
-PEAK: Final = 6  # Nm
-CONTINUOUS: Final = 8  # Nm; 0: no I²t
-BUDGET: Final = 10  # Nm² s
-WINDING_RISE: Final = 12  # K per Nm²
-WINDING_SHARE: Final = 14  # of the way to the steady rise, in a tick
-HOUSING_RISE: Final = 16
-HOUSING_SHARE: Final = 18
-AMBIENT: Final = 20  # °C, as the next three
-DERATING_START: Final = 22
-DERATING_END: Final = 24
-OVERHEAT: Final = 26
-TRACKING: Final = 28  # rad/s
-CAN_OVERLOAD: Final = 30  # one: whether I²t is a fault
-HAS_LIMITS: Final = 31  # one: whether I²t or temperature count
-MOTOR_NUMBERS: Final = 32
+MOTOR_NUMBERS: Final = float_fields(
+    {
+        "haste": PAIR,  # way of this torque loop in a tick over that of the plant's
+        "gain": PAIR,
+        "offset_Nm": PAIR,
+        "peak_Nm": PAIR,
+        "continuous_Nm": PAIR,  # Nm; 0: no I²t
+        "budget_Nm2_s": PAIR,
+        "winding_rise_K_Nm2": PAIR,  # K per Nm²
+        "winding_share": PAIR,  # of the way to the steady rise, in a tick
+        "housing_rise_K_Nm2": PAIR,
+        "housing_share": PAIR,
+        "ambient_C": PAIR,  # °C, as the next three
+        "derating_start_C": PAIR,
+        "derating_end_C": PAIR,
+        "overheat_C": PAIR,
+        "tracking_rad_s": PAIR,
+        "can_overload": (),  # one: whether I²t is a fault
+        "has_limits": (),  # one: whether I²t or temperature count
+    }
+)
 
-# Places in the state; pairs are joint 1, joint 2.
-WINDING: Final = 0  # w above, K
-HOUSING: Final = 2  # h above, K
-EFFORT: Final = 4  # E above, Nm² s
-IS_SPENT: Final = 6  # whether I²t leaves the continuous current only
-IS_OVERHEATED: Final = 8
-IS_LIMITED: Final = 10  # whether the drive wants more than it may
-MOTOR_STATE: Final = 12
+MOTOR_STATE: Final = float_fields(
+    {
+        "winding_K": PAIR,  # w above, K
+        "housing_K": PAIR,  # h above, K
+        "effort_Nm2_s": PAIR,  # E above, Nm² s
+        "is_spent": PAIR,  # whether I²t leaves the continuous current only
+        "is_overheated": PAIR,
+        "is_limited": PAIR,  # whether the drive wants more than it may
+    }
+)
 
 
-def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float]) -> Vector:
-    """Pack the drives' properties for compiled functions (MOTOR_NUMBERS,)."""
-    numbers = np.zeros(MOTOR_NUMBERS)
+def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float]) -> np.void:
+    """Pack the drives' properties for compiled functions, one element of MOTOR_NUMBERS."""
+    numbers: np.void = np.zeros(1, MOTOR_NUMBERS)[0]
     plant_way = math.expm1(-2.0 * math.pi * CURRENT_LOOP_HZ * TICK_S)
     for joint in range(2):
         rated_Nm = rated_torque_Nm[joint]
@@ -76,57 +80,57 @@ def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float])
         if continuous_Nm >= peak_Nm:
             continuous_Nm = 0.0  # never less than all that there is
         way = math.expm1(-2.0 * math.pi * settings.current_loop_Hz[joint] * TICK_S)
-        numbers[HASTE + joint] = way / plant_way
-        numbers[GAIN + joint] = 1.0 + settings.torque_constant_error[joint]
-        numbers[OFFSET + joint] = settings.torque_offset_Nm[joint]
-        numbers[PEAK + joint] = peak_Nm
-        numbers[CONTINUOUS + joint] = continuous_Nm
-        numbers[BUDGET + joint] = (peak_Nm**2 - continuous_Nm**2) * settings.peak_time_s[joint]
-        numbers[WINDING_RISE + joint] = settings.winding_rise_K[joint] / rated_Nm**2
-        numbers[WINDING_SHARE + joint] = -math.expm1(-TICK_S / settings.winding_time_s[joint])
-        numbers[HOUSING_RISE + joint] = settings.housing_rise_K[joint] / rated_Nm**2
-        numbers[HOUSING_SHARE + joint] = -math.expm1(-TICK_S / settings.housing_time_s[joint])
-        numbers[AMBIENT + joint] = settings.ambient_C[joint]
-        numbers[DERATING_START + joint] = settings.derating_start_C[joint]
-        numbers[DERATING_END + joint] = settings.derating_end_C[joint]
-        numbers[OVERHEAT + joint] = settings.overheat_C[joint]
-        numbers[TRACKING + joint] = 2.0 * math.pi * settings.velocity_loop_Hz[joint]
-    numbers[CAN_OVERLOAD] = 1.0 if settings.i2t_reaction == "fault" else 0.0
+        numbers["haste"][joint] = way / plant_way
+        numbers["gain"][joint] = 1.0 + settings.torque_constant_error[joint]
+        numbers["offset_Nm"][joint] = settings.torque_offset_Nm[joint]
+        numbers["peak_Nm"][joint] = peak_Nm
+        numbers["continuous_Nm"][joint] = continuous_Nm
+        numbers["budget_Nm2_s"][joint] = (peak_Nm**2 - continuous_Nm**2) * settings.peak_time_s[joint]
+        numbers["winding_rise_K_Nm2"][joint] = settings.winding_rise_K[joint] / rated_Nm**2
+        numbers["winding_share"][joint] = -math.expm1(-TICK_S / settings.winding_time_s[joint])
+        numbers["housing_rise_K_Nm2"][joint] = settings.housing_rise_K[joint] / rated_Nm**2
+        numbers["housing_share"][joint] = -math.expm1(-TICK_S / settings.housing_time_s[joint])
+        numbers["ambient_C"][joint] = settings.ambient_C[joint]
+        numbers["derating_start_C"][joint] = settings.derating_start_C[joint]
+        numbers["derating_end_C"][joint] = settings.derating_end_C[joint]
+        numbers["overheat_C"][joint] = settings.overheat_C[joint]
+        numbers["tracking_rad_s"][joint] = 2.0 * math.pi * settings.velocity_loop_Hz[joint]
+    numbers["can_overload"] = 1.0 if settings.i2t_reaction == "fault" else 0.0
     heats = (*settings.winding_rise_K, *settings.housing_rise_K)
-    is_warm = any(settings.preheat_K) or np.any(numbers[AMBIENT : AMBIENT + 2] > numbers[DERATING_START:DERATING_END])
-    numbers[HAS_LIMITS] = 1.0 if any(settings.continuous_torque_Nm) or any(heats) or is_warm else 0.0
+    is_warm = any(settings.preheat_K) or np.any(numbers["ambient_C"] > numbers["derating_start_C"])
+    numbers["has_limits"] = 1.0 if any(settings.continuous_torque_Nm) or any(heats) or is_warm else 0.0
     return numbers
 
 
-def motor_state(settings: DriveSettings) -> Vector:
-    """Give the motors at power-on (MOTOR_STATE,)."""
-    state = np.zeros(MOTOR_STATE)
-    state[HOUSING : HOUSING + 2] = settings.preheat_K
+def motor_state(settings: DriveSettings) -> np.void:
+    """Give the motors at power-on."""
+    state: np.void = np.zeros(1, MOTOR_STATE)[0]
+    state["housing_K"][:] = settings.preheat_K
     return state
 
 
 @compiled
-def winding_temperature(numbers: Vector, state: Vector, joint: int) -> float:
+def winding_temperature(numbers: np.void, state: np.void, joint: int) -> float:
     """Give T above, °C."""
-    return float(numbers[AMBIENT + joint] + state[WINDING + joint] + state[HOUSING + joint])
+    return float(numbers["ambient_C"][joint] + state["winding_K"][joint] + state["housing_K"][joint])
 
 
 @compiled
-def available_torque(numbers: Vector, state: Vector, joint: int) -> float:
+def available_torque(numbers: np.void, state: np.void, joint: int) -> float:
     """Give the largest torque that the drive may ask for now, Nm."""
-    limit_Nm = numbers[PEAK + joint]
-    if numbers[HAS_LIMITS] == 0.0:
+    limit_Nm = numbers["peak_Nm"][joint]
+    if numbers["has_limits"] == 0.0:
         return float(limit_Nm)
-    if state[IS_SPENT + joint] != 0.0:
-        limit_Nm = numbers[CONTINUOUS + joint]
-    start_C, end_C = numbers[DERATING_START + joint], numbers[DERATING_END + joint]
+    if state["is_spent"][joint] != 0.0:
+        limit_Nm = numbers["continuous_Nm"][joint]
+    start_C, end_C = numbers["derating_start_C"][joint], numbers["derating_end_C"][joint]
     left = (end_C - winding_temperature(numbers, state, joint)) / (end_C - start_C)
     return float(limit_Nm * min(max(left, 0.0), 1.0))
 
 
 @compiled
 def command_torque(
-    numbers: Vector, state: Vector, joint: int, wanted_Nm: float, tau_Nm: float, is_powered: bool
+    numbers: np.void, state: np.void, joint: int, wanted_Nm: float, tau_Nm: float, is_powered: bool
 ) -> float:
     """Give the target at which the plant's torque loop brings the motor to where it is after this tick, Nm.
 
@@ -136,50 +140,48 @@ def command_torque(
     """
     limit_Nm = available_torque(numbers, state, joint)
     target_Nm = min(max(wanted_Nm, -limit_Nm), limit_Nm)
-    state[IS_LIMITED + joint] = 1.0 if abs(wanted_Nm) > limit_Nm else 0.0
+    state["is_limited"][joint] = 1.0 if abs(wanted_Nm) > limit_Nm else 0.0
     if is_powered:
-        target_Nm = numbers[GAIN + joint] * (target_Nm + numbers[OFFSET + joint])
-    if numbers[HASTE + joint] == 1.0:
+        target_Nm = numbers["gain"][joint] * (target_Nm + numbers["offset_Nm"][joint])
+    if numbers["haste"][joint] == 1.0:
         return float(target_Nm)
-    return float(tau_Nm + (target_Nm - tau_Nm) * numbers[HASTE + joint])
+    return float(tau_Nm + (target_Nm - tau_Nm) * numbers["haste"][joint])
 
 
 @compiled
-def heat_motor(numbers: Vector, state: Vector, joint: int, tau_Nm: float) -> None:
+def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> None:
     """Carry I²t and temperature over a tick at whose end the motor gives `tau_Nm`. Only if HAS_LIMITS."""
-    current_Nm = tau_Nm / numbers[GAIN + joint]
+    current_Nm = tau_Nm / numbers["gain"][joint]
     square = current_Nm * current_Nm
-    state[WINDING + joint] += (numbers[WINDING_RISE + joint] * square - state[WINDING + joint]) * numbers[
-        WINDING_SHARE + joint
-    ]
-    state[HOUSING + joint] += (numbers[HOUSING_RISE + joint] * square - state[HOUSING + joint]) * numbers[
-        HOUSING_SHARE + joint
-    ]
+    winding_away_K = numbers["winding_rise_K_Nm2"][joint] * square - state["winding_K"][joint]
+    state["winding_K"][joint] += winding_away_K * numbers["winding_share"][joint]
+    housing_away_K = numbers["housing_rise_K_Nm2"][joint] * square - state["housing_K"][joint]
+    state["housing_K"][joint] += housing_away_K * numbers["housing_share"][joint]
     temperature_C = winding_temperature(numbers, state, joint)
-    if temperature_C >= numbers[OVERHEAT + joint]:
-        state[IS_OVERHEATED + joint] = 1.0
-    elif temperature_C < numbers[DERATING_START + joint]:
-        state[IS_OVERHEATED + joint] = 0.0
-    continuous_Nm = numbers[CONTINUOUS + joint]
+    if temperature_C >= numbers["overheat_C"][joint]:
+        state["is_overheated"][joint] = 1.0
+    elif temperature_C < numbers["derating_start_C"][joint]:
+        state["is_overheated"][joint] = 0.0
+    continuous_Nm = numbers["continuous_Nm"][joint]
     if continuous_Nm > 0.0:
-        budget = numbers[BUDGET + joint]
-        effort = state[EFFORT + joint] + (square - continuous_Nm * continuous_Nm) * TICK_S
-        state[EFFORT + joint] = min(max(effort, 0.0), budget)
+        budget = numbers["budget_Nm2_s"][joint]
+        effort = state["effort_Nm2_s"][joint] + (square - continuous_Nm * continuous_Nm) * TICK_S
+        state["effort_Nm2_s"][joint] = min(max(effort, 0.0), budget)
         if effort >= budget:
-            state[IS_SPENT + joint] = 1.0
+            state["is_spent"][joint] = 1.0
         elif effort < _RELEASE * budget:
-            state[IS_SPENT + joint] = 0.0
+            state["is_spent"][joint] = 0.0
 
 
-def believed_torque(numbers: Vector, joint: int, tau_Nm: float) -> float:
+def believed_torque(numbers: np.void, joint: int, tau_Nm: float) -> float:
     """Give m above, Nm: what the drive makes of its current while the motor gives `tau_Nm`."""
-    return float(tau_Nm / numbers[GAIN + joint] - numbers[OFFSET + joint])
+    return float(tau_Nm / numbers["gain"][joint] - numbers["offset_Nm"][joint])
 
 
-def error_code(numbers: Vector, state: Vector, joint: int) -> int:
+def error_code(numbers: np.void, state: np.void, joint: int) -> int:
     """Give the error code that the motor's state calls for now, 0 for none."""
-    if state[IS_OVERHEATED + joint]:
+    if state["is_overheated"][joint]:
         return EXCESS_TEMPERATURE
-    if state[IS_SPENT + joint] and numbers[CAN_OVERLOAD]:
+    if state["is_spent"][joint] and numbers["can_overload"]:
         return CONTINUOUS_OVER_CURRENT
     return 0

@@ -30,47 +30,49 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
+from adacd_hil.compiled import compiled, float_fields
 from adacd_hil.records import Vector
 from firmware_sim.arm.device_settings import SensorSettings
-from firmware_sim.arm.joint_mechanics import REFERENCE_C
+from firmware_sim.arm.joint_mechanics import PAIR, REFERENCE_C
 from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import torque_counts
 
-# Places in the vector of numbers; pairs are joint 1, joint 2.
-INDEX_ERROR: Final = 0  # rad
-ONCE: Final = 2  # e₁, rad
-ONCE_PHASE: Final = 4  # p₁, rad
-TWICE: Final = 6  # e₂, rad
-TWICE_PHASE: Final = 8  # p₂, rad
-ENCODER_LSB: Final = 10  # rad
-ENCODER_NUMBERS: Final = 12
+ENCODER_NUMBERS: Final = float_fields(
+    {
+        "index_error_rad": PAIR,
+        "once_rad": PAIR,  # e₁, rad
+        "once_phase_rad": PAIR,  # p₁, rad
+        "twice_rad": PAIR,  # e₂, rad
+        "twice_phase_rad": PAIR,  # p₂, rad
+        "lsb_rad": PAIR,
+    }
+)
 
 NOISE_TICKS: Final = 64
 """Ticks whose noise is drawn at once, in a few µs; a call that advances the arm by more is divided."""
 
 
-def encoder_numbers(settings: SensorSettings) -> Vector:
-    """Pack the encoders' properties for compiled functions (ENCODER_NUMBERS,)."""
-    numbers = np.zeros(ENCODER_NUMBERS)
-    numbers[INDEX_ERROR : INDEX_ERROR + 2] = settings.index_error_rad
-    numbers[ONCE : ONCE + 2] = settings.eccentricity_rad
-    numbers[ONCE_PHASE : ONCE_PHASE + 2] = settings.eccentricity_phase_rad
-    numbers[TWICE : TWICE + 2] = settings.ellipticity_rad
-    numbers[TWICE_PHASE : TWICE_PHASE + 2] = settings.ellipticity_phase_rad
-    numbers[ENCODER_LSB : ENCODER_LSB + 2] = [2.0 * math.pi / (1 << bits) for bits in settings.encoder_bits]
+def encoder_numbers(settings: SensorSettings) -> np.void:
+    """Pack the encoders' properties for compiled functions, one element of ENCODER_NUMBERS."""
+    numbers: np.void = np.zeros(1, ENCODER_NUMBERS)[0]
+    numbers["index_error_rad"][:] = settings.index_error_rad
+    numbers["once_rad"][:] = settings.eccentricity_rad
+    numbers["once_phase_rad"][:] = settings.eccentricity_phase_rad
+    numbers["twice_rad"][:] = settings.ellipticity_rad
+    numbers["twice_phase_rad"][:] = settings.ellipticity_phase_rad
+    numbers["lsb_rad"][:] = [2.0 * math.pi / (1 << bits) for bits in settings.encoder_bits]
     return numbers
 
 
 @compiled
-def read_angle(numbers: Vector, joint: int, angle_rad: float, noise_counts: float) -> float:
+def read_angle(numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> float:
     """Give the angle that the drive reads, rad."""
-    disc_rad = angle_rad + numbers[INDEX_ERROR + joint]
-    if numbers[ONCE + joint] != 0.0:
-        disc_rad += numbers[ONCE + joint] * math.sin(angle_rad + numbers[ONCE_PHASE + joint])
-    if numbers[TWICE + joint] != 0.0:
-        disc_rad += numbers[TWICE + joint] * math.sin(2.0 * angle_rad + numbers[TWICE_PHASE + joint])
-    lsb_rad = numbers[ENCODER_LSB + joint]
+    disc_rad = angle_rad + numbers["index_error_rad"][joint]
+    if numbers["once_rad"][joint] != 0.0:
+        disc_rad += numbers["once_rad"][joint] * math.sin(angle_rad + numbers["once_phase_rad"][joint])
+    if numbers["twice_rad"][joint] != 0.0:
+        disc_rad += numbers["twice_rad"][joint] * math.sin(2.0 * angle_rad + numbers["twice_phase_rad"][joint])
+    lsb_rad = numbers["lsb_rad"][joint]
     return float(math.floor(disc_rad / lsb_rad + noise_counts + 0.5) * lsb_rad)
 
 
@@ -98,56 +100,60 @@ class EncoderNoise:
 STOPS: Final = 4
 """Stop operators per sensor: each branch of the loop has as many bends after a reversal."""
 
-# Places in the vector of numbers; pairs are joint 1, joint 2.
-GAIN: Final = 0
-GAIN_DRIFT: Final = 2  # 1/K
-CROSS_TALK: Final = 4
-OFFSET: Final = 6  # Nm
-OFFSET_RAMP: Final = 8  # Nm/s
-OFFSET_DRIFT: Final = 10  # Nm/K
-LOOP_WEIGHT: Final = 12  # w above
-LOOP_RADIUS: Final = 14  # r above, Nm
-BANDWIDTH: Final = 16  # rad/s; 0: no filter
-RATE: Final = 18  # Hz of the own clock, error included; 0: at SYNC
-PHASE: Final = 20  # sample periods
-LSB: Final = 22  # of the converter, Nm
-HIGHEST: Final = 24  # code of the converter; the lowest is −1 − HIGHEST
-HAS_MEMORY: Final = 26  # whether what happens within a tick matters: hysteresis, filter, own clock
-TRANSDUCER_NUMBERS: Final = 27
+TRANSDUCER_NUMBERS: Final = float_fields(
+    {
+        "gain": PAIR,
+        "gain_drift_1_K": PAIR,
+        "cross_talk": PAIR,
+        "offset_Nm": PAIR,
+        "offset_ramp_Nm_s": PAIR,  # Nm/s
+        "offset_drift_Nm_K": PAIR,  # Nm/K
+        "loop_weight": PAIR,  # w above
+        "loop_radius_Nm": PAIR,  # r above, Nm
+        "bandwidth_rad_s": PAIR,  # rad/s; 0: no filter
+        "rate_Hz": PAIR,  # Hz of the own clock, error included; 0: at SYNC
+        "phase": PAIR,  # sample periods
+        "lsb_Nm": PAIR,  # of the converter, Nm
+        "highest": PAIR,  # code of the converter; the lowest is −1 − HIGHEST
+        "has_memory": (),  # whether what happens within a tick matters: hysteresis, filter, own clock
+    }
+)
 
-# Places in the state; pairs are joint 1, joint 2.
-BRIDGE: Final = 0  # x above at the last tick, Nm
-SHAPED: Final = 2  # y above
-AMPLIFIED: Final = 4  # z above
-INDEX: Final = 6  # n of the latest sample of the own clock
-HELD: Final = 8  # that sample, Nm
-SENT_INDEX: Final = 10  # n of the sample in the last frame
-SENT: Final = 12  # its counts
-WALK: Final = 14  # Nm
-WALK_TICK: Final = 16  # tick of the walk's last step
-STOP: Final = 17  # e above: 4 of joint 1, 4 of joint 2, Nm
-TRANSDUCER_STATE: Final = STOP + 2 * STOPS
+TRANSDUCER_STATE: Final = float_fields(
+    {
+        "bridge_Nm": PAIR,  # x above at the last tick, Nm
+        "shaped_Nm": PAIR,  # y above
+        "amplified_Nm": PAIR,  # z above
+        "index": PAIR,  # n of the latest sample of the own clock
+        "held_Nm": PAIR,  # that sample, Nm
+        "sent_index": PAIR,  # n of the sample in the last frame
+        "sent": PAIR,  # its counts
+        "walk_Nm": PAIR,
+        "walk_tick": (),  # tick of the walk's last step
+        "stop_Nm": (2, STOPS),  # e above
+    }
+)
 
 
-def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float]) -> Vector:
-    """Pack the sensors' properties for compiled functions (TRANSDUCER_NUMBERS,)."""
-    numbers = np.zeros(TRANSDUCER_NUMBERS)
+def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float]) -> np.void:
+    """Pack the sensors' properties for compiled functions, one element of TRANSDUCER_NUMBERS."""
+    numbers: np.void = np.zeros(1, TRANSDUCER_NUMBERS)[0]
     reach_Nm = np.array(settings.hysteresis_reach_Nm)
-    numbers[GAIN : GAIN + 2] = 1.0 + np.array(settings.gain_error)
-    numbers[GAIN_DRIFT : GAIN_DRIFT + 2] = settings.gain_drift_1_K
-    numbers[CROSS_TALK : CROSS_TALK + 2] = settings.cross_talk
-    numbers[OFFSET : OFFSET + 2] = offset_Nm
-    numbers[OFFSET_RAMP : OFFSET_RAMP + 2] = settings.offset_drift_Nm_s
-    numbers[OFFSET_DRIFT : OFFSET_DRIFT + 2] = settings.offset_drift_Nm_K
-    numbers[LOOP_WEIGHT : LOOP_WEIGHT + 2] = np.array(settings.hysteresis_Nm) / (2.5 * reach_Nm)
-    numbers[LOOP_RADIUS : LOOP_RADIUS + 2] = 0.5 * reach_Nm
-    numbers[BANDWIDTH : BANDWIDTH + 2] = 2.0 * math.pi * np.array(settings.torque_bandwidth_Hz)
-    numbers[RATE : RATE + 2] = np.array(settings.sample_rate_Hz) * (1.0 + 1e-6 * np.array(settings.clock_error_ppm))
-    numbers[PHASE : PHASE + 2] = settings.clock_phase
-    numbers[LSB : LSB + 2] = 2.0 * np.array(settings.torque_range_Nm) / 2.0 ** np.array(settings.torque_bits)
-    numbers[HIGHEST : HIGHEST + 2] = 2.0 ** (np.array(settings.torque_bits) - 1.0) - 1.0
+    numbers["gain"][:] = 1.0 + np.array(settings.gain_error)
+    numbers["gain_drift_1_K"][:] = settings.gain_drift_1_K
+    numbers["cross_talk"][:] = settings.cross_talk
+    numbers["offset_Nm"][:] = offset_Nm
+    numbers["offset_ramp_Nm_s"][:] = settings.offset_drift_Nm_s
+    numbers["offset_drift_Nm_K"][:] = settings.offset_drift_Nm_K
+    numbers["loop_weight"][:] = np.array(settings.hysteresis_Nm) / (2.5 * reach_Nm)
+    numbers["loop_radius_Nm"][:] = 0.5 * reach_Nm
+    numbers["bandwidth_rad_s"][:] = 2.0 * math.pi * np.array(settings.torque_bandwidth_Hz)
+    numbers["rate_Hz"][:] = np.array(settings.sample_rate_Hz) * (1.0 + 1e-6 * np.array(settings.clock_error_ppm))
+    numbers["phase"][:] = settings.clock_phase
+    numbers["lsb_Nm"][:] = 2.0 * np.array(settings.torque_range_Nm) / 2.0 ** np.array(settings.torque_bits)
+    numbers["highest"][:] = 2.0 ** (np.array(settings.torque_bits) - 1.0) - 1.0
     memory = (*settings.hysteresis_Nm, *settings.torque_bandwidth_Hz, *settings.sample_rate_Hz)
-    numbers[HAS_MEMORY] = 1.0 if any(memory) else 0.0
+    numbers["has_memory"] = 1.0 if any(memory) else 0.0
     return numbers
 
 
@@ -158,72 +164,71 @@ def converter_ends(settings: SensorSettings, joint: int) -> tuple[int, int]:
 
 
 @compiled
-def _convert(numbers: Vector, joint: int, torque_Nm: float) -> int:
+def _convert(numbers: np.void, joint: int, torque_Nm: float) -> int:
     """Convert as the sensor's converter does, then to counts of the wire; saturates."""
-    lsb_Nm = numbers[LSB + joint]
-    highest = numbers[HIGHEST + joint]
+    lsb_Nm = numbers["lsb_Nm"][joint]
+    highest = numbers["highest"][joint]
     code = min(max(math.floor(torque_Nm / lsb_Nm + 0.5), -1.0 - highest), highest)
     return torque_counts(code * lsb_Nm)
 
 
 @compiled
-def _bridge(numbers: Vector, joint: int, tau_Nm: float, other_Nm: float, temperature_C: float) -> float:
+def _bridge(numbers: np.void, joint: int, tau_Nm: float, other_Nm: float, temperature_C: float) -> float:
     """Give x above, Nm."""
-    gain = numbers[GAIN + joint] + numbers[GAIN_DRIFT + joint] * (temperature_C - REFERENCE_C)
-    return float(gain * tau_Nm + numbers[CROSS_TALK + joint] * other_Nm)
+    gain = numbers["gain"][joint] + numbers["gain_drift_1_K"][joint] * (temperature_C - REFERENCE_C)
+    return float(gain * tau_Nm + numbers["cross_talk"][joint] * other_Nm)
 
 
 @compiled
 def settle_transducer(
-    numbers: Vector, state: Vector, tau1_Nm: float, tau2_Nm: float, temperature1_C: float, temperature2_C: float
+    numbers: np.void, state: np.void, tau1_Nm: float, tau2_Nm: float, temperature1_C: float, temperature2_C: float
 ) -> None:
-    """Power on under a steady load: the amplifier has settled, and the spring has no memory yet."""
-    state[:] = 0.0
-    state[BRIDGE] = _bridge(numbers, 0, tau1_Nm, tau2_Nm, temperature1_C)
-    state[BRIDGE + 1] = _bridge(numbers, 1, tau2_Nm, tau1_Nm, temperature2_C)
+    """Power on under a steady load, from a state of zeros: the amplifier has settled, the spring has no memory yet."""
+    state["bridge_Nm"][0] = _bridge(numbers, 0, tau1_Nm, tau2_Nm, temperature1_C)
+    state["bridge_Nm"][1] = _bridge(numbers, 1, tau2_Nm, tau1_Nm, temperature2_C)
     for joint in range(2):
-        state[SHAPED + joint] = state[BRIDGE + joint]
-        state[AMPLIFIED + joint] = state[BRIDGE + joint]
-        state[HELD + joint] = state[BRIDGE + joint]
-        state[INDEX + joint] = math.floor(-numbers[PHASE + joint])
-        state[SENT_INDEX + joint] = state[INDEX + joint] - 1.0
+        state["shaped_Nm"][joint] = state["bridge_Nm"][joint]
+        state["amplified_Nm"][joint] = state["bridge_Nm"][joint]
+        state["held_Nm"][joint] = state["bridge_Nm"][joint]
+        state["index"][joint] = math.floor(-numbers["phase"][joint])
+        state["sent_index"][joint] = state["index"][joint] - 1.0
 
 
 @compiled
-def _sense_joint(numbers: Vector, state: Vector, joint: int, tick: float, bridge_Nm: float) -> None:
+def _sense_joint(numbers: np.void, state: np.void, joint: int, tick: float, bridge_Nm: float) -> None:
     """Carry one sensor over the tick that began at `tick` and ended with `bridge_Nm`."""
     shaped_Nm = bridge_Nm
-    weight = numbers[LOOP_WEIGHT + joint]
+    weight = numbers["loop_weight"][joint]
     if weight > 0.0:
-        change_Nm = bridge_Nm - state[BRIDGE + joint]
+        change_Nm = bridge_Nm - state["bridge_Nm"][joint]
         for k in range(STOPS):
-            radius_Nm = numbers[LOOP_RADIUS + joint] * (k + 1) / STOPS
-            place = STOP + STOPS * joint + k
-            state[place] = min(max(state[place] + change_Nm, -radius_Nm), radius_Nm)
-            shaped_Nm -= weight * state[place]
-    before_Nm = state[AMPLIFIED + joint]
+            radius_Nm = numbers["loop_radius_Nm"][joint] * (k + 1) / STOPS
+            stop_Nm = min(max(state["stop_Nm"][joint, k] + change_Nm, -radius_Nm), radius_Nm)
+            state["stop_Nm"][joint, k] = stop_Nm
+            shaped_Nm -= weight * stop_Nm
+    before_Nm = state["amplified_Nm"][joint]
     amplified_Nm = shaped_Nm
-    if numbers[BANDWIDTH + joint] > 0.0:
-        turn = numbers[BANDWIDTH + joint] * TICK_S
-        lag_Nm = (shaped_Nm - state[SHAPED + joint]) / turn  # behind a ramp
-        amplified_Nm = shaped_Nm - lag_Nm + (before_Nm - state[SHAPED + joint] + lag_Nm) * math.exp(-turn)
-    rate_Hz = numbers[RATE + joint]
+    if numbers["bandwidth_rad_s"][joint] > 0.0:
+        turn = numbers["bandwidth_rad_s"][joint] * TICK_S
+        lag_Nm = (shaped_Nm - state["shaped_Nm"][joint]) / turn  # behind a ramp
+        amplified_Nm = shaped_Nm - lag_Nm + (before_Nm - state["shaped_Nm"][joint] + lag_Nm) * math.exp(-turn)
+    rate_Hz = numbers["rate_Hz"][joint]
     if rate_Hz > 0.0:
-        index = math.floor((tick + 1.0) * TICK_S * rate_Hz - numbers[PHASE + joint])
-        if index > state[INDEX + joint]:
-            share = (index + numbers[PHASE + joint]) / (rate_Hz * TICK_S) - tick  # of the tick, when it was sampled
+        index = math.floor((tick + 1.0) * TICK_S * rate_Hz - numbers["phase"][joint])
+        if index > state["index"][joint]:
+            share = (index + numbers["phase"][joint]) / (rate_Hz * TICK_S) - tick  # of the tick, when it was sampled
             share = min(max(share, 0.0), 1.0)
-            state[INDEX + joint] = index
-            state[HELD + joint] = before_Nm + share * (amplified_Nm - before_Nm)
-    state[BRIDGE + joint] = bridge_Nm
-    state[SHAPED + joint] = shaped_Nm
-    state[AMPLIFIED + joint] = amplified_Nm
+            state["index"][joint] = index
+            state["held_Nm"][joint] = before_Nm + share * (amplified_Nm - before_Nm)
+    state["bridge_Nm"][joint] = bridge_Nm
+    state["shaped_Nm"][joint] = shaped_Nm
+    state["amplified_Nm"][joint] = amplified_Nm
 
 
 @compiled
 def sense_torque(
-    numbers: Vector,
-    state: Vector,
+    numbers: np.void,
+    state: np.void,
     tick: float,
     tau1_Nm: float,
     tau2_Nm: float,
@@ -236,18 +241,18 @@ def sense_torque(
 
 
 @compiled
-def walk_offset(state: Vector, tick: float, step_Nm: Vector) -> None:
+def walk_offset(state: np.void, tick: float, step_Nm: Vector) -> None:
     """Let the zeros walk up to `tick`. step_Nm (2,): normal numbers times the walk's rms after one second."""
-    root_s = math.sqrt((tick - state[WALK_TICK]) * TICK_S)
-    state[WALK] += step_Nm[0] * root_s
-    state[WALK + 1] += step_Nm[1] * root_s
-    state[WALK_TICK] = tick
+    root_s = math.sqrt((tick - state["walk_tick"]) * TICK_S)
+    state["walk_Nm"][0] += step_Nm[0] * root_s
+    state["walk_Nm"][1] += step_Nm[1] * root_s
+    state["walk_tick"] = tick
 
 
 @compiled
 def sample_torque(
-    numbers: Vector,
-    state: Vector,
+    numbers: np.void,
+    state: np.void,
     joint: int,
     tick: float,
     tau_Nm: float,
@@ -259,17 +264,19 @@ def sample_torque(
 
     tau, other: torque in the spring of this joint and of the other one, now.
     """
-    if numbers[HAS_MEMORY] == 0.0:
+    if numbers["has_memory"] == 0.0:
         torque_Nm = _bridge(numbers, joint, tau_Nm, other_Nm, temperature_C)
-    elif numbers[RATE + joint] == 0.0:
-        torque_Nm = state[AMPLIFIED + joint]
+    elif numbers["rate_Hz"][joint] == 0.0:
+        torque_Nm = state["amplified_Nm"][joint]
     else:
-        if state[INDEX + joint] == state[SENT_INDEX + joint]:
-            return int(state[SENT + joint])
-        state[SENT_INDEX + joint] = state[INDEX + joint]
-        torque_Nm = state[HELD + joint]
-    offset_Nm = numbers[OFFSET + joint] + numbers[OFFSET_RAMP + joint] * (tick * TICK_S) + state[WALK + joint]
-    offset_Nm += numbers[OFFSET_DRIFT + joint] * (temperature_C - REFERENCE_C)
+        if state["index"][joint] == state["sent_index"][joint]:
+            return int(state["sent"][joint])
+        state["sent_index"][joint] = state["index"][joint]
+        torque_Nm = state["held_Nm"][joint]
+    offset_Nm = (
+        numbers["offset_Nm"][joint] + numbers["offset_ramp_Nm_s"][joint] * (tick * TICK_S) + state["walk_Nm"][joint]
+    )
+    offset_Nm += numbers["offset_drift_Nm_K"][joint] * (temperature_C - REFERENCE_C)
     counts = _convert(numbers, joint, torque_Nm + offset_Nm + noise_Nm)
-    state[SENT + joint] = counts
+    state["sent"][joint] = counts
     return counts

@@ -10,8 +10,8 @@ from long_cases import long_but
 
 from adacd_hil.control.motion_laws import corner_to_corner
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
-from firmware_sim.arm.plant import CURRENT_LOOP_RAD_S, DSHAFT, SHAFT, TAU, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
+from firmware_sim.arm.plant import CURRENT_LOOP_RAD_S, mass_matrix
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table
 
 POINT_PAYLOAD = (1.0, (0.0, 0.0), 0.0)
 BODY_PAYLOAD = (1.5, (0.05, 0.08), 0.01)
@@ -90,12 +90,12 @@ def paper_torque(arm: GeneralArm, seconds: float) -> tuple[np.ndarray, np.ndarra
     share = -math.expm1(-turn) / turn
     for cycle in range(round(seconds * 1e3)):
         corner_to_corner(cycle * 1e-3, amplitude, half_s, q_d, dq_d, ddq_d)
-        shaft = arm.state[SHAFT : SHAFT + 2] if is_elastic else arm.q
-        speed = arm.state[DSHAFT : DSHAFT + 2] if is_elastic else arm.dq
+        shaft = arm.state["q_m"] if is_elastic else arm.q
+        speed = arm.state["dq_m"] if is_elastic else arm.dq
         target = np.array([500.0, 40.0]) * (q_d - shaft) + np.array([25.0, 1.5]) * (dq_d - speed)
-        before = arm.state[TAU : TAU + 2].copy()
+        before = arm.state["tau_m"].copy()
         history = arm.run(10, *target)
-        reached = np.vstack([before, history[:-1, TAU : TAU + 2]])
+        reached = np.vstack([before, history["tau_m"][:-1]])
         torques.append(target + (reached - target) * share)
         positions.append(arm.q.copy())
     return np.array(positions), np.concatenate(torques)
@@ -196,7 +196,7 @@ def test_a_prescribed_pulse_changes_the_momentum_as_in_mujoco(settings, link, po
         data.qfrc_applied[:] = 0.0
         mujoco.mj_applyFT(model, data, force_N * direction, np.zeros(3), point, body, data.qfrc_applied)
         mujoco.mj_step(model, data)
-    arm.run(300, contact=np.array(contact.row()))
+    arm.run(300, contact=contact_table((contact,)))
     gained = momentum(arm, arm.q, arm.dq) - before
     expected = momentum(arm, data.qpos[links], data.qvel[links]) - before
     assert np.linalg.norm(expected) > 0.1
@@ -240,7 +240,7 @@ def test_a_ball_that_hits_link_2_in_mujoco_moves_our_arm_alike(speed_m_s, payloa
         angle_deg=-90.0,
         shape="half_sine",
     )
-    arm.run(duration_ticks, contact=np.array(pulse.row()))
+    arm.run(duration_ticks, contact=contact_table((pulse,)))
     arm.run(len(touching) - duration_ticks, contact=NOBODY)
     gained = momentum(arm, arm.q, arm.dq)
     expected = momentum(arm, data.qpos[links], data.qvel[links])

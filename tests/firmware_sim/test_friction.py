@@ -8,7 +8,6 @@ from general_arm import GeneralArm, one_joint
 
 from firmware_sim.arm.joint_mechanics import advance_bristle, bristle_rate
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
-from firmware_sim.arm.plant import BRISTLE, DQ, DSHAFT, SHAFT, WARMTH, Q
 from firmware_sim.arm.scripted_contact import TICK_S
 
 COULOMB_NM, STATIC_NM, STRIBECK_RAD_S = 0.5, 0.8, 0.1
@@ -50,7 +49,8 @@ def test_a_joint_breaks_away_at_its_static_friction_and_not_before(way):
     arm, _ = one_joint(COULOMB_NM)
     held = GeneralArm(arm, MechanicsSettings(**STRIBECK))
     history = held.run(5_000, way * 0.999 * STATIC_NM)
-    assert np.abs(history[:, [Q, DQ]]).max() == 0.0
+    assert not np.any(history["q"][:, 0])
+    assert not np.any(history["dq"][:, 0])
     assert held.observe()["friction"][0] == pytest.approx(way * 0.999 * STATIC_NM, rel=1e-9)
     held.run(5_000, way * 1.001 * STATIC_NM)
     assert way * held.dq[0] > 5e-4
@@ -60,9 +60,9 @@ def test_a_joint_that_has_broken_away_accelerates_by_what_friction_falls():
     """Above v_s the friction has fallen to Coulomb's: the torque that just broke it away accelerates by F_s - F_c."""
     arm, inertia = one_joint(COULOMB_NM)
     moved = GeneralArm(arm, MechanicsSettings(**STRIBECK), dq=(0.5, 0.0))
-    moved.state[4] = STATIC_NM
+    moved.state["tau_m"][0] = STATIC_NM
     history = moved.run(1_000, STATIC_NM)
-    acceleration = (history[-1, DQ] - history[500, DQ]) / (499 * TICK_S)
+    acceleration = (history["dq"][-1, 0] - history["dq"][500, 0]) / (499 * TICK_S)
     assert acceleration == pytest.approx((STATIC_NM - COULOMB_NM) / inertia, rel=1e-6)
 
 
@@ -82,7 +82,7 @@ def test_small_swings_of_a_bristled_joint_have_the_frequency_of_its_bristles():
     arm, inertia = one_joint(COULOMB_NM)
     settings = MechanicsSettings(sigma0_Nm_rad=(2000.0, 0.0), sigma2_Nm_s=(0.0, 0.0))
     swinging = GeneralArm(arm, settings, dq=(1e-5, 0.0))
-    velocity = swinging.run(20_000)[:, DQ]
+    velocity = swinging.run(20_000)["dq"][:, 0]
     upward = np.flatnonzero((velocity[:-1] < 0.0) & (velocity[1:] >= 0.0))
     crossing = upward - velocity[upward] / (velocity[upward + 1] - velocity[upward])
     period_s = np.diff(crossing).mean() * TICK_S
@@ -106,9 +106,9 @@ def test_a_stiff_bristle_at_high_speed_stays_stable():
     settings = MechanicsSettings(sigma0_Nm_rad=(20_000.0, 0.0), sigma1_Nm_s=(20.0, 0.0))
     fast = GeneralArm(arm, settings, dq=(8.0, 0.0))
     history = fast.run(2_000)
-    assert np.all(np.diff(history[:, DQ]) < 0.0)
+    assert np.all(np.diff(history["dq"][:, 0]) < 0.0)
     assert fast.observe()["friction"][0] == pytest.approx(COULOMB_NM, rel=1e-6)
-    assert np.abs(history[:, BRISTLE]).max() == pytest.approx(COULOMB_NM / 20_000.0, rel=1e-9)
+    assert np.abs(history["bristle_rad"][:, 0]).max() == pytest.approx(COULOMB_NM / 20_000.0, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -128,9 +128,9 @@ def test_a_joint_drawn_slowly_through_a_spring_sticks_and_slips(is_bristled):
         rotor_inertia_kg_m2=(1e7, 0.0),
     )
     drawn = GeneralArm(arm, settings)
-    drawn.state[DSHAFT] = 0.02
+    drawn.state["dq_m"][0] = 0.02
     history = drawn.run(80_000)
-    velocity, spring_Nm = history[:, DQ], 50.0 * (history[:, SHAFT] - history[:, Q])
+    velocity, spring_Nm = history["dq"][:, 0], 50.0 * (history["q_m"][:, 0] - history["q"][:, 0])
     if not is_bristled:
         assert int(np.argmax(velocity != 0.0)) == pytest.approx(STATIC_NM / 50.0 / 0.02 / TICK_S, abs=2)
     is_slipping = velocity > 0.02
@@ -185,11 +185,11 @@ def test_a_joint_warms_by_the_power_of_its_friction_and_cools_to_ambient():
     history = warmed.run(30_000, COULOMB_NM)
     times_s = np.arange(1, 30_001) * TICK_S
     expected = 20.0 + 5.0 * (1.0 - np.exp(-times_s / 0.5))
-    assert np.abs(history[:, WARMTH] - expected).max() < 0.005
-    assert np.ptp(history[:, WARMTH + 1]) == 0.0
-    warmed.state[DQ] = 0.0
+    assert np.abs(history["temperature_C"][:, 0] - expected).max() < 0.005
+    assert np.ptp(history["temperature_C"][:, 1]) == 0.0
+    warmed.state["dq"][0] = 0.0
     warmed.run(5_000)
-    assert warmed.state[WARMTH] == pytest.approx(20.0 + 5.0 * math.exp(-1.0), abs=0.02)
+    assert warmed.state["temperature_C"][0] == pytest.approx(20.0 + 5.0 * math.exp(-1.0), abs=0.02)
 
 
 def test_motor_side_friction_warms_the_joint_as_well():
@@ -206,4 +206,4 @@ def test_motor_side_friction_warms_the_joint_as_well():
     warmed = GeneralArm(arm, settings, dq=(2.0, 0.0))
     warmed.run(1_000)
     heat_J = (0.3 + 0.2) * 2.0 * 0.1
-    assert warmed.state[WARMTH] == pytest.approx(25.0 + heat_J / 0.1, abs=0.01)
+    assert warmed.state["temperature_C"][0] == pytest.approx(25.0 + heat_J / 0.1, abs=0.01)

@@ -17,7 +17,7 @@ from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import ConfigError, parse
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.mechanics_settings import LARGEST_SUBSTEPS, MechanicsSettings
-from firmware_sim.arm.plant import DQ, DSHAFT, MECHANICAL_STATE, Q, accelerate, fit_payload, integrate
+from firmware_sim.arm.plant import MECHANICAL_STATE, accelerate, fit_payload, integrate
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.body.body import Body
@@ -60,7 +60,7 @@ def test_energy_stays_for_a_minute_without_friction_torque_and_contact(settings,
     chosen = {} if payload is None else {"payload": payload}
     arm = GeneralArm(without_friction(), settings, q=(0.3, -0.7), dq=(2.0, -5.0), substeps=substeps, **chosen)
     if is_struck:
-        arm.state[DSHAFT : DSHAFT + 2] = 0.0
+        arm.state["dq_m"][:] = 0.0
     at_rest = GeneralArm(without_friction(), settings, q=(0.3, -0.7), **chosen)
     before_J = arm.energy_J()
     moving_J = before_J - at_rest.energy_J()
@@ -76,9 +76,9 @@ def test_the_general_integrator_with_nothing_to_do_is_the_rigid_plant(name):
     arm = ARMS[name]
     general = GeneralArm(arm, AS_RIGID, q=(0.3, -0.7))
     assert general.substeps == 1
-    state = np.zeros(MECHANICAL_STATE)
+    state = np.zeros(1, MECHANICAL_STATE)[0]
     fit_payload(state, arm.numbers(), 0.0)
-    state[Q : Q + 2] = 0.3, -0.7
+    state["q"][:] = 0.3, -0.7
     times_s = np.arange(5_000) * TICK_S
     target1 = 2.0 * arm.coulomb_Nm[0] * np.sin(9.0 * times_s)
     target2 = 2.0 * arm.coulomb_Nm[1] * np.sin(7.0 * times_s)
@@ -86,10 +86,10 @@ def test_the_general_integrator_with_nothing_to_do_is_the_rigid_plant(name):
     rigid = np.zeros((times_s.size, 4))
     for index in range(times_s.size):
         integrate(state, arm.numbers(), NOBODY, 0.0, target1[index], target2[index], TICK_S)
-        rigid[index] = state[:4]
+        rigid[index] = *state["q"], *state["dq"]
     assert np.abs(rigid).max() > 0.1
     assert (rigid[:, 2] == 0.0).sum() > 100
-    assert np.abs(history[:, :4] - rigid).max() < 1e-9
+    assert np.abs(np.hstack([history["q"], history["dq"]]) - rigid).max() < 1e-9
 
 
 @pytest.mark.slow
@@ -101,8 +101,8 @@ def test_an_arm_below_its_breakaway_torque_does_not_move_by_a_bit():
     )
     swing = (-1.0) ** np.arange(2_000)
     history = arm.run(2_000, 0.35 * swing, 0.2 * swing)
-    assert np.ptp(history[500:, Q : Q + 2], axis=0).tolist() == [0.0, 0.0]
-    assert np.abs(history[:, DQ : DQ + 2]).max() == 0.0
+    assert np.ptp(history["q"][500:], axis=0).tolist() == [0.0, 0.0]
+    assert np.abs(history["dq"]).max() == 0.0
 
 
 def pinocchio_arm(payload, tilt_rad: float, direction_rad: float) -> pinocchio.Model:
@@ -163,7 +163,7 @@ def test_a_joint_stop_holds_against_the_drive(way):
     )
     stopped = GeneralArm(arm, settings)
     history = stopped.run(20_000, way * 8.0)
-    assert np.abs(history[:, Q]).max() < math.radians(20.0) + 0.06
+    assert np.abs(history["q"][:, 0]).max() < math.radians(20.0) + 0.06
     assert stopped.q[0] == pytest.approx(way * (math.radians(20.0) + 8.0 / 2000.0), abs=1e-6)
     assert stopped.observe()["tau_ext"][0] == pytest.approx(-way * 8.0, rel=1e-3)
 
@@ -191,14 +191,14 @@ def test_an_undamped_joint_stop_gives_the_arm_its_speed_back():
     history = stopped.run(4_000)
     assert stopped.dq[0] == pytest.approx(-1.0, abs=1e-5)
     deepest = math.radians(10.0) + math.sqrt(inertia / 3000.0)
-    assert history[:, Q].max() == pytest.approx(deepest, abs=1e-5)
+    assert history["q"][:, 0].max() == pytest.approx(deepest, abs=1e-5)
 
 
 def test_a_fitted_payload_beside_the_link_shares_the_momentum_of_a_moving_arm():
     arm = ARMS["P"]
-    state = np.zeros(MECHANICAL_STATE)
+    state = np.zeros(1, MECHANICAL_STATE)[0]
     fit_payload(state, arm.numbers(), 0.0)
-    state[:4] = 0.4, 0.2, 1.0, -2.0
+    state["q"], state["dq"] = (0.4, 0.2), (1.0, -2.0)
     fit_payload(state, arm.numbers(), *(PAYLOAD[0], *PAYLOAD[1], PAYLOAD[2]))
     light = ARMS["P"].links
     inertias = []
@@ -217,7 +217,7 @@ def test_a_fitted_payload_beside_the_link_shares_the_momentum_of_a_moving_arm():
         body = pinocchio.Inertia(payload[0], np.array([*payload[1], 0.0]), np.diag([0.0, 0.0, payload[2]]))
         model.appendBodyToJoint(parent, body, place)
         inertias.append(pinocchio.crba(model, model.createData(), np.array([0.4, 0.2])))
-    assert inertias[1] @ state[DQ : DQ + 2] == pytest.approx(inertias[0] @ [1.0, -2.0], rel=1e-12)
+    assert inertias[1] @ state["dq"] == pytest.approx(inertias[0] @ [1.0, -2.0], rel=1e-12)
 
 
 def test_the_closed_brake_of_a_drive_that_is_off_holds_the_arm_on_a_slope():
@@ -396,6 +396,7 @@ SPRING_MASS = """
 import math, sys
 import numpy as np
 import firmware_sim.arm.touch_forces
+from firmware_sim.arm.scripted_contact import contact_table
 from adacd_hil.compiled import compiled
 
 @compiled
@@ -414,18 +415,18 @@ from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload
 
 arm, inertia = one_joint()
 mechanics = MechanicsSettings(rotor_inertia_kg_m2=(0.1, 0.1)).numbers(arm)
-state, contact, work = np.zeros(MECHANICAL_STATE), np.array([0.02, 0.0]), work_space(2)
+state, contact, work = np.zeros(1, MECHANICAL_STATE)[0], np.array([0.02, 0.0]), work_space(2)
 fit_payload(state, arm.numbers(), 0.0)
 for index in range(500):
     integrate_mechanics(
-        state, arm.numbers(), mechanics, np.zeros(0), np.array([[400.0, 0.2]]), contact, index * 1e-4, 0.0, 0.0, 0.0,
-        1e-4, 1, work
+        state, arm.numbers(), mechanics, contact_table(()), np.array([[400.0, 0.2]]), contact, index * 1e-4,
+        0.0, 0.0, 0.0, 1e-4, 1, work
     )
 total, spring = inertia + 0.1, 400.0
 reduced = total * 0.2 / (total + 0.2)
 swing = 0.02 * math.cos(math.sqrt(spring / reduced) * 0.05)
 centre = 0.2 * 0.02 / (total + 0.2)
-print(contact[0] - state[0] - swing, centre + (swing * -0.2 / (total + 0.2)) - state[0])
+print(contact[0] - state["q"][0] - swing, centre + (swing * -0.2 / (total + 0.2)) - state["q"][0])
 """
 
 

@@ -16,7 +16,6 @@ from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.bench.bench import Bench
 from firmware_sim.body.body import Body
 from firmware_sim.body.motor import (
-    EFFORT,
     available_torque,
     command_torque,
     error_code,
@@ -161,7 +160,7 @@ def test_i2t_allows_the_continuous_torque_for_ever():
     motors = Motors(**I2T)
     motors.hold(4.0, 5.0)
     assert motors.available_Nm() == 10.0
-    assert motors.state[EFFORT] == 0.0
+    assert motors.state["effort_Nm2_s"][0] == 0.0
 
 
 def test_i2t_lets_go_when_a_tenth_is_free_again():

@@ -11,11 +11,7 @@ import pytest
 from adacd_hil.compiled import compiled
 from firmware_sim.arm.arms import ARMS, ArmProfile
 from firmware_sim.arm.plant import (
-    DQ,
     MECHANICAL_STATE,
-    PAYLOAD,
-    TAU,
-    Q,
     accelerate,
     decide_slips,
     external_torque,
@@ -23,16 +19,17 @@ from firmware_sim.arm.plant import (
     integrate,
     mass_matrix,
 )
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table
 
-NOBODY = np.zeros(0)
+NOBODY = contact_table(())
+INERTIA = ("alpha", "beta", "gamma")
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 
 def state_of(arm: ArmProfile, q=(0.0, 0.0), dq=(0.0, 0.0), payload_kg=0.0, tau=(0.0, 0.0)) -> np.ndarray:
-    state = np.zeros(MECHANICAL_STATE)
+    state = np.zeros(1, MECHANICAL_STATE)[0]
     fit_payload(state, arm.numbers(), payload_kg)
-    state[Q : Q + 2], state[DQ : DQ + 2], state[TAU : TAU + 2] = q, dq, tau
+    state["q"], state["dq"], state["tau_m"][:] = q, dq, tau
     return state
 
 
@@ -49,8 +46,8 @@ def run(state, arm, contact, target1, target2, step_s, count):
 
 
 def kinetic_energy_J(state: np.ndarray) -> float:
-    m11, m12, m22 = mass_matrix(state, state[Q + 1])
-    dq1, dq2 = state[DQ], state[DQ + 1]
+    m11, m12, m22 = mass_matrix(state, state["q"][1])
+    dq1, dq2 = state["dq"][0], state["dq"][1]
     return 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
 
 
@@ -118,9 +115,9 @@ def test_a_fitted_payload_gives_the_inertia_that_the_arm_computes():
     arm = ARMS["S"]
     state = state_of(arm)
     fit_payload(state, arm.numbers(), 0.8)
-    assert state[7:10] == pytest.approx(arm.inertia(0.8), rel=1e-15)
+    assert [state[name] for name in INERTIA] == pytest.approx(arm.inertia(0.8), rel=1e-15)
     fit_payload(state, arm.numbers(), 0.0)
-    assert tuple(state[7:10]) == arm.inertia()
+    assert tuple(state[name] for name in INERTIA) == arm.inertia()
 
 
 def test_the_mass_matrix_is_positive_definite_in_every_pose():
@@ -145,14 +142,14 @@ def test_the_momentum_about_the_base_stays_when_joint_1_is_free():
     state = state_of(arm, q=(0.3, -0.7), dq=(2.0, -5.0))
 
     def momentum() -> float:
-        m11, m12, _ = mass_matrix(state, state[Q + 1])
-        return m11 * state[DQ] + m12 * state[DQ + 1]
+        m11, m12, _ = mass_matrix(state, state["q"][1])
+        return m11 * state["dq"][0] + m12 * state["dq"][1]
 
     before = momentum()
     # Whatever joint 2 does to link 2 it does to link 1 the other way round; joint 1 alone reaches the base.
     run(state, arm.numbers(), NOBODY, 0.0, 1.5, TICK_S, 3_000)
     assert momentum() == pytest.approx(before, rel=1e-9)
-    assert abs(state[DQ + 1]) > 1.0
+    assert abs(state["dq"][1]) > 1.0
 
 
 def test_a_shoulder_under_constant_torque_moves_as_the_text_book_says():
@@ -162,37 +159,36 @@ def test_a_shoulder_under_constant_torque_moves_as_the_text_book_says():
     run(state, arm.numbers(), NOBODY, 1.2, 0.0, TICK_S, 5_000)
     alpha, beta, gamma = arm.inertia()
     acceleration = (1.2 - 0.2) / (alpha + gamma + 2.0 * beta)
-    assert state[DQ] == pytest.approx(acceleration * 0.5, rel=1e-11)
-    assert state[Q] == pytest.approx(0.5 * acceleration * 0.25, rel=1e-11)
-    assert state[DQ + 1] == 0.0
+    assert state["dq"][0] == pytest.approx(acceleration * 0.5, rel=1e-11)
+    assert state["q"][0] == pytest.approx(0.5 * acceleration * 0.25, rel=1e-11)
+    assert state["dq"][1] == 0.0
 
 
 def test_work_done_on_the_arm_is_kinetic_energy_plus_heat():
     arm = ARMS["M"]
     numbers = arm.numbers()
     state = state_of(arm, q=(0.1, 0.6), dq=(0.4, -0.3))
-    contact = np.array(
-        ContactSettings(
-            at_s=0.0, link=2, point_m=0.2, force_N=18.0, duration_s=0.3, shape="half_sine", angle_deg=70.0
-        ).row()
+    push = ContactSettings(
+        at_s=0.0, link=2, point_m=0.2, force_N=18.0, duration_s=0.3, shape="half_sine", angle_deg=70.0
     )
+    contact = contact_table((push,))
     before_J = kinetic_energy_J(state)
     samples = []
     step_s = 2.5e-5
     count = 12_000
     for index in range(count + 1):
-        ext1, ext2 = external_torque(numbers, contact, index * step_s, *state[Q : Q + 2], *state[DQ : DQ + 2])
+        ext1, ext2 = external_torque(numbers, contact, index * step_s, *state["q"], *state["dq"])
         slips = decide_slips(
-            state, numbers, state[TAU] + ext1, state[TAU + 1] + ext2, state[Q + 1], *state[DQ : DQ + 2]
+            state, numbers, state["tau_m"][0] + ext1, state["tau_m"][1] + ext2, state["q"][1], *state["dq"]
         )
         _, _, friction1, friction2 = accelerate(
-            state, numbers, *slips, state[TAU] + ext1, state[TAU + 1] + ext2, state[Q + 1], *state[DQ : DQ + 2]
+            state, numbers, *slips, state["tau_m"][0] + ext1, state["tau_m"][1] + ext2, state["q"][1], *state["dq"]
         )
-        viscous1, viscous2 = arm.viscous_Nm_s[0] * state[DQ], arm.viscous_Nm_s[1] * state[DQ + 1]
+        viscous1, viscous2 = arm.viscous_Nm_s[0] * state["dq"][0], arm.viscous_Nm_s[1] * state["dq"][1]
         samples.append(
             (
-                (state[TAU] + ext1) * state[DQ] + (state[TAU + 1] + ext2) * state[DQ + 1],
-                (friction1 + viscous1) * state[DQ] + (friction2 + viscous2) * state[DQ + 1],
+                (state["tau_m"][0] + ext1) * state["dq"][0] + (state["tau_m"][1] + ext2) * state["dq"][1],
+                (friction1 + viscous1) * state["dq"][0] + (friction2 + viscous2) * state["dq"][1],
             )
         )
         if index < count:
@@ -211,10 +207,10 @@ def test_a_joint_holds_below_its_coulomb_friction_and_breaks_away_above(name, jo
     target[joint] = sign * 0.999 * arm.coulomb_Nm[joint]
     state = state_of(arm, q=(0.2, -0.4))
     run(state, arm.numbers(), NOBODY, target[0], target[1], TICK_S, 1_000)
-    assert state[:4].tolist() == [0.2, -0.4, 0.0, 0.0]
+    assert [*state["q"], *state["dq"]] == [0.2, -0.4, 0.0, 0.0]
     target[joint] = sign * 1.001 * arm.coulomb_Nm[joint]
     run(state, arm.numbers(), NOBODY, target[0], target[1], TICK_S, 1_000)
-    assert sign * state[DQ + joint] > 1e-6
+    assert sign * state["dq"][joint] > 1e-6
 
 
 def test_a_sliding_joint_stops_at_the_analytic_instant_and_stays():
@@ -225,13 +221,13 @@ def test_a_sliding_joint_stops_at_the_analytic_instant_and_stays():
     # stops after 0.3 · inertia / 0.5 = 0.306 s, within a step
     before_s = math.floor(0.3 * inertia / 0.5 / TICK_S)
     run(state, arm.numbers(), NOBODY, 0.0, 0.0, TICK_S, before_s)
-    assert state[DQ] > 0.0
+    assert state["dq"][0] > 0.0
     run(state, arm.numbers(), NOBODY, 0.0, 0.0, TICK_S, 1)
-    assert state[DQ] == 0.0
-    assert state[Q] == pytest.approx(0.5 * inertia * 0.3**2 / 0.5, rel=1e-11)
+    assert state["dq"][0] == 0.0
+    assert state["q"][0] == pytest.approx(0.5 * inertia * 0.3**2 / 0.5, rel=1e-11)
     rest = state.copy()
     run(state, arm.numbers(), NOBODY, 0.3, 0.0, TICK_S, 1_000)
-    assert state[:4].tolist() == rest[:4].tolist()
+    assert (state["q"].tolist(), state["dq"].tolist()) == (rest["q"].tolist(), rest["dq"].tolist())
 
 
 def test_a_reversed_joint_turns_at_the_analytic_instant():
@@ -243,7 +239,7 @@ def test_a_reversed_joint_turns_at_the_analytic_instant():
     run(state, arm.numbers(), NOBODY, -2.0, 0.0, TICK_S, 2_000)
     turned_s = 0.3 * inertia / 2.5
     assert turned_s / TICK_S != pytest.approx(round(turned_s / TICK_S), abs=1e-3)
-    assert state[DQ] == pytest.approx(-1.5 / inertia * (0.2 - turned_s), rel=1e-10)
+    assert state["dq"][0] == pytest.approx(-1.5 / inertia * (0.2 - turned_s), rel=1e-10)
 
 
 def test_a_slowly_pushed_joint_breaks_away_at_the_analytic_instant():
@@ -251,13 +247,11 @@ def test_a_slowly_pushed_joint_breaks_away_at_the_analytic_instant():
     for coulomb_Nm in (0.5, 0.502, 0.5033):
         arm = dataclasses.replace(ARMS["S"], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(coulomb_Nm, 100.0))
         alpha, beta, gamma = arm.inertia()
-        row = ContactSettings(
-            at_s=0.0, link=1, point_m=0.2, force_N=20.0, duration_s=0.4, shape="push", ramp_s=0.1
-        ).row()
+        push = ContactSettings(at_s=0.0, link=1, point_m=0.2, force_N=20.0, duration_s=0.4, shape="push", ramp_s=0.1)
         state = state_of(arm)
-        run(state, arm.numbers(), np.array(row), 0.0, 0.0, TICK_S, 300)
+        run(state, arm.numbers(), contact_table((push,)), 0.0, 0.0, TICK_S, 300)
         slid_s = 0.03 - coulomb_Nm / 40.0
-        assert state[DQ] == pytest.approx(0.5 * 40.0 * slid_s**2 / (alpha + gamma + 2.0 * beta), rel=1e-10)
+        assert state["dq"][0] == pytest.approx(0.5 * 40.0 * slid_s**2 / (alpha + gamma + 2.0 * beta), rel=1e-10)
 
 
 def test_a_held_elbow_is_dragged_only_when_the_shoulder_accelerates_hard():
@@ -265,8 +259,8 @@ def test_a_held_elbow_is_dragged_only_when_the_shoulder_accelerates_hard():
     for torque, is_dragged in ((0.5, False), (3.0, True)):
         state = state_of(arm, q=(0.0, 0.5))
         run(state, arm.numbers(), NOBODY, torque, 0.0, TICK_S, 50)
-        assert state[DQ] > 0.0
-        assert (state[DQ + 1] != 0.0) == is_dragged
+        assert state["dq"][0] > 0.0
+        assert (state["dq"][1] != 0.0) == is_dragged
 
 
 def test_friction_at_standstill_obeys_its_law_for_any_torque():
@@ -300,7 +294,7 @@ def test_a_resting_arm_shows_no_chatter_when_torque_swings_below_friction():
     state = state_of(arm, q=(0.2, -0.4))
     for index in range(500):
         integrate(state, arm.numbers(), NOBODY, 0.0, 0.14 * (-1) ** index, 0.07 * (-1) ** index, TICK_S)
-        assert state[:4].tolist() == [0.2, -0.4, 0.0, 0.0]
+        assert [*state["q"], *state["dq"]] == [0.2, -0.4, 0.0, 0.0]
 
 
 def test_halving_the_step_changes_a_millisecond_by_less_than_1e_8():
@@ -310,12 +304,12 @@ def test_halving_the_step_changes_a_millisecond_by_less_than_1e_8():
             coarse = state_of(
                 arm, generator.uniform(-1, 1, 2), generator.uniform(0.05, 3, 2) * generator.choice([-1, 1], 2)
             )
-            coarse[TAU : TAU + 2] = generator.uniform(-3, 3, 2)
+            coarse["tau_m"][:] = generator.uniform(-3, 3, 2)
             fine = coarse.copy()
-            target = coarse[TAU : TAU + 2] + generator.uniform(-2, 2, 2)
+            target = coarse["tau_m"] + generator.uniform(-2, 2, 2)
             run(coarse, arm.numbers(), NOBODY, target[0], target[1], TICK_S, 10)
             run(fine, arm.numbers(), NOBODY, target[0], target[1], 0.5 * TICK_S, 20)
-            assert np.abs(coarse - fine)[:6].max() < 1e-8
+            assert max(np.abs(coarse[name] - fine[name]).max() for name in ("q", "dq", "tau_m")) < 1e-8
 
 
 def test_stops_and_reversals_do_not_spoil_the_convergence():
@@ -326,7 +320,7 @@ def test_stops_and_reversals_do_not_spoil_the_convergence():
         target = (0.4 * math.sin(0.05 * index), 0.2 * math.sin(0.07 * index))
         run(coarse, arm.numbers(), NOBODY, target[0], target[1], TICK_S, 10)
         run(fine, arm.numbers(), NOBODY, target[0], target[1], 0.125 * TICK_S, 80)
-    assert np.abs(coarse - fine)[:4].max() < 1e-7
+    assert max(np.abs(coarse[name] - fine[name]).max() for name in ("q", "dq")) < 1e-7
 
 
 def test_the_motor_torque_follows_its_target_with_the_current_loop():
@@ -334,24 +328,24 @@ def test_the_motor_torque_follows_its_target_with_the_current_loop():
     state = state_of(arm)
     run(state, arm.numbers(), NOBODY, 2.0, -1.0, TICK_S, 3)
     reached = 1.0 - math.exp(-2.0 * math.pi * 1000.0 * 3 * TICK_S)
-    assert state[TAU : TAU + 2] == pytest.approx([2.0 * reached, -1.0 * reached], rel=1e-12)
+    assert state["tau_m"] == pytest.approx([2.0 * reached, -1.0 * reached], rel=1e-12)
 
 
 def test_a_payload_fitted_at_rest_moves_nothing():
     arm = ARMS["P"]
     state = state_of(arm, q=(0.4, 0.2))
     fit_payload(state, arm.numbers(), 1.0)
-    assert state[:4].tolist() == [0.4, 0.2, 0.0, 0.0]
-    assert state[PAYLOAD] == 1.0
+    assert [*state["q"], *state["dq"]] == [0.4, 0.2, 0.0, 0.0]
+    assert state["payload_kg"] == 1.0
 
 
 def test_a_payload_fitted_to_a_moving_arm_shares_its_momentum():
     arm = ARMS["P"]
     state = state_of(arm, q=(0.4, 0.2), dq=(1.0, -2.0))
-    before = pinocchio.crba(model := pinocchio_arm(arm, 0.0), model.createData(), state[:2]) @ state[DQ : DQ + 2]
+    before = pinocchio.crba(model := pinocchio_arm(arm, 0.0), model.createData(), state["q"]) @ state["dq"]
     energy_J = kinetic_energy_J(state)
     fit_payload(state, arm.numbers(), 1.0)
-    after = pinocchio.crba(model := pinocchio_arm(arm, 1.0), model.createData(), state[:2]) @ state[DQ : DQ + 2]
+    after = pinocchio.crba(model := pinocchio_arm(arm, 1.0), model.createData(), state["q"]) @ state["dq"]
     assert after == pytest.approx(before, rel=1e-12)
     assert kinetic_energy_J(state) < energy_J
 
@@ -360,7 +354,7 @@ def test_a_payload_taken_off_a_moving_arm_leaves_with_its_speed():
     arm = ARMS["P"]
     state = state_of(arm, q=(0.4, 0.2), dq=(1.0, -2.0), payload_kg=1.0)
     fit_payload(state, arm.numbers(), 0.0)
-    assert state[DQ : DQ + 2].tolist() == [1.0, -2.0]
+    assert state["dq"].tolist() == [1.0, -2.0]
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
@@ -371,8 +365,8 @@ def test_an_arm_that_is_thrown_stays_between_its_stops_and_comes_to_rest(profile
     furthest = np.zeros(2)
     for _ in range(1_500):
         run(state, arm.numbers(), NOBODY, 0.0, 0.0, TICK_S, 100)
-        furthest = np.maximum(furthest, np.abs(state[Q : Q + 2]))
+        furthest = np.maximum(furthest, np.abs(state["q"]))
     stops = np.radians(arm.stop_deg)
     assert (furthest > stops - 0.01).any()
     assert (furthest < stops + 0.2).all()
-    assert state[DQ] == state[DQ + 1] == 0.0
+    assert state["dq"][0] == state["dq"][1] == 0.0

@@ -7,7 +7,7 @@ import pytest
 
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.scripted_contact import contact_force, contact_torque
+from firmware_sim.arm.scripted_contact import contact_force, contact_table, contact_torque
 from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 
 CONTACT = "{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
@@ -51,7 +51,7 @@ def test_the_paper_scenario_touches_each_link_both_ways_before_and_after_the_pay
 @pytest.mark.parametrize("index", range(8))
 def test_every_contact_of_the_paper_scenario_is_well_above_the_threshold(index):
     contact = load_scenario("paper").contacts[index]
-    row = np.array(contact.row())
+    row = contact_table((contact,))[0]
     sign = math.copysign(1, contact.angle_deg)
     for elbow_rad in np.radians(np.linspace(-68, 68, 35)):
         tau1, tau2 = contact_torque(row, contact_force(row, 0.0), 0.35, 0.1, elbow_rad)

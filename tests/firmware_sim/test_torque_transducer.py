@@ -15,12 +15,7 @@ from firmware_sim.arm.scripted_contact import TICK_S
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, DriveMode, TorqueNoise, torque_counts
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import (
-    AMPLIFIED,
-    HELD,
-    INDEX,
-    SHAPED,
     TRANSDUCER_STATE,
-    WALK,
     converter_ends,
     sample_torque,
     sense_torque,
@@ -40,7 +35,7 @@ class Sensors:
 
     def __init__(self, offset_Nm=(0.0, 0.0), start_Nm=(0.0, 0.0), **settings) -> None:
         self.numbers = transducer_numbers(parse(SensorSettings, settings), offset_Nm)
-        self.state = np.zeros(TRANSDUCER_STATE)
+        self.state = np.zeros(1, TRANSDUCER_STATE)[0]
         self.tick = 0
         self.tau_Nm = start_Nm
         settle_transducer(self.numbers, self.state, *start_Nm, 25.0, 25.0)
@@ -55,7 +50,7 @@ class Sensors:
         """Load joint 1 steadily up or down to `to_Nm`; return what comes out of the spring then."""
         for load_Nm in np.linspace(self.tau_Nm[0], to_Nm, ticks + 1)[1:]:
             self.load(load_Nm)
-        return self.state[SHAPED]
+        return self.state["shaped_Nm"][0]
 
     def counts(self, joint: int = 0, temperature_C: float = 25.0, noise_Nm: float = 0.0) -> int:
         own, other = self.tau_Nm[joint], self.tau_Nm[1 - joint]
@@ -112,11 +107,11 @@ def test_the_zero_walks_with_the_variance_of_its_time(is_regular):
     ends = []
     for seed in range(400):
         steps = TorqueNoise(np.random.SeedSequence(seed, spawn_key=(1,)), (0.1, 0.3))
-        state = np.zeros(TRANSDUCER_STATE)
+        state = np.zeros(1, TRANSDUCER_STATE)[0]
         ticks = np.linspace(0, 5_000, 51) if is_regular else np.array([0, 0, 7, 800, 801, 4_000, 5_000])
         for tick in ticks:
             walk_offset(state, float(tick), steps.draw())
-        ends.append(state[WALK : WALK + 2].copy())
+        ends.append(state["walk_Nm"].copy())
     # after half a second; the rms of 400 values is known within 3.5 %
     assert np.std(ends, axis=0) == pytest.approx([0.1 * math.sqrt(0.5), 0.3 * math.sqrt(0.5)], rel=0.12)
     assert np.abs(np.corrcoef(np.array(ends).T)[0, 1]) < 0.15
@@ -171,7 +166,7 @@ def test_the_hysteresis_returns_to_the_point_where_it_turned():
     for sensors in (with_loop, without):
         sensors.ramp(-20.0)
         sensors.ramp(2.0)
-    turned = with_loop.state[SHAPED]
+    turned = with_loop.state["shaped_Nm"][0]
     inner = with_loop.ramp(0.5)
     returned = with_loop.ramp(2.0)
     assert inner > 0.5 - 0.2 + 0.02
@@ -196,7 +191,7 @@ def test_the_amplifier_is_a_first_order_low_pass():
     outputs = [0.0]
     for load_Nm in loads[1:]:
         sensors.load(load_Nm)
-        outputs.append(sensors.state[AMPLIFIED])
+        outputs.append(sensors.state["amplified_Nm"][0])
     omega = 2.0 * math.pi * 80.0
     _, expected, _ = signal.lsim(signal.lti([omega], [1.0, omega]), loads, np.arange(200) * TICK_S, interp=True)
     assert np.allclose(outputs, expected, rtol=0.0, atol=1e-9)
@@ -207,7 +202,7 @@ def test_the_amplifier_passes_its_bandwidth_with_3_db_less():
     outputs = []
     for tick in range(1, 3_001):
         sensors.load(10.0 * math.sin(2.0 * math.pi * 100.0 * tick * TICK_S))
-        outputs.append(sensors.state[AMPLIFIED])
+        outputs.append(sensors.state["amplified_Nm"][0])
     assert max(outputs[1_000:]) == pytest.approx(10.0 / math.sqrt(2.0), rel=1e-3)
 
 
@@ -259,8 +254,8 @@ def test_an_own_clock_samples_at_its_own_instants_within_the_tick():
     for tick in range(1, 20_001):
         sensors.load(20.0 * tick * TICK_S)  # the load tells the time
         if tick % 10 == 0 and tick > 20:
-            sampled_s = sensors.state[HELD] / 20.0
-            assert sampled_s == pytest.approx((sensors.state[INDEX] + CLOCK_PHASE) / rate_Hz, abs=1e-9)
+            sampled_s = sensors.state["held_Nm"][0] / 20.0
+            assert sampled_s == pytest.approx((sensors.state["index"][0] + CLOCK_PHASE) / rate_Hz, abs=1e-9)
             ages_s.append(tick * TICK_S - sampled_s)
     assert min(ages_s) > -1e-9
     assert max(ages_s) < 1.0 / rate_Hz + 1e-9

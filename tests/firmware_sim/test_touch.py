@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.settings.schema import ConfigError, parse
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_force, contact_torque
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_force, contact_table, contact_torque
 
 L1_M, L2_M = 0.35, 0.30
 
@@ -31,7 +31,7 @@ def test_the_torque_of_a_contact_is_its_virtual_work(link, frame):
     for _ in range(100):
         q = generator.uniform(-3, 3, 2)
         point_m, angle_deg = generator.uniform(0, 0.3), generator.uniform(-360, 360)
-        row = np.array(contact(link=link, frame=frame, point_m=point_m, angle_deg=angle_deg).row())
+        row = contact_table((contact(link=link, frame=frame, point_m=point_m, angle_deg=angle_deg),))[0]
         found = contact_torque(row, 20.0, L1_M, q[0], q[1])
         link_angle = q[0] if link == 1 else q[0] + q[1]
         psi = math.radians(angle_deg) + (link_angle if frame == "link" else 0.0)
@@ -45,19 +45,19 @@ def test_the_torque_of_a_contact_is_its_virtual_work(link, frame):
 
 
 def test_a_push_along_the_normal_of_a_link_turns_its_joint_forward():
-    assert contact_torque(np.array(contact(link=1).row()), 20.0, L1_M, 0.7, -0.3) == pytest.approx((4.0, 0.0))
-    forward = contact_torque(np.array(contact(link=2).row()), 20.0, L1_M, 0.7, 0.0)
+    assert contact_torque(contact_table((contact(link=1),))[0], 20.0, L1_M, 0.7, -0.3) == pytest.approx((4.0, 0.0))
+    forward = contact_torque(contact_table((contact(link=2),))[0], 20.0, L1_M, 0.7, 0.0)
     assert forward == pytest.approx((20.0 * (0.35 + 0.2), 4.0))
 
 
 def test_a_push_along_link_2_is_not_felt_by_joint_2():
-    row = np.array(contact(link=2, angle_deg=0.0).row())
+    row = contact_table((contact(link=2, angle_deg=0.0),))[0]
     assert contact_torque(row, 20.0, L1_M, 0.7, -0.3)[1] == 0.0
 
 
 def test_the_force_and_lever_of_a_link_2_contact_follow_from_both_torques():
     """Closed form for a frictionless contact: F = (tau1 − tau2) / (l1 cos q2), lever tau2 / F."""
-    tau1, tau2 = contact_torque(np.array(contact(link=2).row()), 17.0, L1_M, -0.4, 0.9)
+    tau1, tau2 = contact_torque(contact_table((contact(link=2),))[0], 17.0, L1_M, -0.4, 0.9)
     force_N = (tau1 - tau2) / (L1_M * math.cos(0.9))
     assert force_N == pytest.approx(17.0, rel=1e-12)
     assert tau2 / force_N == pytest.approx(0.2, rel=1e-12)
@@ -76,7 +76,7 @@ def test_the_force_and_lever_of_a_link_2_contact_follow_from_both_torques():
 def test_a_contact_gives_the_impulse_of_its_shape(changes, impulse_N_s):
     one = contact(**changes)
     times_s = np.linspace(0.0, one.duration_s, 20_001)
-    forces_N = [contact_force(np.array(one.row()), elapsed_s) for elapsed_s in times_s]
+    forces_N = [contact_force(contact_table((one,))[0], elapsed_s) for elapsed_s in times_s]
     assert np.trapezoid(forces_N, times_s) == pytest.approx(impulse_N_s, rel=1e-6)
     assert one.impulse_N_s == pytest.approx(impulse_N_s, rel=1e-12)
     assert max(forces_N) == pytest.approx(20.0)
@@ -84,7 +84,7 @@ def test_a_contact_gives_the_impulse_of_its_shape(changes, impulse_N_s):
 
 @pytest.mark.parametrize("shape", ["half_sine", "push"])
 def test_soft_shapes_begin_and_end_without_force(shape):
-    row = np.array(contact(shape=shape).row())
+    row = contact_table((contact(shape=shape),))[0]
     assert contact_force(row, 0.0) == 0.0
     assert contact_force(row, 0.05) == pytest.approx(0.0, abs=1e-12)
 

@@ -6,20 +6,10 @@ import numpy as np
 import pytest
 from touched_arm import TouchedArm
 
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_torque
-from firmware_sim.arm.touch_forces import (
-    ENERGY,
-    PRESENCE,
-    SHIFT,
-    SHIFT_RATE,
-    SIDE,
-    initial_touch_state,
-    largest_rate_rad_s,
-    touch,
-    touch_substeps,
-    touch_table,
-)
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table, contact_torque
+from firmware_sim.arm.touch_forces import ENERGY, touch
 from firmware_sim.arm.touch_settings import BODY_REGIONS, BodySettings, HandSettings, WallSettings
+from firmware_sim.body.touch_table import initial_touch_state, largest_rate_rad_s, touch_substeps, touch_table
 
 POSE = (0.3, 0.7)
 SOFT = {"mass_kg": 1.5, "stiffness_N_m": 2000.0}
@@ -87,7 +77,7 @@ def test_an_elastic_blow_has_the_force_time_and_speeds_of_two_masses(profile, li
     touched = seen["force"] > 0.0
     assert seen["force"].max() == pytest.approx(0.01 * math.sqrt(body.stiffness * mass_kg), rel=2e-3)
     assert np.count_nonzero(touched) * TICK_S == pytest.approx(math.pi / rate_rad_s, abs=1.5 * TICK_S)
-    assert arm.own(0, SHIFT_RATE)[-1] == pytest.approx(0.01 * 2.0 * mass_kg / body.mass, rel=1e-3)
+    assert arm.own(0, "shift_rate_m_s")[-1] == pytest.approx(0.01 * 2.0 * mass_kg / body.mass, rel=1e-3)
     q, dq = arm.y[:2], arm.y[2:4]
     after_m_s = side * normal_of(link, POSE) @ arm.jacobian(link, point_m, q) @ dq
     mobility = mass_kg * arm.mobility(link, point_m, POSE, normal_of(link, POSE))
@@ -107,14 +97,14 @@ def test_a_damped_blow_has_the_restitution_of_spring_and_damper_that_part_withou
     damped = math.sqrt(1.0 - damping_ratio**2)
     parting = math.pi - math.atan2(2.0 * damping_ratio * damped, 1.0 - 2.0 * damping_ratio**2)
     restitution = math.exp(-damping_ratio / damped * parting)
-    assert arm.own(0, SHIFT_RATE)[-1] == pytest.approx(0.001 * (1.0 + restitution) * mass_kg / 1.5, rel=2e-3)
+    assert arm.own(0, "shift_rate_m_s")[-1] == pytest.approx(0.001 * (1.0 + restitution) * mass_kg / 1.5, rel=2e-3)
 
 
 def depth_of(body: BodySettings, arm: TouchedArm, seen) -> np.ndarray:
     """Penetration over time, by the foot of the perpendicular."""
     free = normal_of(body.link, POSE)
     depths = []
-    for q1, q2, shift in zip(seen["q1"], seen["q2"], arm.own(0, SHIFT), strict=True):
+    for q1, q2, shift in zip(seen["q1"], seen["q2"], arm.own(0, "shift_m"), strict=True):
         center = np.array([body.x_m, body.y_m]) + shift * free
         off = center - point_of(2, 0.0, (q1, q2))
         depths.append(body.radius_m - off @ normal_of(2, (q1, q2)))
@@ -134,7 +124,7 @@ def test_what_the_arm_gives_is_the_bodys_motion_its_spring_and_its_heat(damping_
     mean_N = np.where(touched[:-1], 0.5 * (force_N[1:] + force_N[:-1]), force_N[1:])
     heat_J = np.cumsum((mean_N - 1000.0 * (depth_m[1:] + depth_m[:-1])) * np.diff(depth_m))
     heat_J = np.concatenate([[0.0], heat_J])
-    motion_J = 0.5 * 1.5 * arm.own(0, SHIFT_RATE) ** 2
+    motion_J = 0.5 * 1.5 * arm.own(0, "shift_rate_m_s") ** 2
     assert 100 < np.count_nonzero(touched) < len(touched)
     assert np.diff(heat_J).min() > -1e-9
     assert (motion_J + spring_J + heat_J)[touched] == pytest.approx(seen["energy"][touched], abs=2e-3 * motion_J.max())
@@ -148,7 +138,7 @@ def test_the_impulse_on_the_joints_is_the_bodys_momentum():
     seen = arm.play(0.12)
     torque = np.array([seen["tau1"], seen["tau2"]])
     impulse_Nm_s = torque.sum(axis=1) * TICK_S
-    momentum = 1.5 * arm.own(0, SHIFT_RATE)[-1] * normal_of(2, POSE)
+    momentum = 1.5 * arm.own(0, "shift_rate_m_s")[-1] * normal_of(2, POSE)
     assert impulse_Nm_s == pytest.approx(-arm.jacobian(2, 0.2, POSE).T @ momentum, rel=5e-3)
 
 
@@ -171,7 +161,7 @@ def test_a_body_pushes_the_arm_off_and_never_pulls_it(side, damping_N_s_m):
     seen = arm.play(0.3)
     assert (side * seen["tau1"]).max() <= 0.0
     assert (side * seen["tau1"]).min() < -1.0
-    assert arm.own(0, SHIFT)[-1] > 0.0
+    assert arm.own(0, "shift_m")[-1] > 0.0
 
 
 @pytest.mark.parametrize("link", [1, 2])
@@ -191,13 +181,13 @@ def test_a_bodys_torque_is_that_of_a_prescribed_force_of_its_size(link, side):
         off = np.array([body.x_m, body.y_m]) - point_of(link, 0.0, bent)
         along = np.array([normal_of(link, bent)[1], -normal_of(link, bent)[0]])
         deep_m = 0.02 - side * off @ normal_of(link, bent)
-        row = np.array(
-            ContactSettings(
-                at_s=0.0, link=link, point_m=float(off @ along), force_N=10.0, duration_s=1.0, angle_deg=-90.0 * side
-            ).row()
+        push = ContactSettings(
+            at_s=0.0, link=link, point_m=float(off @ along), force_N=10.0, duration_s=1.0, angle_deg=-90.0 * side
         )
         assert deep_m > 0.0
-        assert found == pytest.approx(contact_torque(row, 25_000.0 * deep_m, 0.35, *bent), rel=1e-9, abs=1e-9)
+        assert found == pytest.approx(
+            contact_torque(contact_table((push,))[0], 25_000.0 * deep_m, 0.35, *bent), rel=1e-9, abs=1e-9
+        )
 
 
 @pytest.mark.parametrize("region", ["hand_finger", "chest", "skull_forehead"])
@@ -208,7 +198,7 @@ def test_a_clamped_body_is_pressed_with_the_force_that_the_motor_gives(region):
     assert seen["force"][-1] == pytest.approx(8.0 / 0.25, rel=1e-3)
     deep_m = float((point_of(1, 0.25, arm.y[:2]) - np.array([body.x_m, body.y_m])) @ normal_of(1, arm.y[:2]))
     assert deep_m == pytest.approx(32.0 / body.stiffness, rel=5e-3)
-    assert abs(arm.own(0, SHIFT)).max() == 0.0
+    assert abs(arm.own(0, "shift_m")).max() == 0.0
     assert seen["energy"][-1] == pytest.approx(0.5 * 32.0**2 / body.stiffness, rel=5e-3)
 
 
@@ -216,8 +206,8 @@ def test_a_body_with_a_wall_behind_it_is_pushed_up_to_the_wall_and_clamped_there
     body = beside(1, 0.25, region="hand_finger", gap_m=0.02)
     arm = TouchedArm(q=POSE, motor=(5.0, 0.0), damping=0.6, substeps=8, bodies=(body,))
     seen = arm.play(3.0)
-    shift_m = arm.own(0, SHIFT)
-    fastest_m_s = arm.own(0, SHIFT_RATE).max()
+    shift_m = arm.own(0, "shift_m")
+    fastest_m_s = arm.own(0, "shift_rate_m_s").max()
     assert fastest_m_s > 0.1
     # No further than one integration step beyond the wall, and no creeping into it.
     assert 0.02 <= shift_m.max() <= 0.02 + fastest_m_s * TICK_S / 8
@@ -230,7 +220,7 @@ def test_a_free_body_flies_on_where_a_body_with_a_wall_stops():
     for gap_m in (None, 0.02):
         arm = strike(beside(1, 0.25, region="hand_finger", gap_m=gap_m), 0.25, speed_m_s=0.4, damping=0.6)
         arm.play(0.5)
-        ends_m.append(arm.own(0, SHIFT)[-1])
+        ends_m.append(arm.own(0, "shift_m")[-1])
     assert ends_m[0] > 0.1
     assert ends_m[1] == pytest.approx(0.02, abs=1e-4)
 
@@ -242,7 +232,7 @@ def test_a_body_moves_only_in_its_free_direction():
     arm = strike(body, 0.2, substeps=2)
     arm.play(0.03)
     mass_kg = 1.0 / (0.25 / 0.5 + arm.mobility(2, 0.2, POSE, normal_of(2, POSE)))
-    assert arm.own(0, SHIFT_RATE)[-1] == pytest.approx(0.5 * 2.0 * 0.01 * mass_kg / 0.5, rel=2e-3)
+    assert arm.own(0, "shift_rate_m_s")[-1] == pytest.approx(0.5 * 2.0 * 0.01 * mass_kg / 0.5, rel=2e-3)
 
 
 def test_a_body_in_the_arms_place_waits_until_the_arm_has_gone():
@@ -251,8 +241,8 @@ def test_a_body_in_the_arms_place_waits_until_the_arm_has_gone():
     seen = arm.play(0.3)
     assert seen["force"].max() == 0.0
     assert (seen["index"] == -1.0).all()
-    assert arm.own(0, PRESENCE)[150] == 0.0
-    assert arm.own(0, PRESENCE)[-1] == 1.0
+    assert arm.own(0, "presence")[150] == 0.0
+    assert arm.own(0, "presence")[-1] == 1.0
 
 
 def test_a_body_that_leaves_takes_its_force_with_it():
@@ -291,11 +281,11 @@ def test_a_link_that_came_round_the_body_touches_it_from_its_new_side():
     body = BodySettings(at_s=0.0, link=2, x_m=0.66, y_m=0.05, region="chest", radius_m=0.005)
     arm = TouchedArm(q=(0.0, 0.0), bodies=(body,))
     arm.play(TICK_S)
-    side_before = arm.own(0, SIDE)[-1]
+    side_before = arm.own(0, "side")[-1]
     arm.y[:2] = (0.2, 0.0)
     arm.play(TICK_S)
     arm.play(TICK_S)
-    assert (side_before, arm.own(0, SIDE)[-1]) == (1.0, -1.0)
+    assert (side_before, arm.own(0, "side")[-1]) == (1.0, -1.0)
 
 
 def test_a_deep_push_does_not_throw_the_body_through_the_link():

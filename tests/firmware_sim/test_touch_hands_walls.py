@@ -9,22 +9,20 @@ from touched_arm import TouchedArm
 
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.plant import DQ, MECHANICAL_STATE, Q, fit_payload, integrate, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_torque
+from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, integrate, mass_matrix
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table, contact_torque
 from firmware_sim.arm.touch_forces import (
     ENERGY,
-    PRESENCE,
-    SHIFT,
-    SHIFT_RATE,
+    THING_STATE,
     TOUCH_HEADER,
     TOUCH_TRUTH,
     add_prescribed_work,
     change_touch,
     describe_touch,
-    largest_rate_rad_s,
     touch,
 )
 from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
+from firmware_sim.body.touch_table import largest_rate_rad_s
 from firmware_sim.scenario.scenario import load_scenario
 
 POSE = (0.3, 0.7)
@@ -103,12 +101,13 @@ def test_changes_that_are_asked_for_twice_at_an_instant_are_done_once():
     presences, pressed = set(), 0
     for _ in range(400):
         arm.play(TICK_S * 8)
-        pressed += arm.own(0, SHIFT)[-1] >= 0.005 and arm.y[4 + TOUCH_HEADER + SHIFT_RATE] > 0.0
+        body_now = arm.y[4 + TOUCH_HEADER :].view(THING_STATE)[0]
+        pressed += arm.own(0, "shift_m")[-1] >= 0.005 and body_now["shift_rate_m_s"] > 0.0
         change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
         once = arm.y.copy()
         change_touch(arm.things, arm.time_s, arm.y[0], arm.y[1], arm.y[4:], False)
         assert arm.y.tobytes() == once.tobytes()
-        presences.add(tuple(arm.own(thing, PRESENCE)[-1] for thing in range(3)))
+        presences.add(tuple(arm.own(thing, "presence")[-1] for thing in range(3)))
     assert len(presences) >= 4
     assert pressed > 10
 
@@ -192,8 +191,8 @@ def test_a_wall_in_the_arms_place_waits_until_the_arm_has_gone():
     arm = TouchedArm(q=(0.3, 0.2), dq=(-1.0, 0.0), walls=(wall,))
     seen = arm.play(0.6)
     assert seen["force"].max() == 0.0
-    assert arm.own(0, PRESENCE)[600] == 0.0
-    assert arm.own(0, PRESENCE)[-1] == 1.0
+    assert arm.own(0, "presence")[600] == 0.0
+    assert arm.own(0, "presence")[-1] == 1.0
 
 
 def test_the_largest_rate_of_wall_and_hand_is_that_of_their_points():
@@ -229,30 +228,30 @@ PRESCRIBED = [
 def test_a_prescribed_force_gives_the_arm_the_energy_that_is_logged(changes):
     arm = dataclasses.replace(ARMS["P"], viscous_Nm_s=(0.0, 0.0), coulomb_Nm=(0.0, 0.0))
     numbers = arm.numbers()
-    state = np.zeros(MECHANICAL_STATE)
+    state = np.zeros(1, MECHANICAL_STATE)[0]
     fit_payload(state, numbers, 0.0)
-    state[Q : Q + 2] = POSE
-    row = np.array(ContactSettings(at_s=0.0, **changes).row())
+    state["q"][:] = POSE
+    row = contact_table((ContactSettings(at_s=0.0, **changes),))
     things = TouchedArm().things
-    touched, out = np.zeros(1), np.zeros(TOUCH_TRUTH)
+    touched, out = np.zeros(1), np.zeros(1, TOUCH_TRUTH)[0]
     powers = []
     for tick in range(500):
         elapsed_s = tick * TICK_S
-        change_touch(things, elapsed_s, state[0], state[1], touched, True)
-        external = describe_touch(things, elapsed_s, *state[:4], touched, row, 4.0, elapsed_s, 0.35, out)
+        change_touch(things, elapsed_s, *state["q"], touched, True)
+        external = describe_touch(things, elapsed_s, *state["q"], *state["dq"], touched, row, 4.0, elapsed_s, 0.35, out)
         powers.append(out[3])
-        assert external == contact_torque(row, out[0], 0.35, state[0], state[1])
-        assert out[1:3].tolist() == [changes["link"], 4.0]
-        before = state[0], state[1]
+        assert external == contact_torque(row[0], out["force_N"], 0.35, *state["q"])
+        assert (out["link"], out["index"]) == (changes["link"], 4.0)
+        before = tuple(state["q"])
         integrate(state, numbers, row, elapsed_s, 0.0, 0.0, TICK_S)
-        add_prescribed_work(row, elapsed_s, TICK_S, 0.35, *before, state[0], state[1], touched)
-    m11, m12, m22 = mass_matrix(state, state[Q + 1])
-    dq1, dq2 = state[DQ], state[DQ + 1]
+        add_prescribed_work(row, elapsed_s, TICK_S, 0.35, *before, *state["q"], touched)
+    m11, m12, m22 = mass_matrix(state, state["q"][1])
+    dq1, dq2 = state["dq"][0], state["dq"][1]
     kinetic_J = 0.5 * m11 * dq1**2 + m12 * dq1 * dq2 + 0.5 * m22 * dq2**2
     assert kinetic_J > 0.01
     assert touched[ENERGY] == pytest.approx(-kinetic_J, rel=2e-5)
     assert TICK_S * sum(powers) == pytest.approx(-kinetic_J, rel=0.02)
-    change_touch(things, 0.06, state[0], state[1], touched, False)
+    change_touch(things, 0.06, *state["q"], touched, False)
     assert touched[ENERGY] == 0.0
 
 

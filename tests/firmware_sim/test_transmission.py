@@ -10,8 +10,8 @@ from general_arm import GeneralArm, one_joint, without_friction
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.joint_mechanics import spring_torque
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
-from firmware_sim.arm.plant import DQ, DSHAFT, JOINT_TORQUE, SHAFT, Q, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings
+from firmware_sim.arm.plant import mass_matrix
+from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, DriveMode
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
@@ -23,8 +23,8 @@ def test_an_elastic_joint_swings_at_its_eigenfrequency():
     arm, inertia = one_joint()
     settings = MechanicsSettings(stiffness_Nm_rad=(5000.0, 0.0), rotor_inertia_kg_m2=(0.2, 0.0))
     swinging = GeneralArm(arm, settings)
-    swinging.state[DSHAFT] = 0.1
-    torque_Nm = swinging.run(20_000)[:, JOINT_TORQUE]
+    swinging.state["dq_m"][0] = 0.1
+    torque_Nm = swinging.run(20_000)["tau_J"][:, 0]
     upward = np.flatnonzero((torque_Nm[:-1] < 0.0) & (torque_Nm[1:] >= 0.0))
     crossing = upward - torque_Nm[upward] / (torque_Nm[upward + 1] - torque_Nm[upward])
     expected_rad_s = math.sqrt(5000.0 * (1.0 / 0.2 + 1.0 / inertia))
@@ -34,7 +34,7 @@ def test_an_elastic_joint_swings_at_its_eigenfrequency():
 def test_both_joints_swing_at_the_two_eigenfrequencies_of_the_linear_arm():
     settings = MechanicsSettings(stiffness_Nm_rad=(5000.0, 1500.0), rotor_inertia_kg_m2=(0.3, 0.05))
     swinging = GeneralArm(without_friction(), settings, q=(0.0, 0.8))
-    swinging.state[DSHAFT : DSHAFT + 2] = 1e-4, -2e-4
+    swinging.state["dq_m"][:] = 1e-4, -2e-4
     history = swinging.run(65_536)
     m11, m12, m22 = mass_matrix(swinging.state, 0.8)
     mass = np.zeros((4, 4))
@@ -45,7 +45,7 @@ def test_both_joints_swing_at_the_two_eigenfrequencies_of_the_linear_arm():
     )
     eigenvalues = np.linalg.eigvals(np.linalg.solve(mass, spring))
     expected_Hz = np.sort(np.sqrt(np.sort(eigenvalues.real)[2:])) / (2.0 * math.pi)
-    spectrum = np.abs(np.fft.rfft(history[:, JOINT_TORQUE + 1] * np.hanning(65_536)))
+    spectrum = np.abs(np.fft.rfft(history["tau_J"][:, 1] * np.hanning(65_536)))
     peaks = np.flatnonzero((spectrum[1:-1] > spectrum[:-2]) & (spectrum[1:-1] > spectrum[2:])) + 1
     highest = np.sort(peaks[np.argsort(spectrum[peaks])[-2:]]) / (65_536 * TICK_S)
     assert highest == pytest.approx(expected_Hz, abs=0.2)
@@ -65,7 +65,7 @@ def test_a_stiffer_and_stiffer_joint_becomes_the_stiff_one():
             damping_Nm_s=(0.01 * math.sqrt(stiffness), 0.01 * math.sqrt(stiffness)),
         )
         history = GeneralArm(arm, settings, q=(0.3, -0.7)).run(4_000, *targets)
-        away.append(np.abs(history[:, Q : Q + 2] - limit[:, Q : Q + 2]).max())
+        away.append(np.abs(history["q"] - limit["q"]).max())
     assert away[1] < 0.2 * away[0]
     assert away[2] < 0.2 * away[1]
     assert away[2] < 2e-5
@@ -102,7 +102,7 @@ def test_motor_side_friction_is_invisible_to_the_sensor(stiffness):
         motor_viscous_Nm_s=(0.4, 0.0),
     )
     moved = GeneralArm(arm, settings, dq=(1.0, 0.0))
-    moved.state[4] = 1.1
+    moved.state["tau_m"][0] = 1.1
     moved.run(1_000, 1.1)
     assert moved.dq[0] == pytest.approx(1.0, abs=1e-9)
     assert abs(moved.joint_torque[0]) < 1e-8
@@ -121,8 +121,9 @@ def test_a_motor_holds_below_its_own_friction_and_the_sensor_sees_the_load(way):
     )
     pushed = GeneralArm(arm, settings)
     push = ContactSettings(at_s=0.0, link=1, point_m=0.2, force_N=10.0, duration_s=100.0, angle_deg=way * 90.0)
-    history = pushed.run(10_000, contact=np.array(push.row()))
-    assert np.abs(history[:, [SHAFT, DSHAFT]]).max() == 0.0
+    history = pushed.run(10_000, contact=contact_table((push,)))
+    assert not np.any(history["q_m"][:, 0])
+    assert not np.any(history["dq_m"][:, 0])
     assert pushed.q[0] == pytest.approx(way * 2.0 / 2000.0, rel=1e-6)
     assert pushed.joint_torque[0] == pytest.approx(-way * 2.0, rel=1e-6)
 
@@ -150,11 +151,11 @@ def test_a_motor_crosses_the_backlash_before_it_moves_the_link():
         damping_Nm_s=(5.0, 0.0),
     )
     crossing = GeneralArm(arm, settings)
-    crossing.state[4] = 0.5
+    crossing.state["tau_m"][0] = 0.5
     history = crossing.run(2_000, 0.5)
-    moved = int(np.argmax(history[:, DQ] != 0.0))
-    assert history[moved - 1, SHAFT] <= 0.01
-    assert history[moved, SHAFT] > 0.01
+    moved = int(np.argmax(history["dq"][:, 0] != 0.0))
+    assert history["q_m"][moved - 1, 0] <= 0.01
+    assert history["q_m"][moved, 0] > 0.01
     assert moved * TICK_S == pytest.approx(math.sqrt(2.0 * 0.01 * 0.1 / 0.5), abs=2e-4)
 
 
@@ -171,7 +172,7 @@ def test_a_hand_finds_the_backlash_as_play_of_the_link():
     for way in (1.0, -1.0):
         held = GeneralArm(dataclasses.replace(arm, viscous_Nm_s=(2.0, 0.0)), settings)
         push = ContactSettings(at_s=0.0, link=1, point_m=0.2, force_N=5.0, duration_s=100.0, angle_deg=way * 90.0)
-        held.run(20_000, contact=np.array(push.row()))
+        held.run(20_000, contact=contact_table((push,)))
         ends.append(held.q[0])
     assert ends[0] - ends[1] == pytest.approx(0.02 + 2.0 * 1.0 / 5000.0, abs=1e-6)
 
@@ -190,7 +191,7 @@ def test_the_ripple_has_its_line_in_the_spectrum_of_the_sensor(is_elastic):
     )
     turning = GeneralArm(arm, settings, dq=(2.0 * math.pi, 0.0))
     history = turning.run(20_000)
-    torque_Nm = history[10_000:, JOINT_TORQUE]
+    torque_Nm = history["tau_J"][10_000:, 0]
     amplitude = np.abs(np.fft.rfft(torque_Nm)) * 2.0 / torque_Nm.size
     assert int(np.argmax(amplitude[1:])) + 1 == 36
     assert amplitude[36] == pytest.approx(0.2 * inertia / (inertia + 0.01), rel=0.03)
@@ -215,9 +216,9 @@ def test_the_encoder_is_on_its_side_of_the_spring(side):
     body = Body(Scenario(mechanics=settings, noise=False))
     for _ in range(10):
         body.advance((5.0, 2.0), TORQUE)
-    state = body._state
-    read = state[SHAFT : SHAFT + 2] if side == "motor" else state[Q : Q + 2]
-    assert np.abs(state[SHAFT : SHAFT + 2] - state[Q : Q + 2]).min() > 10.0 * POSITION_LSB_RAD
+    state = body._arm
+    read = state["q_m"] if side == "motor" else state["q"]
+    assert np.abs(state["q_m"] - state["q"]).min() > 10.0 * POSITION_LSB_RAD
     assert body.sample().q == pytest.approx(read, abs=0.51 * POSITION_LSB_RAD)
 
 
@@ -226,7 +227,7 @@ def test_the_sensor_of_an_elastic_arm_measures_its_springs():
     body = Body(Scenario(mechanics=settings, noise=False))
     for _ in range(10):
         body.advance((5.0, 2.0), TORQUE)
-    twist = body._state[SHAFT : SHAFT + 2] - body._state[Q : Q + 2]
+    twist = body._arm["q_m"] - body._arm["q"]
     assert body.sample().tau_J == pytest.approx(500.0 * twist, abs=1e-3)
     assert body.motor_torque_Nm == pytest.approx((5.0, 2.0), rel=1e-9)
 
@@ -237,6 +238,7 @@ def test_one_elastic_and_one_stiff_joint_go_together():
     ends = []
     for settings in (both, one):
         arm = GeneralArm(ARMS["M"], settings, q=(0.3, -0.7))
-        ends.append(arm.run(3_000, 2.0, -0.5)[-1, [Q, Q + 1, SHAFT, SHAFT + 1]])
+        last = arm.run(3_000, 2.0, -0.5)[-1]
+        ends.append([*last["q"], *last["q_m"]])
     assert ends[0] == pytest.approx(ends[1], abs=5e-5)
     assert ends[1][1] == ends[1][3]

@@ -6,22 +6,14 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from firmware_sim.arm.arms import ARMS, ArmProfile
-from firmware_sim.arm.plant import COULOMB, DQ, MECHANICAL_STATE, VISCOUS, Q, accelerate, fit_payload, mass_matrix
-from firmware_sim.arm.scripted_contact import TICK_S
-from firmware_sim.arm.touch_forces import (
-    THING_STATE,
-    TOUCH_HEADER,
-    TOUCH_TRUTH,
-    change_touch,
-    describe_touch,
-    initial_touch_state,
-    touch,
-    touch_table,
-)
+from firmware_sim.arm.plant import MECHANICAL_STATE, accelerate, fit_payload, mass_matrix
+from firmware_sim.arm.scripted_contact import TICK_S, contact_table
+from firmware_sim.arm.touch_forces import THING_STATE, TOUCH_HEADER, TOUCH_TRUTH, change_touch, describe_touch, touch
+from firmware_sim.body.touch_table import initial_touch_state, touch_table
 from firmware_sim.scenario.scenario import Scenario
 
 HISTORY = ("time_s", "q1", "q2", "dq1", "dq2", "force", "link", "index", "power", "energy", "tau1", "tau2")
-NOBODY = np.zeros(0)
+NOBODY = contact_table(())
 
 
 @compiled
@@ -32,20 +24,21 @@ def _rates(mechanical, arm, things, time_s, motor1, motor2, y, rates):
 
 
 @compiled
-def play(mechanical, arm, things, y, start_s, tick_count, substeps, motor, history, states):
+def play(mechanical, arm, things, nobody, y, start_s, tick_count, substeps, motor, history, states):
     """Integrate `tick_count` ticks; one row of history and one state per tick, before it."""
     step_s = TICK_S / substeps
     a, b, c, d = np.zeros(y.size), np.zeros(y.size), np.zeros(y.size), np.zeros(y.size)
-    out = np.zeros(TOUCH_TRUTH)
+    truth = np.zeros(5)
+    out = truth.view(TOUCH_TRUTH)[0]
     for tick in range(tick_count):
         time_s = start_s + tick * TICK_S
         change_touch(things, time_s, y[0], y[1], y[4:], False)
         tau1, tau2 = describe_touch(
-            things, time_s, y[0], y[1], y[2], y[3], y[4:], history[0, :0], -1.0, 0.0, arm[3], out
+            things, time_s, y[0], y[1], y[2], y[3], y[4:], nobody, -1.0, 0.0, arm["length_m"][0], out
         )
         history[tick, 0] = time_s
         history[tick, 1:5] = y[:4]
-        history[tick, 5:10] = out
+        history[tick, 5:10] = truth
         history[tick, 10], history[tick, 11] = tau1, tau2
         states[tick] = y[4:]
         for substep in range(substeps):
@@ -65,11 +58,11 @@ class TouchedArm:
         self.scenario = Scenario(start_deg=start_deg, **scenario)
         self.arm: ArmProfile = ARMS[self.scenario.profile]
         self.numbers = self.arm.numbers()
-        self.numbers[[VISCOUS, VISCOUS + 1, COULOMB, COULOMB + 1]] = damping, damping, 0.0, 0.0
+        self.numbers["viscous_Nm_s"], self.numbers["coulomb_Nm"] = damping, 0.0
         self.things = touch_table(self.scenario)
-        self.mechanical = np.zeros(MECHANICAL_STATE)
+        self.mechanical = np.zeros(1, MECHANICAL_STATE)[0]
         fit_payload(self.mechanical, self.numbers, self.scenario.payload_kg)
-        self.mechanical[Q : Q + 2], self.mechanical[DQ : DQ + 2] = q, dq
+        self.mechanical["q"], self.mechanical["dq"][:] = q, dq
         self.y = np.concatenate([q, dq, initial_touch_state(self.things)])
         self.motor = np.array(motor, dtype=np.float64)
         self.substeps = substeps
@@ -82,15 +75,15 @@ class TouchedArm:
         history = np.zeros((count, len(HISTORY)))
         self.states = np.zeros((count, self.y.size - 4))
         play(
-            self.mechanical, self.numbers, self.things, self.y, self.time_s, count, self.substeps, self.motor,
+            self.mechanical, self.numbers, self.things, NOBODY, self.y, self.time_s, count, self.substeps, self.motor,
             history, self.states,
         )  # fmt: skip
         self.time_s += count * TICK_S
         return dict(zip(HISTORY, history.T, strict=True))
 
-    def own(self, thing: int, place: int) -> np.ndarray:
-        """History of one place of one thing's state."""
-        return self.states[:, TOUCH_HEADER + thing * THING_STATE + place]
+    def own(self, thing: int, name: str) -> np.ndarray:
+        """History of one value of one thing's state."""
+        return self.states[:, TOUCH_HEADER:].copy().view(THING_STATE)[name][:, thing]
 
     def kinetic_J(self, history: dict[str, np.ndarray]) -> np.ndarray:
         """Kinetic energy of the arm over time."""

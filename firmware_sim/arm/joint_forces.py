@@ -1,0 +1,203 @@
+"""Forces and friction of one instant in the arm with everything that the rigid plant leaves out.
+
+Equations: `firmware_sim.arm.mechanics`, which integrates them. `now` is one element of ROW: where the arm is.
+"""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from adacd_hil.compiled import Structured, compiled, float_fields
+from adacd_hil.records import Vector
+from firmware_sim.arm.joint_mechanics import PAIR, bristle_rate, drift_factor, dry_level, ripple_torque, spring_torque
+from firmware_sim.arm.plant import accelerate, decide_slips, external_torque
+from firmware_sim.arm.touch_forces import touch
+
+Slips = tuple[int, int, int, int]
+"""Of both links, then of both motors."""
+
+ROW: Final = float_fields({"q": PAIR, "dq": PAIR, "q_m": PAIR, "dq_m": PAIR, "bristle_rad": PAIR, "tau_m": PAIR})
+"""What is integrated, or its rates: link side, motor side, bristles, motor torque. The touch state is beside it."""
+
+FORCES: Final = float_fields(
+    {
+        "viscous_drift": PAIR,  # factors of friction at this temperature
+        "coulomb_drift": PAIR,
+        "link_Nm": PAIR,  # on the link side, less dry and viscous friction
+        "motor_Nm": PAIR,  # on the motor side of an elastic joint, less dry friction
+        "motor_level_Nm": PAIR,  # dry friction there
+        "joint_Nm": PAIR,  # through the sensor; of a stiff joint before motor friction and rotor
+        "external_Nm": PAIR,
+        "held_Nm": PAIR,  # gravity torque, positive where it must be held along +q
+        "bristles_Nm": PAIR,  # LuGre's σ₀ z + σ₁ ż
+        "bristle_level_Nm": PAIR,  # g of a joint with bristles
+        "viscous_Nm_s": PAIR,  # friction of the link side as it is at this instant
+        "coulomb_Nm": PAIR,
+    }
+)
+"""Forces and friction of one instant."""
+
+
+class Surroundings(NamedTuple):
+    """What acts on the arm in a tick: elements of MECHANICAL_STATE, ARM_NUMBERS and MECHANICS_NUMBERS, and who touches.
+
+    contact: one row of the contact table, or none. things: the touch table.
+    """
+
+    state: np.void
+    arm: np.void
+    mechanics: np.void
+    contact: Structured
+    things: Structured
+
+
+@compiled
+def gravity_torque(state: np.void, arm: np.void, mechanics: np.void, q1: float, q2: float) -> tuple[float, float]:
+    """Give tau_gravity of both joints in Nm, positive where it must be held along +q."""
+    gravity = mechanics["gravity_m_s2"]
+    if gravity == 0.0:
+        return 0.0, 0.0
+    length1_m = arm["length_m"][0]
+    downhill1 = mechanics["downhill_rad"] - q1
+    downhill2 = downhill1 - q2
+    moment1 = arm["moment_kg_m"] + state["payload_kg"] * length1_m
+    along2 = state["beta"] / length1_m
+    beside2 = state["sigma"] / length1_m
+    exerted2 = gravity * (along2 * math.sin(downhill2) - beside2 * math.cos(downhill2))
+    return -(gravity * moment1 * math.sin(downhill1) + exerted2), -exerted2
+
+
+@compiled
+def set_drift(state: np.void, mechanics: np.void, forces: np.void) -> None:
+    """Set the factors of friction at the joints' temperatures."""
+    for joint in range(2):
+        temperature_C = state["temperature_C"][joint]
+        forces["viscous_drift"][joint] = drift_factor(mechanics["viscous_drop_per_K"][joint], temperature_C)
+        forces["coulomb_drift"][joint] = drift_factor(mechanics["coulomb_drop_per_K"][joint], temperature_C)
+
+
+@compiled
+def collect_forces(
+    around: Surroundings,
+    now: np.void,
+    touch_state: Vector,
+    touch_rates: Vector,
+    time_s: float,
+    elapsed_s: float,
+    forces: np.void,
+) -> None:
+    """Fill forces, friction levels and touch rates of this instant. elapsed_s: since the contact's onset."""
+    state, arm, mechanics = around.state, around.arm, around.mechanics
+    q1, q2, dq1, dq2 = now["q"][0], now["q"][1], now["dq"][0], now["dq"][1]
+    ext1, ext2 = external_torque(arm, around.contact, elapsed_s, q1, q2, dq1, dq2)
+    touch1, touch2 = 0.0, 0.0
+    if around.things.size != 0:
+        touch1, touch2 = touch(around.things, time_s, q1, q2, dq1, dq2, touch_state, touch_rates)
+    held1, held2 = gravity_torque(state, arm, mechanics, q1, q2)
+    forces["external_Nm"][0] = ext1 + touch1
+    forces["external_Nm"][1] = ext2 + touch2
+    forces["held_Nm"][0], forces["held_Nm"][1] = held1, held2
+    for joint in range(2):
+        velocity = now["dq"][joint]
+        tau = now["tau_m"][joint]
+        motor = tau + ripple_torque(mechanics, joint, now["q_m"][joint], tau)
+        viscous = arm["viscous_Nm_s"][joint] * forces["viscous_drift"][joint]
+        motor_viscous = mechanics["motor_viscous_Nm_s"][joint] * forces["viscous_drift"][joint]
+        motor_level = mechanics["motor_coulomb_Nm"][joint] * forces["coulomb_drift"][joint] + state["brake_Nm"][joint]
+        is_elastic = mechanics["stiffness_Nm_rad"][joint] != 0.0
+        through = motor
+        if is_elastic:
+            twist = now["q_m"][joint] - now["q"][joint]
+            through = spring_torque(mechanics, joint, twist, now["dq_m"][joint] - velocity)
+            forces["motor_Nm"][joint] = motor - through - motor_viscous * now["dq_m"][joint]
+        level = dry_level(mechanics, joint, arm["coulomb_Nm"][joint], velocity, through, forces["coulomb_drift"][joint])
+        bristles = 0.0
+        sigma0 = mechanics["sigma0_Nm_rad"][joint]
+        if sigma0 != 0.0:
+            z = now["bristle_rad"][joint]
+            bristles = sigma0 * z + mechanics["sigma1_Nm_s"][joint] * bristle_rate(sigma0, z, velocity, level)
+            forces["bristle_level_Nm"][joint] = level
+            viscous = mechanics["sigma2_Nm_s"][joint] * forces["viscous_drift"][joint]
+            level = 0.0
+        if not is_elastic:
+            viscous += motor_viscous
+            level += motor_level
+        forces["motor_level_Nm"][joint] = motor_level
+        forces["joint_Nm"][joint] = through
+        forces["bristles_Nm"][joint] = bristles
+        forces["link_Nm"][joint] = through + forces["external_Nm"][joint] - forces["held_Nm"][joint] - bristles
+        forces["viscous_Nm_s"][joint] = viscous
+        forces["coulomb_Nm"][joint] = level
+
+
+@compiled
+def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
+    """Say whether nothing dry acts on a link, so that it never sticks."""
+    is_braked = mechanics["stiffness_Nm_rad"][joint] == 0.0 and state["brake_Nm"][joint] != 0.0
+    return bool(mechanics["is_free"][joint] != 0.0 and not is_braked)
+
+
+@compiled
+def decide(now: np.void, around: Surroundings, forces: np.void) -> Slips:
+    """Decide the slips of both links and both motors from the forces of this instant."""
+    state, mechanics = around.state, around.mechanics
+    slip1, slip2 = decide_slips(
+        state, forces, forces["link_Nm"][0], forces["link_Nm"][1], now["q"][1], now["dq"][0], now["dq"][1]
+    )
+    if is_free(0, state, mechanics):
+        slip1 = 1
+    if is_free(1, state, mechanics):
+        slip2 = 1
+    return slip1, slip2, _motor_slip(0, now, mechanics, forces), _motor_slip(1, now, mechanics, forces)
+
+
+@compiled
+def _motor_slip(joint: int, now: np.void, mechanics: np.void, forces: np.void) -> int:
+    """Decide the slip of one motor; only an elastic joint with motor-side Coulomb friction has one."""
+    if mechanics["stiffness_Nm_rad"][joint] == 0.0 or forces["motor_level_Nm"][joint] == 0.0:
+        return 1
+    velocity = now["dq_m"][joint]
+    if velocity != 0.0:
+        return 1 if velocity > 0.0 else -1
+    torque = forces["motor_Nm"][joint]
+    if abs(torque) <= forces["motor_level_Nm"][joint]:
+        return 0
+    return 1 if torque > 0.0 else -1
+
+
+@compiled
+def accelerate_links(
+    now: np.void, around: Surroundings, slips: Slips, forces: np.void
+) -> tuple[float, float, float, float]:
+    """Give ddq of both links and their dry friction, as `firmware_sim.arm.plant.accelerate` does."""
+    link_Nm = forces["link_Nm"]
+    return accelerate(
+        around.state, forces, slips[0], slips[1], link_Nm[0], link_Nm[1], now["q"][1], now["dq"][0], now["dq"][1]
+    )
+
+
+@compiled
+def find_friction(
+    now: np.void, around: Surroundings, forces: np.void
+) -> tuple[float, float, float, float, float, float]:
+    """Give ddq, friction of the joint and of a stiff joint's motor side, two each, from the forces of this instant."""
+    mechanics = around.mechanics
+    ddq1, ddq2, dry1, dry2 = accelerate_links(now, around, decide(now, around, forces), forces)
+    motor1, motor2 = 0.0, 0.0
+    if mechanics["stiffness_Nm_rad"][0] == 0.0:
+        motor1 = _motor_share(0, dry1, now, mechanics, forces)
+    if mechanics["stiffness_Nm_rad"][1] == 0.0:
+        motor2 = _motor_share(1, dry2, now, mechanics, forces)
+    friction1 = dry1 + forces["viscous_Nm_s"][0] * now["dq"][0] + forces["bristles_Nm"][0] - motor1
+    friction2 = dry2 + forces["viscous_Nm_s"][1] * now["dq"][1] + forces["bristles_Nm"][1] - motor2
+    return ddq1, ddq2, friction1, friction2, motor1, motor2
+
+
+@compiled
+def _motor_share(joint: int, dry_Nm: float, now: np.void, mechanics: np.void, forces: np.void) -> float:
+    """Give the motor-side part of a stiff joint's friction, Nm."""
+    viscous = mechanics["motor_viscous_Nm_s"][joint] * forces["viscous_drift"][joint] * now["dq"][joint]
+    if forces["coulomb_Nm"][joint] == 0.0:
+        return float(viscous)
+    return float(viscous + dry_Nm * forces["motor_level_Nm"][joint] / forces["coulomb_Nm"][joint])

@@ -1,0 +1,304 @@
+"""The emulated arm from tick to tick, compiled: drives' inner loops, mechanics, the person, and the sensors.
+
+In each tick of 100 µs
+
+    the person's and the payload's change of this tick → torque target of each drive → integrate → encoder → velocity
+
+Callers hold state and numbers as plain vectors, which cost less to hand over; BODY_STATE and BODY_NUMBERS name what is
+in them.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.compiled import Structured, compiled, float_fields
+from adacd_hil.records import TRUTH_LAYOUT, Vector
+from firmware_sim.arm.joint_mechanics import PAIR
+from firmware_sim.arm.mechanics import integrate_mechanics, observe
+from firmware_sim.arm.plant import (
+    ARM_NUMBERS,
+    MECHANICAL_STATE,
+    accelerate,
+    decide_slips,
+    external_torque,
+    fit_payload,
+    integrate,
+    mirror_stiff_joints,
+)
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, VELOCITY_LSB_RAD_S, DriveMode, to_counts, track
+from firmware_sim.arm.touch_forces import TOUCH_TRUTH, add_prescribed_work, change_touch, describe_touch
+from firmware_sim.body.motor import MOTOR_NUMBERS, MOTOR_STATE, command_torque, heat_motor
+from firmware_sim.body.sensors import (
+    ENCODER_NUMBERS,
+    NOISE_TICKS,
+    TRANSDUCER_NUMBERS,
+    TRANSDUCER_STATE,
+    read_angle,
+    sample_torque,
+    sense_torque,
+    walk_offset,
+)
+
+_COURSE: Final = float_fields(
+    {
+        "tick": (),  # since power-on
+        "start_tick": (),  # tick of scenario time 0; −1 before
+        "contact": (),  # index of the contact in force or the next one
+        "change": (),  # index of the next payload change
+        "encoder_rad": PAIR,
+        "estimate_rad": PAIR,  # position of the tracking loop
+        "velocity_rad_s": PAIR,  # velocity of the tracking loop
+    }
+)
+BODY_STATE: Final = np.dtype(
+    [("arm", MECHANICAL_STATE), ("course", _COURSE), ("motor", MOTOR_STATE), ("transducer", TRANSDUCER_STATE)]
+)
+BODY_NUMBERS: Final = np.dtype(
+    [("arm", ARM_NUMBERS), ("motor", MOTOR_NUMBERS), ("encoder", ENCODER_NUMBERS), ("transducer", TRANSDUCER_NUMBERS)]
+)
+PAYLOAD_CHANGE: Final = float_fields(
+    {
+        "tick": (),
+        "mass_kg": (),
+        "along_m": (),
+        "beside_m": (),
+        "inertia_kg_m2": (),
+    }  # from the tip; along, beside link 2
+)
+_TRUTH: Final = float_fields({field.name: (field.size,) for field in TRUTH_LAYOUT.fields})
+
+_OFF: Final = int(DriveMode.OFF)
+_TORQUE: Final = int(DriveMode.TORQUE)
+_BRAKE: Final = int(DriveMode.BRAKE)
+_BRAKE_SLOWLY: Final = int(DriveMode.BRAKE_SLOWLY)
+_BRAKE_HARD: Final = int(DriveMode.BRAKE_HARD)
+_SLOW_SHARE: Final = 0.5
+_HARD_SHARE: Final = 1.5
+"""Of the brake's damping. The shortest time constant, 10 ms / 1.5, is four lags of the drive's velocity: no
+overshoot."""
+
+
+@compiled
+def find_contact(course: np.void, contacts: Structured) -> Structured:
+    """Give the row of the contact in force at this tick, or none; steps over those that have ended."""
+    tick = course["tick"] - course["start_tick"]
+    index = int(course["contact"])
+    while index < contacts.size and contacts[index]["end_tick"] <= tick:
+        index += 1
+    course["contact"] = index
+    if course["start_tick"] >= 0.0 and index < contacts.size and contacts[index]["onset_tick"] <= tick:
+        return contacts[index : index + 1]
+    return contacts[:0]
+
+
+@compiled
+def _elapsed_s(course: np.void, contact: Structured) -> float:
+    """Give the time since the onset of the contact in force, 0 without one."""
+    if contact.size == 0:
+        return 0.0
+    return float((course["tick"] - course["start_tick"] - contact[0]["onset_tick"]) * TICK_S)
+
+
+@compiled
+def _change_payload(state: np.void, arm: np.void, payloads: Structured) -> None:
+    """Fit or take off what the scenario says for this tick; payloads: rows of PAYLOAD_CHANGE."""
+    course = state["course"]
+    if course["start_tick"] < 0.0:
+        return
+    tick = course["tick"] - course["start_tick"]
+    index = int(course["change"])
+    while index < payloads.size and payloads[index]["tick"] <= tick:
+        change = payloads[index]
+        fit_payload(
+            state["arm"], arm, change["mass_kg"], change["along_m"], change["beside_m"], change["inertia_kg_m2"]
+        )
+        index += 1
+    course["change"] = index
+
+
+@compiled
+def _scenario_s(course: np.void) -> float:
+    """Give the scenario time of this tick in s, −1 before the scenario starts."""
+    return float((course["tick"] - course["start_tick"]) * TICK_S) if course["start_tick"] >= 0.0 else -1.0
+
+
+@compiled
+def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velocity_rad_s: float) -> float:
+    """Say what a drive asks of its torque loop, Nm, within its rated torque."""
+    limit_Nm = arm["torque_limit_Nm"][joint]
+    if mode == _TORQUE:
+        return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
+    damping = arm["brake_damping_Nm_s"][joint]
+    if mode == _BRAKE_SLOWLY:
+        damping *= _SLOW_SHARE
+    elif mode == _BRAKE_HARD:
+        damping *= _HARD_SHARE
+    elif mode != _BRAKE:
+        return 0.0
+    return float(min(max(-damping * velocity_rad_s, -limit_Nm), limit_Nm))
+
+
+@compiled
+def _read_encoder(course: np.void, numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> None:
+    """Take the encoder's position at the end of a tick and advance the drive's velocity. angle: that of its shaft."""
+    now_rad = read_angle(numbers["encoder"], joint, angle_rad, noise_counts)
+    course["estimate_rad"][joint], course["velocity_rad_s"][joint] = track(
+        course["encoder_rad"][joint],
+        now_rad,
+        course["estimate_rad"][joint],
+        course["velocity_rad_s"][joint],
+        TICK_S,
+        numbers["motor"]["tracking_rad_s"][joint],
+    )
+    course["encoder_rad"][joint] = now_rad
+
+
+@compiled
+def _measure_tick(state: np.void, numbers: np.void, encoder_noise: NDArray[np.float64]) -> None:
+    """Let motors, encoders and torque sensors see the end of a tick."""
+    arm, course, motor = state["arm"], state["course"], numbers["motor"]
+    tick = course["tick"]
+    noise = encoder_noise[int(tick) % (2 * NOISE_TICKS)]
+    for joint in range(2):
+        _read_encoder(course, numbers, joint, arm["q_encoder"][joint], noise[joint])
+    if motor["has_limits"] != 0.0:
+        for joint in range(2):
+            heat_motor(motor, state["motor"], joint, arm["tau_m"][joint])
+    if numbers["transducer"]["has_memory"] != 0.0:
+        tau_J, temperature_C = arm["tau_J"], arm["temperature_C"]
+        sense_torque(
+            numbers["transducer"], state["transducer"], tick, tau_J[0], tau_J[1], temperature_C[0], temperature_C[1]
+        )
+
+
+@compiled
+def advance_body(
+    state_vector: Vector,
+    number_vector: Vector,
+    mechanics: Structured | None,
+    contacts: Structured,
+    things: Structured,
+    touch_state: Vector,
+    payloads: Structured,
+    encoder_noise: NDArray[np.float64],
+    setpoint1_Nm: float,
+    setpoint2_Nm: float,
+    mode1: int,
+    mode2: int,
+    tick_count: int,
+    substeps: int,
+    work: Vector,
+) -> None:
+    """Advance the body by `tick_count` ticks; without mechanics the rigid arm, and numba then compiles nothing else."""
+    state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
+    now, course, motors = state["arm"], state["course"], state["motor"]
+    arm, motor = numbers["arm"], numbers["motor"]
+    step_s = TICK_S / substeps
+    for _ in range(tick_count):
+        _change_payload(state, arm, payloads)
+        contact = find_contact(course, contacts)
+        elapsed_s = _elapsed_s(course, contact)
+        before1, before2 = now["q"][0], now["q"][1]
+        change_touch(things, _scenario_s(course), before1, before2, touch_state, contact.size != 0)
+        wanted1 = _torque_target(arm, 0, mode1, setpoint1_Nm, course["velocity_rad_s"][0])
+        wanted2 = _torque_target(arm, 1, mode2, setpoint2_Nm, course["velocity_rad_s"][1])
+        target1 = command_torque(motor, motors, 0, wanted1, now["tau_m"][0], mode1 != _OFF)
+        target2 = command_torque(motor, motors, 1, wanted2, now["tau_m"][1], mode2 != _OFF)
+        if mechanics is None:
+            for substep in range(substeps):
+                integrate(now, arm, contact, elapsed_s + substep * step_s, target1, target2, step_s)
+            mirror_stiff_joints(now)
+        else:
+            brake_Nm = mechanics[0]["holding_brake_Nm"]
+            now["brake_Nm"][0] = brake_Nm[0] if mode1 == _OFF else 0.0
+            now["brake_Nm"][1] = brake_Nm[1] if mode2 == _OFF else 0.0
+            integrate_mechanics(
+                now, arm, mechanics[0], contact, things, touch_state,
+                _scenario_s(course), elapsed_s, target1, target2, TICK_S, substeps, work,
+            )  # fmt: skip
+        add_prescribed_work(
+            contact, elapsed_s, TICK_S, arm["length_m"][0], before1, before2, now["q"][0], now["q"][1], touch_state
+        )
+        _measure_tick(state, numbers, encoder_noise)
+        course["tick"] += 1.0
+
+
+@compiled
+def sample_body(
+    state_vector: Vector, number_vector: Vector, noise: Vector, walk: Vector, out: NDArray[np.int64]
+) -> None:
+    """Quantise what the devices measure now: position, velocity, torque counts, two each (6,)."""
+    state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
+    arm, course, transducers = state["arm"], state["course"], state["transducer"]
+    tick = course["tick"]
+    walk_offset(transducers, tick, walk)
+    for joint in range(2):
+        tau, other = arm["tau_J"][joint], arm["tau_J"][1 - joint]
+        out[joint] = to_counts(course["encoder_rad"][joint], POSITION_LSB_RAD)
+        out[2 + joint] = to_counts(course["velocity_rad_s"][joint], VELOCITY_LSB_RAD_S)
+        out[4 + joint] = sample_torque(
+            numbers["transducer"], transducers, joint, tick, tau, other, arm["temperature_C"][joint], noise[joint]
+        )
+
+
+@compiled
+def fill_truth(
+    state_vector: Vector,
+    number_vector: Vector,
+    mechanics: Structured | None,
+    contacts: Structured,
+    things: Structured,
+    touch_state: Vector,
+    payloads: Structured,
+    work: Vector,
+    touch_truth: Vector,
+    block: Vector,
+) -> None:
+    """Fill a block laid out by TRUTH_LAYOUT with what is true at this instant. touch_truth: room for TOUCH_TRUTH."""
+    state, arm = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]["arm"]
+    now, course = state["arm"], state["course"]
+    touched, out = touch_truth.view(TOUCH_TRUTH)[0], block.view(_TRUTH)[0]
+    block[:] = 0.0
+    _change_payload(state, arm, payloads)
+    contact = find_contact(course, contacts)
+    elapsed_s = _elapsed_s(course, contact)
+    q1, q2, dq1, dq2 = now["q"][0], now["q"][1], now["dq"][0], now["dq"][1]
+    time_s = _scenario_s(course)
+    change_touch(things, time_s, q1, q2, touch_state, contact.size != 0)
+    describe_touch(
+        things, time_s, q1, q2, dq1, dq2, touch_state,
+        contact, course["contact"], elapsed_s, arm["length_m"][0], touched,
+    )  # fmt: skip
+    if mechanics is None:
+        ext1, ext2 = external_torque(arm, contact, elapsed_s, q1, q2, dq1, dq2)
+        torque1 = now["tau_m"][0] + ext1
+        torque2 = now["tau_m"][1] + ext2
+        slip1, slip2 = decide_slips(now, arm, torque1, torque2, q2, dq1, dq2)
+        _, _, friction1, friction2 = accelerate(now, arm, slip1, slip2, torque1, torque2, q2, dq1, dq2)
+        friction1 += arm["viscous_Nm_s"][0] * dq1
+        friction2 += arm["viscous_Nm_s"][1] * dq2
+        held1, held2 = 0.0, 0.0
+    else:
+        ext1, ext2, friction1, friction2, held1, held2 = observe(
+            now, arm, mechanics[0], contact, things, touch_state, time_s, elapsed_s, work
+        )
+    out["tau_ext"][0], out["tau_ext"][1] = ext1, ext2
+    out["tau_friction"][0], out["tau_friction"][1] = friction1, friction2
+    out["tau_gravity"][0], out["tau_gravity"][1] = held1, held2
+    out["contact_force"][0] = touched["force_N"]
+    out["contact_link"][0] = touched["link"]
+    out["contact_index"][0] = touched["index"]
+    out["contact_power"][0] = touched["power_W"]
+    out["contact_energy"][0] = touched["energy_J"]
+    out["payload"][0] = now["payload_kg"]
+    theta = out["theta"]
+    theta[0], theta[1], theta[2] = now["alpha"] + now["gamma"], now["beta"], now["gamma"]
+    for joint in range(2):
+        theta[3 + joint], theta[5 + joint] = arm["viscous_Nm_s"][joint], arm["coulomb_Nm"][joint]
+        out["q"][joint], out["dq"][joint] = now["q"][joint], now["dq"][joint]
+        out["tau_J"][joint] = now["tau_J"][joint]
+        out["q_m"][joint], out["tau_m"][joint] = now["q_m"][joint], now["tau_m"][joint]
+        out["joint_temperature"][joint] = now["temperature_C"][joint]
