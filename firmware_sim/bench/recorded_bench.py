@@ -19,7 +19,8 @@ from adacd_hil.records import Vector
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode
-from firmware_sim.bench.bench import Bench, ClockMode, Movable
+from firmware_sim.bench.bench import Bench, ClockMode
+from firmware_sim.bench.bench_nodes import Movable
 from firmware_sim.body.body import Measurement
 from firmware_sim.canopen.contracts import EmulatedContract
 from firmware_sim.nodes.sensor_node import ROOM_TEMPERATURE_C
@@ -207,7 +208,7 @@ class RecordedBench(Bench):
     def outlive_host(self) -> None:
         """Do nothing: the recording moves the arm, with or without host."""
 
-    def _build_body(self) -> Movable:
+    def _build_body(self, scenario: Scenario, seed: int) -> Movable:  # noqa: ARG002 (the recording is the arm)
         return self._body_now
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
@@ -226,12 +227,12 @@ class RecordedBench(Bench):
 
     @property
     def _is_plain(self) -> bool:
-        is_whole = sorted(can_id for can_id, _ in self._answers_now) == sorted(self._answers)
+        is_whole = sorted(can_id for can_id, _ in self._answers_now) == sorted(self._nodes.answers)
         return is_whole and super()._is_plain
 
     def _listen(self) -> None:
         super()._listen()
-        self._senders = ((0, self._send_recorded),) if self._senders else ()
+        self._nodes.senders = ((0, self._send_recorded),) if self._nodes.senders else ()
 
     def _send_recorded(self) -> None:
         for can_id, data in self._answers_now:

@@ -10,7 +10,8 @@ from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError, open_bus
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS
-from firmware_sim.bench.bench import LONGEST_ORPHANAGE_NS, Bench, ClockMode
+from firmware_sim.bench.bench import Bench, ClockMode
+from firmware_sim.bench.bench_time import LONGEST_ORPHANAGE_NS
 from firmware_sim.bench.outbox import Departure
 from firmware_sim.canopen.contracts import is_fd
 from firmware_sim.canopen.pdo_record import LISTENED_IDS

@@ -30,7 +30,7 @@ def enabled_host(objects: dict[tuple[int, int, int], int] | None = None) -> Benc
 
 def poll(host: BenchHost) -> None:
     """Let the bench look again after something was done to a device."""
-    host.bench._poll(host.bench.now_ns)
+    host.bench.time.poll(host.bench.now_ns)
 
 
 def pass_ms(host: BenchHost, count: int) -> None:

@@ -271,7 +271,7 @@ def test_emergency_messages_keep_their_inhibit_time_and_none_is_lost(host):
         host.bench.devices[0].trip(watchdog, 0)
     sent = []
     for t_ms in range(12):
-        host.bench._poll(t_ms * 1_000_000)
+        host.bench.time.poll(t_ms * 1_000_000)
         sent.extend((t_ms, struct.unpack_from("<H", data)[0]) for data in host.taken(0x081))
     assert sent == [(0, 0x8130), (5, 0x8250), (10, 0x8700)]
 

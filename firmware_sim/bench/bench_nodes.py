@@ -1,0 +1,169 @@
+"""The nodes of a bench, two drives and two torque sensors around one arm, and what they exchange on the bus."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from adacd_hil.records import JOINTS, Vector
+from adacd_hil.wire.codec import Codec, contract_folder
+from adacd_hil.wire.time_marks import answers_to_sync
+from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.bench.injector import Handler, Injector
+from firmware_sim.body.body import Measurement
+from firmware_sim.body.sensors import converter_ends
+from firmware_sim.canopen.contracts import EmulatedContract, longest_pdo
+from firmware_sim.canopen.object_dictionary import Abort, refuse
+from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
+from firmware_sim.nodes.drive_node import DriveNode, Motor
+from firmware_sim.nodes.sensor_node import SensorNode
+from firmware_sim.scenario.faults import device_ids, own_messages
+from firmware_sim.scenario.scenario import Scenario
+
+TICK_NS = round(TICK_S * 1e9)
+_NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
+_LONGEST_PERIOD_US = 100_000
+
+
+class Movable(Protocol):
+    """The arm itself, as far as its devices have to do with it; `Body` says what each means."""
+
+    @property
+    def motor_torque_Nm(self) -> tuple[float, float]:
+        """Torque that the drives know."""
+
+    @property
+    def is_torque_limited(self) -> tuple[bool, bool]:
+        """Whether each drive wants more torque than it may have."""
+
+    @property
+    def motor_error_code(self) -> tuple[int, int]:
+        """Fault that each motor calls for, 0 for none."""
+
+    @property
+    def joint_temperature_C(self) -> tuple[float, float]:
+        """Temperature of each joint."""
+
+    @property
+    def drive_velocity_rad_s(self) -> tuple[float, float]:
+        """Velocity that the drives know."""
+
+    def start_scenario(self) -> None:
+        """Take note that the drives are enabled."""
+
+    def advance(
+        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int | None = None
+    ) -> None:
+        """Move by some ticks."""
+
+    def sample(self) -> Measurement:
+        """Measure."""
+
+    def truth(self, out: Vector) -> None:
+        """Fill in what is true."""
+
+
+class BenchNodes:
+    """All nodes of one bench: which frames each takes and sends, and what is due by time."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        codec: Codec,
+        contract: EmulatedContract,
+        injector: Injector,
+        arm: Movable,
+        is_free_running: bool,
+    ) -> None:
+        """Build the nodes around an arm. `is_free_running`: time passes without SYNC, so drives watch for it.
+
+        Raises CodecError when the DBC lacks a message, OSError when an EDS can't be read.
+        """
+        self.senders: tuple[tuple[int, Callable[[], None]], ...] = ()
+        """What answers SYNC: place of a node, and how it sends."""
+        self.commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
+        """By identifier, the nodes that take a frame of the host, and how."""
+        self.has_all_answers = False
+        """Whether all cyclic frames of the contract, and no others, answer SYNC."""
+        self.answers = answers_to_sync(codec)
+        self._arm = arm
+        folder = contract_folder()
+        files = [contract.drive_eds if name.startswith("Drive") else contract.sensor_eds for name in _NODES]
+        right_ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
+        ids = device_ids(scenario.faults, right_ids)
+        longest = longest_pdo(codec)
+        self.devices = tuple(
+            EmulatedDevice(
+                ids[i],
+                folder / files[i],
+                injector.sender(i),
+                own_messages(codec.by_id, right_ids[i], ids[i]),
+                longest,
+            )
+            for i in range(len(_NODES))
+        )
+        rated_Nm = scenario.arm.rated_torque_Nm
+        self.drives = tuple(
+            DriveNode(self.devices[i], codec, i + 1, self._motor(i), rated_Nm[i], is_free_running)
+            for i in range(JOINTS)
+        )
+        self.sensors = tuple(self._make_sensor(i, codec, scenario) for i in range(JOINTS))
+        injector.attach(self.devices, self.drives, self.sensors)
+        self.period_ns = self.devices[0].value(0x1006) * 1000
+        for device in self.devices:
+            device.watch(0x1006, 0, check=_check_period)
+        self.devices[0].watch(0x1006, 0, self._set_period)
+        self.listeners = SyncListeners(self.devices)
+
+    def listen(self) -> None:
+        """Take over which PDOs the devices exchange."""
+        self.senders = tuple((i, send) for i, device in enumerate(self.devices) for send in device.pdos.on_sync)
+        self.has_all_answers = self.answers == frozenset().union(*(device.pdos.answers for device in self.devices))
+        commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
+        for place, device in enumerate(self.devices):
+            for can_id, take in device.pdos.handlers():
+                commands[can_id] = (*commands.get(can_id, ()), (place, take))
+        self.commands = commands
+
+    def poll(self, t_ns: int) -> int:
+        """Do what is due by time; return when to look again."""
+        drive1, drive2 = self.drives
+        sensor1, sensor2 = self.sensors
+        return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
+
+    def move_arm(self, tick_count: int) -> None:
+        """Let the arm move with what its motors are told."""
+        drive1, drive2 = self.drives
+        torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
+        self._arm.advance(torque_Nm, (drive1.motor_mode, drive2.motor_mode), tick_count)
+
+    def lose_sync(self, heard: Sequence[int], t_ns: int) -> None:
+        """Let the drives that have not heard a SYNC count its period; `heard`: how often each node has."""
+        for drive, has_heard in zip(self.drives, heard, strict=False):  # the drives come first
+            if not has_heard:
+                drive.on_lost_sync(t_ns)
+
+    def _motor(self, joint: int) -> Motor:
+        return Motor(
+            velocity_rad_s=lambda: self._arm.drive_velocity_rad_s[joint],
+            torque_Nm=lambda: self._arm.motor_torque_Nm[joint],
+            is_limited=lambda: self._arm.is_torque_limited[joint],
+            error_code=lambda: self._arm.motor_error_code[joint],
+        )
+
+    def _make_sensor(self, joint: int, codec: Codec, scenario: Scenario) -> SensorNode:
+        return SensorNode(
+            self.devices[JOINTS + joint],
+            codec,
+            joint + 1,
+            converter_ends(scenario.sensors, joint),
+            lambda: self._arm.joint_temperature_C[joint],
+        )
+
+    def _set_period(self, period_us: int) -> None:
+        if period_us:  # 0 is written to change 0x1019; the period stays
+            self.period_ns = period_us * 1000
+
+
+def _check_period(period_us: int) -> None:
+    """Accept whole ticks, and 0."""
+    if not 0 <= period_us <= _LONGEST_PERIOD_US or period_us * 1000 % TICK_NS:
+        refuse(Abort.VALUE_RANGE)
