@@ -15,7 +15,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.pacing import Tick, make_pacer
+from adacd_hil.control.pacing import GridPacer, Tick, make_pacer
 from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.contract import load_contract
@@ -122,7 +122,8 @@ class FirstHost:
         self.tap = Tap(wire.ends[FIRST], wire.clock)
         self.arm = Arm(settings, codec, self.tap)
         self.master = Master(settings, codec, self.tap)
-        self._exchange = Exchange(settings, self.tap, self.arm, self.master, wire.clock)
+        pacer = GridPacer(wire.clock, PERIOD_NS)
+        self._exchange = Exchange(settings, self.tap, self.arm, self.master, pacer, wire.clock)
         self.cycle = -1
         self._clock = wire.clock
         self.states = []

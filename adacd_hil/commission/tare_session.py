@@ -22,9 +22,9 @@ from adacd_hil.commission.tare import (
     measure_pose,
     solve_tare,
 )
-from adacd_hil.commission.zero_torque import IdleCycle
+from adacd_hil.commission.zero_torque import ZeroTorqueLoop
 from adacd_hil.control.session import git_commit
-from adacd_hil.control.tare_file import FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
+from adacd_hil.control.tare_file import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master
@@ -72,7 +72,7 @@ class TareSession:
         self._arm = Arm(dataclasses.replace(self.settings, arm=arm), self.codec, tap)
         self._master = Master(self.settings, self.codec, tap)
         self._canopen = CanopenBus(self.bus)
-        self._cycle = IdleCycle(self.settings, tap, self._arm, self._master, self.clock)
+        self._loop = ZeroTorqueLoop(self.settings, tap, self.clock, self._arm, self._master)
         self._period_s = self.settings.bus.period_s
 
     def interrupt(self) -> None:
@@ -115,7 +115,7 @@ class TareSession:
     def _step(self) -> ArmState:
         if self._is_interrupted:
             raise TareInterruptedError("interrupted")
-        return self._cycle.step()
+        return self._loop.step().state
 
     def _cycles(self, duration_s: float) -> int:
         return max(1, round(duration_s / self._period_s))
@@ -262,7 +262,7 @@ class TareSession:
             for identity, temperature in zip(sensors, temperatures, strict=True)
         )
         return Tare(
-            format=FORMAT,
+            format=TARE_FORMAT,
             offset_Nm=_floats(solution.offset_Nm),
             standard_error_Nm=_floats(solution.standard_error_Nm),
             spread_Nm=_floats(solution.spread_Nm),

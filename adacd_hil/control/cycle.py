@@ -12,17 +12,18 @@ import numpy as np
 
 from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
-from adacd_hil.control.exchange import Evidence, Exchange
+from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.fault_report import FaultReport
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
-from adacd_hil.control.pacing import Pacer, Tick
+from adacd_hil.control.pacing import Pacer
 from adacd_hil.control.recovery import StopEscalation
 from adacd_hil.control.reference import Reference
 from adacd_hil.control.self_checks import SelfChecks
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
 from adacd_hil.device.arm_watch import ArmWatch, Recurrence
+from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.network import Master
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
@@ -48,8 +49,6 @@ FAULT_LINGER_S = 0.5
 """How long a faulted run goes on, so that the drives' quick stop is in the log."""
 FINISH_S = 10.0
 """How long an arm may take to park once it is to finish, three times the longest way; then it ends where it is."""
-DISABLE_CYCLES = 20
-"""Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
 FRAME_CHECKS_S = 1.0
 """How often the log gets what the checks of frames have counted."""
 
@@ -84,13 +83,11 @@ class Cycle:
     ) -> None:
         """Prepare. `clock`: what durations within a cycle are measured by."""
         self._period_s = settings.bus.period_s
-        self._heartbeats = Recurrence(settings.bus.heartbeat_ms * 1e-3, self._period_s)
         self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
-        self._exchange = Exchange(settings, bus, arm, master, clock)
-        self._evidence = Evidence(settings, bus, arm, self._exchange, clock)
+        self._exchange = Exchange(settings, bus, arm, master, pacer, clock)
         self._watch = ArmWatch(settings, master.watch)
         self._data = DataWatch(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
@@ -148,20 +145,16 @@ class Cycle:
         output = None
         self._pacer.resume()
         while not self._is_over(output):
-            tick = self._pacer.next()
-            arm = self._watch.judge(self._exchange.read(tick))
+            turn = self._exchange.turn()
+            arm = self._watch.judge(turn.arm)
             self._data.note(arm)
             self._faults.note(self._state, arm)
-            request = self._checks.judge(arm, self._state) or self._request(tick)
+            request = self._checks.judge(arm, self._state) or self._request(arm.cycle)
             output = self._pipeline.step(arm, request)
             self._reference.step(arm, output)
             self._follow(arm, output)
-            self._bus.held_ns = self._pacer.spend(self._exchange.feedback_ns)
-            command, flags = self._limit(arm, output, self._bus.held_ns)
-            self._arm.write(command)
-            record = self._evidence.record(tick, arm, self._pacer.overruns, recorder.waiting_bytes)
-            if self._heartbeats.is_due(tick.cycle):
-                self._master.send_heartbeat()
+            command, flags = self._limit(arm, output, self._exchange.leave())
+            record = self._exchange.end(turn, command, recorder.waiting_bytes)
             self._look_after_devices(arm, output)
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE
@@ -172,7 +165,7 @@ class Cycle:
                 else f"not parked within {FINISH_S:g} s"
             )
             text = f"{why}: the drives are disabled where the arm is"
-            recorder.event(tick.t_ns, Event("warning", "run", text))
+            recorder.event(turn.tick.t_ns, Event("warning", "run", text))
             self._progress(text)
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(
@@ -186,11 +179,11 @@ class Cycle:
         elif output.state in POWERED:
             self._master.parameters.step(arm.cycle, arm.t_ns)
 
-    def _request(self, tick: Tick) -> Request:
+    def _request(self, cycle: int) -> Request:
         """Ask the operator; what concerns the end of the run stays here."""
         if self._interrupts and not self._is_finishing:
             return self._finish()
-        elapsed_s = None if self._enabled_cycle is None else (tick.cycle - self._enabled_cycle) * self._period_s
+        elapsed_s = None if self._enabled_cycle is None else (cycle - self._enabled_cycle) * self._period_s
         if self._carried is not None and elapsed_s is not None:
             request, self._carried = self._carried, None
         else:
@@ -251,16 +244,13 @@ class Cycle:
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))
         recorder.cycle(t_ns, messages, self._bus.take())
-        exchange = self._exchange
         for source in (
             self._master,
             self._arm.strangers,
             self._data,
             self._master.parameters,
             self._escalation,
-            exchange.troubles,
-            exchange.late_commands,
-            self._evidence,
+            self._exchange.events,
             self._pipeline,
         ):
             for event in source.take_events():
@@ -312,8 +302,7 @@ class Cycle:
         self._tau_c[:] = 0.0
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
         for _ in range(DISABLE_CYCLES):
-            tick = self._pacer.next()
-            self._exchange.read(tick)
+            tick, _ = self._exchange.turn()
             self._arm.write(command)
             recorder.cycle(tick.t_ns, [], self._bus.take())
         checks = pack_frame_checks(self._arm.frame_checks())

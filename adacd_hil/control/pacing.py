@@ -66,8 +66,8 @@ class HostLatency:
         return drawn
 
 
-_MOST_FRAMES = 1000
-"""Frames taken at once, so that a bus that somebody floods can't hold up the cycle."""
+MOST_FRAMES = 1000
+"""Frames taken at once, so that a bus that somebody floods can't hold up the cycle: a classic one carries 21 per ms."""
 _JUDGED_SYNCS = 101
 """SYNCs after which their period is judged. The median of so many doesn't mind that a host stalls."""
 _PERIOD_TOLERANCE = 0.1
@@ -94,7 +94,7 @@ class Tick(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Calibration:
+class SpinCalibration:
     """How late sleeps were woken, ns, and how long the pacer spins because of it."""
 
     p50_ns: int
@@ -225,7 +225,7 @@ class FollowingPacer:
                     f"no SYNC on {bus.channel} within {self._timeout_ns // 1_000_000} ms: the host that sends it "
                     "begins first and ends last"
                 )
-        for _ in range(_MOST_FRAMES):
+        for _ in range(MOST_FRAMES):
             frame = bus.receive(0.0)
             if frame is None:
                 break
@@ -265,7 +265,7 @@ class FollowingPacer:
             )
 
 
-def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> Calibration:
+def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> SpinCalibration:
     """Measure how late this process wakes up from sleeps of 0.2 to 1 ms, and choose how long to spin; takes 30 ms.
 
     cpu_count: processors that others can use while this process spins. With one, nothing else would run meanwhile, not
@@ -285,7 +285,7 @@ def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> Calibration:
         for share in (0.5, _SPIN_SHARE, 0.99)
     )
     spin_ns = min(spin_ns, _MOST_SPIN_NS, round(_MOST_SPIN_SHARE * period_ns)) if cpu_count > 1 else 0
-    return Calibration(p50_ns, p99_ns, lateness_ns[-1], spin_ns)
+    return SpinCalibration(p50_ns, p99_ns, lateness_ns[-1], spin_ns)
 
 
 def prepare_spin(pacer: Pacer, settings: Settings, clock: Clock, grant: RealtimeGrant) -> dict[str, str]:

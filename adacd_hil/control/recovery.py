@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 from adacd_hil.clock import Clock
 from adacd_hil.control.operator import FaultAnswer, Operator
+from adacd_hil.control.pacing import MOST_FRAMES
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_watch import Notices
+from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.device.drive import Cia402State
 from adacd_hil.device.network import Master
 from adacd_hil.log.recording.recorder import Recorder
@@ -21,8 +22,6 @@ _LOOK_NS = 10_000_000
 """How often the user is asked and the bus is read while a fault is latched."""
 _RETRY_NS = 500_000_000
 """How often a bus that can't be emptied yet, such as an interface that is down, is tried again."""
-_MOST_FRAMES = 1000
-"""Frames taken in one look: more than a full bus carries in that time."""
 
 
 class Recovery:
@@ -80,7 +79,7 @@ class Recovery:
         self._clock.sleep_until_ns(self._clock.now_ns() + duration_ns)
         self._tap.held_ns = None
         try:
-            for _ in range(_MOST_FRAMES):
+            for _ in range(MOST_FRAMES):
                 if self._tap.receive(0.0) is None:
                     break
         except BusError:
@@ -97,7 +96,7 @@ PATIENCE_CYCLES = 10
 with that one; eight more for lost frames."""
 
 
-class StopEscalation(Notices):
+class StopEscalation(RateLimitedEvents):
     """The second stage of a stop: NMT takes a drive out of Operation enabled that is still in it after FAULT.
 
     The first stage is a quick stop by command. Where somebody else commands the drive, too, or where it doesn't hear,

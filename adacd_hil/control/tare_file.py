@@ -22,7 +22,7 @@ from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import read_toml, to_toml
 
 TARE_NAME = "tare.toml"
-FORMAT = 1
+TARE_FORMAT = 1
 SMALLEST_STD_NM = 0.001
 """No zero is known better than this, however long it was measured."""
 _NS_PER_H = 3_600_000_000_000
@@ -76,7 +76,7 @@ class PoseRecord:
 class Tare:
     """Offsets of both joint torque sensors and where they come from."""
 
-    format: int = setting(low=FORMAT, high=FORMAT, meaning="version of this file's layout")
+    format: int = setting(low=TARE_FORMAT, high=TARE_FORMAT, meaning="version of this file's layout")
     offset_Nm: tuple[float, float] = setting(unit="Nm", low=-50.0, high=50.0, meaning="subtracted after the sign")
     standard_error_Nm: tuple[float, float] = setting(unit="Nm", low=0.0, meaning="of the offset")
     spread_Nm: tuple[float, float] = setting(unit="Nm", low=0.0, meaning="highest less lowest residual of the poses")

@@ -67,7 +67,7 @@ REPEAT_NS = 1_000_000_000
 """Least time between two events of one kind."""
 
 
-class Notices:
+class RateLimitedEvents:
     """Collects events, each kind at once, then at most once a second with the count of those between.
 
     `take_events` gives those since the last call.
@@ -80,13 +80,17 @@ class Notices:
 
     def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
         """Take an event of a kind at a time. `count`: how many it stands for."""
-        said_ns = self._said_ns.get(kind)
-        if said_ns is not None and t_ns - said_ns < REPEAT_NS:
+        if not self.is_due(kind, t_ns):
             self._unsaid[kind] = self._unsaid.get(kind, 0) + count
             return
         more = self._unsaid.pop(kind, 0)
         self._said_ns[kind] = t_ns
         self._events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
+
+    def is_due(self, kind: Hashable, t_ns: int) -> bool:
+        """Tell whether an event of a kind would be said at once."""
+        said_ns = self._said_ns.get(kind)
+        return said_ns is None or t_ns - said_ns >= REPEAT_NS
 
     def take_events(self) -> list[Event]:
         """Return and forget the events since the last call."""

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple, NoReturn
 
-from adacd_hil.device.arm_watch import Notices, Recurrence
+from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
 from adacd_hil.device.canopen_bus import SDO_ABORT, DeviceError, explained, find_variable
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, torque_limit_permille
 from adacd_hil.device.profile import ObjectName, PlacedDevice
@@ -203,7 +203,7 @@ class _KnownObject(NamedTuple):
         return f"{self.slave.name} (node {self.slave.node_id}): {self.slave.describe(*self.place)}"
 
 
-class ParameterWatch(Notices):
+class ParameterWatch(RateLimitedEvents):
     """Reads what the set-up has written or compared again, one object after the other, without waiting for it.
 
     A device that has reset itself to its defaults, or into which somebody else has written, runs the arm with other

@@ -14,6 +14,9 @@ from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 
 MODE_CYCLIC_SYNCHRONOUS_TORQUE = 10
 
+DISABLE_CYCLES = 20
+"""Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
+
 IMPLAUSIBLE_JUMP_RAD = 0.02
 """Position against velocity, per frame. The drive's velocity lags 1.6 ms, so 100 rad/s² leave 0.3 mrad; a flipped
 high bit of the unprotected frame is at least 0.1 rad."""

@@ -13,7 +13,7 @@ CRC and alive counter are no secret: they find errors, not intent. See `docs/thr
 from collections import deque
 
 from adacd_hil.clock import Clock
-from adacd_hil.device.arm_watch import Notices
+from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.profile import place_devices
 from adacd_hil.records import Event
@@ -80,7 +80,7 @@ def _plain(name: str) -> str:
     return f"{name[:-1].lower()} {name[-1]}"
 
 
-class Strangers(Notices):
+class Strangers(RateLimitedEvents):
     """Hears them. `can_ids`: what only this host sends."""
 
     def __init__(self, settings: Settings, codec: Codec) -> None:

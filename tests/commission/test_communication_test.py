@@ -5,7 +5,8 @@ import pytest
 from bench_bus import PERIOD_NS, BenchBus
 
 from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict, judge
-from adacd_hil.commission.zero_torque import DISABLE_CYCLES, ZeroTorqueLoop
+from adacd_hil.commission.zero_torque import ZeroTorqueLoop
+from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.records import FaultReason
 from adacd_hil.wire.bus import QueueBytes
 from adacd_hil.wire.codec import load_codec

@@ -1,12 +1,14 @@
-"""One exchange with the arm: what belongs to which cycle, when the last of it came, and what its record says."""
+"""One exchange with the arm: what belongs to which cycle, when the last of it came, its record and its events."""
 
+import numpy as np
 import pytest
 from bench_bus import CODEC, PERIOD_NS, BenchBus
 
-from adacd_hil.control.exchange import Evidence, Exchange
-from adacd_hil.control.pacing import Tick
+from adacd_hil.control.exchange import Exchange, say_trouble
+from adacd_hil.control.pacing import GridPacer
 from adacd_hil.device.arm_report import ArmReport
-from adacd_hil.records import ArmState
+from adacd_hil.device.arm_watch import RateLimitedEvents
+from adacd_hil.records import ArmCommand, ArmState
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 
 
@@ -17,17 +19,11 @@ class Rig:
         self.bench = BenchBus()
         self.bench.start()
         bench = self.bench
-        self.exchange = Exchange(bench.settings, bench.tap, bench.arm, bench.master, bench.clock)
-        self._cycle = -1
-
-    def begin(self) -> Tick:
-        clock = self.bench.clock
-        clock.sleep_until_ns((clock.now_ns() // PERIOD_NS + 1) * PERIOD_NS)
-        self._cycle += 1
-        return Tick(self._cycle, clock.now_ns(), 1, 0)
+        self.pacer = GridPacer(bench.clock, PERIOD_NS)
+        self.exchange = Exchange(bench.settings, bench.tap, bench.arm, bench.master, self.pacer, bench.clock)
 
     def read(self) -> ArmState:
-        return self.exchange.read(self.begin())
+        return self.exchange.turn().arm
 
 
 def drain(bus: EmbeddedBus) -> list[Frame]:
@@ -84,7 +80,7 @@ def test_feedback_that_was_read_with_a_followed_sync_came_when_its_last_frame_di
     rig = Rig()
     bus = rig.bench.bus
     rig.read()
-    tick = rig.begin()
+    tick = rig.pacer.next()
     bus.send(0x080, bytes((1 + tick.cycle,)))  # for the answers, as they wait beside a SYNC of another host
     ahead = tuple(frame._replace(t_ns=tick.t_ns + 1000 * place) for place, frame in enumerate(drain(bus), 1))
     rig.bench.tamper = lambda can_id, data: None
@@ -99,17 +95,54 @@ def test_frames_that_the_kernel_dropped_are_counted_and_said_at_most_once_a_seco
     bench = rig.bench
     lost = [0]
     monkeypatch.setattr(EmbeddedBus, "frames_lost", property(lambda _: lost[-1]))
-    evidence = Evidence(bench.settings, bench.tap, bench.arm, rig.exchange, bench.clock)
+    exchange, off = rig.exchange, ArmCommand(np.zeros(2), enable=False, quick_stop=False)
     counted, said = [], []
     for count in (0, 1, 4, 4):
         lost.append(count)
-        tick = rig.begin()
-        counted.append(evidence.record(tick, rig.exchange.read(tick), 0, 0).frames_lost)
-        said += evidence.take_events()
+        counted.append(exchange.end(exchange.turn(), off).frames_lost)
+        said += exchange.events.take_events()
     assert counted == [0, 1, 4, 4]
     assert [event.message for event in said] == ["1 received frame dropped by the kernel: this host reads too late"]
     bench.clock.sleep_until_ns(bench.clock.now_ns() + 1_000_000_000)
-    tick = rig.begin()
-    evidence.record(tick, rig.exchange.read(tick), 0, 0)
-    (event,) = evidence.take_events()
+    exchange.end(exchange.turn(), off)
+    (event,) = exchange.events.take_events()
     assert event.message.startswith("3 received frames")
+
+
+def passive(t_s: float) -> Frame:
+    return Frame(0x204, bytes((0, 0x20, 0, 0, 0, 0, 130, 0)), int(t_s * 1e9), is_error=True)
+
+
+def no_acknowledge(t_s: float) -> Frame:
+    return Frame(0x020, bytes(8), int(t_s * 1e9), is_error=True)
+
+
+def texts(events: RateLimitedEvents) -> list[str]:
+    return [event.message for event in events.take_events()]
+
+
+def test_an_error_frame_is_an_event_in_words() -> None:
+    events = RateLimitedEvents()
+    say_trouble(events, passive(0.0))
+    assert texts(events) == ["error passive (sending); error counters: sending 130, receiving 0"]
+
+
+def test_a_kind_is_said_once_a_second_and_the_rest_counted() -> None:
+    events = RateLimitedEvents()
+    for t_s in (0.0, 0.4, 0.999, 1.0):
+        say_trouble(events, no_acknowledge(t_s))
+    assert texts(events) == ["no acknowledgement", "no acknowledgement (and 2 before)"]
+
+
+def test_kinds_do_not_hide_each_other() -> None:
+    events = RateLimitedEvents()
+    say_trouble(events, no_acknowledge(0.0))
+    say_trouble(events, passive(0.1))
+    assert len(texts(events)) == 2
+
+
+def test_events_are_taken_once() -> None:
+    events = RateLimitedEvents()
+    say_trouble(events, no_acknowledge(0.0))
+    events.take_events()
+    assert events.take_events() == []
