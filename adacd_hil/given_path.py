@@ -22,6 +22,9 @@ class GivenPath(click.Path):
         return super().convert(value, param, ctx)
 
 
+GIVEN_FILE = GivenPath(dir_okay=False)
+
+
 class WrittenPath(GivenPath):
     """A path that is written: no link that leads nowhere stands where a folder would have to be made."""
 

@@ -72,7 +72,7 @@ def _distance(word: str, name: str) -> int:
     return last[-1]
 
 
-_ROOT = Path(__file__).resolve().parent.parent
+_SOURCE_TREE = Path(__file__).resolve().parent.parent
 
 
 def install_command(extra: str) -> str:
@@ -80,8 +80,8 @@ def install_command(extra: str) -> str:
 
     This package is in no registry: without a source tree the command names the package, and its file has to be given.
     """
-    is_source = (_ROOT / "pyproject.toml").is_file()
-    source = "adacd-hil" if not is_source else "." if Path.cwd() == _ROOT else str(_ROOT)
+    is_source = (_SOURCE_TREE / "pyproject.toml").is_file()
+    source = "adacd-hil" if not is_source else "." if Path.cwd() == _SOURCE_TREE else str(_SOURCE_TREE)
     return f"{_pip()} install {'-e ' if is_source else ''}'{source}[{extra}]'"
 
 

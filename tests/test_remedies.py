@@ -111,7 +111,7 @@ def test_from_elsewhere_it_names_the_clone_and_a_pip_that_is_there(
 
 
 def test_without_a_source_tree_it_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remedies, "_ROOT", tmp_path)
+    monkeypatch.setattr(remedies, "_SOURCE_TREE", tmp_path)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "bin" / "python"))
     monkeypatch.chdir(tmp_path)
     assert install_command("mf4") == "bin/python -m pip install 'adacd-hil[mf4]'"

@@ -8,7 +8,7 @@ import can
 import numpy as np
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
-from adacd_hil.control.history_file import FORMAT, CertificateRecord, History, devices_digest
+from adacd_hil.control.history_file import HISTORY_FORMAT, CertificateRecord, History, devices_digest
 from adacd_hil.control.tare_file import DeviceRecord
 from adacd_hil.log.editing.cut_and_merge import TimeWindow, cut
 from adacd_hil.log.formats.can_messages import to_messages
@@ -188,7 +188,7 @@ def _history() -> History:
         )  # fmt: skip
         digest = record.digest_after(digest)
         records.append(replace(record, digest=digest))
-    return History(FORMAT, devices, tuple(records))
+    return History(HISTORY_FORMAT, devices, tuple(records))
 
 
 def _scenarios() -> list[Path]:

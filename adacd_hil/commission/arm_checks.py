@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.clock import Clock
 from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
-from adacd_hil.commission.diagnosis import Check, Outcome, failed, ok, skipped, warning
+from adacd_hil.commission.diagnosis import Check, CheckOutcome, failed, ok, skipped, warning
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
@@ -115,13 +115,13 @@ class ArmExamination:
         return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
 
 
-def check_bus(patient: ArmExamination) -> Outcome:
+def check_bus(patient: ArmExamination) -> CheckOutcome:
     """Check that the bus opens."""
     patient.connect()
     return ok(f"{patient.tap.channel} is open")
 
 
-def check_other_masters(patient: ArmExamination) -> Outcome:
+def check_other_masters(patient: ArmExamination) -> CheckOutcome:
     """Check that nobody else plays the host."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
@@ -135,7 +135,7 @@ def check_other_masters(patient: ArmExamination) -> Outcome:
     return ok(f"none in {LISTEN_S:g} s; {len(traffic.talks)} identifiers heard, {traffic.error_frames} error frames")
 
 
-def check_nodes(patient: ArmExamination) -> Outcome:
+def check_nodes(patient: ArmExamination) -> CheckOutcome:
     """Check that the expected nodes are there, with the expected identity."""
     expected = expected_nodes(patient.master.slaves)
     found = survey(patient.tap, patient.clock, 0.0)
@@ -149,13 +149,13 @@ def check_nodes(patient: ArmExamination) -> Outcome:
     return ok(", ".join(f"{node.name} (node {node.node_id})" for node in expected))
 
 
-def check_boot(patient: ArmExamination) -> Outcome:
+def check_boot(patient: ArmExamination) -> CheckOutcome:
     """Check that each node boots after a reset of communication."""
     patient.reset()
     return ok("all nodes booted after a reset of communication")
 
 
-def check_contract(patient: ArmExamination) -> Outcome:
+def check_contract(patient: ArmExamination) -> CheckOutcome:
     """Check that host and devices are made for the same contract."""
     codec = patient.codec
     lacking = []
@@ -176,14 +176,14 @@ def check_contract(patient: ArmExamination) -> Outcome:
     return ok(f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}")
 
 
-def check_set_up(patient: ArmExamination) -> Outcome:
+def check_set_up(patient: ArmExamination) -> CheckOutcome:
     """Check that the nodes take identity check and set-up as a run does them."""
     patient.master.identify()
     patient.master.configure()
     return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")
 
 
-def check_pdo_map(patient: ArmExamination) -> Outcome:
+def check_pdo_map(patient: ArmExamination) -> CheckOutcome:
     """Check that the PDOs that the devices have configured are those of the contract."""
     lines = []
     for name, node in patient.master.nodes.items():
@@ -193,7 +193,7 @@ def check_pdo_map(patient: ArmExamination) -> Outcome:
     return ok("read back, equal to the contract")
 
 
-def check_protection(patient: ArmExamination) -> Outcome:
+def check_protection(patient: ArmExamination) -> CheckOutcome:
     """List the cyclic frames that carry no end-to-end header."""
     names = [
         message.name
@@ -208,7 +208,7 @@ def check_protection(patient: ArmExamination) -> Outcome:
     return ok("every cyclic frame has an end-to-end header")
 
 
-def check_cycle(patient: ArmExamination) -> Outcome:
+def check_cycle(patient: ArmExamination) -> CheckOutcome:
     """Run cycles at the period, drives not enabled."""
     patient.tap.take()
     patient.master.start()
@@ -220,7 +220,7 @@ def check_cycle(patient: ArmExamination) -> Outcome:
     return ok(f"{len(patient.cycles)} cycles, torque zero, drives not enabled")
 
 
-def check_rate(patient: ArmExamination) -> Outcome:
+def check_rate(patient: ArmExamination) -> CheckOutcome:
     """Check that SYNC and feedback keep the period."""
     report = patient.communication()
     elapsed_s = report.periods * patient.settings.bus.period_s
@@ -239,7 +239,7 @@ def check_rate(patient: ArmExamination) -> Outcome:
     return warning(text, remedy) if report.verdict is Verdict.WARNING else ok(text)
 
 
-def check_load(patient: ArmExamination) -> Outcome:
+def check_load(patient: ArmExamination) -> CheckOutcome:
     """Check that the bus has room for what is not cyclic."""
     load = patient.communication().load_percent
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
@@ -248,7 +248,7 @@ def check_load(patient: ArmExamination) -> Outcome:
     return ok(text)
 
 
-def check_heartbeats(patient: ArmExamination) -> Outcome:
+def check_heartbeats(patient: ArmExamination) -> CheckOutcome:
     """Check that each node says that it lives and is operational."""
     expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
     silent, odd, slow = [], [], []
@@ -271,7 +271,7 @@ def check_heartbeats(patient: ArmExamination) -> Outcome:
     return ok(f"all operational, every {patient.settings.bus.heartbeat_ms} ms")
 
 
-def check_devices(patient: ArmExamination) -> Outcome:
+def check_devices(patient: ArmExamination) -> CheckOutcome:
     """Check that no drive is in fault, no device reports an error."""
     lines = [line for line in ArmReport(patient.arm).describe_faults() if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
@@ -280,7 +280,7 @@ def check_devices(patient: ArmExamination) -> Outcome:
     return ok("no fault, no EMCY")
 
 
-def check_saturation(patient: ArmExamination) -> Outcome:
+def check_saturation(patient: ArmExamination) -> CheckOutcome:
     """Check that no sensor is saturated or invalid."""
     told = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
     text = ", ".join(f"{name} {status!r}" for name, status in told.items())
@@ -291,7 +291,7 @@ def check_saturation(patient: ArmExamination) -> Outcome:
     return ok("within range")
 
 
-def check_rest(patient: ArmExamination) -> Outcome:
+def check_rest(patient: ArmExamination) -> CheckOutcome:
     """Check that the arm stands still with its drives off."""
     dq = patient.joint_values("dq")
     if not len(dq):
@@ -304,7 +304,7 @@ def check_rest(patient: ArmExamination) -> Outcome:
     return ok(text)
 
 
-def check_torque_zero(patient: ArmExamination) -> Outcome:
+def check_torque_zero(patient: ArmExamination) -> CheckOutcome:
     """Check that the torque at rest is near zero."""
     tau_J = patient.joint_values("tau_J")
     if not len(tau_J):
@@ -320,7 +320,7 @@ def check_torque_zero(patient: ArmExamination) -> Outcome:
     return ok(text)
 
 
-def check_noise(patient: ArmExamination) -> Outcome:
+def check_noise(patient: ArmExamination) -> CheckOutcome:
     """Check that the torque signal is alive and quiet."""
     tau_J = patient.joint_values("tau_J")
     if len(tau_J) < 2:
@@ -336,7 +336,7 @@ def check_noise(patient: ArmExamination) -> Outcome:
     return ok(text)
 
 
-def check_bus_errors(patient: ArmExamination) -> Outcome:
+def check_bus_errors(patient: ArmExamination) -> CheckOutcome:
     """Check that the bus stayed without errors while the cycle ran."""
     link = patient.read_link()
     errors = patient.traffic.error_frames
@@ -348,8 +348,8 @@ def check_bus_errors(patient: ArmExamination) -> Outcome:
     return ok(f"no error frame{counters}")
 
 
-def _check_joint(joint: int) -> Callable[[ArmExamination], Outcome]:
-    def check(patient: ArmExamination) -> Outcome:
+def _check_joint(joint: int) -> Callable[[ArmExamination], CheckOutcome]:
+    def check(patient: ArmExamination) -> CheckOutcome:
         if patient.ask is None:
             return skipped(patient.no_move_reason)
         tau_J = patient.joint_values("tau_J")
@@ -407,7 +407,7 @@ class HandMotion:
         self._last = state.q
         self._way = state.q - self._start
 
-    def judge(self) -> Outcome:
+    def judge(self) -> CheckOutcome:
         """Say what the motion told."""
         joint, number = self._joint, self._joint + 1
         ways_deg = np.degrees(self._way)
@@ -426,7 +426,7 @@ class HandMotion:
             return failed(f"position decreases toward +q ({text})", f"reverse arm.sign of joint {number}")
         return self._judge_torque(text)
 
-    def _judge_torque(self, text: str) -> Outcome:
+    def _judge_torque(self, text: str) -> CheckOutcome:
         work_J = self._work_J[self._joint]
         if work_J > WORK_FLOOR_J:
             return failed(

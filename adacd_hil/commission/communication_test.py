@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.score.timing import CycleColumns, columns_of_records
+from adacd_hil.analysis.score.timing import OLDEST_CYCLES, CycleColumns, columns_of_records
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.drive import Drive
@@ -23,8 +23,6 @@ from adacd_hil.wire.traffic import LoadMeter
 
 SUFFICIENT_SHARE = 0.90
 GOOD_SHARE = 0.95
-OLDEST_CYCLES = 10
-"""Ages from here on are one bin."""
 _LOAD_CYCLES = 1000
 """Cycles at the end of the test whose frames make the bus load."""
 

@@ -20,7 +20,7 @@ class Status(Enum):
     SKIPPED = "skipped"
 
 
-class Outcome(NamedTuple):
+class CheckOutcome(NamedTuple):
     """What a check found. `remedy`: what to do about it; "" when there is nothing to do."""
 
     status: Status
@@ -44,28 +44,28 @@ class Check(NamedTuple, Generic[Examination]):
     """One line of the table. `needs`: names of checks before it that must not have failed."""
 
     name: str
-    run: Callable[[Examination], Outcome]
+    run: Callable[[Examination], CheckOutcome]
     needs: tuple[str, ...] = ()
 
 
-def ok(reason: str) -> Outcome:
+def ok(reason: str) -> CheckOutcome:
     """Say that there is nothing to do."""
-    return Outcome(Status.OK, reason)
+    return CheckOutcome(Status.OK, reason)
 
 
-def warning(reason: str, remedy: str) -> Outcome:
+def warning(reason: str, remedy: str) -> CheckOutcome:
     """Say that the arm can run, with less margin than it should have."""
-    return Outcome(Status.WARNING, reason, remedy)
+    return CheckOutcome(Status.WARNING, reason, remedy)
 
 
-def failed(reason: str, remedy: str) -> Outcome:
+def failed(reason: str, remedy: str) -> CheckOutcome:
     """Say that the arm must not or can't run."""
-    return Outcome(Status.FAILED, reason, remedy)
+    return CheckOutcome(Status.FAILED, reason, remedy)
 
 
-def skipped(reason: str) -> Outcome:
+def skipped(reason: str) -> CheckOutcome:
     """Say that it can't be told here."""
-    return Outcome(Status.SKIPPED, reason)
+    return CheckOutcome(Status.SKIPPED, reason)
 
 
 def diagnose(
@@ -96,7 +96,7 @@ def diagnose(
     return findings
 
 
-def _run(check: Check[Examination], examination: Examination) -> Outcome:
+def _run(check: Check[Examination], examination: Examination) -> CheckOutcome:
     try:
         return check.run(examination)
     except DeviceError as error:

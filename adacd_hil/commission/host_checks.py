@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from adacd_hil.commission.diagnosis import Check, Outcome, failed, ok, skipped, warning
+from adacd_hil.commission.diagnosis import Check, CheckOutcome, failed, ok, skipped, warning
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeGrant, isolated_cpus
 from adacd_hil.wire.can_interface import CANFD_MTU, InterfaceState, can_interfaces
 
@@ -43,7 +43,7 @@ class Host:
         return self.interface == "socketcan"
 
 
-def check_kernel(host: Host) -> Outcome:
+def check_kernel(host: Host) -> CheckOutcome:
     """Check that SocketCAN is there and lets us in."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} does not use the kernel's CAN")
@@ -58,7 +58,7 @@ def check_kernel(host: Host) -> Outcome:
     return ok("SocketCAN, raw sockets allowed")
 
 
-def check_interface(host: Host) -> Outcome:
+def check_interface(host: Host) -> CheckOutcome:
     """Check that the interface exists and is up."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} is python-can's own")
@@ -73,10 +73,10 @@ def check_interface(host: Host) -> Outcome:
     return ok(f"{name} is up, hardware" + (f" ({link.kind})" if link.kind else ""))
 
 
-def _with_hardware(check: Callable[[Host, InterfaceState], Outcome]) -> Callable[[Host], Outcome]:
+def _with_hardware(check: Callable[[Host, InterfaceState], CheckOutcome]) -> Callable[[Host], CheckOutcome]:
     """Skip a check that says nothing of a virtual bus."""
 
-    def run(host: Host) -> Outcome:
+    def run(host: Host) -> CheckOutcome:
         if host.link is None:
             return skipped("no SocketCAN interface")
         if host.link.is_virtual:
@@ -86,7 +86,7 @@ def _with_hardware(check: Callable[[Host, InterfaceState], Outcome]) -> Callable
     return run
 
 
-def check_bitrate(host: Host, link: InterfaceState) -> Outcome:
+def check_bitrate(host: Host, link: InterfaceState) -> CheckOutcome:
     """Check that the bit rates are the contract's."""
     if link.bitrate is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -100,7 +100,7 @@ def check_bitrate(host: Host, link: InterfaceState) -> Outcome:
     return ok(f"{link.bitrate} bit/s" + (f", data phase {link.data_bitrate}" if host.data_bitrate else ""))
 
 
-def check_sample_point(_host: Host, link: InterfaceState) -> Outcome:
+def check_sample_point(_host: Host, link: InterfaceState) -> CheckOutcome:
     """Check that the sample point suits the devices'."""
     if link.sample_point is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -111,7 +111,7 @@ def check_sample_point(_host: Host, link: InterfaceState) -> Outcome:
     return ok(text)
 
 
-def check_restart(_host: Host, link: InterfaceState) -> Outcome:
+def check_restart(_host: Host, link: InterfaceState) -> CheckOutcome:
     """Check what happens after bus-off."""
     if link.restart_ms is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -123,7 +123,7 @@ def check_restart(_host: Host, link: InterfaceState) -> Outcome:
     return ok(f"{link.restart_ms} ms after bus-off")
 
 
-def check_controller(_host: Host, link: InterfaceState) -> Outcome:
+def check_controller(_host: Host, link: InterfaceState) -> CheckOutcome:
     """Check that the controller takes part in the bus."""
     if link.state is None:
         return skipped("the kernel does not tell it here; install iproute2")
@@ -135,7 +135,7 @@ def check_controller(_host: Host, link: InterfaceState) -> Outcome:
     return ok(counters)
 
 
-def check_queue(host: Host) -> Outcome:
+def check_queue(host: Host) -> CheckOutcome:
     """Check that the transmit queue holds no more than what is worth sending."""
     if host.link is None:
         return skipped("no SocketCAN interface")
@@ -150,7 +150,7 @@ def check_queue(host: Host) -> Outcome:
     return ok(f"txqueuelen {length}")
 
 
-def check_mtu(host: Host) -> Outcome:
+def check_mtu(host: Host) -> CheckOutcome:
     """Check that CAN FD frames fit, where the contract has some."""
     if host.link is None:
         return skipped("no SocketCAN interface")
@@ -161,7 +161,7 @@ def check_mtu(host: Host) -> Outcome:
     return ok(f"{host.link.mtu}, CAN FD frames fit")
 
 
-def check_permissions(host: Host) -> Outcome:
+def check_permissions(host: Host) -> CheckOutcome:
     """Check that this process may empty the interface's queue after a fault."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} has no queue in the kernel")
@@ -178,7 +178,7 @@ def check_permissions(host: Host) -> Outcome:
     return ok("CAP_NET_ADMIN: the interface's queue can be emptied")
 
 
-def check_scheduler(host: Host) -> Outcome:
+def check_scheduler(host: Host) -> CheckOutcome:
     """Check that scheduler, processor, locked memory and shallow idle states are granted."""
     grant = host.request_realtime()
     if grant.missing:
@@ -187,7 +187,7 @@ def check_scheduler(host: Host) -> Outcome:
     return ok(", ".join(f"{name.replace('_', ' ')} {value}" for name, value in grant.describe().items()))
 
 
-def check_throttling(host: Host) -> Outcome:
+def check_throttling(host: Host) -> CheckOutcome:
     """Check that the kernel doesn't stop a real-time process that has worked for a while."""
     folder = host.root / "proc/sys/kernel"
     try:
@@ -204,7 +204,7 @@ def check_throttling(host: Host) -> Outcome:
     return ok(text)
 
 
-def check_preemption(host: Host) -> Outcome:
+def check_preemption(host: Host) -> CheckOutcome:
     """Check that the kernel wakes a real-time process in time."""
     version = _read(host.root / "proc/version")
     if _read(host.root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
@@ -213,7 +213,7 @@ def check_preemption(host: Host) -> Outcome:
     return warning(f"{kind}: single cycles can be late by milliseconds", "install a PREEMPT_RT kernel (linux-image-rt)")
 
 
-def check_processor(host: Host) -> Outcome:
+def check_processor(host: Host) -> CheckOutcome:
     """Check that the processors' clock is steady."""
     folder = host.root / "sys/devices/system/cpu"
     governors = sorted({_read(path) for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor")})
@@ -225,7 +225,7 @@ def check_processor(host: Host) -> Outcome:
     return ok(text)
 
 
-def check_isolation(host: Host) -> Outcome:
+def check_isolation(host: Host) -> CheckOutcome:
     """Check that the processor the cycle runs on is its own."""
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"

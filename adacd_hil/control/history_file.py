@@ -27,7 +27,7 @@ from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 HISTORY_NAME = "history.toml"
-FORMAT = 1
+HISTORY_FORMAT = 1
 _LARGEST = 1000.0
 _FUTURE_NS = 360_000_000_000
 """How far ahead of this machine's clock a certificate may be dated."""
@@ -81,7 +81,7 @@ class CertificateRecord:
 class History:
     """The certificates of one arm, the oldest first."""
 
-    format: int = setting(low=FORMAT, high=FORMAT, meaning="version of this file's layout")
+    format: int = setting(low=HISTORY_FORMAT, high=HISTORY_FORMAT, meaning="version of this file's layout")
     devices: tuple[DeviceRecord, ...] = setting(meaning="drives and sensors of the arm")
     certificates: tuple[CertificateRecord, ...] = setting(meaning="what runs have certified")
 
@@ -204,7 +204,7 @@ class UsedHistory:
             records.append(dataclasses.replace(record, digest=before))
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(self.path, is_durable=True) as new:
-            new.write_text(to_toml(History(FORMAT, devices, tuple(records))), encoding="utf-8")
+            new.write_text(to_toml(History(HISTORY_FORMAT, devices, tuple(records))), encoding="utf-8")
         return f"{self.path}: {len(certificates)} more, {len(records)} in all"
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from adacd_hil.control.motion_laws import PEAK_SPEED_FACTOR, Admittance, Excitation, corner_to_corner, evaluate, to_rest
 from adacd_hil.records import JOINTS, ArmState, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
+from adacd_hil.scheme.supervisor.supervisor import LEARNING, REACTING
 from adacd_hil.settings.configuration import Settings
 
 SHORTEST_APPROACH_S = 0.6
@@ -38,8 +39,6 @@ ENDING = 0.6
 """A blow ends when its torque has fallen to this part of its largest."""
 
 _FOLLOWING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
-_LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
-_REACTING = (SchemeState.REACT, SchemeState.STOPPED)
 _ON_PATH = (Reaction.NONE, Reaction.SLOW_DOWN)
 
 Segment = Callable[[float], None]
@@ -96,12 +95,12 @@ class Reference:
     @property
     def is_floating(self) -> bool:
         """Whether there is no desired motion: the arm gives way."""
-        return self._state in _REACTING and self._reaction is Reaction.FLOAT
+        return self._state in REACTING and self._reaction is Reaction.FLOAT
 
     def park(self) -> None:
         """From the next step on, go to the start corner and stay there; stay where it is while the arm is stopped."""
         self._is_parking = True
-        if self._state not in _REACTING:
+        if self._state not in REACTING:
             self._segment = None
 
     def is_parked(self, cycle: int) -> bool:
@@ -117,11 +116,11 @@ class Reference:
             self._enter(output, arm)
         elif self._waits(arm):
             return
-        if self._state in _REACTING and output.reaction is not self._reaction:
+        if self._state in REACTING and output.reaction is not self._reaction:
             self._react(output, arm)
-        if self._is_parking and self._segment is None and self._state not in _REACTING:
+        if self._is_parking and self._segment is None and self._state not in REACTING:
             self._park_end_cycle = self._approach(cycle) + round(PARK_SETTLE_S / self._period_s)
-        if self._state in _REACTING and self._is_yielding(arm, output):
+        if self._state in REACTING and self._is_yielding(arm, output):
             return
         if self._segment is None:
             self._stay(arm)
@@ -145,7 +144,7 @@ class Reference:
     def _begin_anew(self, arm: ArmState) -> None:
         """Plan from the measured motion what the state asks for."""
         self._q_d[:], self._dq_d[:], self._ddq_d[:] = arm.q, arm.dq, 0.0
-        if self._is_parking and self._state not in _REACTING:
+        if self._is_parking and self._state not in REACTING:
             self._segment = None
         elif self._state in _FOLLOWING:
             self._follows_at_cycle = self._approach(arm.cycle)
@@ -174,14 +173,14 @@ class Reference:
 
     def _advance(self, cycle: int) -> None:
         """Fill the desired motion of the segment, along which the arm may move slowly."""
-        wanted = self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in _REACTING else 1.0
+        wanted = self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
         change = min(max(wanted - self._rate, -self._period_s / SLOWING_S), self._period_s / SLOWING_S)
         self._rate += change
         self._lag_s += (1.0 - self._rate) * self._period_s
         has_come = self._follows_at_cycle is not None and cycle - self._lag_s / self._period_s >= self._follows_at_cycle
         if has_come and not self._is_parking:
             assert self._follows_at_cycle is not None
-            is_learning = self._excitation.is_on and self._state in _LEARNING
+            is_learning = self._excitation.is_on and self._state in LEARNING
             self._segment = self._excite if is_learning else self._follow
             self._start_cycle = self._follows_at_cycle
             self._follows_at_cycle = None
@@ -198,7 +197,7 @@ class Reference:
         if state is SchemeState.REACT:
             self._has_model = previous is SchemeState.MONITOR
         was_on_path = previous in _FOLLOWING or (previous is SchemeState.REACT and self._reaction in _ON_PATH)
-        has_excited = self._excitation.is_on and previous in _LEARNING and state is SchemeState.MONITOR
+        has_excited = self._excitation.is_on and previous in LEARNING and state is SchemeState.MONITOR
         is_moving_on = state in _FOLLOWING and was_on_path and not has_excited
         if state is SchemeState.REACT:
             self._react(output, arm)
@@ -211,7 +210,7 @@ class Reference:
             return
         self._follows_at_cycle = None
         if self._is_parking:
-            self._segment = None if previous in _REACTING else self._segment
+            self._segment = None if previous in REACTING else self._segment
         elif state in _FOLLOWING:
             self._follows_at_cycle = self._approach(cycle)
         elif state is SchemeState.PAYLOAD:

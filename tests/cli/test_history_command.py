@@ -13,7 +13,7 @@ from adacd_hil.cli.commands.run_command import ask_first_run
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import date_ns, wall_ns
 from adacd_hil.control.history_file import (
-    FORMAT,
+    HISTORY_FORMAT,
     CertificateRecord,
     History,
     Origin,
@@ -157,10 +157,10 @@ def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(fil
     found = read_history(file)
     second = replace(found.last, date_utc="2030-01-01T00:00:00Z")
     second = replace(second, digest=second.digest_after(found.last.digest))
-    assert len(History(FORMAT, found.devices, (found.last, second)).certificates) == 2
+    assert len(History(HISTORY_FORMAT, found.devices, (found.last, second)).certificates) == 2
     for certificates in ((second,), (second, found.last), (found.last, found.last)):
         with pytest.raises(ValueError, match="is not as it was written"):
-            History(FORMAT, found.devices, certificates)
+            History(HISTORY_FORMAT, found.devices, certificates)
 
 
 def test_a_certificate_that_lacks_values_is_refused_though_its_digest_is_right(file: Path) -> None:
@@ -187,7 +187,7 @@ def test_values_that_no_arm_has_are_refused_though_their_digest_is_right(
         forger.setattr(CertificateRecord, "__post_init__", lambda self: None)
         forged = replace(found.last, **{old: new})  # type: ignore[arg-type]
         forged = replace(forged, digest=forged.digest_after(devices_digest(found.devices)))
-        file.write_text(to_toml(History(FORMAT, found.devices, (forged,))))
+        file.write_text(to_toml(History(HISTORY_FORMAT, found.devices, (forged,))))
     with pytest.raises(ConfigError) as caught:
         read_history(file)
     assert says in str(caught.value)

@@ -27,7 +27,8 @@ from adacd_hil.analysis.replay.log_source import (
     Places,
     Stretch,
 )
-from adacd_hil.device.arm import SYNC_OVERFLOW
+from adacd_hil.device.arm import FEEDBACK_SHARE, SYNC_OVERFLOW
+from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
@@ -36,11 +37,8 @@ from adacd_hil.log.types.record_arrays import as_logged
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 
-FEEDBACK_SHARE: Final = 0.7
-"""Part of the period in which the host awaits its feedback in real time."""
 _REALTIME: Final = (0.9, 1.1)
 """Median interval of SYNC over the period, of a bus that runs in real time; in lockstep it runs as fast as it can."""
-_DISABLE_CYCLES: Final = 20
 _CYCLIC: Final = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 _NOWHERE: Final = np.int64(2**62)
 
@@ -276,11 +274,11 @@ class RecordingAlone:
 def _disabling(frames: NDArray[Any], t_ns: Places, codec: Codec) -> int:
     """Count the last cycles of an attempt in which both drives are told to be off; at most as many as a host sends."""
     commands = [codec.message(name) for name in ("Drive1Command", "Drive2Command")]
-    for count, cycle_ns in enumerate(t_ns[: -_DISABLE_CYCLES - 1 : -1].tolist()):
+    for count, cycle_ns in enumerate(t_ns[: -DISABLE_CYCLES - 1 : -1].tolist()):
         for message in commands:
             is_mine = (frames["cycle_t_ns"] == cycle_ns) & (frames["can_id"] == message.can_id)
             at = [signal.name for signal in message.signals].index("controlword")
             data = [row[: message.length].tobytes() for row in frames["data"][is_mine]]
             if any(message.decode(each)[at] for each in data):
                 return count
-    return min(_DISABLE_CYCLES, len(t_ns))
+    return min(DISABLE_CYCLES, len(t_ns))

@@ -16,9 +16,8 @@ from adacd_hil.log.reader import LoggedContact
 from adacd_hil.records import FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.batch import SchemeBatch
 from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.settings.configuration import Settings
-
-_LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 
 
 class Transition(NamedTuple):
@@ -106,7 +105,7 @@ class OutcomeGatherer:
         state = transition.state
         if state is SchemeState.ADAPT and self._began is None:
             self._began = transition.cycle, transition.t_ns
-        elif state is SchemeState.MONITOR and transition.previous in _LEARNING and self._began is not None:
+        elif state is SchemeState.MONITOR and transition.previous in LEARNING and self._began is not None:
             took_s = (transition.t_ns - self._began[1]) * 1e-9
             self.adaptations.append(Adaptation(self._began[1], took_s, tuple(theta_hat.tolist())))
             self._began = None

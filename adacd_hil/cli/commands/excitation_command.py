@@ -24,7 +24,7 @@ _LABELS = (
 )
 
 
-class Outcome(NamedTuple):
+class ExcitationOutcome(NamedTuple):
     """What a search came to; `present` is None where the configuration has no excitation."""
 
     config: str
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
     excitation: ExcitationSettings
 
 
-def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> Outcome:
+def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> ExcitationOutcome:
     """Search; `out` is where it will be written. Raises ConfigError, CommandError."""
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
@@ -48,16 +48,16 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
     finally:
         progress.close()
     present = task.figures(task.present) if task.present.period_s else None
-    return Outcome(config, present, task.figures(found), task.limits, found)
+    return ExcitationOutcome(config, present, task.figures(found), task.limits, found)
 
 
-def as_toml(outcome: Outcome) -> str:
+def as_toml(outcome: ExcitationOutcome) -> str:
     """Write the excitation as a configuration that extends the one that it was found for."""
     base = outcome.config if outcome.config in builtin_names() else str(Path(outcome.config).resolve())
     return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(outcome.excitation)}"
 
 
-def as_json(outcome: Outcome) -> str:
+def as_json(outcome: ExcitationOutcome) -> str:
     """Write everything as JSON."""
     named = {
         "present": None if outcome.present is None else dataclasses.asdict(outcome.present),
@@ -68,7 +68,7 @@ def as_json(outcome: Outcome) -> str:
     return json.dumps(named, indent=2, allow_nan=False)
 
 
-def as_text(outcome: Outcome) -> str:
+def as_text(outcome: ExcitationOutcome) -> str:
     """Write the figures as a table, joint 1 / joint 2."""
     limits = outcome.limits.as_json()
     rows = [

@@ -10,24 +10,22 @@ import click
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option
 from adacd_hil.file_access import replace_file
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WrittenPath
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.foreign.recording_identification import Identified, Watched
     from adacd_hil.analysis.foreign.recording_import import Recording
 
-_FILE = GivenPath(dir_okay=False)
-
 
 @click.command(
     epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
     "test: a residual reached its threshold."
 )
-@click.argument("recordings", nargs=-1, required=True, type=_FILE)
-@click.option("--map", "map_path", required=True, type=_FILE, help="TOML: what the columns are, and of which arm.")
-@click.option("--test", type=_FILE, help="Recording to test on; default: the last part of the last one fitted.")
-@click.option("--watch", multiple=True, type=_FILE, help="Recording in which to look for contacts; repeatable.")
+@click.argument("recordings", nargs=-1, required=True, type=GIVEN_FILE)
+@click.option("--map", "map_path", required=True, type=GIVEN_FILE, help="TOML: what the columns are, and of which arm.")
+@click.option("--test", type=GIVEN_FILE, help="Recording to test on; default: the last part of the last one fitted.")
+@click.option("--watch", multiple=True, type=GIVEN_FILE, help="Recording in which to look for contacts; repeatable.")
 @click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
 @click.option("--until", "end_s", type=float, default=float("inf"), help="Fit until this time, s; default: the end.")
 @click.option("--out", type=WrittenPath(file_okay=False), help="Folder for pictures and identify.json.")

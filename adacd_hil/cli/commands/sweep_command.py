@@ -11,14 +11,13 @@ import click
 
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.options import explained, json_option, profile_option
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.plan import Plan, Row, Task, Values
 
-_FILE = GivenPath(dir_okay=False)
 _SIMULATED_CONFIG = "certified"
 """Of simulated runs where no --config is given."""
 
@@ -40,9 +39,9 @@ _SIMULATED_CONFIG = "certified"
     metavar="ADDRESS",
     help="Dask scheduler to use instead: tls://host:8786. One at tcp:// runs what anybody sends who reaches it.",
 )
-@click.option("--tls-ca-file", type=_FILE, help="Of tls://: who signs the cluster's certificates; PEM.")
-@click.option("--tls-cert", type=_FILE, help="Of tls://: the certificate to show; PEM.")
-@click.option("--tls-key", type=_FILE, help="Of tls://: its key, where the certificate's file lacks it; PEM.")
+@click.option("--tls-ca-file", type=GIVEN_FILE, help="Of tls://: who signs the cluster's certificates; PEM.")
+@click.option("--tls-cert", type=GIVEN_FILE, help="Of tls://: the certificate to show; PEM.")
+@click.option("--tls-key", type=GIVEN_FILE, help="Of tls://: its key, where the certificate's file lacks it; PEM.")
 @click.option("--out", required=True, type=WrittenPath(file_okay=False), help="Folder of the results.")
 @json_option
 @explained

@@ -31,7 +31,7 @@ from adacd_hil.scheme.pipeline.batch import RunsBatches
 from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
 from adacd_hil.scheme.pipeline.contact_course import ContactCourse
 from adacd_hil.scheme.pipeline.intervals import Intervals
-from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.scheme.supervisor.supervisor import LEARNING, REACTING, Supervisor
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm, Observation, SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
@@ -47,7 +47,6 @@ _MODES = {
     SchemeState.PAYLOAD: _WATCH,
 }
 _WITHHELD = int(Observation.WITHHELD)
-_LEARNING = (SchemeState.ADAPT, SchemeState.CERTIFY)
 
 
 class CertifiedPipeline(RunsBatches):
@@ -291,7 +290,7 @@ class CertifiedPipeline(RunsBatches):
         It may have learnt the contact's beginning, or this may be no contact but an earlier one that was learnt. Then
         only a model that claims to know nothing lets the arm go on.
         """
-        is_disturbed = state in (SchemeState.REACT, SchemeState.STOPPED) and self._supervisor.origin in _LEARNING
+        is_disturbed = state in REACTING and self._supervisor.origin in LEARNING
         is_reported = is_disturbed and not self._touch.is_reporting
         if is_reported and not self._has_forgotten:
             certified_kernel.begin_adaptation(self._constants, self._memory, self._is_payload, False)

@@ -7,12 +7,11 @@ from adacd_hil.records import ContactLevel, ContactReport, Reaction, SchemeState
 from adacd_hil.scheme.contact.contact_report import ContactReporter
 from adacd_hil.scheme.contact.reaction import ReactionChoice
 from adacd_hil.scheme.kernel.loop import TouchWatch
-from adacd_hil.scheme.supervisor.supervisor import Supervisor
+from adacd_hil.scheme.supervisor.supervisor import REACTING, Supervisor
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm, Observation
 from adacd_hil.settings.configuration import Settings
 
 _COLLISION = int(Observation.COLLISION)
-_REACTING = (SchemeState.REACT, SchemeState.STOPPED)
 
 
 class ContactCourse:
@@ -81,7 +80,7 @@ class ContactCourse:
         self._reporter.observe(q, tau_ext_wide_hat, sigma, threshold)
         state, joints = supervisor.state, observation >> CONTACT_SHIFT
         level = ContactLevel.COLLISION if observation & _COLLISION else ContactLevel.CONTACT
-        if state not in _REACTING:
+        if state not in REACTING:
             self._leave(state)
             return None
         if not self._is_reacting:

@@ -66,7 +66,8 @@ POWERED = frozenset(
 )
 """Where the drives are enabled and may have torque."""
 _CHECKED = POWERED | {SchemeState.ENABLE}
-_LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
+LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
+REACTING = frozenset((SchemeState.REACT, SchemeState.STOPPED))
 _HELD_FROM = frozenset((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
 """Where a host that is late holds the arm, or does so already; elsewhere there is no way to, and it is a fault."""
 
@@ -236,7 +237,7 @@ class Supervisor:
         force lets the arm move on, so that a contact clears without rest.
         """
         self._phase_cycles += arm.periods
-        self._learning_cycles += arm.periods if self._state in _LEARNING else 0
+        self._learning_cycles += arm.periods if self._state in LEARNING else 0
         self._still_cycles = self._still_cycles + 1 if observation & _AT_REST else 0
         self._moving_cycles = 0 if observation & _AT_REST else self._moving_cycles + 1
         self._cleared_cycles = 0 if observation & _ANY_CONTACT else self._cleared_cycles + 1
@@ -299,7 +300,7 @@ class Supervisor:
         """Count calm cycles; observations (n,), periods (n,)."""
         elapsed = int(periods.sum())
         self._phase_cycles += elapsed
-        self._learning_cycles += elapsed if self._state in _LEARNING else 0
+        self._learning_cycles += elapsed if self._state in LEARNING else 0
         self._blind_cycles = _run_at_end(observations & _UNSEEN != 0, self._blind_cycles)
         self._stale_cycles = 0  # where it counts, a stale value is not calm
         self._still_cycles = _run_at_end(observations & _AT_REST != 0, self._still_cycles)
@@ -436,7 +437,7 @@ class Supervisor:
     @property
     def _spent(self) -> int:
         """Periods that count towards this phase's timeout."""
-        return self._learning_cycles if self._state in _LEARNING else self._phase_cycles
+        return self._learning_cycles if self._state in LEARNING else self._phase_cycles
 
     def _check(self, arm: ArmState, observation: int) -> FaultReason:
         """Return why the arm must not go on, or NONE."""
