@@ -13,7 +13,8 @@ from firmware_sim.body.sensors import converter_ends
 from firmware_sim.canopen.contracts import EmulatedContract, longest_pdo
 from firmware_sim.canopen.object_dictionary import Abort, refuse
 from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
-from firmware_sim.nodes.drive_node import DriveNode, Motor
+from firmware_sim.nodes.drive_node import DriveNode
+from firmware_sim.nodes.drive_profile import Motor
 from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario

@@ -13,9 +13,6 @@ the controlword, SDO writes only those that take the power away: Disable voltage
 Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
@@ -30,17 +27,17 @@ from firmware_sim.nodes.drive_profile import (
     STATE_BITS,
     DriveEvent,
     DriveState,
+    Motor,
+    Patience,
     Standstill,
     Stop,
     TorqueLimits,
     decode_command,
     find_transition,
+    velocity_lsb,
 )
 
 CYCLIC_SYNCHRONOUS_TORQUE = 10
-_NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
-_NO_PATIENCE = 1 << 30  # a drive without 0x2200 doesn't count SYNCs
-_TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
 _BRAKE_WATCH_NS = 1_000_000  # how often a drive without SYNC looks whether it stands still
 
 _ENABLE_OPERATION_WORD = 0x0F
@@ -52,19 +49,6 @@ _POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _KIND_BITS = {2: 1 << 1, 4: 1 << 3}  # of 0x1001 by first digit of the error code: current, temperature
 _RAMPED = {DriveEvent.SHUTDOWN: 0x605B, DriveEvent.SWITCH_ON: 0x605C}  # option codes of transitions 8 and 5
 _EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
-
-
-class Motor(NamedTuple):
-    """What the drive knows of its motor without the bus: velocity in rad/s, torque in Nm.
-
-    is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
-    fault that the motor's state calls for now, 0 for none.
-    """
-
-    velocity_rad_s: Callable[[], float]
-    torque_Nm: Callable[[], float]
-    is_limited: Callable[[], bool] = lambda: False
-    error_code: Callable[[], int] = lambda: 0
 
 
 class DriveNode:
@@ -96,13 +80,14 @@ class DriveNode:
         self.is_free_running = is_free_running
         """Whether time passes without SYNC, so that SYNC is watched."""
         self._rated_mNm = round(rated_torque_Nm * 1000)
-        self._velocity_lsb_rad_s = _velocity_lsb(codec, number)
+        self._velocity_lsb_rad_s = velocity_lsb(codec, number)
         self._position = self._velocity = 0
         self._limits = TorqueLimits(device, self._pdos)
         self._demand = self._acted_commands = 0
         self._received_word: int | None = None
         self._controlword = 0
-        self._error_code = 0
+        self.error_code = 0
+        """0x603F: the fault that is latched, 0 for none."""
         self._cause: Watchdog | None = None
         self._failure = 0
         self._is_found_by_time = False
@@ -111,12 +96,8 @@ class DriveNode:
         self._is_braking = False
         self._is_motor_limited = self._is_limiting = False
         self._standstill = Standstill()
-        self._silent_syncs = _NO_COMMAND_YET
-        self._sync_ns = 0
         self._mode = self._wanted_mode = 0
-        self._patience_syncs = device.value_or(_NO_PATIENCE, 0x2200)
-        self._period_us = device.value(0x1006)
-        self._tenth_periods = device.value_or(_TENTH_PERIODS, 0x2201)
+        self._patience = Patience(device)
         self._serve(codec)
         self._configure()
         device.attach(self)
@@ -129,7 +110,7 @@ class DriveNode:
         serve(0x2000, 2, lambda: codec.layout_digest)
         serve(0x2202, 0, lambda: self._acted_commands & 0xFFFF)
         serve(0x2212, 0, lambda: self._obstacle)
-        serve(0x603F, 0, lambda: self._error_code)
+        serve(0x603F, 0, lambda: self.error_code)
         serve(0x6040, 0, lambda: self._controlword)
         serve(0x6041, 0, lambda: self.statusword)
         serve(0x6061, 0, lambda: self._mode)
@@ -151,9 +132,6 @@ class DriveNode:
         device.watch(0x605C, 0, check=one_of(*RAMPS))
         device.watch(0x605E, 0, check=one_of(*FAULT_REACTIONS))
         device.watch(0x6060, 0, self._want_mode, one_of(0, CYCLIC_SYNCHRONOUS_TORQUE))
-        device.watch(0x1006, 0, self._set_period)
-        device.watch(0x2200, 0, self._set_patience)
-        device.watch(0x2201, 0, self._set_tolerance)
 
     @property
     def is_enabled(self) -> bool:
@@ -192,18 +170,13 @@ class DriveNode:
     def _follows_target(self) -> bool:
         return self.state is _ENABLED and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None
 
-    @property
-    def error_code(self) -> int:
-        """0x603F: the fault that is latched, 0 for none."""
-        return self._error_code
-
     def on_sync(self, position: int, velocity: int, t_ns: int, *, is_distorted: bool = False) -> None:
         """Let the pending command act. `position`, `velocity`: sampled at this SYNC, in the body's LSBs.
 
         `is_distorted`: the velocity isn't the motor's, so it counts where the contract has an LSB of its own, too.
         """
         t_ns = self._clock.own_ns(t_ns)
-        self._sync_ns = t_ns
+        self._patience.sync_ns = t_ns
         self._position = position
         lsb_rad_s = self._velocity_lsb_rad_s
         if lsb_rad_s is None:
@@ -212,7 +185,7 @@ class DriveNode:
             speed_rad_s = velocity * VELOCITY_LSB_RAD_S if is_distorted else self._motor.velocity_rad_s()
             self._velocity = round(speed_rad_s / lsb_rad_s)
         if self._pdos.act_on_sync(t_ns):
-            self._silent_syncs = 0
+            self._patience.silent_syncs = 0
             self._acted_commands += 1
         else:
             self._miss_command(t_ns)
@@ -316,7 +289,7 @@ class DriveNode:
         self._received_word = None
         if not is_node_reset:
             return
-        self._error_code = 0
+        self.error_code = 0
         self._cause = None
         self.device.is_faulty = False
         self.device.fault_bits = 0
@@ -324,7 +297,7 @@ class DriveNode:
         self._limits.target = 0
         self._mode = self._wanted_mode
         self._ramp_end = None
-        self._silent_syncs = _NO_COMMAND_YET
+        self._patience.restart()
         self.state = DriveState.START
         self._apply(DriveEvent.POWER_ON, 0)
         self._apply(DriveEvent.INITIALISED, 0)
@@ -413,7 +386,7 @@ class DriveNode:
         if self.state is not DriveState.FAULT or self._is_cause_present(t_ns):
             return
         self._apply(DriveEvent.FAULT_RESET, t_ns)
-        self._error_code = 0
+        self.error_code = 0
         self._cause = None
         self.device.is_faulty = False
         self.device.fault_bits = 0
@@ -426,7 +399,7 @@ class DriveNode:
     def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
         if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
             return
-        self._error_code = code
+        self.error_code = code
         self._cause = cause
         self._is_found_by_time = is_found_by_time
         self.device.is_faulty = True
@@ -469,18 +442,17 @@ class DriveNode:
             self.device.clear(Watchdog.COMMAND_PDO, t_ns)
 
     def _miss_command(self, t_ns: int) -> None:
-        self._silent_syncs += 1
-        if self.is_enabled and self._silent_syncs >= self._patience_syncs:
+        self._patience.silent_syncs += 1
+        if self.is_enabled and self._patience.is_command_missing:
             self._fault(Watchdog.COMMAND, t_ns)
 
     def _watch_bus(self, t_ns: int) -> int:
         """Fault when SYNC or commands stay away for too long; return when to look again."""
         due_ns = NEVER_NS
         if self.is_free_running:
-            patience_ns = self._period_us * self._tenth_periods * 100
-            if t_ns - self._sync_ns >= patience_ns:
+            due_ns = self._patience.sync_due_ns
+            if t_ns >= due_ns:
                 self._fault(Watchdog.SYNC, t_ns, is_found_by_time=True)
-            due_ns = self._sync_ns + patience_ns
         if self._pdos.find_late(t_ns):
             self._fault(Watchdog.COMMAND, t_ns, is_found_by_time=True)
         return min(due_ns, self._pdos.deadline_ns) if self.is_enabled else t_ns
@@ -493,7 +465,7 @@ class DriveNode:
         return 2 if self.device.is_operational else 1
 
     def _is_command_missing(self, t_ns: int) -> bool:
-        return self._silent_syncs >= self._patience_syncs or self._pdos.find_late(t_ns)
+        return self._patience.is_command_missing or self._pdos.find_late(t_ns)
 
     def _watch_standstill(self, t_ns: int) -> None:
         """End the braking once the motor stands still, or after the longest time."""
@@ -508,12 +480,8 @@ class DriveNode:
 
     def _drive_motor(self) -> None:
         """Tell the motor what the state allows: torque only in Operation enabled with mode 10."""
-        if self._follows_target:
-            self._demand = self._limits.demand()
-            self.torque_Nm = self._demand * self._rated_mNm * 1e-6
-        else:
-            self._demand = 0
-            self.torque_Nm = 0.0
+        self._demand = self._limits.demand() if self._follows_target else 0
+        self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 
     @property
     def _torque_permille(self) -> int:
@@ -530,20 +498,3 @@ class DriveNode:
         self.has_news |= self._mode != self._wanted_mode
         self._mode = self._wanted_mode
         self._drive_motor()
-
-    def _set_period(self, period_us: int) -> None:
-        if period_us:  # 0 is written to change 0x1019; SYNC is watched all the same
-            self._period_us = period_us
-
-    def _set_tolerance(self, tenth_periods: int) -> None:
-        self._tenth_periods = tenth_periods
-
-    def _set_patience(self, syncs: int) -> None:
-        self._patience_syncs = syncs
-
-
-def _velocity_lsb(codec: Codec, number: int) -> float | None:
-    """Return the contract's LSB of velocity in rad/s, None when it is the body's own."""
-    signals = codec.message(f"Drive{number}Feedback").signals
-    scale = next(signal.scale for signal in signals if signal.name == "velocity")
-    return None if scale == VELOCITY_LSB_RAD_S else scale

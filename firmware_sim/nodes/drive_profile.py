@@ -1,4 +1,4 @@
-"""The CiA 402 profile of a torque drive: its state machine as one table, how it stops, what limits its torque.
+"""The CiA 402 profile of a torque drive: its state machine as one table, how it stops, its limits.
 
 The table has the standard's transition numbers. In cyclic synchronous torque the drive leaves the set-point and brakes
 by itself: on the slow-down ramp, on the quick-stop ramp, or up to its current limit. Ramps by voltage limit don't exist
@@ -12,10 +12,12 @@ Source: CiA 402-2 (IEC 61800-7-201): power drive system finite state automaton, 
 objects 0x605A to 0x605E, cyclic synchronous torque mode.
 """
 
+from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
 
-from firmware_sim.arm.sensing import DriveMode
+from adacd_hil.wire.codec import Codec
+from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
 from firmware_sim.canopen.object_dictionary import ObjectDictionary
 from firmware_sim.canopen.pdo import Pdos
 
@@ -177,6 +179,9 @@ class Standstill:
         return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
 
 
+_NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
+_NO_PATIENCE = 1 << 30  # a drive without 0x2200 doesn't count SYNCs
+_TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
 _UNLIMITED = 0xFFFF  # where the EDS lacks a limit
 
 
@@ -237,3 +242,63 @@ class TorqueLimits:
         """Of several limits the smallest counts."""
         self._high = min(self._max, self._positive)
         self._low = -min(self._max, self._negative)
+
+
+class Motor(NamedTuple):
+    """What the drive knows of its motor without the bus: velocity in rad/s, torque in Nm.
+
+    is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
+    fault that the motor's state calls for now, 0 for none.
+    """
+
+    velocity_rad_s: Callable[[], float]
+    torque_Nm: Callable[[], float]
+    is_limited: Callable[[], bool] = lambda: False
+    error_code: Callable[[], int] = lambda: 0
+
+
+class Patience:
+    """How long an enabled drive goes without SYNC and without commands: 0x1006, 0x2200, 0x2201."""
+
+    def __init__(self, dictionary: ObjectDictionary) -> None:
+        self.silent_syncs = _NO_COMMAND_YET
+        """SYNCs since the last command."""
+        self.sync_ns = 0
+        """When the last SYNC came, by the device's clock."""
+        self._syncs = dictionary.value_or(_NO_PATIENCE, 0x2200)
+        self._period_us = dictionary.value(0x1006)
+        self._tenth_periods = dictionary.value_or(_TENTH_PERIODS, 0x2201)
+        dictionary.watch(0x1006, 0, self._set_period)
+        dictionary.watch(0x2200, 0, self._set_syncs)
+        dictionary.watch(0x2201, 0, self._set_tolerance)
+
+    @property
+    def is_command_missing(self) -> bool:
+        """Whether too many SYNCs came without a command."""
+        return self.silent_syncs >= self._syncs
+
+    @property
+    def sync_due_ns(self) -> int:
+        """When SYNC is missing, by the device's clock."""
+        return self.sync_ns + self._period_us * self._tenth_periods * 100
+
+    def restart(self) -> None:
+        """Forget the last command."""
+        self.silent_syncs = _NO_COMMAND_YET
+
+    def _set_syncs(self, syncs: int) -> None:
+        self._syncs = syncs
+
+    def _set_period(self, period_us: int) -> None:
+        if period_us:  # 0 is written to change 0x1019; SYNC is watched all the same
+            self._period_us = period_us
+
+    def _set_tolerance(self, tenth_periods: int) -> None:
+        self._tenth_periods = tenth_periods
+
+
+def velocity_lsb(codec: Codec, number: int) -> float | None:
+    """Return the contract's LSB of velocity in rad/s, None when it is the body's own."""
+    signals = codec.message(f"Drive{number}Feedback").signals
+    scale = next(signal.scale for signal in signals if signal.name == "velocity")
+    return None if scale == VELOCITY_LSB_RAD_S else scale

@@ -24,7 +24,7 @@ from firmware_sim.body.motor import (
     motor_state,
     winding_temperature,
 )
-from firmware_sim.nodes.drive_node import Motor
+from firmware_sim.nodes.drive_profile import Motor
 from firmware_sim.scenario.scenario import Scenario
 
 TORQUE = (DriveMode.TORQUE, DriveMode.TORQUE)

@@ -1,0 +1,205 @@
+"""Rows of a scenario's faults: when each acts, what it draws, and what becomes of a frame or a value that it hits.
+
+Each row draws from a stream of its own, which follows from the seed, the row's kind, node and frame or signal, and how
+many rows before it are alike in these. So rows that come or go leave the draws of the others alone, and so do the
+numbers within a row. A row draws for each frame that it is about, whatever other rows do to that frame.
+"""
+
+import random
+from collections.abc import Callable, Sequence
+
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
+from adacd_hil.wire.e2e import Protection, crc8, crc16
+from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+from firmware_sim.scenario.faults import NODES, FaultSettings
+
+EVERYBODY = -1
+"""For `receive`: a frame that comes to all devices at once."""
+ANY_FRAME = -1  # in place of an identifier
+_DBC_NAMES = {
+    "feedback": "Feedback",
+    "torque": "Torque",
+    "status": "Status",
+    "command": "Command",
+    "heartbeat": "Heartbeat",
+    "emcy": "Emcy",
+    "sdo_request": "SdoRequest",
+    "sdo_response": "SdoResponse",
+}
+SIGNALS = {"position": (0, POSITION_LSB_RAD), "velocity": (1, VELOCITY_LSB_RAD_S), "torque": (2, TORQUE_LSB_NM)}
+_INSTANT_KINDS = ("reboot", "drive_fault")
+
+Sent = list[tuple[int, bytes]]
+Place = tuple[int, int]
+"""Node and identifier."""
+
+
+class FaultRow:
+    """One row and what it has done so far."""
+
+    def __init__(self, index: int, settings: FaultSettings, seed: str, period_ns: int) -> None:
+        self.index = index
+        self.settings = settings
+        self.draws = random.Random(seed)
+        self.begin_ns = settings.onset_ns
+        duration_ns = settings.duration_ns
+        if settings.kind in _INSTANT_KINDS and not duration_ns:
+            duration_ns = period_ns
+        self.end_ns = NEVER_NS if duration_ns is None else self.begin_ns + duration_ns
+        self.is_active = self.is_over = False
+        self.hits_left = NEVER_NS if settings.count is None else settings.count
+        self.sent = 0
+        self.held: dict[int, Sent] = {}
+        self.kept: dict[int, int] = {}
+
+    @property
+    def next_ns(self) -> int:
+        """When it begins or ends."""
+        return NEVER_NS if self.is_over else self.end_ns if self.is_active else self.begin_ns
+
+    @property
+    def flood_ns(self) -> int:
+        """When the next frame of a flood is due."""
+        rate_Hz = self.settings.rate_Hz or 0.0
+        return self.begin_ns + round(self.sent * 1e9 / rate_Hz) if rate_Hz and self.hits_left > 0 else NEVER_NS
+
+    @property
+    def due_ns(self) -> int:
+        """When it begins, ends or, in a storm of EMCY, goes on."""
+        is_storming = self.is_active and self.settings.kind == "emcy_storm"
+        return min(self.next_ns, self.flood_ns) if is_storming else self.next_ns
+
+    def hit(self) -> bool:
+        """Draw whether a frame or value is hit, and count it."""
+        if self.hits_left <= 0 or not self.is_active:
+            return False
+        chance = self.settings.chance
+        if chance < 1.0 and self.draws.random() >= chance:
+            return False
+        self.hits_left -= 1
+        return True
+
+    def late_ns(self) -> int:
+        """Draw how late."""
+        settings = self.settings
+        jitter_us = settings.jitter_us * self.draws.random() if settings.jitter_us else 0.0
+        return round(((settings.delay_us or 0.0) + jitter_us) * 1e3)
+
+
+def distort_value(row: FaultRow, node: int, counts: int, lsb: float) -> int:
+    """Return what becomes of one value."""
+    settings = row.settings
+    if not row.hit():
+        return counts
+    is_torque = settings.signal == "torque"
+    if settings.kind == "stick":
+        return row.kept.setdefault(node, counts)
+    if settings.kind == "jump":
+        moved = counts + round((settings.step or 0.0) / lsb)
+        return min(max(moved, TORQUE_COUNTS[0]), TORQUE_COUNTS[1]) if is_torque else moved
+    if settings.value is None:
+        return TORQUE_COUNTS[counts >= 0]
+    bound = round(settings.value / lsb)
+    return min(max(counts, -bound), bound)
+
+
+def _lose(_row: FaultRow, _message: MessageCodec | None, _frames: Sent) -> Sent:
+    return []
+
+
+def _duplicate(_row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
+    return [frame for frame in frames for _ in range(2)]
+
+
+def _delay(row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
+    late_ns = row.late_ns()
+    return [(delay_ns + late_ns, data) for delay_ns, data in frames]
+
+
+def _corrupt(row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
+    return [(delay_ns, _flip(row, data)) for delay_ns, data in frames]
+
+
+def _flip(row: FaultRow, data: bytes) -> bytes:
+    """Flip the bits of the mask, or random ones."""
+    settings = row.settings
+    bits = int.from_bytes(data, "little")
+    if settings.mask is not None:
+        bits ^= int.from_bytes(bytes.fromhex(settings.mask)[: len(data)], "little")
+    else:
+        size = 8 * len(data)
+        for bit in row.draws.sample(range(size), min(settings.bits or 1, size)):
+            bits ^= 1 << bit
+    return bits.to_bytes(len(data), "little")
+
+
+def _freeze_counter(row: FaultRow, message: MessageCodec | None, frames: Sent) -> Sent:
+    if message is None:
+        return frames
+    return [
+        (delay_ns, _freeze(row, message, data) if len(data) == message.length else data) for delay_ns, data in frames
+    ]
+
+
+def _freeze(row: FaultRow, message: MessageCodec, data: bytes) -> bytes:
+    """Give a protected frame the counter of the first one, and the CRC that goes with it."""
+    frame = bytearray(data)
+    if message.protection is Protection.PROFILE_2:
+        counter = row.kept.setdefault(message.can_id, data[1] & 0x0F)
+        frame[1] = data[1] & 0xF0 | counter
+        frame[0] = crc8(frame, message.data_ids[counter])
+    else:
+        frame[2] = row.kept.setdefault(message.can_id, data[2])
+        frame[:2] = crc16(frame, message.data_ids).to_bytes(2, "little")
+    return bytes(frame)
+
+
+FRAME_CHANGES: dict[str, Callable[[FaultRow, MessageCodec | None, Sent], Sent]] = {
+    "lose": _lose,
+    "duplicate": _duplicate,
+    "delay": _delay,
+    "corrupt": _corrupt,
+    "freeze_counter": _freeze_counter,
+}
+
+
+def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSettings, str]]:
+    """Give each row the name of its stream."""
+    counts: dict[str, int] = {}
+    named = []
+    for row in rows:
+        name = f"{row.kind} {row.node} {row.frame} {row.signal}"
+        counts[name] = counts.get(name, 0) + 1
+        named.append((row, f"{seed} {name} {counts[name]}"))
+    return named
+
+
+def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place]:
+    """Return node and identifier of the frames that a row is about. Raises ConfigError."""
+    if row.frame is None:
+        return frozenset()
+    if row.frame == "any":
+        return frozenset((node, ANY_FRAME) for node in row.nodes)
+    try:
+        if row.is_broadcast:
+            return frozenset([(EVERYBODY, codec.message(_broadcast_name(row)).can_id)])
+        found = [(node, _message(codec, row, node)) for node in row.nodes]
+    except CodecError as error:
+        raise ConfigError(f"faults[{index}]: frame {row.frame!r} is not in {codec.path.name}: {error}") from None
+    for _, message in found:
+        if row.kind == "freeze_counter" and not message.is_protected:
+            raise ConfigError(f"faults[{index}]: {message.name} has no counter to freeze in {codec.path.name}")
+    return frozenset((node, message.can_id) for node, message in found)
+
+
+def _broadcast_name(row: FaultSettings) -> str:
+    return "HostHeartbeat" if row.frame == "heartbeat" else (row.frame or "").capitalize()
+
+
+def _message(codec: Codec, row: FaultSettings, node: int) -> MessageCodec:
+    frame = row.frame or ""
+    if frame in ("sync", "nmt"):
+        return codec.message(frame.capitalize())
+    return codec.message(f"{NODES[node].capitalize()}{_DBC_NAMES[frame]}")
