@@ -20,7 +20,7 @@ from lab_motion import PERIOD_S, Motion, cut, join, multisine, paper_motion, ran
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import Structured, compiled
-from adacd_hil.control.controller import HANDOVER_S, _torque
+from adacd_hil.control.controller import HANDOVER_S, fill_torque
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
 from firmware_sim.arm.arms import ARMS, ArmProfile
@@ -166,7 +166,7 @@ def _play(
             arm["viscous_Nm_s"][i] = viscous[i] * drift[k, 0]
             arm["coulomb_Nm"][i] = coulomb[i] * drift[k, 1]
         _lead_over(theta_ff, theta_cycles, k, handover, theta)
-        _torque(q[k], dq[k], q_d[k], dq_d[k], ddq_d[k], theta, Kp, Kd, tau_d)
+        fill_torque(q[k], dq[k], q_d[k], dq_d[k], ddq_d[k], theta, Kp, Kd, tau_d)
         latched[:] = command
         _limit(tau_d, limits[0], limits[1], limits[2], command)
         tau_c[k] = command
@@ -226,16 +226,16 @@ def record(
         raise ValueError("encoder noise and a walk of the torque offset are drawn outside the compiled loop")
     body = Body(scenario, PERIOD_S)
     body.start_scenario()
-    body._numbers["arm"]["torque_limit_Nm"][:] = body._numbers["motor"]["peak_Nm"][:] = _UNLIMITED_NM
+    parts = body.parts
+    numbers = parts.numbers.view(BODY_NUMBERS)[0]
+    numbers["arm"]["torque_limit_Nm"][:] = numbers["motor"]["peak_Nm"][:] = _UNLIMITED_NM
     rated_Nm = np.array(arm.arm.rated_torque_Nm)
     rate_share = np.array(ArmSettings().torque_rate_limit_Nm_s) / ArmSettings().rated_torque_Nm
     noise = np.random.default_rng(seed).standard_normal((count, JOINTS)) * arm.sensors.torque_noise_Nm
     drift = arm.drift(seed, count)
     q, dq, tau_J, tau_c, tau_ext = (np.zeros((count, JOINTS)) for _ in range(5))
     _play(
-        body._state_vector, body._number_vector, body._mechanics, body._contacts, body._things, body._touch_state,
-        body._payloads, body._encoder_noise.table, body._substeps,
-        body._work, _push_table(pushes), drift, arm.asymmetry, noise, motion.q_d, motion.dq_d, motion.ddq_d,
+        *parts, _push_table(pushes), drift, arm.asymmetry, noise, motion.q_d, motion.dq_d, motion.ddq_d,
         np.array(arm.Kp), np.array(arm.Kd),
         np.stack((rated_Nm, rate_share * rated_Nm * PERIOD_S, 1e-3 * rated_Nm)),
         np.array([theta for _, theta in feedforward], np.float64).reshape(-1, len(PARAMETER_NAMES)),

@@ -31,7 +31,7 @@ class Controller:
     def compile(self) -> None:
         """Run the compiled part once, so that nothing compiles in the cycle."""
         zeros = np.zeros(JOINTS)
-        _torque(zeros, zeros, zeros, zeros, zeros, self._theta, self._Kp, self._Kd, np.zeros(JOINTS))
+        fill_torque(zeros, zeros, zeros, zeros, zeros, self._theta, self._Kp, self._Kd, np.zeros(JOINTS))
 
     def feed_forward(self, theta: Vector) -> None:
         """Use these parameters (p,) from now on; the same array again changes nothing."""
@@ -46,11 +46,11 @@ class Controller:
             self._cycles_left -= 1
             share = self._cycles_left / self._handover_cycles
             self._theta = share * self._old + (1.0 - share) * self._new
-        _torque(q, dq, q_d, dq_d, ddq_d, self._theta, self._Kp, self._Kd, tau_d)
+        fill_torque(q, dq, q_d, dq_d, ddq_d, self._theta, self._Kp, self._Kd, tau_d)
 
 
 @compiled
-def _torque(
+def fill_torque(
     q: Vector,
     dq: Vector,
     q_d: Vector,
@@ -61,6 +61,7 @@ def _torque(
     Kd: Vector,
     tau_d: Vector,
 ) -> None:
+    """Fill the desired torque tau_d (2,), Nm, of the law in the head of this file; theta (p,) is fed forward."""
     feedforward = inverse_dynamics(q_d, dq_d, ddq_d, theta)
     for i in range(JOINTS):
         tau_d[i] = Kp[i] * (q_d[i] - q[i]) + Kd[i] * (dq_d[i] - dq[i]) + feedforward[i]

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adacd_hil.compiled import Structured
 from adacd_hil.records import TRUTH_LAYOUT, Vector
@@ -76,6 +77,21 @@ class Measurement(NamedTuple):
     def tau_J(self) -> Vector:
         """Measured joint torque, Nm (2,)."""
         return np.array(self.torque_counts) * TORQUE_LSB_NM
+
+
+class BodyParts(NamedTuple):
+    """What `body_ticks.advance_body` takes beside set-points, modes and ticks; the arrays are the body's own."""
+
+    state: Vector
+    numbers: Vector
+    mechanics: Structured | None
+    contacts: Structured
+    things: Structured
+    touch_state: Vector
+    payloads: Structured
+    encoder_noise: NDArray[np.float64]
+    substeps: int
+    work: Vector
 
 
 def _pack_numbers(scenario: Scenario) -> Vector:
@@ -155,6 +171,14 @@ class Body:
             self._numbers["transducer"], state["transducer"], *self._arm["tau_J"], *self._arm["temperature_C"]
         )
         self._compile()
+
+    @property
+    def parts(self) -> BodyParts:
+        """What the compiled functions take, for who plays many cycles without a call for each."""
+        return BodyParts(
+            self._state_vector, self._number_vector, self._mechanics, self._contacts, self._things, self._touch_state,
+            self._payloads, self._encoder_noise.table, self._substeps, self._work,
+        )  # fmt: skip
 
     def _compile(self) -> None:
         """Run every compiled function once, on a copy of the state."""

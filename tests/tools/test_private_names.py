@@ -34,10 +34,7 @@ def is_private(name: str) -> bool:
     return name.startswith("_") and not name.startswith("__")
 
 
-EXCEPT = {"lab.py": "plays the emulator's compiled body and the controller without their classes"}
-
-
-@pytest.mark.parametrize("tool", [tool for tool in PYTHON_TOOLS if tool.name not in EXCEPT], ids=lambda path: path.name)
+@pytest.mark.parametrize("tool", PYTHON_TOOLS, ids=lambda path: path.name)
 def test_a_tool_uses_public_names_only(tool: Path) -> None:
     assert private_names(tool.read_text(encoding="utf-8")) == []
 
