@@ -19,7 +19,7 @@ late. And whether a frame without counter that comes when it usually does is a p
 the arm moves. It counts as the latter; a second frame on the same SYNC shows that it was the former.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 USUAL_ANSWERS = 100
@@ -122,6 +122,12 @@ class AnswerClock:
         self._latest_ns = max(self._latest_ns, offset_ns)
         self._usual_count += 1
 
+    def follow(self, ordinal: int) -> None:
+        """Take note that the device has answered this SYNC, the one after the last that it answered; it is settled."""
+        self.answered = ordinal
+        self._is_guess = False
+        self._unanswered = self._unanswered << 1 & _MASK
+
     def pass_by(self, ordinal: int) -> None:
         """Take note that every SYNC up to this one was answered in time by frames that were read elsewhere."""
         self.answered = ordinal
@@ -156,6 +162,12 @@ class SampleAlignment:
         place = ordinal % KEPT
         self._ordinals[device][place] = ordinal
         self._values[device][place] = values
+
+    def put_all(self, ordinal: int, values: Sequence[tuple[float, ...]]) -> None:
+        """Keep the values of all devices of one SYNC."""
+        place = ordinal % KEPT
+        for ordinals, kept, one in zip(self._ordinals, self._values, values, strict=True):
+            ordinals[place], kept[place] = ordinal, one
 
     def newest(self, last: int, after: int) -> Sample | None:
         """Return the newest complete sample of the SYNCs up to `last` that come behind `after`, or None."""

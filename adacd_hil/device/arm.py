@@ -11,6 +11,7 @@ import numpy as np
 
 from adacd_hil.device.answer_clock import KEPT, AnswerClock, SampleAlignment
 from adacd_hil.device.arm_watch import PATIENCE_PERIODS
+from adacd_hil.device.cycle_frames import NO_CYCLE, CycleFrames
 from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
 from adacd_hil.device.profile import PlacedDevice, place_devices
 from adacd_hil.device.strangers import Strangers
@@ -82,6 +83,7 @@ class Arm:
         self._last_data = [b""] * len(self.devices)
         self.repeats = [0] * len(self.devices)
         """How often each device's frame came again, the same or with the same counter."""
+        self._frames = CycleFrames(self.devices, period_s)
         self.strangers = Strangers(settings, codec)
         self._emergency_ids = {EMERGENCY_ID + device.node_id: device for device in self.devices}
         self._tolerated_codes = frozenset(settings.safety.tolerated_emergencies)
@@ -110,11 +112,15 @@ class Arm:
 
         SYNC is sent here, unless another host sends it; pipelined commands leave behind it.
         """
+        if self._frames.held:
+            self._release()
         if self._cycle >= 0:
             if not self.has_all_frames:
                 self._miss()
             self._remember_gaps()
         self._begin_cycle(cycle, t_ns)
+        if periods == 1 and (self._frames.read_cycle == cycle - 1 or self._are_in_step()):
+            self._frames.is_open = True
         self._periods = periods
         self._received = 0
         self._seen = 0
@@ -148,6 +154,8 @@ class Arm:
 
     def pass_by(self, cycles: int, cycle: int, t_ns: int) -> None:
         """Take so many cycles, all complete and in time, for read elsewhere; the last one and its SYNC are given."""
+        self._release()
+        self._frames.read_cycle = NO_CYCLE
         for device in self.devices:
             device.skip(cycles)
         self._ordinal += cycles - 1
@@ -176,6 +184,12 @@ class Arm:
             self._hear_emergency(frame)
             return self.strangers.accept(frame, self._cycle)
         take, place = handler
+        if self._frames.is_open:
+            if place != _STATUS and not is_late and self._frames.hold(place, frame):
+                if self._frames.are_all_in:
+                    self._take_together()
+                return True
+            self._release()
         if place != _STATUS:
             self._answer(frame, take, place, self._ordinal - 1 if is_late and self._ordinal else self._ordinal)
         elif is_late:
@@ -186,6 +200,7 @@ class Arm:
 
     def _answer(self, frame: Frame, take: _Take, place: int, newest: int) -> None:
         """Take a cyclic frame for the SYNC that it answers; `newest`: the last one before it came."""
+        self._frames.read_cycle = NO_CYCLE
         if newest < 0:
             return  # before any SYNC there is nothing to answer
         device, clock, data = self.devices[place], self._clocks[place], frame.data
@@ -216,6 +231,35 @@ class Arm:
             clock.pass_by(newest)  # the device has begun anew, so that its counter says nothing of before
         elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
             clock.note(ordinal, newest, offset_ns, device.is_protected)
+
+    def _are_in_step(self) -> bool:
+        """Tell whether every device has answered the last SYNC, each as usual; then its next frame is known."""
+        last = self._ordinal - 1
+        return all(clock.is_settled and clock.answered == last for clock in self._clocks) and self._frames.begin(
+            self._cycle
+        )
+
+    def _take_together(self) -> None:
+        """Take the frames of all devices in one call; one by one where they aren't the next right ones."""
+        cycle, ordinal = self._cycle, self._ordinal
+        values = self._frames.read(cycle)
+        if values is None:
+            self._release()
+            return
+        for place, frame in self._frames.close():
+            data = frame.data
+            self.devices[place].follow(data, values[place], cycle)
+            self._clocks[place].follow(ordinal)
+            self._last_data[place] = data
+        self._alignment.put_all(ordinal, [device.values for device in self.devices])
+        self._received = self._seen = _COMPLETE
+        self.has_all_frames = True
+
+    def _release(self) -> None:
+        """Take the frames that are held one by one."""
+        for place, frame in self._frames.close():
+            take, _ = self._handlers[frame.can_id]
+            self._answer(frame, take, place, self._ordinal)
 
     def _soonest_ns(self, place: int) -> int:
         """Return how soon a device can answer this SYNC: as the first of those whose frames are not in."""
@@ -265,27 +309,29 @@ class Arm:
     @property
     def is_complete(self) -> bool:
         """Whether all cyclic frames of this cycle are in and passed their checks."""
-        return self._received == _COMPLETE
+        return self.received == _COMPLETE
 
     @property
     def missing_frames(self) -> int:
         """Count the cyclic frames of this cycle that are not in or failed their checks."""
-        return (_COMPLETE & ~self._received).bit_count()
+        return (_COMPLETE & ~self.received).bit_count()
 
     @property
     def received(self) -> int:
         """Bits of the devices whose cyclic frame of this cycle is in and passed its checks."""
+        if self._frames.held:
+            self._release()
         return self._received
 
     def missing_names(self) -> list[str]:
         """Name the devices whose cyclic frame of this cycle is not in or failed its checks."""
         names = [drive.name for drive in self.drives] + [sensor.name for sensor in self.sensors]
-        return [name for bit, name in enumerate(names) if not self._received & (1 << bit)]
+        return [name for bit, name in enumerate(names) if not self.received & (1 << bit)]
 
     def state(self) -> ArmState:
         """Join what has been received into the state of this cycle: the newest complete sample, else what is newest."""
         cycle = self._cycle
-        if self._received == _COMPLETE:
+        if self.received == _COMPLETE:
             return self._state_of(self._ordinal, tuple(device.values for device in self.devices), (cycle,) * 4)
         sample = self._alignment.newest(self._ordinal, self._sampled_ordinal)
         if sample is not None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import Structured, compiled, released
 from adacd_hil.device.arm_watch import OPERATIONAL
 from adacd_hil.records import JOINTS
-from adacd_hil.wire.e2e_batch import MOST_DATA_IDS, counter_of, is_next
+from adacd_hil.wire.cyclic_codec import counter_of, read_frame
 
 DEVICES = 2 * JOINTS
 STATUS = DEVICES
@@ -29,20 +29,10 @@ UNUSUAL = KINDS
 STANDARD_IDS = 0x800
 MOST_WATCHED = 8
 
-MESSAGE = np.dtype(
+CHECKS = np.dtype(
     [
         ("length", np.int64),
-        ("profile", np.int64),  # of the end-to-end header, 0 without
-        ("data_ids", np.uint8, (MOST_DATA_IDS,)),
-        # The values: position and velocity, or torque. value = raw * scale + offset
-        ("first_byte", np.int64, (2,)),
-        ("byte_count", np.int64, (2,)),
-        ("is_signed", np.int64, (2,)),  # numba has no arrays of bool in a structure
-        ("scale", np.float64, (2,)),
-        ("offset", np.float64, (2,)),
-        # Without header: largest step of position beyond velocity x time, or of torque; the end of the torque's range.
-        ("step_limit", np.float64),
-        ("range_limit", np.float64),
+        ("range_limit", np.float64),  # the end of the torque's range
         # What must stay as it is: data[byte] & mask == value.
         ("watched_count", np.int64),
         ("byte", np.int64, (MOST_WATCHED,)),
@@ -51,6 +41,7 @@ MESSAGE = np.dtype(
         ("renews_status", np.int64),  # of a drive: its arrival makes the status young
     ]
 )
+"""Of each cyclic and status frame, beside what the codec checks."""
 CONSTANTS = np.dtype(
     [
         ("sync_id", np.int64),
@@ -98,7 +89,7 @@ def read_cycles(
     at: int,
     ticks: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
     constants: Structured,
-    messages: Structured,
+    contract: tuple[Structured, Structured, Structured],
     kinds: NDArray[np.uint8],
     memory: Structured,
     is_enabled: bool,
@@ -106,7 +97,8 @@ def read_cycles(
 ) -> tuple[int, int]:
     """Read ordinary cycles; return how many, and where the frames of the last one begin.
 
-    ticks: cycle, t_ns, periods (n,). values (n, devices, 2) gets position and velocity, and torque.
+    ticks: cycle, t_ns, periods (n,). contract: CHECKS of both kinds of frames, messages and signal rows of the cyclic
+    ones, position and velocity or torque alone. values (n, devices, 2) gets position and velocity, and torque.
     """
     cycles, times_ns, periods = ticks
     found = np.empty(KINDS, np.int64)
@@ -115,10 +107,10 @@ def read_cycles(
         cycle, t_ns = cycles[place], times_ns[place]
         if periods[place] != 1 or cycle != memory[0]["cycle"] + 1:
             return place, last
-        end = _check(frames, t_ns, at, constants, messages, kinds, memory, found, values[place])
-        if end < 0 or _is_old(frames, cycle, t_ns, constants, messages, memory, found, is_enabled):
+        end = _check(frames, t_ns, at, constants, contract, kinds, memory, found, values[place])
+        if end < 0 or _is_old(frames, cycle, t_ns, constants, contract[0], memory, found, is_enabled):
             return place, last
-        _keep(frames, cycle, t_ns, messages, memory, found, values[place])
+        _keep(frames, cycle, t_ns, contract, memory, found, values[place])
         last, at = at, end
     return len(cycles), last
 
@@ -129,7 +121,7 @@ def _check(
     t_ns: int,
     at: int,
     constants: Structured,
-    messages: Structured,
+    contract: tuple[Structured, Structured, Structured],
     kinds: NDArray[np.uint8],
     memory: Structured,
     found: NDArray[np.int64],
@@ -150,7 +142,7 @@ def _check(
             kind = int(kinds[can_id])
             if kind == UNUSUAL or not has_sync or (kind <= STATUS and found[kind] >= 0):
                 return -1
-            if not _is_usual(frames, place, kind, t_ns, constants, messages, memory, values):
+            if not _is_usual(frames, place, kind, t_ns, constants, contract, memory, values):
                 return -1
             found[kind] = place
         place += 1
@@ -167,7 +159,7 @@ def _is_usual(
     kind: int,
     t_ns: int,
     constants: Structured,
-    messages: Structured,
+    contract: tuple[Structured, Structured, Structured],
     memory: Structured,
     values: NDArray[np.float64],
 ) -> bool:
@@ -176,40 +168,20 @@ def _is_usual(
     length = int(frames.length[place])
     if kind > HEARTBEAT:
         return bool(length == 1 and int(data[place, 0]) & 0x7F == OPERATIONAL)
-    message = messages[kind - 1]
-    if length != message["length"]:
+    checks, messages, rows = contract
+    check = checks[kind - 1]
+    if length != check["length"]:
         return False
-    for slot in range(message["watched_count"]):
-        if int(data[place, message["byte"][slot]]) & message["mask"][slot] != message["value"][slot]:
+    for slot in range(check["watched_count"]):
+        if int(data[place, check["byte"][slot]]) & check["mask"][slot] != check["value"][slot]:
             return False
     if kind > STATUS:
         return True
     device = kind - 1
-    last = memory[0]["last"][device]
-    values[device, 0] = _value(data, place, message, 0)
-    if device < JOINTS:
-        values[device, 1] = _value(data, place, message, 1)
-    if message["profile"] == 0:
-        step = values[device, 0] - last
-        if device < JOINTS:
-            step -= values[device, 1] * constants[0]["period_s"]
-        is_right = abs(step) <= message["step_limit"]
-    else:
-        counter = memory[0]["counter"][device]
-        is_right = is_next(data, place, length, message["profile"], message["data_ids"], counter)
-    return bool(is_right and frames.t_ns[place] >= t_ns and abs(values[device, 0]) < message["range_limit"])
-
-
-@compiled
-def _value(data: NDArray[np.uint8], row: int, message: Any, slot: int) -> float:
-    """Decode one value of a frame."""
-    first, count = message["first_byte"][slot], message["byte_count"][slot]
-    raw = 0
-    for byte in range(count):
-        raw |= int(data[row, first + byte]) << (8 * byte)
-    if message["is_signed"][slot] > 0 and raw >> (8 * count - 1) > 0:
-        raw -= 1 << (8 * count)
-    return float(raw * message["scale"][slot] + message["offset"][slot])
+    counter, last = memory[0]["counter"][device], memory[0]["last"][device]
+    period_s = constants[0]["period_s"]
+    is_right = read_frame(data, place, length, messages[device], rows, counter, last, period_s, values[device])
+    return bool(is_right and frames.t_ns[place] >= t_ns and abs(values[device, 0]) < check["range_limit"])
 
 
 @compiled
@@ -218,7 +190,7 @@ def _is_old(
     cycle: int,
     t_ns: int,
     constants: Structured,
-    messages: Structured,
+    checks: Structured,
     memory: Structured,
     found: NDArray[np.int64],
     is_enabled: bool,
@@ -230,7 +202,7 @@ def _is_old(
         if t_ns - heard_ns > constants[0]["patience_ns"]:
             return True
     for joint in range(JOINTS):
-        is_renewed = messages[joint]["renews_status"] > 0 or found[1 + STATUS + joint] >= 0
+        is_renewed = checks[joint]["renews_status"] > 0 or found[1 + STATUS + joint] >= 0
         age = 1 if is_renewed else cycle - memory[0]["status_cycle"][joint]
         if is_enabled and age > constants[0]["status_age_limit"][joint]:
             return True
@@ -242,13 +214,14 @@ def _keep(
     frames: FrameColumns,
     cycle: int,
     t_ns: int,
-    messages: Structured,
+    contract: tuple[Structured, Structured, Structured],
     memory: Structured,
     found: NDArray[np.int64],
     values: NDArray[np.float64],
 ) -> None:
     """Remember what the next cycle is compared with, and the last frames of each kind."""
     state = memory[0]
+    checks, messages, _ = contract
     state["cycle"] = cycle
     for device in range(DEVICES):
         if messages[device]["profile"] > 0:
@@ -259,7 +232,7 @@ def _keep(
             state["frame"][kind] = found[kind]
             state["frame_cycle"][kind] = cycle - 1 if frames.t_ns[found[kind]] < t_ns else cycle
     for joint in range(JOINTS):
-        if messages[joint]["renews_status"] > 0:
+        if checks[joint]["renews_status"] > 0:
             state["status_cycle"][joint] = cycle
         elif found[1 + STATUS + joint] >= 0:
             state["status_cycle"][joint] = state["frame_cycle"][1 + STATUS + joint]

@@ -5,9 +5,11 @@ Source: CiA 402-2 / IEC 61800-7-201, clause 10.3 (state machine), clause 16 (cyc
 """
 
 from collections import deque
+from collections.abc import Sequence
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
+from adacd_hil.device.cycle_frames import CyclicFrame
 from adacd_hil.device.profile import ProfileSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
@@ -260,22 +262,28 @@ class Drive:
         if len(data) != self.feedback_message.length:
             self.implausible_frames += 1
             return False
+        if self.is_protected and not self.end_to_end.check(data).is_valid:
+            return False
+        values = self.feedback_message.decode_values(data)
+        if not (self.is_protected or self._is_plausible(values[self._position_at], values[self._velocity_at], cycle)):
+            return False
+        self._use(values, cycle)
+        return True
+
+    def follow(self, _data: bytes, values: Sequence[float], cycle: int) -> None:
+        """Take the values of the feedback that follows the last one and was checked elsewhere."""
         if self.is_protected:
-            if not self.end_to_end.check(data).is_valid:
-                return False
-            values = self.feedback_message.decode_values(data)
-            position = values[self._position_at]
+            self.end_to_end.follow()
         else:
-            values = self.feedback_message.decode_values(data)
-            position = values[self._position_at]
-            if not self._is_plausible(position, values[self._velocity_at], cycle):
-                return False
-        self.position_rad = position
+            self._received_position_rad, self._received_cycle = values[self._position_at], cycle
+        self._use(values, cycle)
+
+    def _use(self, values: Sequence[float], cycle: int) -> None:
+        self.position_rad = values[self._position_at]
         self.velocity_rad_s = values[self._velocity_at]
         self.sample_cycle = cycle
         if not self.has_status_frame:
             self._take_status(values, self._feedback_status, cycle)
-        return True
 
     def _is_plausible(self, position: float, velocity: float, cycle: int) -> bool:
         last, self._received_position_rad = self._received_position_rad, position
@@ -310,6 +318,11 @@ class Drive:
         return abs(values[self._position_at] - self._received_position_rad - travel)
 
     @property
+    def cyclic_frame(self) -> CyclicFrame:
+        """Describe the feedback."""
+        return CyclicFrame(self.feedback_message, "position", "velocity", jump=self.position_jump_rad)
+
+    @property
     def is_steady(self) -> bool:
         """Whether the last feedback that came is in use, and the next is to follow it without loss."""
         if self.is_protected:
@@ -336,7 +349,7 @@ class Drive:
             self._take_status(message.decode_values(data), self._status_places, cycle)
         return is_valid
 
-    def _take_status(self, values: tuple[float, ...], at: _StatusPlaces, cycle: int) -> None:
+    def _take_status(self, values: Sequence[float], at: _StatusPlaces, cycle: int) -> None:
         self.status_cycle = cycle
         if at.statusword >= 0:
             self.statusword = int(values[at.statusword])

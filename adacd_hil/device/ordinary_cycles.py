@@ -10,11 +10,11 @@ import numpy as np
 
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_batch import (
+    CHECKS,
     CONSTANTS,
     DEVICES,
     HEARTBEAT,
     MEMORY,
-    MESSAGE,
     MOST_WATCHED,
     STANDARD_IDS,
     STATUS,
@@ -23,15 +23,15 @@ from adacd_hil.device.arm_batch import (
     read_cycles,
 )
 from adacd_hil.device.arm_watch import HeartbeatWatch
+from adacd_hil.device.cycle_frames import lay_out_frames
 from adacd_hil.device.drive import Drive
 from adacd_hil.device.torque_sensor import STATUS_BITS, TorqueSensor
 from adacd_hil.records import JOINTS, ArmBatch, ArmState, FaultReason
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.codec import MessageCodec, SignalCodec
+from adacd_hil.wire.codec import MessageCodec
+from adacd_hil.wire.codec_columns import SignalCodec, signal_rows
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
-from adacd_hil.wire.e2e_batch import PROFILE_NUMBERS
 
-_MOST_BITS = 32
 _MOST_CYCLES = 8192
 """Cycles of one call."""
 _ALWAYS_NS = 1 << 62
@@ -70,7 +70,9 @@ class OrdinaryCycles:
         if settings.bus.follows:
             raise NotOrdinaryError("SYNC is received")
         self._arm, self._heartbeats = arm, heartbeats
-        self._messages = np.zeros(2 * DEVICES, MESSAGE)
+        self._checks = np.zeros(2 * DEVICES, CHECKS)
+        frames = [device.cyclic_frame for device in arm.devices]
+        self._contract = (self._checks, *lay_out_frames(frames, is_brief=True))
         self._constants = np.zeros(1, CONSTANTS)
         self._memory = np.zeros(1, MEMORY)
         self._values = np.zeros((_MOST_CYCLES, DEVICES, 2))
@@ -81,7 +83,7 @@ class OrdinaryCycles:
         for index, drive in enumerate(arm.drives):
             self._lay_out_drive(index, drive)
         for index, sensor in enumerate(arm.sensors, JOINTS):
-            self._lay_out_sensor(index, sensor, settings.bus.period_s)
+            self._lay_out_sensor(index, sensor)
         for can_id in arm.unusual_ids:
             self._name(can_id, UNUSUAL)
 
@@ -96,8 +98,6 @@ class OrdinaryCycles:
 
     def _lay_out_drive(self, index: int, drive: Drive) -> None:
         message = self._lay_out_message(index, drive.feedback_message)
-        _place_values(message, drive.feedback_message, ("position", "velocity"))
-        message["step_limit"] = drive.position_jump_rad
         message["range_limit"] = np.inf
         message["renews_status"] = int(not drive.has_status_frame)
         status = self._lay_out_status(index, drive.status_message)
@@ -110,11 +110,9 @@ class OrdinaryCycles:
                 elif signal.name == "mode_display":
                     self._watch_number(number, found, signal, lambda: drive.mode)
 
-    def _lay_out_sensor(self, index: int, sensor: TorqueSensor, period_s: float) -> None:
+    def _lay_out_sensor(self, index: int, sensor: TorqueSensor) -> None:
         found = sensor.torque_message
         message = self._lay_out_message(index, found)
-        _place_values(message, found, ("torque",))
-        message["step_limit"] = sensor.torque_rate_Nm_s * period_s
         message["range_limit"] = np.inf
         names = [signal.name for signal in found.values]
         if "status" in names:
@@ -129,10 +127,8 @@ class OrdinaryCycles:
             self._watch_status(status, sensor.status_message, sensor)
 
     def _lay_out_message(self, index: int, found: MessageCodec) -> Any:
-        message = self._messages[index]
+        message = self._checks[index]
         message["length"] = found.length
-        message["profile"] = PROFILE_NUMBERS[found.protection]
-        message["data_ids"][: len(found.data_ids)] = list(found.data_ids)
         self._name(found.can_id, 1 + index)
         return message
 
@@ -156,18 +152,27 @@ class OrdinaryCycles:
         """Watch all bytes of a signal that is a whole number."""
         if signal.scale != 1.0 or signal.offset != 0.0:
             raise NotOrdinaryError(f"{found.name}.{signal.name} is scaled")
-        for byte in range(_byte_count(found, signal)):
-            self._watch(number, found.first_byte(signal) + byte, 0xFF, read, down=8 * byte)
+        begin, size = self._place_of(found, signal)
+        for byte in range(size):
+            self._watch(number, begin + byte, 0xFF, read, down=8 * byte)
+
+    @staticmethod
+    def _place_of(found: MessageCodec, signal: SignalCodec) -> tuple[int, int]:
+        """Return where a signal that has its bytes for itself begins, and how many it has."""
+        if signal.mask:
+            raise NotOrdinaryError(f"{found.name}.{signal.name} is part of a byte")
+        row = signal_rows(found.signals)[found.signals.index(signal)]
+        return int(row["byte"]), int(row["size"])
 
     def _watch_status(self, number: int, found: MessageCodec, sensor: TorqueSensor) -> None:
         """Watch the bits of a sensor's status."""
         signal = next(signal for signal in found.values if signal.name == "status")
-        if signal.scale != 1.0 or signal.offset != 0.0 or signal.mask:
-            raise NotOrdinaryError(f"{found.name}.status is scaled or shares a byte")
-        self._watch(number, found.first_byte(signal), STATUS_BITS, lambda: sensor.status)
+        if signal.scale != 1.0 or signal.offset != 0.0:
+            raise NotOrdinaryError(f"{found.name}.status is scaled")
+        self._watch(number, self._place_of(found, signal)[0], STATUS_BITS, lambda: sensor.status)
 
     def _watch(self, number: int, byte: int, mask: int, read: Callable[[], int], down: int = 0, up: int = 0) -> None:
-        message = self._messages[number]
+        message = self._checks[number]
         slot = int(message["watched_count"])
         if slot == MOST_WATCHED:
             raise NotOrdinaryError("too many bytes to watch")
@@ -186,7 +191,7 @@ class OrdinaryCycles:
         most = slice(place, place + _MOST_CYCLES)
         ticks = batch.cycle[most], batch.t_ns[most], batch.periods[most]
         count, last = read_cycles(
-            frames, at, ticks, self._constants, self._messages, self._kinds, memory, state.is_enabled, self._values
+            frames, at, ticks, self._constants, self._contract, self._kinds, memory, state.is_enabled, self._values
         )
         read = slice(place, place + count)
         batch.q[read] = constants["sign"] * values[:count, :JOINTS, 0]
@@ -221,26 +226,8 @@ class OrdinaryCycles:
         memory["heard_ns"] = [heard_ns.get(can_id, _ALWAYS_NS) for can_id in self._heartbeat_ids]
         memory["frame"] = -1
         for number, slot, read, down, up in self._watched:
-            self._messages[number]["value"][slot] = (int(read()) >> down & 0xFF) << up
+            self._checks[number]["value"][slot] = (int(read()) >> down & 0xFF) << up
         return True
 
 
 _NOTHING = OrdinaryStretch(0, 0, [])
-
-
-def _place_values(message: Any, found: MessageCodec, names: tuple[str, ...]) -> None:
-    """Say where the values of a cyclic frame are and what a count is worth."""
-    for slot, name in enumerate(names):
-        signal = next(signal for signal in found.values if signal.name == name)
-        message["first_byte"][slot] = found.first_byte(signal)
-        message["byte_count"][slot] = _byte_count(found, signal)
-        message["is_signed"][slot] = signal.raw_low < 0
-        message["scale"][slot], message["offset"][slot] = signal.scale, signal.offset
-
-
-def _byte_count(found: MessageCodec, signal: SignalCodec) -> int:
-    """Count the bytes of a signal that has them for itself."""
-    bits = (signal.raw_high - signal.raw_low).bit_length()
-    if signal.mask or bits > _MOST_BITS:
-        raise NotOrdinaryError(f"{found.name}.{signal.name} is part of a byte or has more than {_MOST_BITS} bits")
-    return bits // 8

@@ -11,7 +11,7 @@ from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.device_setup import Slave
 from adacd_hil.device.profile import ObjectName, PdoSettings
 from adacd_hil.wire.bus import MAX_STANDARD_ID
-from adacd_hil.wire.codec import Codec, MessageCodec, SignalCodec
+from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import NOT_VALID
 
 RTR_NOT_ALLOWED = 1 << 30
@@ -184,13 +184,9 @@ def _differences(message: MessageCodec, pdo: Pdo) -> list[str]:
     for signal in message.signals:
         wanted = SIGNAL_OBJECTS.get(signal.name)
         found = places.get(bit)
-        width = _bits(signal)
+        width = signal.bits
         if wanted is not None and (found is None or found.object_index != wanted or found.bits != width):
             there = "no object" if found is None else f"0x{found.object_index:04X} with {found.bits} bits"
             lines.append(f"{message.name}.{signal.name}: {there} at bit {bit}, not 0x{wanted:04X} with {width}")
         bit += width
     return lines
-
-
-def _bits(signal: SignalCodec) -> int:
-    return (signal.raw_high - signal.raw_low).bit_length()

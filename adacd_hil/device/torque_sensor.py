@@ -5,8 +5,10 @@ one ages. Torque is the device's own, with its own zero: sign and tare belong to
 """
 
 import math
+from collections.abc import Sequence
 from enum import IntFlag
 
+from adacd_hil.device.cycle_frames import CyclicFrame
 from adacd_hil.device.drive import find_signal
 from adacd_hil.wire.codec import Codec
 
@@ -76,20 +78,21 @@ class TorqueSensor:
         if len(data) != self.torque_message.length:
             self.implausible_frames += 1
             return False
-        if self.is_protected:
-            if not self.end_to_end.check(data).is_valid:
-                return False
-            values = self.torque_message.decode_values(data)
-            torque = values[self._torque_at]
-        else:
-            values = self.torque_message.decode_values(data)
-            torque = values[self._torque_at]
-            if not self._is_plausible(torque, cycle):
-                return False
-        self.torque_Nm = torque
-        self.sample_cycle = cycle
-        self._take_status(data, values, torque)
+        if self.is_protected and not self.end_to_end.check(data).is_valid:
+            return False
+        values = self.torque_message.decode_values(data)
+        if not (self.is_protected or self._is_plausible(values[self._torque_at], cycle)):
+            return False
+        self._use(data, values, cycle)
         return True
+
+    def follow(self, data: bytes, values: Sequence[float], cycle: int) -> None:
+        """Take the values of the torque frame that follows the last one and was checked elsewhere."""
+        if self.is_protected:
+            self.end_to_end.follow()
+        else:
+            self._received_torque_Nm, self._received_cycle = values[self._torque_at], cycle
+        self._use(data, values, cycle)
 
     def _is_plausible(self, torque: float, cycle: int) -> bool:
         last, self._received_torque_Nm = self._received_torque_Nm, torque
@@ -101,7 +104,9 @@ class TorqueSensor:
             return False
         return True
 
-    def _take_status(self, data: bytes, values: tuple[float, ...], torque: float) -> None:
+    def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:
+        torque = self.torque_Nm = values[self._torque_at]
+        self.sample_cycle = cycle
         if self._status_at is not None:
             self.status = _STATUSES[int(values[self._status_at]) & STATUS_BITS]
         elif self.status_in_header is not None:
@@ -114,6 +119,11 @@ class TorqueSensor:
     def values(self) -> tuple[float]:
         """Torque in use, Nm."""
         return (self.torque_Nm,)
+
+    @property
+    def cyclic_frame(self) -> CyclicFrame:
+        """Describe the torque frame."""
+        return CyclicFrame(self.torque_message, "torque", rate=self.torque_rate_Nm_s)
 
     @property
     def is_steady(self) -> bool:

@@ -12,7 +12,6 @@ import logging
 import re
 import struct
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 
 import cantools
@@ -21,6 +20,7 @@ from cantools.database.errors import Error as DatabaseError
 
 from adacd_hil.file_access import read_input
 from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
+from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
 from adacd_hil.wire.e2e import (
     E2eReceiver,
     E2eSender,
@@ -33,12 +33,13 @@ from adacd_hil.wire.e2e import (
 
 logging.getLogger("cantools").addHandler(logging.NullHandler())  # it tells a terminal what is refused here in a line
 
-_FORMATS = {(8, False): "B", (8, True): "b", (16, False): "H", (16, True): "h"} | {
-    (32, False): "I",
-    (32, True): "i",
-    (64, False): "Q",
-    (64, True): "q",
+_FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"} | {
+    (4, False): "I",
+    (4, True): "i",
+    (8, False): "Q",
+    (8, True): "q",
 }
+"""Of a container, by its bytes and whether it is signed. Source: the module struct."""
 _MOST_MESSAGES = 1000
 """Of a contract: to judge their budget takes 3 s, and four times that for twice as many."""
 E2E_SIGNALS = ("e2e_crc", "e2e_counter", "e2e_status")
@@ -53,50 +54,22 @@ class CodecError(ValueError):
     """A DBC that can't serve as the contract, or a value that doesn't fit its signal; one line."""
 
 
-@dataclass(frozen=True)
-class SignalCodec:
-    """One signal: where its raw integer is, and `value = raw * scale + offset` in `unit`."""
-
-    name: str
-    unit: str
-    scale: float
-    offset: float
-    container: int
-    shift: int
-    mask: int  # 0: the whole container
-    raw_low: int
-    raw_high: int
-
-    def to_raw(self, value: float) -> int:
-        """Quantise a physical value. Raises CodecError when it doesn't fit."""
-        raw = round((value - self.offset) / self.scale)
-        if not self.raw_low <= raw <= self.raw_high:
-            bound = self.raw_high if raw > self.raw_high else self.raw_low
-            raise CodecError(f"{self.name} = {value:g} {self.unit} exceeds {bound * self.scale + self.offset:g}")
-        return raw
-
-
-class MessageCodec:
+class MessageCodec(MessageTable):
     """Encodes and decodes the frames of one message."""
 
     def __init__(self, message: Message) -> None:
-        self.name: str = message.name
-        self.can_id: int = message.frame_id
-        self.length: int = message.length
-        self.senders: tuple[str, ...] = tuple(message.senders)
         _check_length(message)
         self.protection, self.data_ids = _protection(message)
         """How the frames are protected; Profile 2: the list of 16 bytes, Profile 5: two bytes, the low one first."""
-        ordered = sorted(message.signals, key=lambda signal: signal.start)
-        self._struct, self.signals = _lay_out(message, ordered)
-        self._signed = [signal.is_signed for signal in ordered]
-        first = len(E2E_SIGNALS) if self.is_protected else 0
-        self.values = self.signals[first:]
+        super().__init__(message.name, message.frame_id, message.length, _lay_out(message))
+        self.senders: tuple[str, ...] = tuple(message.senders)
+        self._struct = _container_struct(self.signals)
+        self.values = self.signals[len(E2E_SIGNALS) if self.is_protected else 0 :]
         """The signals without the end-to-end header."""
         # The hot path: values that each fill a container of their own need no shifting.
         is_plain = all(signal.mask == 0 for signal in self.values)
         self._scales = tuple((signal.scale, signal.offset) for signal in self.values)
-        self._body = struct.Struct("<" + _body_format(ordered[first:])) if is_plain else None
+        self._body = _container_struct(self.values) if is_plain else None
         self._body_offset = self.header_bytes
 
     @property
@@ -113,11 +86,6 @@ class MessageCodec:
     def is_fd(self) -> bool:
         """Whether the frames are CAN FD: those of up to 8 bytes are classic on every bus."""
         return self.length > CLASSIC_BYTES
-
-    def first_byte(self, signal: SignalCodec) -> int:
-        """Return where the container of a signal begins in a frame."""
-        containers = self._struct.format[1:]
-        return struct.calcsize("<" + containers[: signal.container])
 
     def sender(self) -> E2eSender:
         """Make the end-to-end sender of this message; without protection it changes nothing."""
@@ -142,9 +110,9 @@ class MessageCodec:
         """
         if len(values) != len(self.values):
             raise CodecError(f"{self.name} takes {len(self.values)} values, {len(values)} given")
-        containers = [0] * len(self._struct.format.strip("<"))
+        containers = [0] * (1 + max((signal.container for signal in self.signals), default=-1))
         for signal, value in zip(self.values, values, strict=True):
-            raw = signal.to_raw(value)
+            raw = _quantise(signal, value)
             containers[signal.container] |= (raw & signal.mask) << signal.shift if signal.mask else raw
         return bytearray(self._struct.pack(*containers))
 
@@ -157,11 +125,11 @@ class MessageCodec:
             raise CodecError(f"{self.name} has {len(data)} bytes, {self.length} expected")
         containers = self._struct.unpack(data)
         values = []
-        for signal, is_signed in zip(self.signals, self._signed, strict=True):
+        for signal in self.signals:
             raw = containers[signal.container]
             if signal.mask:
                 raw = (raw >> signal.shift) & signal.mask
-                if is_signed and raw > signal.mask >> 1:
+                if signal.is_signed and raw > signal.mask >> 1:
                     raw -= signal.mask + 1
             values.append(raw * signal.scale + signal.offset)
         return tuple(values)
@@ -189,8 +157,19 @@ class MessageCodec:
         return frame
 
 
-def _body_format(signals: list[Signal]) -> str:
-    return "".join(_FORMATS[(signal.length, signal.is_signed)] for signal in signals)
+def _container_struct(signals: tuple[SignalCodec, ...]) -> struct.Struct:
+    """Make the struct of the containers that hold signals."""
+    formats = {signal.container: _FORMATS[signal.size, signal.is_signed and not signal.mask] for signal in signals}
+    return struct.Struct("<" + "".join(formats.values()))
+
+
+def _quantise(signal: SignalCodec, value: float) -> int:
+    """Return the raw integer of a physical value. Raises CodecError when it doesn't fit."""
+    raw = round((value - signal.offset) / signal.scale)
+    if not signal.raw_low <= raw <= signal.raw_high:
+        bound = signal.raw_high if raw > signal.raw_high else signal.raw_low
+        raise CodecError(f"{signal.name} = {value:g} {signal.unit} exceeds {bound * signal.scale + signal.offset:g}")
+    return raw
 
 
 def _check_length(message: Message) -> None:
@@ -245,7 +224,7 @@ def _data_id(name: str, value: float | str | None) -> bytes:
 
 
 def _check_header(message: Message, protection: Protection) -> None:
-    first = sorted(message.signals, key=lambda signal: signal.start)[: len(E2E_SIGNALS)]
+    first = _in_order(message)[: len(E2E_SIGNALS)]
     places = tuple((signal.name, (signal.start, signal.length), signal.is_signed) for signal in first)
     bits = _E2E_BITS[protection]
     if places != tuple((name, place, False) for name, place in zip(E2E_SIGNALS, bits, strict=True)):
@@ -253,25 +232,26 @@ def _check_header(message: Message, protection: Protection) -> None:
         raise CodecError(f"{message.name}: a message protected by {protection.value} begins with unsigned {header}")
 
 
-def _lay_out(message: Message, signals: list[Signal]) -> tuple[struct.Struct, tuple[SignalCodec, ...]]:
+def _in_order(message: Message) -> list[Signal]:
+    return sorted(message.signals, key=lambda signal: signal.start)
+
+
+def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
     """Place the signals in containers on byte borders that cover the frame without gaps."""
-    format_text = "<"
     end_bit = 0
     containers = 0
     codecs = []
-    for signal in signals:
+    for signal in _in_order(message):
         where = f"{message.name}.{signal.name}"
         if signal.byte_order != "little_endian" or signal.is_float or signal.is_multiplexer:
             raise CodecError(f"{where}: only plain little-endian integers can be cyclic")
         is_whole = signal.start % 8 == 0 and signal.length in (8, 16, 32, 64)
         if is_whole and signal.start == end_bit:
-            format_text += _FORMATS[(signal.length, signal.is_signed)]
             container, shift, mask = containers, 0, 0
             containers += 1
             end_bit += signal.length
         elif signal.start % 8 + signal.length <= 8 and signal.start // 8 * 8 in (end_bit, end_bit - 8):
             if signal.start // 8 * 8 == end_bit:
-                format_text += "B"
                 containers += 1
                 end_bit += 8
             container, shift, mask = containers - 1, signal.start % 8, (1 << signal.length) - 1
@@ -283,7 +263,7 @@ def _lay_out(message: Message, signals: list[Signal]) -> tuple[struct.Struct, tu
         codecs.append(SignalCodec(signal.name, unit, scale, offset, container, shift, mask, low, high))
     if end_bit != message.length * 8:
         raise CodecError(f"{message.name}: signals cover {end_bit} of {message.length * 8} bits")
-    return struct.Struct(format_text), tuple(codecs)
+    return tuple(codecs)
 
 
 def _check_messages(database: Database) -> None:

@@ -200,6 +200,11 @@ class E2eReceiver:
         self.counts[E2eStatus.OK] += count
         self.restart()
 
+    def follow(self) -> None:
+        """Take the frame that follows the last one for OK, checked elsewhere; `counter` was not None."""
+        self.counts[E2eStatus.OK] += 1
+        self.status = E2eStatus.OK
+
     def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
         return E2eStatus.OK
 
@@ -226,6 +231,11 @@ class _SequenceReceiver(E2eReceiver):
     def counter(self) -> int | None:
         """The last frame's counter while that frame was in sequence; None when it wasn't or none came."""
         return self._last if self._missing == self._to_sync == 0 else None
+
+    def follow(self) -> None:
+        """Take the frame that follows the last one for OK, checked elsewhere; `counter` was not None."""
+        super().follow()
+        self._last = ((self._last or 0) + 1) % self.counter_range
 
     def _note_silence(self) -> None:
         self._missing += 1

@@ -13,11 +13,11 @@ from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
 from adacd_hil.log.recording.packet_writer import PacketWriter
 from adacd_hil.log.recording.processes import LiveSetup, WriterSetup
-from adacd_hil.log.types.decoded_messages import plain_messages
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.log.viewer.client import LiveClient, LiveMessage
 from adacd_hil.log.viewer.feed import LiveFeed
 from adacd_hil.records import Event
+from adacd_hil.wire.codec_columns import plain_tables
 
 EPOCH_NS = 1_700_000_000_000_000_000
 URDF = '<robot name="a"/>'
@@ -32,7 +32,7 @@ def setup_of(live: LiveSetup | None, path: Path = Path("run.mcap"), parameter_co
         path=path,
         is_truth=False,
         is_blocking=False,
-        messages=plain_messages(CODEC.messages.values()),
+        messages=plain_tables(CODEC.messages.values()),
         parameter_count=parameter_count,
         epoch_ns=EPOCH_NS,
         part_bytes=0,

@@ -41,6 +41,7 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
+from adacd_hil.wire.codec_columns import MessageTable
 
 CHANNELS = (*run_channels(9, tuple(CODEC.messages.values())), *truth_channels())
 STAMP = struct.pack("<II", 12, 34)
@@ -96,14 +97,8 @@ def test_two_fields_with_one_ros_name_are_refused():
 
 
 def test_a_dbc_message_may_not_take_the_name_of_our_own_type():
-    class Scheme:
-        name = "Scheme"
-        can_id = 1
-        length = 0
-        signals = ()
-
     with pytest.raises(LogError, match="the type name adacd_hil_msgs/msg/Scheme is taken"):
-        run_channels(7, (Scheme(),))
+        run_channels(7, (MessageTable("Scheme", 1, 0, ()),))
 
 
 def test_the_layout_of_a_type_is_aligned_as_cdr_demands():

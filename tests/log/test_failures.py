@@ -21,10 +21,10 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording import recorder as recorder_module
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.decoded_messages import PlainMessage
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec_columns import MessageTable
 
 CONTROL_PROCESS = """
 import sys
@@ -247,7 +247,7 @@ def test_a_path_that_can_not_be_created_is_an_error_before_the_run(name, reason,
 def test_messages_that_have_no_topic_are_an_error_before_the_run_and_leave_no_file(tmp_path):
     path = tmp_path / "run.mcap"
     with pytest.raises(LogError, match=f"^log {path} can't be written: .*adacd_hil_msgs/msg/Scheme is taken$"):
-        Recorder(path, messages=[PlainMessage("Scheme", 1, 0, ())])
+        Recorder(path, messages=[MessageTable("Scheme", 1, 0, ())])
     assert not path.exists()
 
 

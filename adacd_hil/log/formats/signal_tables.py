@@ -27,10 +27,10 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
 from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
-from adacd_hil.log.types.decoded_messages import ColumnDecoder
 from adacd_hil.log.types.topics import DECODED, EVENTS_TOPIC
 from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.codec_columns import ColumnCodec
 
 _LONGEST_STEM = 60
 """Letters of the name of a file, so that it has room in 255 bytes."""
@@ -70,7 +70,7 @@ def frame_columns(frames: NDArray[Any], codec: Codec) -> Iterator[tuple[str, dic
         found = frames[is_data & (frames["can_id"] == message.can_id) & (frames["length"] == message.length)]
         if not len(found):
             continue
-        decoder = ColumnDecoder(message)
+        decoder = ColumnCodec(message)
         values = np.empty((len(found), decoder.count))
         decoder.decode(np.ascontiguousarray(found["data"][:, : message.length]), values)
         columns: dict[str, Any] = {"t_ns": found["t_ns"], "cycle_t_ns": found["cycle_t_ns"]}

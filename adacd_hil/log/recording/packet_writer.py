@@ -32,7 +32,6 @@ from adacd_hil.log.recording.packet import (
     unpack_event,
     windows,
 )
-from adacd_hil.log.types.decoded_messages import ColumnDecoder, MessageLike
 from adacd_hil.log.types.message_types import (
     CAN_FRAME_DTYPE,
     ENCAPSULATION,
@@ -49,6 +48,7 @@ from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import SCHEME_BLOCK, ChannelId
 from adacd_hil.records import JOINTS, Event, scheme_layout
 from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
+from adacd_hil.wire.codec_columns import ColumnCodec, MessageTable
 
 _HEAD = struct.Struct("<BQHIQQ")
 _CHANNEL = slice(9, 11)
@@ -82,7 +82,7 @@ class PacketWriter:
     def __init__(
         self,
         file: McapFile,
-        messages: tuple[MessageLike, ...],
+        messages: tuple[MessageTable, ...],
         epoch_ns: int,
         parameter_count: int,
         watch: Watch | None = None,
@@ -99,7 +99,7 @@ class PacketWriter:
         self._is_known[list(file.ids)] = True
         known = sorted({message.can_id: index for index, message in enumerate(messages)}.items())
         self._can_ids = np.array([can_id for can_id, _ in known], np.int64)
-        self._decoders = [ColumnDecoder(messages[index]) for _, index in known]
+        self._decoders = [ColumnCodec(messages[index]) for _, index in known]
         self._decoded_ids = [file.ids[ChannelId.DECODED_FIRST + index] for _, index in known]
         self._lengths = np.array([decoder.length for decoder in self._decoders], np.int64)
         slices = scheme_layout(parameter_count).slices

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from adacd_hil.log.types.decoded_messages import PlainMessage, PlainSignal
+from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
 
 MOST_VIEWERS = 8
 """Viewers of a live view at a time, unless --live-viewers says otherwise."""
@@ -50,7 +50,7 @@ class WriterSetup:
     path: Path
     is_truth: bool
     is_blocking: bool
-    messages: tuple[PlainMessage, ...]
+    messages: tuple[MessageTable, ...]
     parameter_count: int
     epoch_ns: int
     part_bytes: int
@@ -74,7 +74,7 @@ class WriterSetup:
         table = json.loads(text)
         table["path"] = Path(table["path"])
         table["messages"] = tuple(
-            PlainMessage(**{**message, "signals": tuple(PlainSignal(**signal) for signal in message["signals"])})
+            MessageTable(**{**message, "signals": tuple(SignalCodec(**signal) for signal in message["signals"])})
             for message in table["messages"]
         )
         table["attachments"] = {name: base64.b64decode(data) for name, data in table["attachments"].items()}

@@ -21,12 +21,12 @@ from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveSetup, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring, room_of
 from adacd_hil.log.recording.run_folder import check_free, make_room
-from adacd_hil.log.types.decoded_messages import MessageLike, plain_messages
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME
 from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec_columns import MessageTable, plain_tables
 
 START_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 60.0
@@ -59,7 +59,7 @@ class Recorder:
         self,
         path: Path,
         *,
-        messages: Iterable[MessageLike] | None = None,
+        messages: Iterable[MessageTable] | None = None,
         parameter_count: int = len(PARAMETER_NAMES),
         further_count: int = 0,
         channel_count: int = 0,
@@ -99,7 +99,7 @@ class Recorder:
             path=path.absolute(),
             is_truth=is_truth,
             is_blocking=blocking,
-            messages=() if is_truth else plain_messages(_own_messages() if messages is None else messages),
+            messages=() if is_truth else plain_tables(_own_messages() if messages is None else messages),
             parameter_count=parameter_count,
             further_count=further_count,
             channel_count=channel_count,
@@ -254,7 +254,7 @@ def _create(path: Path, is_truth: bool) -> int:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None
 
 
-def _own_messages() -> Iterable[MessageLike]:
+def _own_messages() -> Iterable[MessageTable]:
     # Takes 0.2 s, which whoever has a codec can spare.
     from adacd_hil.wire.codec import load_codec
 

@@ -25,7 +25,6 @@ from enum import IntEnum
 from typing import Any
 
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.types.decoded_messages import MessageLike
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     FD_FRAME,
@@ -56,6 +55,7 @@ from adacd_hil.records import (
     certified_layout,
     scheme_layout,
 )
+from adacd_hil.wire.codec_columns import MessageTable
 from adacd_hil.wire.e2e import E2eStatus
 
 PACKAGE = "adacd_hil_msgs/msg"
@@ -179,7 +179,7 @@ SCHEME_BLOCK = _SCHEME_HEAD.size
 
 
 def run_channels(
-    parameter_count: int, messages: "tuple[MessageLike, ...]" = (), further_count: int = 0, channel_count: int = 0
+    parameter_count: int, messages: tuple[MessageTable, ...] = (), further_count: int = 0, channel_count: int = 0
 ) -> tuple[LogChannel, ...]:
     """List the topics of a run for `parameter_count` dynamic parameters and the DBC's messages.
 
@@ -214,7 +214,7 @@ def truth_channels() -> tuple[LogChannel, ...]:
     return (LogChannel(ChannelId.TRUTH, "/truth", truth), LogChannel(ChannelId.EVENTS, "/events", LOG))
 
 
-def _decoded_channel(channel_id: int, message: MessageLike) -> LogChannel:
+def _decoded_channel(channel_id: int, message: MessageTable) -> LogChannel:
     members = (Member(signal.name, "float64", unit=signal.unit) for signal in message.signals)
     message_type = number_type(f"{PACKAGE}/{ros_message_name(message.name)}", members)
     return LogChannel(channel_id, DECODED + message.name, message_type)

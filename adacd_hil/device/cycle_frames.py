@@ -1,0 +1,142 @@
+"""The cyclic frames of one SYNC, held until all are in and then read in one call of the compiled codec.
+
+That is possible where nothing is unusual: every device has answered every SYNC of late, and each frame is the next
+right one. Whatever else comes, the frames held so far go through the classes of each device, one by one, in the order
+in which they came; the result is the same.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adacd_hil.compiled import Structured
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec import MessageCodec
+from adacd_hil.wire.codec_columns import SIGNAL_ROW, signal_rows
+from adacd_hil.wire.cyclic_codec import CYCLIC_MESSAGE, NO_SPEED, PROFILE_NUMBERS, read_cycle
+from adacd_hil.wire.e2e import E2eReceiver
+
+NO_CYCLE = -2
+"""Before any, the first of which is 0: the one before it is no cycle either."""
+_MOST_BYTES = 64
+
+
+class CyclicFrame(NamedTuple):
+    """A device's frame of every cycle.
+
+    main: the signal by which a frame without end-to-end header is judged: it changes by `speed`, a signal of its rate
+    of change ("": none), times the time, within jump + rate * time.
+    """
+
+    message: MessageCodec
+    main: str
+    speed: str = ""
+    jump: float = 0.0
+    rate: float = 0.0
+
+
+class CyclicDevice(Protocol):
+    """A device that answers every SYNC with one frame."""
+
+    end_to_end: E2eReceiver
+    sample_cycle: int
+
+    @property
+    def cyclic_frame(self) -> CyclicFrame:
+        """Describe its frame."""
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """What is in use of it, the main value first."""
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the last frame that came is in use, and the next is to follow it without loss."""
+
+
+def lay_out_frames(frames: Sequence[CyclicFrame], is_brief: bool = False) -> tuple[Structured, Structured]:
+    """Lay the messages of a cycle out for compiled code, and the rows of their values: of all, or of main and speed."""
+    messages = np.zeros(len(frames), CYCLIC_MESSAGE)
+    rows: list[NDArray[Any]] = []
+    for entry, (message, main, speed, jump, rate) in zip(messages, frames, strict=True):
+        names = [signal.name for signal in message.values]
+        chosen = [name for name in (main, speed) if name] if is_brief else names
+        table = signal_rows(message.signals)[len(message.signals) - len(names) :]
+        entry["length"], entry["profile"] = message.length, PROFILE_NUMBERS[message.protection]
+        entry["data_ids"][: len(message.data_ids)] = list(message.data_ids)
+        entry["first"], entry["count"] = sum(map(len, rows)), len(chosen)
+        entry["main"], entry["speed"] = chosen.index(main), chosen.index(speed) if speed else NO_SPEED
+        entry["jump"], entry["rate"] = jump, rate
+        rows.append(table[[names.index(name) for name in chosen]])
+    return messages, np.concatenate(rows) if rows else np.zeros(0, SIGNAL_ROW)
+
+
+class CycleFrames:
+    """Holds the frames of a cycle.
+
+    is_open: whether frames are held at all in this cycle. held: each with the place of its device, as they came.
+    """
+
+    def __init__(self, devices: Sequence[CyclicDevice], period_s: float) -> None:
+        """Lay out what the compiled code reads, and compile it."""
+        self.is_open = False
+        self.held: list[tuple[int, Frame]] = []
+        self._devices, self._period_s = devices, period_s
+        self._messages, self._rows = lay_out_frames([device.cyclic_frame for device in devices])
+        self._lengths = self._messages["length"].tolist()
+        self._data = np.zeros((len(devices), _MOST_BYTES), np.uint8)
+        self._bytes = self._data.reshape(-1).data
+        self._counters = np.zeros(len(devices), np.int64)
+        self._last = np.zeros(len(devices))
+        self._values = np.zeros((len(devices), max(self._messages["count"].tolist())))
+        self._places = 0
+        self._all = (1 << len(devices)) - 1
+        self.read_cycle = NO_CYCLE
+        """The last cycle whose frames were all read here, and nothing of it by the devices' classes."""
+        self._read()
+
+    def _read(self) -> bool:
+        return read_cycle(
+            self._data, self._messages, self._rows, self._counters, self._last, self._period_s, self._values
+        )
+
+    def begin(self, cycle: int) -> bool:
+        """Take over from the devices' classes before a cycle; False where one's last frame is not in use."""
+        devices = self._devices
+        if not all(device.is_steady and device.sample_cycle == cycle - 1 for device in devices):
+            return False
+        self._counters[:] = [device.end_to_end.counter or 0 for device in devices]
+        self._last[:] = [device.values[0] for device in devices]
+        return True
+
+    def hold(self, place: int, frame: Frame) -> bool:
+        """Hold a frame; False, and nothing is held, when it isn't the device's first of this cycle or of its length."""
+        length, bit = len(frame.data), 1 << place
+        if self._places & bit or length != self._lengths[place]:
+            return False
+        begin = place * _MOST_BYTES
+        self._bytes[begin : begin + length] = frame.data
+        self.held.append((place, frame))
+        self._places |= bit
+        return True
+
+    @property
+    def are_all_in(self) -> bool:
+        """Whether the frames of all devices are held."""
+        return self._places == self._all
+
+    def read(self, cycle: int) -> list[list[float]] | None:
+        """Return the values of each device's frame, all being in; None unless each is the next right one."""
+        if not self._read():
+            return None
+        self.read_cycle = cycle
+        return self._values.tolist()  # type: ignore[no-any-return]
+
+    def close(self) -> list[tuple[int, Frame]]:
+        """Hold nothing more in this cycle; return what is held."""
+        held, self.held = self.held, []
+        self._places = 0
+        self.is_open = False
+        return held
