@@ -15,31 +15,31 @@ from adacd_hil.settings.schema import setting
 class ArmSettings:
     """The arm: what the host may know of it."""
 
-    profile: str = setting("P", choices=("P", "S", "M"), meaning="which of the emulated arms this is meant for")
+    profile: str = setting("P", choices=("P", "S", "M"), meaning="emulated arm that this configuration is for")
     link_length_m: tuple[float, float] = setting((0.35, 0.30), unit="m", low=0.01, high=5.0, meaning="joint to joint")
     rated_torque_Nm: tuple[float, float] = setting(
-        (12.0, 6.0), unit="Nm", low=0.1, high=1000.0, meaning="0x6076; 1000 per mille of target torque"
+        (12.0, 6.0), unit="Nm", low=0.1, high=1000.0, meaning="rated torque of each drive, 0x6076"
     )
     sign: tuple[int, int] = setting((1, 1), low=-1, high=1, meaning="+1 or -1: device direction to joint direction")
     torque_offset_Nm: tuple[float, float] = setting(
-        (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="sensor zero, subtracted after the sign"
+        (0.0, 0.0), unit="Nm", low=-50.0, high=50.0, meaning="zero of each torque sensor, subtracted after the sign"
     )
     torque_offset_std_Nm: tuple[float, float] | None = setting(
-        None, unit="Nm", low=1e-6, high=100.0, meaning="how well that zero is known, a deviation; `--tare` says it"
+        None, unit="Nm", low=1e-6, high=100.0, meaning="standard deviation of that zero; `--tare` sets it"
     )
     holding_torque_Nm: tuple[float, float] | None = setting(
         None,
         unit="Nm",
         low=0.0,
         high=1000.0,
-        meaning="most that brake, friction and cogging of a motor without power hold; 0: free; absent: not known",
+        meaning="largest torque that brake, friction and cogging hold without power; 0: free; absent: unknown",
     )
     position_torque_Nm: float = setting(
         0.0,
         unit="Nm",
         low=0.0,
         high=10.0,
-        meaning="`certified`: most that depends on where the arm is, of a cable or a tilted base; 0: none",
+        meaning="`certified`: largest torque that depends on the arm's place, as of a cable or a tilted base; 0: none",
     )
     torque_limit_Nm: tuple[float, float] = setting(
         (12.0, 6.0), unit="Nm", low=0.0, high=1000.0, meaning="largest commanded torque"
@@ -48,7 +48,7 @@ class ArmSettings:
         0.3, low=0.01, high=10.0, meaning="largest difference of commanded and actual torque, part of rated torque"
     )
     torque_rate_limit_Nm_s: tuple[float, float] = setting(
-        (2000.0, 1000.0), unit="Nm/s", low=1.0, high=1e6, meaning="largest change of commanded torque"
+        (2000.0, 1000.0), unit="Nm/s", low=1.0, high=1e6, meaning="largest rate of the commanded torque"
     )
     position_limit_deg: tuple[float, float] = setting(
         (75.0, 120.0), unit="deg", low=1.0, high=720.0, meaning="largest |q|; beyond it the run faults"
@@ -56,7 +56,7 @@ class ArmSettings:
     velocity_limit_deg_s: tuple[float, float] = setting(
         (250.0, 300.0), unit="deg/s", low=1.0, high=3600.0, meaning="largest |dq|; beyond it the run faults"
     )
-    cad_theta: tuple[float, ...] = setting((), low=0.0, meaning="the CAD model, in the order of the parameters")
+    cad_theta: tuple[float, ...] = setting((), low=0.0, meaning="the CAD model's parameters; empty: no model")
 
     def __post_init__(self) -> None:
         if any(sign == 0 for sign in self.sign):
@@ -99,7 +99,7 @@ class DevicesSettings:
     )
     bitrate: int = setting(1_000_000, unit="bit/s", low=10_000, high=1_000_000, meaning="of a composed contract")
     data_bitrate: int = setting(
-        5_000_000, unit="bit/s", low=0, high=8_000_000, meaning="CAN FD data phase of a composed contract; 0: classic"
+        5_000_000, unit="bit/s", low=0, high=8_000_000, meaning="bit rate of its CAN FD data phase; 0: classic CAN"
     )
 
     def __post_init__(self) -> None:

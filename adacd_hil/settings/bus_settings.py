@@ -17,13 +17,11 @@ class BusSettings:
     sync_patience_periods: float = setting(
         1.5, low=1.1, high=25.5, meaning="periods without SYNC until a drive faults by itself, 0x2201 in tenths"
     )
-    max_age_cycles: int = setting(3, low=1, high=100, meaning="oldest usable value; older faults the run")
+    max_age_cycles: int = setting(3, low=1, high=100, meaning="age of the oldest usable value; older faults the run")
     feedback_timeout_ms: int = setting(
         1000, unit="ms", low=1, high=60_000, meaning="lockstep: longest wait for one cycle's feedback"
     )
-    arms: int = setting(
-        1, low=1, high=7, meaning="arms of this contract on the bus, each with a host; from 2 on it is shared"
-    )
+    arms: int = setting(1, low=1, high=7, meaning="arms of this contract on the bus, each with its own host")
     host_node: int = setting(127, low=1, high=127, meaning="node id of this host; each host on the bus has its own")
     sync: str = setting(
         "produce", choices=("produce", "follow"), meaning="send SYNC, or begin each cycle with that of another host"
@@ -34,7 +32,7 @@ class BusSettings:
         meaning="commands leave when they are ready, to act at the next SYNC; or behind that one, to act one later",
     )
     sync_timeout_ms: int = setting(
-        100, unit="ms", low=1, high=60_000, meaning="follow: longest wait for SYNC; the drives have stopped before"
+        100, unit="ms", low=1, high=60_000, meaning="follow: longest wait for SYNC; the drives stop earlier"
     )
 
     def __post_init__(self) -> None:
@@ -75,16 +73,16 @@ class DataSettings:
         5,
         low=2,
         high=1000,
-        meaning="cycles in a row without a fresh sample for the model that fault the run; bus.max_age_cycles if more",
+        meaning="cycles in a row without a fresh sample that fault the run; at least `bus.max_age_cycles`",
     )
     incomplete_share: float = setting(
-        0.1, low=0.0, high=1.0, meaning="cycles in which some frame is missing or late; more is said and judged"
+        0.1, low=0.0, high=1.0, meaning="share of cycles with a missing or late frame from which on the run warns"
     )
     no_new_data_share: float = setting(
-        0.05, low=0.0, high=1.0, meaning="cycles without a new frame of one device; more is said and judged"
+        0.05, low=0.0, high=1.0, meaning="the same for cycles without a new frame of one device"
     )
     repeated_share: float = setting(
-        0.01, low=0.0, high=1.0, meaning="cycles with a repeated frame of one device; more is said and judged"
+        0.01, low=0.0, high=1.0, meaning="the same for cycles with a repeated frame of one device"
     )
 
 
@@ -101,11 +99,11 @@ class LockstepSettings:
         60.0, unit="us", low=0.0, high=1e6, meaning="constant: it; uniform: the lowest; lognormal: the median"
     )
     latency_high_us: float = setting(
-        200.0, unit="us", low=0.0, high=1e6, meaning="uniform: the highest; lognormal: exceeded by 1 in 1000"
+        200.0, unit="us", low=0.0, high=1e6, meaning="uniform: its highest; lognormal: exceeded by 1 in 1000"
     )
     stall_us: float = setting(0.0, unit="us", low=0.0, high=1e7, meaning="how much longer a stalled cycle takes")
     stall_every_s: float = setting(0.0, unit="s", low=0.0, high=1e6, meaning="mean time between stalls; 0: none")
-    seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the latency")
+    seed: int = setting(1, low=0, high=2**63 - 1, meaning="seed of the latency")
     stuffing: str = setting(
         "exact", choices=("exact", "worst"), meaning="length of frames: by their bits, or the longest that can be"
     )

@@ -27,7 +27,7 @@ class CertifiedSettings:
         200.0, unit="rad/s", low=10.0, high=3000.0, meaning="second low-pass behind each filter, against velocity noise"
     )
     noise_sigmas: float = setting(6.5, low=1.0, high=50.0, meaning="threshold in deviations of the torque's noise")
-    model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold in deviations of the model")
+    model_sigmas: float = setting(5.0, low=1.0, high=50.0, meaning="threshold, in standard deviations of the model")
     friction_terms: tuple[str, ...] = setting(
         ("stribeck", "load", "dahl_short", "dahl_long"),
         choices=FRICTION_TERMS,
@@ -40,7 +40,7 @@ class CertifiedSettings:
         0.01,
         low=0.0,
         high=0.5,
-        meaning="part of the other joint's torque that a torque sensor shows, a deviation; 0: not identified",
+        meaning="share of the other joint's torque in a sensor's value, a standard deviation; 0: not identified",
     )
     still_rad_s: float = setting(
         0.002,
@@ -70,16 +70,16 @@ class CertifiedSettings:
     model_error: tuple[float, ...] = setting(
         (0.003, 0.01, 0.01, 0.01, 0.0, 0.1, 0.1), low=0.0, high=1.0, meaning=f"part that no model explains: {_KINDS}"
     )
-    payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="what a payload at the tip may weigh")
+    payload_std_kg: float = setting(3.0, unit="kg", low=0.0, high=1000.0, meaning="deviation of a payload's mass")
     payload_inertia_std: float = setting(
         0.02, unit="kg m²", low=0.0, high=100.0, meaning="what it may add to each inertia beside a point mass"
     )
-    residual_Nm: float = setting(0.02, unit="Nm", low=1e-4, high=10.0, meaning="residual of one filtered sample")
-    learn_every: int = setting(4, low=1, high=100, meaning="samples between two that are learnt")
+    residual_Nm: float = setting(0.02, unit="Nm", low=1e-4, high=10.0, meaning="deviation of one filtered residual")
+    learn_every: int = setting(4, low=1, high=100, meaning="the estimator learns from one sample in so many")
     hold_back_s: float = setting(
         0.06, unit="s", low=0.0, high=1.0, meaning="how long a sample waits until it is learnt; a contact discards it"
     )
-    recover_s: float = setting(0.5, unit="s", low=0.0, high=60.0, meaning="after a contact, nothing is learnt so long")
+    recover_s: float = setting(0.5, unit="s", low=0.0, high=60.0, meaning="nothing is learnt so long after a contact")
     fit_s: tuple[float, float] = setting(
         (1.4, 0.45), unit="s", low=0.05, high=600.0, meaning="shortest fit: of the arm, of a payload"
     )
@@ -99,9 +99,9 @@ class CertifiedSettings:
         3.3e-3, unit="rad/s", low=0.0, high=1.0, meaning="velocity, largest error of one sample"
     )
     lag_s: float = setting(
-        0.00125, unit="s", low=0.0, high=0.1, meaning="expected age of the velocity when the torque is new; identified"
+        0.00125, unit="s", low=0.0, high=0.1, meaning="expected lag of the velocity behind the torque; identified"
     )
-    standstill_share: float = setting(1.0, low=0.0, high=10.0, meaning="part of F_c that is uncertain at rest")
+    standstill_share: float = setting(1.0, low=0.0, high=10.0, meaning="share of F_c that is uncertain at rest")
 
     def __post_init__(self) -> None:
         if len(self.cutoffs_rad_s) < 2:

@@ -11,7 +11,7 @@ class SafetySettings:
     """Checks before torque."""
 
     commission_s: float = setting(
-        0.2, unit="s", low=0.01, high=100.0, meaning="how long the arm rests, with complete data, before enabling"
+        0.2, unit="s", low=0.01, high=100.0, meaning="time at rest with complete data before the drives are enabled"
     )
     rest_velocity_rad_s: float = setting(0.05, unit="rad/s", low=1e-4, high=1.0, meaning="|dq| that counts as at rest")
     rest_torque_Nm: float = setting(1.0, unit="Nm", low=0.01, high=100.0, meaning="largest |tau_J| before enabling")
@@ -47,7 +47,7 @@ class TareSettings:
         0.06, unit="Nm", low=1e-6, high=100.0, meaning="largest standard deviation; sensors have about 0.02"
     )
     peak_to_peak_limit_Nm: float = setting(
-        0.5, unit="Nm", low=1e-6, high=100.0, meaning="largest distance of two samples; catches a short knock"
+        0.5, unit="Nm", low=1e-6, high=100.0, meaning="largest difference of two samples; shows a short knock"
     )
     drift_limit_Nm: float = setting(
         0.02, unit="Nm", low=1e-6, high=100.0, meaning="largest difference of the means of the window's halves"
@@ -68,16 +68,16 @@ class TareSettings:
     auto_zero_limit_Nm: float = setting(
         0.02, unit="Nm", low=1e-6, high=10.0, meaning="largest torque left after the sensor's own zero, 0x6125"
     )
-    warn_age_h: float = setting(24.0, unit="h", low=0.0, high=1e5, meaning="a run warns of a tare older than this")
-    max_age_h: float = setting(0.0, unit="h", low=0.0, high=1e5, meaning="a run refuses one older than this; 0: never")
+    warn_age_h: float = setting(24.0, unit="h", low=0.0, high=1e5, meaning="age beyond which a run warns of a tare")
+    max_age_h: float = setting(0.0, unit="h", low=0.0, high=1e5, meaning="age at which a run refuses a tare; 0: never")
     drift_Nm_sqrt_s: float = setting(
-        2e-5, unit="Nm/√s", low=0.0, high=1.0, meaning="random walk of a sensor's zero; take the data sheet's"
+        2e-5, unit="Nm/√s", low=0.0, high=1.0, meaning="random walk of a sensor's zero; see its data sheet"
     )
     drift_Nm_K: float = setting(
-        1e-3, unit="Nm/K", low=0.0, high=10.0, meaning="drift of a sensor's zero with temperature; likewise"
+        1e-3, unit="Nm/K", low=0.0, high=10.0, meaning="drift of a sensor's zero with temperature; see its data sheet"
     )
     temperature_K: float = setting(
-        5.0, unit="K", low=0.0, high=200.0, meaning="how far the temperature may be from that of the tare"
+        5.0, unit="K", low=0.0, high=200.0, meaning="largest difference of temperature since the tare"
     )
 
     def drift_variance(self, age_s: float) -> float:
@@ -89,23 +89,23 @@ class TareSettings:
 class HistorySettings:
     """What the arm's last certificate, of another run, says of it; `run --history` fills it in from the arm's file."""
 
-    date_utc: str = setting("", meaning="when it was certified, ISO 8601, UTC; empty: no last certificate")
+    date_utc: str = setting("", meaning="time of the last certificate, ISO 8601, UTC; empty: none")
     friction_Nm: tuple[float, ...] = setting(
-        (), unit="Nm", low=-1000.0, high=1000.0, meaning="of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2"
+        (), unit="Nm", low=-1000.0, high=1000.0, meaning="friction of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2"
     )
     friction_std_Nm: tuple[float, ...] = setting((), unit="Nm", low=0.0, high=1000.0, meaning="their deviations")
-    inertia_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=-1000.0, high=1000.0, meaning="a1, a2, a3")
+    inertia_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=-1000.0, high=1000.0, meaning="inertias a1, a2, a3")
     inertia_std_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=0.0, high=1000.0, meaning="their deviations")
     offset_Nm: tuple[float, ...] = setting(
-        (), unit="Nm", low=-1000.0, high=1000.0, meaning="zero of each torque sensor, arm.torque_offset_Nm included"
+        (), unit="Nm", low=-1000.0, high=1000.0, meaning="zero of each torque sensor, `arm.torque_offset_Nm` included"
     )
     offset_std_Nm: tuple[float, ...] = setting(
         (), unit="Nm", low=0.0, high=1000.0, meaning="their deviations, drift since the certificate included"
     )
     friction_share: float = setting(
-        0.2, low=0.0, high=10.0, meaning="how far friction differs from run to run, a deviation, share of it"
+        0.2, low=0.0, high=10.0, meaning="standard deviation of friction from run to run, as a share of it"
     )
-    inertia_share: float = setting(0.02, low=0.0, high=10.0, meaning="likewise of an inertia")
+    inertia_share: float = setting(0.02, low=0.0, high=10.0, meaning="the same of an inertia")
 
     def __post_init__(self) -> None:
         for name, values, count in (

@@ -27,12 +27,12 @@ class ExcitationSettings:
     In amplitudes of the trajectory, q_d = -1 + sum_n cosine_n (cos(n w t) - 1) + sine_n sin(n w t), w = 2 pi / period.
     """
 
-    period_s: float = setting(0.0, unit="s", low=0.0, high=600.0, meaning="of the motion; 0: adapt on the trajectory")
+    period_s: float = setting(0.0, unit="s", low=0.0, high=600.0, meaning="its period; 0: adapt on the trajectory")
     cosine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
-        ((), ()), low=-2.0, high=2.0, meaning="per joint and harmonic"
+        ((), ()), low=-2.0, high=2.0, meaning="amplitudes by joint and harmonic, rad"
     )
     sine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
-        ((), ()), low=-2.0, high=2.0, meaning="per joint and harmonic"
+        ((), ()), low=-2.0, high=2.0, meaning="amplitudes by joint and harmonic, rad"
     )
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class ControllerSettings:
         (20.0, 30.0), unit="deg", low=0.1, high=360.0, meaning="largest |q - q_d| of an arm that nobody touches"
     )
     following_timeout_s: float = setting(
-        0.1, unit="s", low=0.001, high=60.0, meaning="how long it may be larger until the run faults"
+        0.1, unit="s", low=0.001, high=60.0, meaning="time beyond that window after which the run faults"
     )
     feedforward: bool = setting(True, meaning="feed the identified model forward once it is valid")
 
@@ -82,16 +82,16 @@ class ReactionSettings:
         3.0, unit="deg", low=0.0, high=90.0, meaning="how far the withdrawal stays from the position limits"
     )
     clear_s: float = setting(
-        0.5, unit="s", low=0.0, high=60.0, meaning="how long nothing pushes until the arm goes on after a contact"
+        0.5, unit="s", low=0.0, high=60.0, meaning="time without a push after which the arm goes on from a contact"
     )
     patience_s: float = setting(
-        10.0, unit="s", low=0.1, high=3600.0, meaning="a contact that lasts longer waits to be acknowledged"
+        10.0, unit="s", low=0.1, high=3600.0, meaning="a contact that lasts longer must be acknowledged"
     )
     contact: tuple[str, str] = setting(
         ("stop", "stop"), choices=REACTIONS, meaning="to a contact of link 1, of link 2; `paper` knows collisions only"
     )
     collision: tuple[str, str] = setting(
-        ("withdraw", "withdraw"), choices=REACTIONS, meaning="to a collision of link 1, of link 2; `paper` withdraws"
+        ("withdraw", "withdraw"), choices=REACTIONS, meaning="reaction to a collision of link 1, of link 2"
     )
     start: str = setting(
         "desired",
@@ -102,13 +102,13 @@ class ReactionSettings:
         0.0, unit="s", low=0.0, high=1.0, meaning="how long a blow may throw the arm faster than its velocity limit"
     )
     two_sided: str = setting(
-        "float", choices=("stop", "float"), meaning="to a push from the other side while withdrawing, as in a clamp"
+        "float", choices=("stop", "float"), meaning="reaction to a push from the other side, as in a clamp"
     )
     damping_Nm_s: tuple[float, float] = setting(
-        (1.0, 0.4), unit="Nm s/rad", low=0.0, high=100.0, meaning="float: what brakes a push that has ended"
+        (1.0, 0.4), unit="Nm s/rad", low=0.0, high=100.0, meaning="float: damping of each joint"
     )
     friction_share: float = setting(
-        0.7, low=0.0, high=1.0, meaning="float: part of the identified friction that is compensated"
+        0.7, low=0.0, high=1.0, meaning="float: share of the identified friction that is compensated"
     )
     mass_kg_m2: tuple[float, float] = setting(
         (0.15, 0.06), unit="kg m²", low=1e-3, high=100.0, meaning="admittance: virtual inertia of each joint"
@@ -122,4 +122,4 @@ class ReactionSettings:
     yield_limit_deg_s: tuple[float, float] = setting(
         (60.0, 90.0), unit="deg/s", low=1.0, high=360.0, meaning="float, admittance: speed that a push may give a joint"
     )
-    slow_share: float = setting(0.2, low=0.0, high=1.0, meaning="slow_down: part of the speed that is left")
+    slow_share: float = setting(0.2, low=0.0, high=1.0, meaning="slow_down: share of the speed that is kept")

@@ -10,7 +10,7 @@ from adacd_hil.settings.schema import ConfigError, setting
 class FilterSettings:
     """Eq. (16): F(s) = b / (s + a)."""
 
-    a_rad_s: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0, meaning="cut-off; 10 rad/s is 1.59 Hz")
+    a_rad_s: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0, meaning="cut-off of the torque filter")
     b_rad_s: float = setting(
         10.0, unit="rad/s", low=0.1, high=1000.0, meaning="gain; DC gain b/a scales every threshold"
     )
@@ -31,9 +31,9 @@ class EstimatorSettings:
         (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5),
         low=0.0,
         high=1e6,
-        meaning="diagonal of P(0), continuous-time gain, 1/s; with gravity those of a4 and a5 may be left out: 50",
+        meaning="diagonal of P(0), gain in continuous time, 1/s; a4 and a5 may be left out (50)",
     )
-    gravity: bool = setting(False, meaning="add a4 and a5: joint axes that are not vertical")
+    gravity: bool = setting(False, meaning="estimate a4 and a5: the joint axes are not vertical")
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -68,7 +68,7 @@ class TerminationSettings:
         (0.1, 0.05, 0.05, 1.0),
         low=1e-6,
         high=1e6,
-        meaning="error that must not stay hidden: inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm",
+        meaning="parameter error that the motion must show: inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm",
     )
 
 
@@ -81,7 +81,7 @@ class DetectorSettings:
         0.01, unit="rad/s", low=0.0, high=1.0, meaning="|dq| below which friction may hold any torque up to F_c; 0: off"
     )
     isolation_window_s: float = setting(
-        0.05, unit="s", low=0.0, high=1.0, meaning="after detection, until the link is final"
+        0.05, unit="s", low=0.0, high=1.0, meaning="time from detection to the final decision on the link"
     )
     collision_Nm: tuple[float, float] = setting(
         (2.0, 1.0), unit="Nm", low=0.01, high=1000.0, meaning="upper threshold; `paper`: any contact is a collision"

@@ -10,24 +10,24 @@ from adacd_hil.settings.schema import ConfigError, setting
 class RequestSettings:
     """One entry of the operator's script."""
 
-    at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="since the drives were enabled")
-    request: str = setting(choices=("payload", "payload_changed", "finish"), meaning="what the user asks")
+    at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="time of the request, since the drives were enabled")
+    request: str = setting(choices=("payload", "payload_changed", "finish"), meaning="request of the user")
 
 
 @dataclass(frozen=True)
 class OperatorSettings:
     """The user, where a script plays the user."""
 
-    script: tuple[RequestSettings, ...] = setting((), meaning="requests by time")
+    script: tuple[RequestSettings, ...] = setting((), meaning="the user's requests, by time")
     acknowledge_after_s: float = setting(
         0.0, unit="s", low=0.0, high=3600.0, meaning="acknowledge a stop by itself after this time; 0: never"
     )
-    acknowledge_faults: int = setting(0, low=0, high=1000, meaning="how many faults are acknowledged by themselves")
+    acknowledge_faults: int = setting(0, low=0, high=1000, meaning="faults acknowledged without the user")
     acknowledge_fault_after_s: float = setting(
-        1.0, unit="s", low=0.0, high=3600.0, meaning="how long after a fault it is acknowledged by itself"
+        1.0, unit="s", low=0.0, high=3600.0, meaning="time after which such a fault is acknowledged"
     )
     acknowledge_on_hardware: bool = setting(
-        False, meaning="let stops and faults be acknowledged by themselves where a real arm may be on the bus, too"
+        False, meaning="allow acknowledgement without the user where a real arm may be on the bus"
     )
 
     @property
@@ -45,15 +45,15 @@ class RealtimeSettings:
     )
     priority: int = setting(80, low=1, high=98, meaning="of SCHED_FIFO; threaded interrupts have 50, the kernel 99")
     cpu: str = setting(
-        ANY_CPU, meaning="processor to stay on: its number, 'isolated' for the first isolated one, or 'any'"
+        ANY_CPU, meaning="processor of the control process: its number, 'isolated' (the first isolated one) or 'any'"
     )
-    lock_memory: bool = setting(True, meaning="keep all memory in place, with a reserve")
+    lock_memory: bool = setting(True, meaning="lock all memory, with a reserve")
     spin_us: float = setting(
         -1.0,
         unit="µs",
         low=-1.0,
         high=1000.0,
-        meaning="how long to read the clock before SYNC is due; -1: by measurement",
+        meaning="time before SYNC in which the process reads the clock instead of sleeping; -1: measured",
     )
     sample_period: str = setting(
         "measured",
@@ -61,8 +61,8 @@ class RealtimeSettings:
         meaning="interval that the scheme integrates over: between SYNCs, or `bus.period_us` as for a simulated arm "
         "that moves by whole periods; lockstep is nominal",
     )
-    misses: int = setting(10, low=1, high=1_000_000, meaning="skipped periods in the window that are too many")
-    misses_window_s: float = setting(1.0, unit="s", low=0.01, high=60.0, meaning="in which they are counted")
+    misses: int = setting(10, low=1, high=1_000_000, meaning="skipped periods within the window that are too many")
+    misses_window_s: float = setting(1.0, unit="s", low=0.01, high=60.0, meaning="window in which they are counted")
     on_misses: str = setting(
         "stop", choices=("stop", "hold"), meaning="FAULT; or, while detection is on, brake and hold until acknowledged"
     )
@@ -85,6 +85,6 @@ class LogSettings:
         4, unit="MiB", low=1, high=256, meaning="memory between control process and writer; 6 s of cycles at 1 kHz"
     )
     part_MiB: int = setting(
-        512, unit="MiB", low=0, high=1_000_000, meaning="largest part, before compression; 0: parts of any size"
+        512, unit="MiB", low=0, high=1_000_000, meaning="largest part, before compression; 0: any size"
     )
-    part_min: float = setting(30.0, unit="min", low=0.0, high=1e6, meaning="longest part; 0: parts of any length")
+    part_min: float = setting(30.0, unit="min", low=0.0, high=1e6, meaning="longest part, log time; 0: any length")
