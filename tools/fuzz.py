@@ -3,7 +3,7 @@
     python tools/fuzz.py --frames 1000000 --seed 1     every frame into codec, end-to-end check, host and devices
     python tools/fuzz.py --cangen 60                   a real bus: runs for 60 s under cangen at full rate, on vcan
 
-What is promised, and what can't be: tests/fuzz/fuzz_receivers.py and tests/test_cangen_fuzz.py.
+What is promised, and what can't be: tests/fuzz/fuzz_receivers.py and tests/vcan/test_cangen_fuzz.py.
 Exit status: 0 nothing was violated; 1 something was; the frame is printed.
 """
 
@@ -94,10 +94,10 @@ def survive(frames: Iterable[CanFrame], receivers: Sequence[Receiver]) -> bool:
 
 
 def fuzz_on_vcan(duration_s: float) -> int:
-    """Run the campaign of tests/test_cangen_fuzz.py for so long."""
+    """Run the campaign of tests/vcan/test_cangen_fuzz.py for so long."""
     limit_s = round(duration_s * 3 + 300)
     command = [ROOT / "tools/with-vcan", "--mem", "2G", "--can", "vcan0", "--timeout", str(limit_s), "--"]
-    test = [sys.executable, "-m", "pytest", "-q", "-s", str(ROOT / "tests/test_cangen_fuzz.py")]
+    test = [sys.executable, "-m", "pytest", "-q", "-s", str(ROOT / "tests/vcan/test_cangen_fuzz.py")]
     timeout = ["-o", f"timeout={limit_s}"]
     environment = os.environ | {"ADACD_HIL_FUZZ_S": f"{duration_s:g}"}
     return subprocess.run([*command, *test, *timeout], env=environment, cwd=ROOT, check=False).returncode

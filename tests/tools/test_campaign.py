@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-CAMPAIGN = Path(__file__).parent.parent / "tools" / "campaign.py"
+CAMPAIGN = Path(__file__).parents[2] / "tools" / "campaign.py"
 SHORT = """
 about = "Too short to adapt."
 group = "short"

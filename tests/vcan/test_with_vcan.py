@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hang import HANG_S
 
-WITH_VCAN = Path(__file__).resolve().parents[1] / "tools" / "with-vcan"
+WITH_VCAN = Path(__file__).resolve().parents[2] / "tools" / "with-vcan"
 STATUS_USAGE = 2
 STATUS_BUS_MISSING = 5
 STATUS_TIMEOUT = 124

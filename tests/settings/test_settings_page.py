@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import settings_page
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "settings.md"
 KEYS = [key for name, section, _ in settings_page.sections() for key, *_ in settings_page.rows_of(section, f"{name}.")]
 NAMED_IN = ("tests/**/*.py", "docs/**/*.md", "README.md", "adacd_hil/configs/*.toml", "docs/examples/**/*.toml")
