@@ -21,6 +21,7 @@ from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import FRAME_DTYPE
 from adacd_hil.records import SchemeState
+from adacd_hil.scheme.detect.detectors import DetectorBankSettings, unregister
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec
@@ -286,6 +287,7 @@ def cycles_of_a_bus_without_devices() -> dict[str, Any]:
 
 
 EXAMPLES: dict[str, Callable[[], dict[str, Any]]] = {
+    "detectors.md": dict,
     "formats.md": dict,
     "scheme-any-arm.md": free_and_pushed_motion,
     "scheme.md": cycles_of_a_bus_without_devices,
@@ -302,6 +304,9 @@ def test_a_python_example_runs(page, documents, folder, capsys):
     assert len(blocks) == 1
     if page == "scheme-any-arm.md":  # the contact that it prints
         assert re.fullmatch(r"10\d\d link2 \S.*\n", capsys.readouterr().out)
+    elif page == "detectors.md":
+        assert "magnitude" in DetectorBankSettings().detectors
+        unregister("magnitude")
     elif page == "formats.md":  # the last message of the log
         assert names["message"].__msgtype__ == names["connection"].msgtype
     else:

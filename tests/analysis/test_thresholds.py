@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from numpy.lib.stride_tricks import sliding_window_view
 
 from adacd_hil.analysis.thresholds import free_motion as module
 from adacd_hil.analysis.thresholds.detector_comparison import (
@@ -24,7 +25,7 @@ from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, comput
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.detect.detectors import DetectorBankSettings
+from adacd_hil.scheme.detect.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import read_toml
 
@@ -247,6 +248,40 @@ def test_the_detectors_are_compared_at_one_rate(statistics, tmp_path):
     assert json.loads(paths[0].read_text())["ranking"][0] == comparison.ranking[0]
     assert paths[1].read_bytes().startswith(b"\x89PNG")
     assert "<svg" in paths[2].read_text()
+
+
+class MeanOfTwenty:
+    """A detector of this file: the mean of the last 20 samples, less what friction may hold."""
+
+    def __init__(self, period_s):
+        assert period_s == T
+        self.last = np.zeros((19, 2)), np.zeros((19, 2))
+
+    def take(self, z, held_Nm):
+        z, held_Nm = (np.concatenate(pair) for pair in zip(self.last, (z, held_Nm), strict=True))
+        self.last = z[len(z) - 19 :], held_Nm[len(z) - 19 :]
+        mean, allowance = (sliding_window_view(column, 20, axis=0).mean(axis=-1) for column in (z, held_Nm))
+        return np.abs(mean) - allowance
+
+
+@compiled_only
+def test_a_detector_that_is_registered_is_in_the_thresholds_and_in_the_report(tmp_path):
+    register("mean of 20", MeanOfTwenty)
+    try:
+        found = statistics_of({"run.mcap": log_of(70.0)}, count=7_001)
+        thresholds = compute_thresholds(found, 5.0)
+        comparison = compare_detectors(found, 5.0, onsets=4)
+    finally:
+        unregister("mean of 20")
+    (channel,) = [row for row in thresholds.channels if row.detector == "mean of 20"]
+    assert channel.channel == "mean of 20"
+    bare = {row.channel: row.threshold for row in thresholds.channels}["first-order 50"]
+    np.testing.assert_allclose(channel.threshold, bare, rtol=0.6)
+    report = json.loads(write_comparison(comparison, tmp_path)[0].read_text())
+    assert "mean of 20" in report["ranking"]
+    delays = {row["detector"]: row["delay_ms"] for row in report["rows"] if row["joint"] == 1}
+    assert delays["mean of 20"][-1] < delays["paper"][0]
+    assert "mean of 20" not in SETTINGS.detectors
 
 
 def test_never_is_a_dash_and_null_and_the_worst_rank():

@@ -15,6 +15,7 @@ from adacd_hil.scheme.detect.detectors import (
     make_stream,
     new_memory,
     record,
+    register,
 )
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.schema import ConfigError
@@ -196,3 +197,44 @@ def test_a_gap_and_a_change_of_theta_are_no_torque():
     np.testing.assert_allclose(
         z[600, 0] - unchanged[600, 0], 0.01 * THETA[0] * (dq[600, 0] - dq[599, 0]) / T, atol=1e-9
     )
+
+
+class Magnitude:
+    """The plainest detector: |z|."""
+
+    def __init__(self, period_s):
+        self.count = 0
+
+    def take(self, z, held_Nm):
+        return np.abs(z)
+
+
+class OfOneJoint(Magnitude):
+    def take(self, z, held_Nm):
+        return np.abs(z[:, 0])
+
+
+class NotANumber(Magnitude):
+    def take(self, z, held_Nm):
+        return np.where(np.arange(len(z))[:, None] == 7, np.nan, np.abs(z))
+
+
+class LooksAhead(Magnitude):
+    def take(self, z, held_Nm):
+        return np.abs(z) / np.abs(z).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "words"),
+    [
+        ("paper", Magnitude, "there is a detector or channel paper already"),
+        ("observer 25", Magnitude, "there is a detector or channel observer 25 already"),
+        ("plain", OfOneJoint, r"detector plain gives statistics \(400,\) for samples \(400, 2\)"),
+        ("plain", NotANumber, "detector plain gives nan for sample 7 of joint 1"),
+        ("plain", LooksAhead, "detector plain gives sample 0 another statistic where the stream is cut at 137"),
+    ],
+)
+def test_a_detector_that_breaks_the_contract_is_refused_and_named(name, make, words):
+    with pytest.raises(ValueError, match=words):
+        register(name, make)
+    assert DetectorBankSettings().detectors.keys() == SETTINGS.detectors.keys()

@@ -24,8 +24,7 @@ from adacd_hil.analysis.thresholds.recorded_thresholds import Statistics, run_de
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.detect import detectors
-from adacd_hil.scheme.pipeline.batch import SchemeBatch
-from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 
@@ -237,7 +236,6 @@ def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
     waiting = sorted((window for window in log.windows or () if window.is_armed), key=lambda window: window.first)
     if not waiting:
         return
-    constants = detectors.constants_of(statistics.settings, statistics.weights, log.motion.period_s)
     before = round(WARM_UP_S / log.motion.period_s)
     stream = TorqueStream(statistics.lag_s, statistics.settings.standstill_rad_s)
     held = tuple(np.empty((0, statistics.z.shape[1])) for _ in range(2))  # what may still be needed of the stream
@@ -249,9 +247,8 @@ def _touches(log: TunedLog, statistics: Statistics) -> Iterator[Touched]:
         for window in [window for window in waiting if window.last < end]:
             first = max(window.first - before, 0)
             rows = slice(first - begin, window.last + 1 - begin)
-            shown: Vector = np.zeros((rows.stop - rows.start, len(statistics.settings.channels), held[0].shape[1]))
-            z, held_Nm = (column[rows] for column in held)
-            detectors.record(constants, detectors.new_memory(constants), z, held_Nm, 1, shown)
+            bank = detectors.DetectorBank(statistics.settings, statistics.weights, log.motion.period_s)
+            shown = bank.take(held[0][rows], held[1][rows])
             since_s = (log.t_ns[window.first : window.last + 1] - log.t_ns[window.first]) * 1e-9
             yield Touched(since_s, shown[window.first - first :], window.is_chosen_on)
         waiting = [window for window in waiting if window.last >= end]

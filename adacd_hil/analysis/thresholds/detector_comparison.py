@@ -186,17 +186,15 @@ def _ratios(
 ) -> Vector:
     """Give the largest ratio of statistic to threshold since the onset (detectors, onsets, after, n)."""
     period_s = statistics.motion.period_s
-    constants = detectors.constants_of(statistics.settings, statistics.weights, period_s)
     largest = np.zeros((len(found), len(starts), after, JOINTS))
-    peaks = np.zeros((before + after, len(statistics.settings.channels), JOINTS))
     for k, (start, phase_s) in enumerate(zip(starts.tolist(), phases_s.tolist(), strict=True)):
         z = statistics.z[start : start + before + after].copy()
         z[before:] += torque_Nm * step_shape(after, phase_s, LOOP_LAG_S, period_s)[:, None]
         held_Nm = statistics.held_Nm[start : start + before + after]
-        detectors.record(constants, detectors.new_memory(constants), z, held_Nm, 1, peaks)
+        shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take(z, held_Nm)
         for place, (name, calibrated) in enumerate(found.items()):
             rows = list(statistics.settings.detectors[name])
-            over = (peaks[before:, rows] / calibrated.thresholds).max(axis=1)
+            over = (shown[before:, rows] / calibrated.thresholds).max(axis=1)
             largest[place, k] = np.maximum.accumulate(over, axis=0)
     return largest
 

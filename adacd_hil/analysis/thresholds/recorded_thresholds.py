@@ -38,7 +38,6 @@ from adacd_hil.analysis.thresholds.free_motion import (
     read_motion,
     sample_of,
 )
-from adacd_hil.compiled import Structured
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
@@ -113,14 +112,14 @@ def run_detectors(
         weights = detectors.likelihood_weights(z[free], settings, lag_s, motion.period_s)
     except ValueError as error:
         raise TooLittleMotionError(f"{free.sum()} contact-free samples: {error}") from None
-    constants = detectors.constants_of(settings, weights, motion.period_s)
-    peaks = _peaks(logs, constants, lag_s, settings, progress)
+    bank = detectors.DetectorBank(settings, weights, motion.period_s)
+    peaks = _peaks(logs, bank, lag_s, settings, progress)
     return Statistics(settings, weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
 
 
 def _peaks(
     logs: Sequence[LoggedMotion],
-    constants: Structured,
+    bank: detectors.DetectorBank,
     lag_s: float,
     settings: detectors.DetectorBankSettings,
     progress: Progress,
@@ -129,7 +128,6 @@ def _peaks(
     block = round(BLOCK_S / logs[0].period_s)
     free = np.concatenate([log.is_free for log in logs])
     peaks = np.zeros((-(-len(free) // block), len(settings.channels), JOINTS))
-    memory = detectors.new_memory(constants)
     rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
     place = told = 0
     for log in logs:
@@ -141,12 +139,12 @@ def _peaks(
             z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
             end = place + len(z) // block
             whole = (end - place) * block
-            detectors.record(constants, memory, z[:whole], held_Nm[:whole], block, peaks[place:end])
+            peaks[place:end] = bank.take(z[:whole], held_Nm[:whole], block)
             rest, place = (z[whole:], held_Nm[whole:]), end
             if place * block - told >= _PROGRESS_SAMPLES:
                 told = place * block
                 progress(f"{log.path}: running the detectors, {told} of {len(free)} cycles")
-    detectors.record(constants, memory, *rest, block, peaks[place:])
+    peaks[place:] = bank.take(*rest, block)
     peaks[~np.logical_and.reduceat(free, np.arange(0, len(free), block))] = np.nan
     return peaks
 

@@ -24,6 +24,9 @@ observer K         generalised-momentum observer of gain K by the implicit trape
 likelihood N       log-likelihood of a step that began N samples ago: the stream's own covariance whitens it; in sigmas
 cusum              sum of what the smoothed channel of highest cut-off has above a drift; in Nm s
 
+**Further detectors** are added by `register`, one channel each. They run wherever those above do: in thresholds, in the
+comparison of `thresholds --report`, in `tune`.
+
 A step of tau_ext passes h of a first-order channel after -ln(1 - h / |tau_ext|) / a. Without the drift, the sum is h
 after h / |tau_ext|.
 
@@ -32,8 +35,9 @@ Sources: De Luca and Mattone, "Sensorless robot collision detection and hybrid f
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -46,6 +50,51 @@ from adacd_hil.settings.schema import ConfigError, setting
 VELOCITY_LAG_S: Final = 1.25e-3
 """The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of
 the interval and not a straight line over it."""
+
+
+class StreamDetector(Protocol):
+    """One detector on one stream, from its beginning."""
+
+    def take(self, z: Vector, held_Nm: Vector) -> Vector:
+        """Take in N more samples of z and of the friction that may hold (N, n); return the statistic of each (N, n).
+
+        An alarm is a statistic above its threshold. A sample's depends on it and on those before it, not on how the
+        stream is cut into pieces.
+        """
+
+
+_REGISTERED: dict[str, Callable[[float], StreamDetector]] = {}
+_CHECK_SAMPLES, _CHECK_CUT, _CHECK_JOINTS = 400, 137, 2
+
+
+def register(name: str, make: Callable[[float], StreamDetector]) -> None:
+    """Add a detector. make: begins one on a stream of a period, s.
+
+    Raises ValueError for a name that is taken, and for a detector that doesn't do as `StreamDetector` says.
+    """
+    settings = DetectorBankSettings()
+    if name in settings.detectors or name in settings.channels:
+        raise ValueError(f"there is a detector or channel {name} already")
+    z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, _CHECK_JOINTS))
+    held_Nm = np.where(z > 1.0, 0.1, 0.0)
+    whole, parts = make(1e-3).take(z, held_Nm), make(1e-3)
+    if whole.shape != z.shape:
+        raise ValueError(f"detector {name} gives statistics {whole.shape} for samples {z.shape}")
+    if not np.isfinite(whole).all():
+        sample, joint = np.argwhere(~np.isfinite(whole))[0].tolist()
+        raise ValueError(f"detector {name} gives {whole[sample, joint]} for sample {sample} of joint {joint + 1}")
+    cut = np.concatenate([parts.take(z[rows], held_Nm[rows]) for rows in (slice(_CHECK_CUT), slice(_CHECK_CUT, None))])
+    if not np.array_equal(whole, cut):
+        sample = int(np.argwhere(whole != cut)[0, 0])
+        raise ValueError(
+            f"detector {name} gives sample {sample} another statistic where the stream is cut at {_CHECK_CUT}"
+        )
+    _REGISTERED[name] = make
+
+
+def unregister(name: str) -> None:
+    """Take a detector out that was registered. Raises KeyError for one that was not."""
+    del _REGISTERED[name]
 
 
 @dataclass(frozen=True)
@@ -87,6 +136,7 @@ class DetectorBankSettings:
             *(f"observer {gain:g}" for gain in self.observer_rad_s),
             *(f"likelihood {age}" for age in self.onset_samples),
             "cusum",
+            *_REGISTERED,
         )
 
     @property
@@ -102,7 +152,8 @@ class DetectorBankSettings:
         for place, gain in enumerate(self.observer_rad_s):
             detectors[f"observer {gain:g}"] = (2 * count + 1 + place,)
         first = 2 * count + 1 + gains
-        return detectors | {"likelihood ratio": tuple(range(first, first + ages)), "cusum": (first + ages,)}
+        detectors |= {"likelihood ratio": tuple(range(first, first + ages)), "cusum": (first + ages,)}
+        return detectors | {name: (first + ages + 1 + place,) for place, name in enumerate(_REGISTERED)}
 
 
 def likelihood_windows(
@@ -241,6 +292,31 @@ def record(
             for i in range(peaks.shape[2]):
                 if k % block_samples == 0 or statistics[row, i] > peaks[block, row, i]:
                     peaks[block, row, i] = statistics[row, i]
+
+
+class DetectorBank:
+    """All detectors on one stream, from its beginning."""
+
+    def __init__(self, settings: DetectorBankSettings, weights: Vector, period_s: float) -> None:
+        """Begin. weights (n, N, L): the joints' likelihood weights."""
+        self._constants = constants_of(settings, weights, period_s)
+        self._memory = new_memory(self._constants)
+        self._channels = len(settings.channels)
+        self._registered = [make(period_s) for make in _REGISTERED.values()]
+
+    def take(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
+        """Take in N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
+
+        One sample per block keeps everything; a stream goes on at a block's end.
+        """
+        count, joints = z.shape
+        own = np.empty((-(-count // block_samples), self._channels - len(self._registered), joints))
+        record(self._constants, self._memory, z, held_Nm, block_samples, own)
+        if not self._registered or not count:
+            return np.concatenate((own, np.zeros((own.shape[0], len(self._registered), joints))), axis=1)
+        starts = np.arange(0, count, block_samples)
+        further = [np.maximum.reduceat(detector.take(z, held_Nm), starts) for detector in self._registered]
+        return np.concatenate((own, np.stack(further, axis=1)), axis=1)
 
 
 @compiled
