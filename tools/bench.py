@@ -37,7 +37,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_scheme
 from adacd_hil.records import ArmState, FaultReason, Request
-from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import contract_folder, load_codec

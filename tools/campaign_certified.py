@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from campaign_schemes import ADAPTING, ARMED, TESTING, Outcome
 from lab import PERIOD_S, Motion, Recording, paper_motion
+from played_record import play_record
 
 from adacd_hil.control.motion_laws import Excitation
 from adacd_hil.records import JOINTS, SchemeState
-from adacd_hil.scheme.kernel import certified_memory, loop
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
 
@@ -42,36 +42,22 @@ class CertifiedScheme:
         settings = replace(
             self._settings, arm=replace(self._settings.arm, link_length_m=recording.arm.arm.link_length_m)
         )
-        n, count = len(recording.q), len(certified_memory.parameter_names(settings))
-        memory = certified_memory.new_memory(settings)
-        state, observation, theta = np.zeros(n), np.zeros(n), np.zeros((n, count))
-        y, h = (np.zeros((n, *memory[0]["y"].shape)) for _ in range(2))
-        loop.step_record(
-            certified_memory.constants_of(settings),
-            memory,
-            certified_memory.new_block(settings),
-            recording.q,
-            recording.dq,
-            recording.tau_J,
-            begins[1] if len(begins) > 1 else -1,
-            state,
-            observation,
-            y,
-            h,
-            theta,
-        )
+        n = len(recording.q)
+        payload_at = begins[1] if len(begins) > 1 else -1
+        played = play_record(settings, recording.q, recording.dq, recording.tau_J, payload_at)
+        y, h = played.y, played.h
         phase = np.full(n, ADAPTING)
         for number, its in _PHASES.items():
-            phase[state == number] = its
+            phase[played.state == number] = its
         armed = []
         for begin, end in zip(begins, (*begins[1:], n), strict=True):
             cycles = np.flatnonzero(phase[begin:end] == ARMED)
             armed.append(begin + int(cycles[0]) if cycles.size else -1)
-        over = observation.astype(np.int64) >> CONTACT_SHIFT
+        over = played.observation.astype(np.int64) >> CONTACT_SHIFT
         wide = self._undo(y[:, WIDE_FILTER], settings.certified.cutoffs_rad_s[WIDE_FILTER])
         most = np.argmax(np.abs(y) / h, axis=1)[:, np.newaxis]
         direction = np.sign(np.take_along_axis(y, most, axis=1)[:, 0])
-        return Outcome(phase, over, y[:, 0], wide, h[:, 0], direction, tuple(armed), theta[np.maximum(armed, 0)])
+        return Outcome(phase, over, y[:, 0], wide, h[:, 0], direction, tuple(armed), played.theta[np.maximum(armed, 0)])
 
     @staticmethod
     def _undo(y: np.ndarray, cutoff_rad_s: float) -> np.ndarray:

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.supervisor.transitions import ADAPTED, CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings, load_settings
 
 ADAPTING, TESTING, ARMED = 0, 1, 2
-_LEARN = int(paper_kernel.LEARN)
-_ARMED = int(paper_kernel.ARMED)
-_ADAPTED = int(paper_kernel.Observation.ADAPTED)
-_CONTACT_SHIFT = int(paper_kernel.CONTACT_SHIFT)
+_LEARN = paper_kernel.LEARN
+_ARMED = paper_kernel.ARMED
 
 
 @dataclass(frozen=True)
@@ -112,11 +111,11 @@ def _run_paper(
         out["tau_J"][:] = tau_J[k]
         observation = paper_kernel.step(constants, memory, block, 1, 1, mode)
         phase[k] = ARMED if mode == _ARMED else ADAPTING
-        over[k] = observation >> _CONTACT_SHIFT if mode == _ARMED else 0
+        over[k] = observation >> CONTACT_SHIFT if mode == _ARMED else 0
         tau_ext_hat[k] = out["tau_ext_hat"]
         wide[k] = out["tau_ext_wide_hat"]
         threshold[k] = out["threshold"]
-        if mode == _LEARN and observation & _ADAPTED:
+        if mode == _LEARN and observation & ADAPTED:
             mode = _ARMED
             armed[adaptation] = k
             theta[adaptation] = out["theta_hat"]

@@ -21,8 +21,10 @@ from adacd_hil.records import (
     SchemeState,
     Vector,
 )
+from adacd_hil.scheme.contact.contact_course import ContactCourse
+from adacd_hil.scheme.contact.contact_report import RecalledContact
+from adacd_hil.scheme.contact.reaction import ReactionChoice
 from adacd_hil.scheme.kernel import paper_kernel
-from adacd_hil.scheme.pipeline.contact_course import ContactCourse
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings, load_settings, merge
@@ -75,12 +77,13 @@ class Rig:
         self._body = Body(scenario, settings.bus.period_s)
         self._body.start_scenario()
         self._theta = np.array(self._theta_of())
-        self._constants = paper_kernel.constants_of(settings)
-        self._memory, self._block = paper_kernel.new_memory(7), paper_kernel.new_block(7)
+        self._constants, self._memory, self._block, self._values = paper_kernel.numbers_of(settings)
         paper_kernel.begin_adaptation(self._constants, self._memory, self._block)
         self._block[0]["theta_hat"][:] = self._theta
         self._collision_Nm = np.array(settings.detector.collision_Nm)
-        self._touch = ContactCourse(settings)
+        block = self._block[0]
+        evidence = RecalledContact(settings, block["q"], block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"])
+        self._touch = ContactCourse(evidence, ReactionChoice(settings), block["tau_ext_hat"])
         self._q_d, self._dq_d, self._ddq_d = np.zeros(2), np.zeros(2), np.zeros(2)
         self._tau_d, self._tau_c = np.zeros(2), np.zeros(2)
         self._reference = Reference(settings, self._q_d, self._dq_d, self._ddq_d)
@@ -139,13 +142,10 @@ class Rig:
         state = self._supervisor.step(arm, request, observation, self._touch.is_reporting, self._touch.goes_on)
         block = self._block[0]
         tau_ext_hat = block["tau_ext_hat"].copy()
-        contact = self._touch.step(
-            self._cycle, self._supervisor, observation, arm.q, tau_ext_hat,
-            block["tau_ext_wide_hat"], SIGMA_NM, block["threshold"], True,
-        )  # fmt: skip
+        contact = self._touch.step(self._cycle, self._supervisor, observation, True)
         output = SchemeOutput(
             self._cycle, state, previous, self._supervisor.fault, observation >> CONTACT_SHIFT, True, self._theta,
-            self._theta, tau_ext_hat, contact, self._block.view(np.float64).copy(), self._touch.reaction,
+            self._theta, tau_ext_hat, contact, self._values.copy(), self._touch.reaction,
         )  # fmt: skip
         self._reference.step(arm, output)
         if self._reference.is_floating:

@@ -23,13 +23,13 @@ from campaign_certified import CertifiedScheme
 from campaign_loop import add_jobs, play_trials
 from lab import PERIOD_S, Motion, cut, join, profile_arm, random_motion, record, still
 from numpy.typing import NDArray
+from played_record import play_record
 
 from adacd_hil.analysis.score.judge import begins_of
 from adacd_hil.cli.output import format_table
 from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES
-from adacd_hil.scheme.kernel import certified_memory, loop
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
 from adacd_hil.settings.configuration import Settings, load_settings
@@ -193,14 +193,7 @@ def play(case: Case, minutes: float, position_torque_Nm: float = 0.0) -> Played:
     known = replace(settings.arm, link_length_m=arm.arm.link_length_m, position_torque_Nm=position_torque_Nm)
     settings = replace(settings, arm=known)
     count = len(motion.q_d)
-    memory = certified_memory.new_memory(settings)
-    state, observation = np.zeros(count), np.zeros(count)
-    theta = np.zeros((count, len(certified_memory.parameter_names(settings))))
-    y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
-    loop.step_record(
-        certified_memory.constants_of(settings), memory, certified_memory.new_block(settings), measured.q, measured.dq,
-        tau_J, loaded_at, state, observation, y, h, theta,
-    )  # fmt: skip
+    state, observation, y, h, _, _ = play_record(settings, measured.q, measured.dq, tau_J, loaded_at)
     begin = max(loaded_at, 0)
     is_monitored = (state == SchemeState.MONITOR) & (np.arange(count) >= begin)
     if not is_monitored.any():

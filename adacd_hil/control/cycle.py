@@ -39,8 +39,8 @@ from adacd_hil.records import (
     SchemeOutput,
     SchemeState,
 )
-from adacd_hil.scheme.identify.last_certificate import Certificate
-from adacd_hil.scheme.pipeline.selection import pipeline_of
+from adacd_hil.scheme.identify.certificate import Certificate
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, POWERED
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Tap
@@ -91,7 +91,7 @@ class Cycle:
         self._watch = ArmWatch(settings, master.watch)
         self._data = DataWatch(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
-        self._pipeline = pipeline_of(settings)
+        self._pipeline = Pipeline(settings)
         self._controller = Controller(settings)
         self._floating = Floating(settings)
         self._gate = Gate(settings.arm, self._period_s)

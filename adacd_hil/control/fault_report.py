@@ -10,8 +10,7 @@ from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.arm_watch import ArmWatch
 from adacd_hil.device.network import Master
 from adacd_hil.records import JOINTS, ArmState, FaultReason, SchemeState
-from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
-from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import Settings
 
 
@@ -23,7 +22,7 @@ class FaultReport:
         settings: Settings,
         arm: Arm,
         watch: ArmWatch,
-        pipeline: Pipeline | CertifiedPipeline,
+        pipeline: Pipeline,
         checks: SelfChecks,
         master: Master,
     ) -> None:

@@ -20,7 +20,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import dangling_link, read_input, replacing
 from adacd_hil.records import Event
-from adacd_hil.scheme.identify.last_certificate import Certificate
+from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.commission_settings import HistorySettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError, parse, setting

@@ -28,7 +28,7 @@ from adacd_hil.log.viewer.robot_description import ROBOT_NAME, robot_description
 from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
-from adacd_hil.scheme.identify.last_certificate import Certificate
+from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, BusError, Tap

@@ -28,7 +28,7 @@ from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
 from adacd_hil.records import CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.settings.toml_files import to_toml
 
 PIECE = 333

@@ -10,7 +10,7 @@ from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event, scheme_layout
-from adacd_hil.scheme.pipeline.batch import SchemeBatch
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch
 from adacd_hil.settings.configuration import load_settings
 
 SETTINGS = load_settings("paper")

@@ -29,7 +29,7 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError

@@ -23,7 +23,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, Request, SchemeState
-from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 from adacd_hil.wire.codec import CodecError, MessageCodec, load_codec

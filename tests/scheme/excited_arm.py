@@ -1,7 +1,9 @@
 """The small 2R arm of `planar_arm` on the excitation: recorded and played, or in closed loop with the pipeline."""
 
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +12,13 @@ from planar_arm import ENCODER_LSB_RAD, THETA, TORQUE_LSB_NM, TORQUE_NOISE_NM, V
 from adacd_hil.compiled import compiled
 from adacd_hil.control.motion_laws import Excitation
 from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme.kernel import certified_kernel, certified_memory, loop
-from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.kernel import certified_memory
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import Settings, load_settings
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from played_record import play_record
 
 PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")
@@ -30,7 +36,7 @@ class Record(NamedTuple):
 
 
 class Played(NamedTuple):
-    """What `loop.step_record` has made of a record."""
+    """What `played_record` has made of a record."""
 
     state: np.ndarray
     observation: np.ndarray
@@ -79,16 +85,8 @@ def record(theta, seconds, tau_ext=None, added=None, added_at_s=0.0, motion=None
 
 def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS, at_rest: int = 0) -> Played:
     """Play a record through the compiled step, after samples at rest where it begins."""
-    count = len(measured.q)
-    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
-    block = certified_memory.new_block(settings)
-    block["q"] = measured.q[0]
-    for _ in range(at_rest):
-        certified_kernel.step(constants, memory, block, 1, 1, certified_kernel.WATCH)
-    state, observation, theta = np.zeros(count), np.zeros(count), np.zeros((count, len(NAMES)))
-    y, h = (np.zeros((count, *memory[0]["y"].shape)) for _ in range(2))
-    loop.step_record(constants, memory, block, *measured, payload_at, state, observation, y, h, theta)
-    return Played(state, observation, y, h, theta, constants, memory, block)
+    *arrays, numbers = play_record(settings, *measured, payload_at, at_rest)
+    return Played(*arrays, *numbers[:3])
 
 
 class Motion:
@@ -149,7 +147,7 @@ class ExcitedLoop:
 
     def __init__(self, settings: Settings = SETTINGS, theta: np.ndarray = THETA["P"], seed: int = 1):
         self.settings = settings
-        self.pipeline = CertifiedPipeline(settings)
+        self.pipeline = Pipeline(settings)
         self.motion = motion_of(settings.trajectory, settings.excitation)
         self.theta = theta.copy()
         self.random = np.random.default_rng(seed)
@@ -235,12 +233,12 @@ class TouchedLoop(ExcitedLoop):
     @property
     def kernel(self):
         """The kernel's constants and memory, as its functions take them."""
-        return self.pipeline._constants, self.pipeline._memory
+        return self.pipeline.numbers[:2]
 
     @property
     def model_theta(self):
         """The parameters of the model in use (p,)."""
-        return self.pipeline._memory[0]["theta"]
+        return self.pipeline.numbers.memory[0]["theta"]
 
     @property
     def offset_error_Nm(self):

@@ -6,7 +6,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.contact.reaction import Withdrawal
 from adacd_hil.scheme.model.regressor import inverse_dynamics
-from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import Settings
 
 THETA = {

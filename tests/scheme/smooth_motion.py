@@ -4,7 +4,9 @@ import numpy as np
 
 from adacd_hil.records import scheme_layout
 from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.kernel.kernel_samples import Recorded, Samples
 from adacd_hil.scheme.model.regressor import inverse_dynamics
+from adacd_hil.scheme.supervisor.transitions import Calm
 from adacd_hil.settings.configuration import Settings, load_settings, merge
 from adacd_hil.settings.schema import parse
 
@@ -39,21 +41,18 @@ def run_kernel(settings, q, dq, tau_J, theta_hat, mode, is_complete=None, period
     """Run the compiled step over a record; return blocks (n, size)."""
     count = q.shape[0]
     ones = np.ones(count, dtype=np.int64)
-    memory = paper_kernel.new_memory(7)
-    blocks = np.repeat(paper_kernel.new_block(7), count)
-    constants = paper_kernel.constants_of(settings)
-    paper_kernel.begin_adaptation(constants, memory, blocks[:1])
-    blocks[0]["theta_hat"] = theta_hat
-    paper_kernel.step_record(
-        constants,
-        memory,
-        np.ascontiguousarray(q),
-        np.ascontiguousarray(dq),
-        np.ascontiguousarray(tau_J),
-        ones if is_complete is None else is_complete,
-        ones if periods is None else periods,
-        np.zeros(count) if period_s is None else period_s,
-        mode,
-        blocks,
+    numbers = paper_kernel.numbers_of(settings)
+    paper_kernel.begin_adaptation(numbers.constants, numbers.memory, numbers.block)
+    numbers.block["theta_hat"] = theta_hat
+    samples = Samples(
+        np.arange(count),
+        *(np.ascontiguousarray(column) for column in (q, dq, tau_J)),
+        period_s=np.zeros(count) if period_s is None else period_s,
+        is_complete=ones if is_complete is None else is_complete,
+        periods=ones,
+        steps=ones if periods is None else periods,
+        findings=np.zeros(count, dtype=np.int64),
     )
-    return blocks.view(np.float64).reshape(count, -1)
+    recorded = Recorded(np.zeros(count, dtype=np.int64), np.zeros((count, numbers.values.size)))
+    paper_kernel.run_paper(numbers, samples, recorded, 0, count - 1, mode, Calm(watched=0, expected=0))
+    return recorded.blocks

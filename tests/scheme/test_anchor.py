@@ -14,7 +14,7 @@ from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.identify import anchor
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
-from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 
 COMMISSION_S = 0.1
 LARGEST_ERROR_NM = 0.06
@@ -82,7 +82,7 @@ def test_what_can_not_be_told_is_said_in_the_certificate():
     loop.tau_ext[0] = 0.5
     loop.run_until(SchemeState.MONITOR)
     assert abs(loop.offset_error_Nm[0]) > 0.4
-    constants, memory = loop.pipeline._constants[0], loop.pipeline._memory[0]
+    constants, memory = loop.pipeline.numbers.constants[0], loop.pipeline.numbers.memory[0]
     assert loop.said("certificate") == [
         f"torque offsets anchored: joint 1 {NOT_AT_ALL}; joint 2 {NOT_AT_ALL}; "
         f"{margin.describe_sight(memory)}; {margin.describe_false_alarms(constants, memory)}; {THIS_RUN_ONLY}"
@@ -299,8 +299,8 @@ def test_a_lean_that_does_not_end_is_a_fault_that_says_so():
 
 
 def test_a_reading_at_rest_begins_anew_when_the_arm_moves():
-    pipeline = CertifiedPipeline(FREE)
-    m = pipeline._memory[0]
+    pipeline = Pipeline(FREE)
+    m = pipeline.numbers.memory[0]
     for cycle in range(60):
         pipeline.step(arm_state(cycle, tau_J=(0.3, 0.0), is_enabled=False))
     pipeline.step(arm_state(60, dq=(0.5, 0.0), tau_J=(0.3, 0.0), is_enabled=False))

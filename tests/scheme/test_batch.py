@@ -10,8 +10,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from adacd_hil.control.motion_laws import Excitation
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.detect.margin import MarginWatch
-from adacd_hil.scheme.pipeline.batch import arm_at
-from adacd_hil.scheme.pipeline.selection import layout_of, pipeline_of
+from adacd_hil.scheme.pipeline.pipeline import Pipeline, arm_at, layout_of
 
 REST = 60
 """Cycles at rest, the first of them without drives."""
@@ -106,9 +105,9 @@ def steps_of(cycle, is_complete, periods):
 
 
 def pipeline_for(scheme):
-    pipeline = pipeline_of(settings_of(scheme))
+    pipeline = Pipeline(settings_of(scheme))
     if scheme == "certified":
-        pipeline._margin = MarginWatch(2, memory_blocks=1.0, warn_share=5.0)
+        pipeline._policy._margin = MarginWatch(2, memory_blocks=1.0, warn_share=5.0)
     return pipeline
 
 
@@ -168,7 +167,7 @@ def test_the_life_has_all_of_it(lived):
     if scheme == "certified":
         assert {output.reaction.name for output in outputs} == {"NONE", "STOP", "WITHDRAW", "SLOW_DOWN"}
         assert outputs[6000].block[layout_of(settings_of(scheme)).slices["promotions"]] >= 5
-        assert [event.name for event in pipeline._events] == ["certificate", "margin", "touch", "touch"]
+        assert [event.name for event in pipeline._policy._events] == ["certificate", "margin", "touch", "touch"]
 
 
 def test_run_gives_the_bits_of_step(life, lived):

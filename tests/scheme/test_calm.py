@@ -5,7 +5,7 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState
-from adacd_hil.scheme.pipeline.batch import arm_at
+from adacd_hil.scheme.pipeline.pipeline import arm_at
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, ArmFinding, Observation, is_calm
 

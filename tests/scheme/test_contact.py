@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from smooth_motion import PLACES, run_kernel, settings_with
 
-from adacd_hil.scheme.contact.contact_report import Isolation
+from adacd_hil.scheme.contact.contact_report import ContactReporter, IntegratedContact
 from adacd_hil.scheme.detect.external_torque import follow_contact
 from adacd_hil.scheme.kernel import paper_kernel
 
@@ -43,33 +43,29 @@ def test_the_strength_does_not_depend_on_the_filter(a, b):
 
 
 class Touch:
-    """An arm at rest in MONITOR that is touched; steps the compiled kernel and the isolation together."""
+    """An arm at rest in MONITOR that is touched; steps the compiled kernel and the reporter together."""
 
     def __init__(self, window_cycles=50):
-        settings = settings_with()
-        self.constants, self.memory, self.block = (
-            paper_kernel.constants_of(settings),
-            paper_kernel.new_memory(7),
-            paper_kernel.new_block(7),
-        )
-        self.isolation = Isolation(window_cycles, settings.filter.a_rad_s)
+        settings = settings_with(detector={"isolation_window_s": window_cycles * T})
+        self.constants, self.memory, self.block, _ = paper_kernel.numbers_of(settings)
+        memory, block = self.memory[0], self.block[0]
+        evidence = IntegratedContact(settings, block["tau_ext_hat"], memory["integral"], memory["peak"])
+        self.reporter = ContactReporter(evidence)
         self.reports = []
 
     def run(self, tau_ext):
         has_begun = False
         for cycle, torque in enumerate(tau_ext):
             self.block[0]["tau_J"][:] = -torque
-            mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.isolation.is_open else 0)
+            mode = paper_kernel.ARMED | (paper_kernel.REPORTING if self.reporter.is_open else 0)
             joints = (
                 paper_kernel.step(self.constants, self.memory, self.block, 1, 1, mode) >> paper_kernel.CONTACT_SHIFT
             )
             if joints and not has_begun:
                 has_begun = True
-                self.isolation.begin(cycle)
-            if self.isolation.is_open:
-                memory = self.memory[0]
-                tau_ext_hat = self.block[0]["tau_ext_hat"]
-                report = self.isolation.report(cycle, joints, tau_ext_hat, memory["integral"], memory["peak"])
+                self.reporter.begin(cycle)
+            if self.reporter.is_open:
+                report = self.reporter.report(cycle, joints)
                 if report is not None:
                     self.reports.append(report)
         return self.reports
@@ -154,10 +150,10 @@ def test_the_impulse_of_a_short_touch_is_kept_until_the_window_ends():
 
 
 def test_a_cancelled_isolation_has_no_open_report():
-    isolation = Isolation(50, 10.0)
-    isolation.begin(3)
-    isolation.cancel()
-    assert not isolation.is_open
+    reporter = Touch().reporter
+    reporter.begin(3)
+    reporter.cancel()
+    assert not reporter.is_open
 
 
 def test_the_direction_is_that_of_the_first_contact_of_the_joint():

@@ -205,7 +205,7 @@ def test_a_contact_as_the_arm_goes_on_lets_it_move_further_the_next_time_four_ti
     loop = MonitoredLoop()
     loop.theta = loop.theta + added(F_c1=0.3)
     loop.run_until_taken_back()
-    assert loop.pipeline._memory[0]["strain"].tolist() == [doubt.MOST_STRAIN, 1.0]
+    assert loop.pipeline.numbers.memory[0]["strain"].tolist() == [doubt.MOST_STRAIN, 1.0]
 
 
 @pytest.mark.parametrize("size", [-0.3, 2.1])

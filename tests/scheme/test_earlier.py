@@ -44,7 +44,7 @@ class HeldLoop(TouchedLoop):
 
     def error_of(self, name):
         place = NAMES.index(name)
-        return abs(self.pipeline._memory[0]["theta"][place] - self.theta[place])
+        return abs(self.pipeline.numbers.memory[0]["theta"][place] - self.theta[place])
 
 
 def distance_to_step(m, s):
@@ -154,16 +154,16 @@ def test_a_certificate_forgets_what_was_kept():
     loop = HeldLoop(FREE)
     loop.learn(1.0)
     loop.lean(0, 1.0, 0.2)
-    assert loop.pipeline._memory[0]["has_kept"] == 1.0
+    assert loop.pipeline.numbers.memory[0]["has_kept"] == 1.0
     loop.recover()
-    assert loop.pipeline._memory[0]["has_kept"] == 0.0
+    assert loop.pipeline.numbers.memory[0]["has_kept"] == 0.0
 
 
 @pytest.mark.parametrize("profile", ["P", "S", "M"])
 def test_an_untouched_arm_is_certified_at_once_and_far_from_the_bound(profile):
     loop = HeldLoop(FREE, theta=THETA[profile], seed=5)
     outputs = loop.run_until(SchemeState.CERTIFY)
-    m = loop.pipeline._memory[0]
+    m = loop.pipeline.numbers.memory[0]
     furthest = max(distance_to_step(m, s) for s in range(int(m["steps_used"])))
     assert furthest < 0.5 * earlier.STEADY * earlier.SMALLEST_SQUARE
     outputs += loop.run_until(SchemeState.MONITOR)
@@ -374,7 +374,7 @@ def test_a_difference_that_is_small_or_not_known_forgets_nothing():
 def test_what_is_kept_is_from_before_the_contact():
     loop = HeldLoop(FREE)
     loop.learn(1.1)
-    m = loop.pipeline._memory[0]
+    m = loop.pipeline.numbers.memory[0]
     steps, of_steps = int(m["steps_used"]), m["steps_theta"].copy()
     kept = steps - earlier.YOUNG_STEPS
     loop.lean(0, 3.0, 0.05)
@@ -388,7 +388,7 @@ def test_what_is_kept_is_from_before_the_contact():
 def test_nothing_is_kept_of_a_fit_that_is_as_young_as_a_touch_of_its_beginning():
     loop = HeldLoop(FREE)
     loop.learn(0.3)
-    m = loop.pipeline._memory[0]
+    m = loop.pipeline.numbers.memory[0]
     assert m["steps_used"] == 1.0
     outputs = loop.lean(0, 5.0, 0.05)
     assert any(output.contact is not None for output in outputs)

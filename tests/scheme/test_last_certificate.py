@@ -11,7 +11,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from test_earlier import FREE, HeldLoop, added, states
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.scheme.identify import earlier, last_certificate
+from adacd_hil.scheme.identify import certificate, earlier
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD, THIS_RUN_ONLY
 
@@ -150,7 +150,7 @@ class Asked:
     def agrees_with(self, name, change):
         self.m["belief"] = 0.1
         self.m["belief"][NAMES.index(name)] += change
-        return last_certificate.is_no_more(self.k, self.m)
+        return certificate.is_no_more(self.k, self.m)
 
 
 @pytest.mark.parametrize(("name", "floor"), [("F_c2", 0.02), ("a3", 0.006)])

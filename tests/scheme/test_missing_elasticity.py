@@ -11,8 +11,7 @@ from scipy.signal import butter, filtfilt
 from test_position import CABLE_NM, FREE, cabled, learnt
 
 from adacd_hil.records import CERTIFICATE_EVENTS
-from adacd_hil.scheme.identify import missing_torque
-from adacd_hil.scheme.kernel import certified_kernel
+from adacd_hil.scheme.identify import certificate, missing_torque
 from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
 
 
@@ -71,8 +70,8 @@ def test_a_cable_is_a_cable(cable_Nm: float) -> None:
 def test_a_fit_that_is_refused_for_it_says_so_and_what_helps() -> None:
     constants, memory = learnt(FREE, elastic(2.0, 8.0))
     m = memory[0]
-    m["withheld_by"] = certified_kernel._missing(constants[0], m)
-    assert m["withheld_by"] == certified_kernel.ELASTIC
+    m["withheld_by"] = certificate.missing_cause(constants[0], m)
+    assert m["withheld_by"] == certificate.ELASTIC
     event = CertificateWatch(constants, memory, "").refuse(is_reading=False)
     assert event is not None
     assert (event.level, event.name) == ("warning", "elastic")

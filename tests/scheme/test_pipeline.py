@@ -15,7 +15,7 @@ from smooth_motion import PLACES, settings_with, smooth_motion, torque_of
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, scheme_layout
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.model.regressor import is_positive_definite
-from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
+from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.scheme.supervisor.transitions import Observation
 from adacd_hil.settings.configuration import load_settings
 

@@ -1,15 +1,19 @@
 """The contact report, made from a hand-written course of torques."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from smooth_motion import settings_with
 
-from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction
-from adacd_hil.scheme.contact.contact_report import ContactHistory, ContactReporter
+from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction, SchemeState
+from adacd_hil.scheme.contact.contact_course import ContactCourse
+from adacd_hil.scheme.contact.contact_report import ContactHistory, ContactReporter, RecalledContact
+from adacd_hil.scheme.contact.reaction import ReactionChoice
+from adacd_hil.scheme.supervisor.transitions import COLLISION, CONTACT, CONTACT_SHIFT
 
-SETTINGS = settings_with()
+SETTINGS = settings_with(reaction={"collision": ["stop", "stop"]})
 SIGMA, THRESHOLD = np.array([0.03, 0.015]), np.array([0.15, 0.08])
 Q = np.array([0.3, 0.4])
 L1 = SETTINGS.arm.link_length_m[0]
@@ -24,23 +28,24 @@ def course(force_N=20.0, lever_m=0.2, duration=40, onset=50, length=400):
 
 def play(tau, detected, joints=3, level=ContactLevel.COLLISION):
     """Return the reports of a contact that is detected in a cycle."""
-    reporter = ContactReporter(SETTINGS)
+    seen = np.zeros(2)
+    course = ContactCourse(RecalledContact(SETTINGS, Q, seen, SIGMA, THRESHOLD), ReactionChoice(SETTINGS), seen)
     reports = []
     for cycle, row in enumerate(tau):
-        reporter.observe(Q, row, SIGMA, THRESHOLD)
-        if cycle == detected:
-            reporter.begin(cycle)
-        if reporter.is_open:
-            over = joints if cycle - detected >= 5 else joints & 1
-            reports.append(reporter.report(cycle, over, level, Reaction.STOP, False))
-    return [report for report in reports if report is not None], reporter
+        seen[:] = row
+        is_begun = cycle >= detected
+        over = joints if cycle - detected >= 5 else joints & 1
+        found = COLLISION if level is ContactLevel.COLLISION else CONTACT
+        arm = SimpleNamespace(state=SchemeState.REACT if is_begun else SchemeState.MONITOR, is_latched=True)
+        reports.append(course.step(cycle, arm, over << CONTACT_SHIFT | found if is_begun else 0, True))
+    return [report for report in reports if report is not None], course
 
 
 def test_a_contact_is_reported_at_once_after_ten_and_after_a_hundred_milliseconds():
-    reports, reporter = play(course(), 55)
+    reports, touch = play(course(), 55)
     assert [report.is_final for report in reports] == [False, False, True]
     assert {report.cycle for report in reports} == {55}
-    assert not reporter.is_open
+    assert not touch.is_reporting
 
 
 def test_a_final_report_says_all_that_can_be_known():
@@ -100,8 +105,8 @@ def test_the_peak_of_a_blow_is_that_of_its_half_sine_however_short_it_is(duratio
 
 
 def test_a_fault_ends_the_report():
-    reporter = ContactReporter(SETTINGS)
-    reporter.observe(Q, np.ones(2), SIGMA, THRESHOLD)
+    reporter = ContactReporter(RecalledContact(SETTINGS, Q, np.ones(2), SIGMA, THRESHOLD))
+    reporter.evidence.observe()
     reporter.begin(0)
     reporter.cancel()
     assert not reporter.is_open

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 from excited_arm import NAMES, SETTINGS
 
-from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.detect import external_torque, sensitivity
 from adacd_hil.scheme.kernel import certified_memory
 
 CERTIFIED = SETTINGS.certified
@@ -360,8 +360,11 @@ def test_the_unit_follows_the_residual_over_twenty_seconds():
 
 
 def test_the_unit_keeps_to_its_bounds():
-    assert units_after(np.zeros(2), 200, 1.005 * sensitivity.SMALLEST_UNIT).tolist() == [sensitivity.SMALLEST_UNIT] * 2
-    assert units_after(np.full(2, 1e9), 1).tolist() == [sensitivity.LARGEST_UNIT] * 2
+    assert (
+        units_after(np.zeros(2), 200, 1.005 * external_torque.SMALLEST_UNIT).tolist()
+        == [external_torque.SMALLEST_UNIT] * 2
+    )
+    assert units_after(np.full(2, 1e9), 1).tolist() == [external_torque.LARGEST_UNIT] * 2
 
 
 @pytest.mark.parametrize(

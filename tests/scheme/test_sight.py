@@ -31,7 +31,7 @@ def tested():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.CERTIFY)
     y, h = [], []
-    m = loop.pipeline._memory[0]
+    m = loop.pipeline.numbers.memory[0]
     while loop.step().state is SchemeState.CERTIFY:
         y.append(m["y"].copy())
         h.append(m["h"].copy())
@@ -64,7 +64,7 @@ def test_a_threshold_that_is_always_the_same_is_said_as_it_is(value_Nm):
 
 
 def test_the_next_test_begins_with_nothing_seen(tested):
-    m = tested[0].pipeline._memory.copy()[0]
+    m = tested[0].pipeline.numbers.memory.copy()[0]
     margin.follow_sight(certified_memory.constants_of(SETTINGS)[0], m)
     for name in ("seen", "seen_push_Nm", "sum_cycles"):
         assert m[name].any()
@@ -76,7 +76,7 @@ def test_the_next_test_begins_with_nothing_seen(tested):
 def test_a_monitor_that_sees_less_than_was_certified_says_so_once():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.MONITOR)
-    m = loop.pipeline._memory[0]
+    m = loop.pipeline.numbers.memory[0]
     loop.run(3000)
     assert loop.said("sight") == []
     m["roughness"][1] = 400.0  # noise of the torque sensor, of variance
@@ -122,7 +122,7 @@ def test_the_rate_under_a_gaussian_tail_is_that_of_the_floor():
 def test_a_new_certificate_that_sees_less_again_is_told_again():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.MONITOR)
-    m = loop.pipeline._memory[0]
+    m = loop.pipeline.numbers.memory[0]
     m["roughness"][1] = 400.0
     loop.run(1500)
     loop.request = Request.PAYLOAD

@@ -35,10 +35,7 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
-from adacd_hil.scheme.pipeline.batch import SchemeBatch, arm_at
-from adacd_hil.scheme.pipeline.certified_pipeline import CertifiedPipeline
-from adacd_hil.scheme.pipeline.paper_pipeline import Pipeline
-from adacd_hil.scheme.pipeline.selection import pipeline_of
+from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 
@@ -155,7 +152,7 @@ class _Player:
         self.gatherer = OutcomeGatherer(settings, truth)
         self.attempts = 0
         self._asking = asking
-        self._pipeline: Pipeline | CertifiedPipeline = pipeline_of(settings)
+        self._pipeline: Pipeline = Pipeline(settings)
         self._state = SchemeState.INIT
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
@@ -202,7 +199,7 @@ class _Player:
         self.comparison.compare_events(logged, replayed, int(ticks.cycle[0]))
 
     def _begin(self) -> None:
-        self._pipeline = pipeline_of(self.settings)
+        self._pipeline = Pipeline(self.settings)
         self._state = SchemeState.INIT
         self.attempts += 1
         if self._asking is not None:

@@ -14,8 +14,7 @@ from adacd_hil.analysis.score.judge import Alarm, Score, TouchWindow, enters_rea
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.records import FaultReason, SchemeState, Vector
-from adacd_hil.scheme.pipeline.batch import SchemeBatch
-from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.settings.configuration import Settings
 

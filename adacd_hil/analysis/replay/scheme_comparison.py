@@ -22,8 +22,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError, arithmetic
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.records import JOINTS, ContactReport, Event, Layout, Request, SchemeState, Vector
-from adacd_hil.scheme.pipeline.batch import SchemeBatch
-from adacd_hil.scheme.pipeline.selection import layout_of
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import OperatorSettings
 

@@ -27,7 +27,7 @@ is given at once and becomes final when the window ends.
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, Reaction, Vector
+from adacd_hil.records import JOINTS, ContactKind, ContactReport, Vector
 from adacd_hil.scheme.contact import localisation
 from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Calm
@@ -108,21 +108,129 @@ def _peak(tau: Vector, sigma: float) -> float:
     return float(np.sign(best) * max(abs(best) - bias, 0.0))
 
 
+class ContactEvidence:
+    """What a scheme knows of a contact that it reports; of what a scheme doesn't do, nothing."""
+
+    due_cycles: tuple[int, ...]
+    """When it is reported, in cycles after its detection: at once first, finally last."""
+    tau_ext: Vector
+    """External torque (2,) of this cycle, Nm: gives the direction of a joint when it crosses its threshold."""
+
+    def compile(self) -> None:
+        """Run every compiled function once."""
+
+    def observe(self) -> None:
+        """Take in one cycle, whatever the state is."""
+
+    def pass_by(self, cycles: int) -> None:
+        """Count cycles that a compiled loop has taken in."""
+
+    def begin(self) -> None:
+        """Take in that a contact is detected in this cycle."""
+
+    def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
+        """Report the contact that was detected in a cycle, so many cycles ago."""
+        raise NotImplementedError
+
+
 class ContactReporter:
     """Makes the reports of one contact after the other."""
 
-    def __init__(self, settings: Settings) -> None:
-        period_s = settings.bus.period_s
-        self._period_s = period_s
-        self._length_m = settings.arm.link_length_m
-        self._link_cycles = round(LINK_S / period_s)
-        self._window_cycles = round(WINDOW_S / period_s)
-        self._before_cycles = round(BEFORE_S / period_s)
-        self.history = ContactHistory(self._before_cycles + 2 * self._window_cycles)
-        self._begin_cycle = 0
+    def __init__(self, evidence: ContactEvidence) -> None:
+        self.evidence = evidence
         self._detected_cycle = 0
         self._direction = [0] * JOINTS
         self._is_open = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a report is out that is not final yet."""
+        return self._is_open
+
+    def calm(self, calm: Calm, cycle: int) -> Calm:
+        """Narrow the bounds to those within which, from this cycle on, no report is due and no direction is new."""
+        if not self._is_open:
+            return calm
+        last = self.evidence.due_cycles[-1]
+        due = next((due for due in self.evidence.due_cycles if due >= cycle - self._detected_cycle), last)
+        new = sum(1 << i for i in range(JOINTS) if self._direction[i] == 0)
+        return calm._replace(watched=calm.watched | new << CONTACT_SHIFT, due=self._detected_cycle + due)
+
+    def begin(self, cycle: int) -> None:
+        """Open the window: a contact is detected in this cycle."""
+        self._detected_cycle = cycle
+        self.evidence.begin()
+        self._direction = [0] * JOINTS
+        self._is_open = True
+
+    def cancel(self) -> None:
+        """Close the window without a final report, as a fault does."""
+        self._is_open = False
+
+    def report(self, cycle: int, joints: int) -> ContactReport | None:
+        """Return the report that is due in this cycle, if one is. joints: bits of those over their threshold."""
+        elapsed = cycle - self._detected_cycle
+        is_final = elapsed >= self.evidence.due_cycles[-1]
+        for i in range(JOINTS):
+            if joints >> i & 1 and self._direction[i] == 0:
+                self._direction[i] = int(np.sign(self.evidence.tau_ext[i]))
+        if elapsed not in self.evidence.due_cycles and not is_final:
+            return None
+        self._is_open = not is_final
+        direction = self._direction[0], self._direction[1]
+        return self.evidence.report(self._detected_cycle, elapsed, direction, is_final)
+
+
+class IntegratedContact(ContactEvidence):
+    """The paper's: what its kernel has integrated since the contact began, at detection and when the window ends.
+
+    tau_ext_hat, integral, peak: of the kernel (2,), views.
+    """
+
+    def __init__(self, settings: Settings, tau_ext_hat: Vector, integral: Vector, peak: Vector) -> None:
+        self.due_cycles = (0, round(settings.detector.isolation_window_s / settings.bus.period_s))
+        self.tau_ext = tau_ext_hat
+        self._integral, self._peak = integral, peak
+        self._a_rad_s = settings.filter.a_rad_s
+
+    def report(
+        self,
+        detected: int,
+        elapsed: int,  # noqa: ARG002
+        direction: tuple[int, int],
+        is_final: bool,
+    ) -> ContactReport:
+        """Report the contact; its impulse is y / a + integral of y."""
+        return ContactReport(
+            cycle=detected,
+            link=2 if direction[1] else 1,
+            direction=direction,
+            tau_ext_peak=_pair(self._peak),
+            impulse=_pair(self._integral + self.tau_ext / self._a_rad_s),
+            is_final=is_final,
+        )
+
+
+class RecalledContact(ContactEvidence):
+    """The certified scheme's: the last samples, at detection, when the link is decided and when the kind is.
+
+    q, tau_ext_wide_hat, sigma, threshold: of the kernel (2,), views; the torque with the filter undone, its standard
+    deviation, the lower thresholds in force, finite or inf.
+    """
+
+    def __init__(
+        self, settings: Settings, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector
+    ) -> None:
+        period_s = settings.bus.period_s
+        window_cycles = round(WINDOW_S / period_s)
+        self.due_cycles = (0, round(LINK_S / period_s), window_cycles)
+        self.tau_ext = tau_ext_wide_hat
+        self._q, self._sigma, self._threshold = q, sigma, threshold
+        self._period_s = period_s
+        self._length_m = settings.arm.link_length_m
+        self._before_cycles = round(BEFORE_S / period_s)
+        self.history = ContactHistory(self._before_cycles + 2 * window_cycles)
+        self._since = 0
 
     def compile(self) -> None:
         """Run every compiled function once."""
@@ -134,57 +242,23 @@ class ContactReporter:
         classify(rows[:, TAU], ones, self._period_s)
         _peak(rows[:, 1], 1.0)
 
-    @property
-    def is_open(self) -> bool:
-        """Whether a report is out that is not final yet."""
-        return self._is_open
+    def observe(self) -> None:
+        """Take in one cycle, whatever the state is."""
+        self.history.put(self._q, self.tau_ext, self._sigma, self._threshold)
 
-    def observe(self, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector) -> None:
-        """Take in one cycle's values (2,), whatever the state is; thresholds as finite numbers or inf."""
-        self.history.put(q, tau_ext_wide_hat, sigma, threshold)
+    def pass_by(self, cycles: int) -> None:
+        """Count cycles whose samples are in the history."""
+        self.history.count += cycles
 
-    def calm(self, calm: Calm, cycle: int) -> Calm:
-        """Narrow the bounds to those within which, from this cycle on, no report is due and no direction is new."""
-        if not self._is_open:
-            return calm
-        at_link = self._detected_cycle + self._link_cycles
-        due = at_link if cycle <= at_link else self._detected_cycle + self._window_cycles
-        new = sum(1 << i for i in range(JOINTS) if self._direction[i] == 0)
-        return calm._replace(watched=calm.watched | new << CONTACT_SHIFT, due=due)
-
-    def begin(self, cycle: int) -> None:
-        """Open the window: a contact is detected in this cycle."""
-        self._detected_cycle = cycle
+    def begin(self) -> None:
+        """Find how many cycles ago the contact began that is detected in this one."""
         rows = self.history.last(self._before_cycles)
         below = np.all(np.abs(rows[:, TAU]) <= np.maximum(ONSET_FRACTION * rows[:, THRESHOLD], rows[:, SIGMA]), axis=1)
-        since = rows.shape[0] - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else rows.shape[0]
-        self._begin_cycle = cycle - since
-        self._direction = [0] * JOINTS
-        self._is_open = True
+        self._since = rows.shape[0] - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else rows.shape[0]
 
-    def cancel(self) -> None:
-        """Close the window without a final report, as a fault does."""
-        self._is_open = False
-
-    def report(
-        self, cycle: int, joints: int, level: ContactLevel, reaction: Reaction, is_two_sided: bool = False
-    ) -> ContactReport | None:
-        """Return the report that is due in this cycle, if one is. joints: bits of those over their threshold."""
-        elapsed = cycle - self._detected_cycle
-        is_final = elapsed >= self._window_cycles
-        tau_ext_hat = self.history.last(1)[0, TAU]
-        for i in range(JOINTS):
-            if joints >> i & 1 and self._direction[i] == 0:
-                self._direction[i] = int(np.sign(tau_ext_hat[i]))
-        if elapsed not in (0, self._link_cycles) and not is_final:
-            return None
-        self._is_open = not is_final
-        return self._make(cycle, level, reaction, is_two_sided, is_final)
-
-    def _make(
-        self, cycle: int, level: ContactLevel, reaction: Reaction, is_two_sided: bool, is_final: bool
-    ) -> ContactReport:
-        rows = self.history.last(max(cycle - self._begin_cycle, 1))
+    def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
+        """Report the contact from the samples since it began."""
+        rows = self.history.last(max(elapsed + self._since, 1))
         tau, sigma, threshold = rows[:, TAU], rows[-1, SIGMA], rows[-1, THRESHOLD]
         peaks = np.array([_peak(tau[:, i], sigma[i]) for i in range(JOINTS)])
         impulse = self._period_s * np.sum(tau, axis=0)
@@ -201,17 +275,14 @@ class ContactReporter:
                 float(peaks[0]), float(rows[-1, Q2]), self._length_m, float(threshold[1])
             )
         return ContactReport(
-            cycle=self._detected_cycle,
+            cycle=detected,
             link=link,
-            direction=(self._direction[0], self._direction[1] if link == 2 else 0),
+            direction=(direction[0], direction[1] if link == 2 else 0),
             tau_ext_peak=_pair(peaks),
             impulse=_pair(impulse),
             is_final=is_final,
-            level=level,
             kind=classify(tau, sigma, self._period_s) if is_final else ContactKind.UNKNOWN,
-            reaction=reaction,
             location=place.location,
-            is_two_sided=is_two_sided,
             tau_ext_peak_sigma=_pair(peak_sigma),
             impulse_sigma=_pair(impulse_sigma),
             force_N=place.force_N,
@@ -261,62 +332,3 @@ def share_left(tau: Vector, sigma: Vector, end_samples: int) -> float:
     for i in range(2):
         left += (np.mean(tau[max(count - end_samples, 0) :, i]) / sigma[i]) ** 2
     return float(np.sqrt(left / largest)) if largest > 0.0 else 0.0
-
-
-class Isolation:
-    """Makes the reports of one collision after the other: one at detection, a final one at the end of the window."""
-
-    def __init__(self, window_cycles: int, a_rad_s: float) -> None:
-        self._window_cycles = window_cycles
-        self._a_rad_s = a_rad_s
-        self._begin_cycle = 0
-        self._direction = [0] * JOINTS
-        self._is_open = False
-
-    @property
-    def is_open(self) -> bool:
-        """Whether a report is out that is not final yet."""
-        return self._is_open
-
-    def calm(self, calm: Calm) -> Calm:
-        """Narrow the bounds to those within which no report is due and no direction is new."""
-        if not self._is_open:
-            return calm
-        new = sum(1 << i for i in range(JOINTS) if self._direction[i] == 0)
-        return calm._replace(watched=calm.watched | new << CONTACT_SHIFT, due=self._begin_cycle + self._window_cycles)
-
-    def begin(self, cycle: int) -> None:
-        """Open the window: a collision is detected in this cycle."""
-        self._begin_cycle = cycle
-        self._direction = [0] * JOINTS
-        self._is_open = True
-
-    def cancel(self) -> None:
-        """Close the window without a final report, as a fault does."""
-        self._is_open = False
-
-    def report(
-        self, cycle: int, joints: int, tau_ext_hat: Vector, integral: Vector, peak: Vector
-    ) -> ContactReport | None:
-        """Take in this cycle and return a report if it is the first or the last of the window.
-
-        joints: bits of the joints that are over their threshold. integral Nm s and peak Nm (2,): of `follow_contact`.
-        """
-        for i in range(JOINTS):
-            if joints >> i & 1 and self._direction[i] == 0:
-                self._direction[i] = int(np.sign(tau_ext_hat[i]))
-        is_final = cycle - self._begin_cycle >= self._window_cycles
-        if not is_final and cycle != self._begin_cycle:
-            return None
-        self._is_open = not is_final
-        return ContactReport(
-            cycle=self._begin_cycle,
-            link=2 if self._direction[1] else 1,
-            direction=(self._direction[0], self._direction[1]),
-            tau_ext_peak=(float(peak[0]), float(peak[1])),
-            impulse=(
-                float(integral[0] + tau_ext_hat[0] / self._a_rad_s),
-                float(integral[1] + tau_ext_hat[1] / self._a_rad_s),
-            ),
-            is_final=is_final,
-        )

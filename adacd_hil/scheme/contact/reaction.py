@@ -27,7 +27,10 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.records import JOINTS, ContactLevel, Reaction, Vector
-from adacd_hil.scheme.supervisor.transitions import Calm, Observation
+from adacd_hil.scheme.supervisor.transitions import (
+    COLLISION,
+    Calm,
+)
 from adacd_hil.settings.configuration import Settings
 
 
@@ -145,7 +148,6 @@ BLIND_S = 0.02
 
 _ROUNDING_NM = 1e-9
 """More than two ways of adding up a torque along a way may differ by."""
-_COLLISION = int(Observation.COLLISION)
 
 
 class ReactionChoice:
@@ -229,7 +231,7 @@ class ReactionChoice:
         if link != self._cause[1]:
             return calm._replace(cycles=0)
         is_contact = self.level is ContactLevel.CONTACT
-        return calm._replace(watched=calm.watched | _COLLISION) if is_contact else calm
+        return calm._replace(watched=calm.watched | COLLISION) if is_contact else calm
 
     @property
     def judged(self) -> tuple[tuple[float, float], float]:
@@ -280,3 +282,22 @@ class ReactionChoice:
         if self._is_two_sided:
             self._is_given_up = True
             self._begin(self._possible(self._two_sided, is_model_valid), tau_ext_hat)
+
+
+class PaperReaction(ReactionChoice):
+    """The paper's: the arm withdraws from every contact, stops without one, and goes on as the supervisor says."""
+
+    def begin(self, level: ContactLevel, link: int, tau_ext_hat: Vector, is_model_valid: bool) -> None:  # noqa: ARG002
+        """Withdraw; nothing changes that any more."""
+        self._begin(Reaction.WITHDRAW, np.zeros(0))
+        self._cause = (ContactLevel.COLLISION, link)
+
+    def step(self, level: ContactLevel, link: int, is_latched: bool, tau_ext_hat: Vector, is_model_valid: bool) -> None:
+        """Change nothing."""
+
+    def calm(self, calm: Calm, link: int) -> Calm:  # noqa: ARG002
+        """Return the bounds as they are."""
+        return calm
+
+    def end(self) -> None:
+        """Leave the reaction as it is, which nobody asks for until the next contact."""

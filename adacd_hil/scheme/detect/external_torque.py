@@ -25,6 +25,10 @@ Shapes: joint vectors (2,); history (WIDE_SAMPLES + 1, 2), newest first.
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 
+SMALLEST_UNIT = 0.05
+LARGEST_UNIT = 9.0
+"""Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
+
 
 @compiled
 def predict(W_f: Vector, theta: Vector, tau_f_hat: Vector) -> None:

@@ -120,19 +120,27 @@ BLOCK_S = 0.064
 """Longer than a touch is held back before it is seen."""
 
 
-def tail_constants(settings: Settings) -> dict[str, Vector]:
-    """Return `excursions_Hz` (2 C - 1,) and `block_cycles`."""
+def constants_of(settings: Settings) -> dict[str, Vector]:
+    """Return `excursions_Hz`, `shown` (2 C - 1,) and `block_cycles`."""
     a = np.array(settings.certified.cutoffs_rad_s)
     return {
         "excursions_Hz": np.concatenate([a, a[1:]]) / np.pi,
         "block_cycles": np.array(max(round(BLOCK_S / settings.bus.period_s), 1)),
+        "shown": np.array(
+            [filter_bank.step_response(WITHIN_S, *channel) for channel in filter_bank.channels_of(settings)]
+        ),
     }
 
 
-def tail_shapes(channels: int) -> dict[str, tuple[int, ...]]:
+def shapes_of(channels: int) -> dict[str, tuple[int, ...]]:
     """Return the shapes of what is remembered, by name."""
-    each = (channels, JOINTS)
-    return {"peak": each, "peak_now": each, "peak_last": each, "tail_Nm": each, "block_used": (), "tail_s": ()}
+    joint, each = (JOINTS,), (channels, JOINTS)
+    return {
+        **dict.fromkeys(("peak", "peak_now", "peak_last", "tail_Nm"), each),
+        **dict.fromkeys(("block_used", "tail_s"), ()),
+        **dict.fromkeys(("seen_worst_Nm", "seen_push_Nm", "sum_push_Nm", "sum_cycles"), joint),
+        "seen": (BINS, JOINTS),
+    }
 
 
 @compiled
@@ -219,24 +227,6 @@ LOWEST_NM, WIDTH, BINS = 1e-3, 0.02, 512
 """Thresholds are counted in bins that are 2 % wide, from 1 mNm to 28 Nm."""
 FEWEST = 100
 """Cycles of motion in a second from which on its mean says something."""
-
-
-def sight_constants(settings: Settings) -> dict[str, Vector]:
-    """Return `shown` (2 C - 1,)."""
-    return {
-        "shown": np.array(
-            [filter_bank.step_response(WITHIN_S, *channel) for channel in filter_bank.channels_of(settings)]
-        )
-    }
-
-
-def sight_shapes() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    each = (JOINTS,)
-    return {
-        "seen": (BINS, JOINTS),
-        **dict.fromkeys(("seen_worst_Nm", "seen_push_Nm", "sum_push_Nm", "sum_cycles"), each),
-    }
 
 
 @compiled

@@ -69,9 +69,6 @@ BARE = 1.15
 """A bare filter leaves nothing else to average it: in 24 h of clean motion it came to 1.02 of a threshold without."""
 UNIT_PEAK = 4.0
 """Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
-SMALLEST_UNIT = 0.05
-LARGEST_UNIT = 9.0
-"""Bounds of the unit: a model is never believed to be more than 4.5 times better, or 3 times worse, than it says."""
 UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
 UNIT_TEST_S = 0.3
@@ -124,6 +121,18 @@ def follow_standstill(
             target = 1.0 if abs(dq[i]) < still_rad_s or has_turned else 0.0
             still[c, i] = target + decay[c] * (still[c, i] - target)
             still_smooth[c, i] = still[c, i] + smoothing * (still_smooth[c, i] - still[c, i])
+
+
+@compiled
+def measure_noise(k: Any, m: Any, tau_J: Vector) -> None:
+    """Take one sample at rest into `roughness` (n,): variance of the torque over that of the settings, at least 1."""
+    m["rest_samples"] += 1.0
+    for i in range(tau_J.shape[0]):
+        if m["rest_samples"] > 1.0:
+            m["rest_square"][i] += 0.5 * (tau_J[i] - m["rest_tau"][i]) ** 2
+            variance = m["rest_square"][i] / (m["rest_samples"] - 1.0)
+            m["roughness"][i] = max(variance / max(k["torque_noise_Nm"] ** 2, 1e-12), 1.0)
+        m["rest_tau"][i] = tau_J[i]
 
 
 @compiled
@@ -227,7 +236,7 @@ def follow_unit(k: Any, m: Any, fit: int, share: float) -> None:
             continue
         ratio = m["r"][fit, i] ** 2 / believed
         unit = m["unit"][i] + share * (UNIT_PEAK * ratio - m["unit"][i])
-        m["unit"][i] = min(max(unit, SMALLEST_UNIT), LARGEST_UNIT)
+        m["unit"][i] = min(max(unit, external_torque.SMALLEST_UNIT), external_torque.LARGEST_UNIT)
 
 
 @compiled

@@ -36,7 +36,6 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.model.regressor import PLACE_TERMS
 from adacd_hil.settings.configuration import Settings
 
 REST, TARE, ACCEPTED, LAST = range(4)
@@ -73,6 +72,15 @@ def constants_of(settings: Settings) -> dict[str, Vector]:
 
 def _or_unknown(values: tuple[float, ...] | None) -> Vector:
     return np.full(JOINTS, np.inf) if values is None else np.array(values)
+
+
+def shapes_of() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what is remembered, by name."""
+    each = (KINDS, JOINTS)
+    return {
+        **dict.fromkeys(("anchor_Nm", "anchor_std", "bound_Nm"), each),
+        **dict.fromkeys(("judged_Nm", "by_place_Nm"), (JOINTS,)),
+    }
 
 
 def begin(k: Any, m: Any) -> None:
@@ -233,11 +241,6 @@ LARGEST_OF_STD = 2.5
 """The largest torque, over the standard deviation that each coefficient is expected to have."""
 
 
-def place_shapes() -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what is remembered, by name."""
-    return {"by_place_Nm": (JOINTS,)}
-
-
 @compiled
 def is_place_bounded(k: Any, m: Any) -> bool:
     """Tell whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `by_place_Nm`."""
@@ -259,7 +262,7 @@ def _largest_Nm(k: Any, m: Any, joint: int) -> float:
     off = innovation(k, m, joint, theta[offset], P[offset, offset])
     for s in range(int(m["samples_kept"])):
         torque = 0.0
-        for term in range(PLACE_TERMS):
+        for term in range(m["X"].shape[1]):
             j = first + term * joints + joint
             torque += m["samples_W"][s, joint, j] * (theta[j] - P[j, offset] * off)
         largest = max(largest, abs(torque))

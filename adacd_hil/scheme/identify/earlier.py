@@ -44,7 +44,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
-from adacd_hil.scheme.detect.sensitivity import LARGEST_UNIT
+from adacd_hil.scheme.detect.external_torque import LARGEST_UNIT
 from adacd_hil.scheme.identify import anchor, fit_check
 from adacd_hil.settings.configuration import Settings
 

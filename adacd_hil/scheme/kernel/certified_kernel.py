@@ -19,22 +19,48 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import Structured, compiled, released
 from adacd_hil.records import JOINTS, Vector
+from adacd_hil.scheme.contact import contact_report
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
     anchor,
     belief,
+    certificate,
     doubt,
     earlier,
     fit_check,
-    last_certificate,
     missing_torque,
     termination,
 )
-from adacd_hil.scheme.kernel.paper_kernel import is_filled, keep_sample, put_between
+from adacd_hil.scheme.kernel import paper_kernel
+from adacd_hil.scheme.kernel.kernel_samples import (
+    Numbers,
+    Recorded,
+    Samples,
+    is_filled,
+    keep_sample,
+    observe,
+    put_between,
+    put_sample,
+    take_out,
+)
 from adacd_hil.scheme.model import filter_bank, regressor
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor.transitions import (
+    AT_REST,
+    CERTIFIED,
+    COLLISION,
+    CONTACT,
+    CONTACT_SHIFT,
+    FITTED,
+    NOT_A_NUMBER,
+    OVER_SPEED,
+    REFUTED,
+    UNSEEN,
+    WITHHELD,
+    Calm,
+    is_calm,
+)
 
 # What a cycle does, as bits.
 MEASURE = 1  # the arm is at rest: measure the torque sensors' noise and zero
@@ -44,21 +70,6 @@ TEST = 8  # test the frozen model
 REFINE = 16  # correct the belief, and let its mean take over after a test
 WEIGH = 32  # weigh what a contact of the certified model looks like
 
-# What contradicts a certificate that is withheld, or taken back.
-NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, ELASTIC = range(8)
-
-_NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
-_OVER_LIMIT = int(Observation.OVER_LIMIT)
-_OVER_SPEED = int(Observation.OVER_SPEED)
-_AT_REST = int(Observation.AT_REST)
-_UNLOADED = int(Observation.UNLOADED)
-_CONTACT = int(Observation.CONTACT)
-_COLLISION = int(Observation.COLLISION)
-_FITTED = int(Observation.FITTED)
-_CERTIFIED = int(Observation.CERTIFIED)
-_REFUTED = int(Observation.REFUTED)
-_UNSEEN = int(Observation.UNSEEN)
-_WITHHELD = int(Observation.WITHHELD)
 
 _EIGENVALUE_EVERY = 64
 """Samples between two looks at the eigenvalues: they take about as long as a step."""
@@ -151,68 +162,37 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     is_complete: 1 if it is a fresh sample. steps: periods since the fresh sample before it. mode: MEASURE to REFINE.
     """
     k, m, out = constants[0], memory[0], block[0]
-    observation = observe(k, out) | _UNSEEN
+    observation = observe(k, out, OVER_SPEED) | UNSEEN
     if out["period_s"][0] == 0.0:
         out["period_s"][0] = max(steps, 1) * k["period_s"]
-    is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
+    is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
         m["anchor_age_s"] += out["period_s"][0]
         m["kept_age_s"][:] += out["period_s"][0]
         if mode & MEASURE:
-            _measure_noise(k, m, out["tau_J"])
-            anchor.measure(k, m, out["tau_J"], observation & _AT_REST != 0)
+            sensitivity.measure_noise(k, m, out["tau_J"])
+            anchor.measure(k, m, out["tau_J"], observation & AT_REST != 0)
         if _filter(k, m, out, steps):
-            observation &= ~_UNSEEN
+            observation &= ~UNSEEN
         if not (np.all(np.isfinite(m["r"])) and np.all(np.isfinite(m["theta"]))):
-            observation |= _NOT_A_NUMBER
+            observation |= NOT_A_NUMBER
     elif is_complete != 0:
         m["has_gap"] = 1.0
     if mode & MEASURE and anchor.is_rest_refused(k, m):
-        m["withheld_by"] = ANCHOR
-        observation |= _WITHHELD
+        m["withheld_by"] = certificate.ANCHOR
+        observation |= WITHHELD
     if mode & WATCH:
         observation |= _watch(k, m, out, is_fresh)
     else:
         out["threshold"][:] = np.inf
         out["threshold_bank"][:] = np.inf
         m["wide_threshold"][:] = np.inf
-    if mode & WEIGH and not observation & _UNSEEN:
+    if mode & WEIGH and not observation & UNSEEN:
         doubt.weigh(k, m)
     if is_fresh and mode & (LEARN | TEST | REFINE):
-        observation |= _improve(k, m, out, observation & _CONTACT != 0, mode)
+        observation |= _improve(k, m, out, observation & CONTACT != 0, mode)
     _fill_model(k, m, out)
     return observation
-
-
-@compiled
-def observe(k: Any, out: Any) -> int:
-    """Return what the measurements alone say."""
-    observation = _AT_REST | _UNLOADED
-    for i in range(out["q"].shape[0]):
-        q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
-        if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
-            observation |= _NOT_A_NUMBER
-        if not (abs(q) <= k["position_limit_rad"][i]):
-            observation |= _OVER_LIMIT
-        if not (abs(dq) <= k["velocity_limit_rad_s"][i]):
-            observation |= _OVER_SPEED
-        if not (abs(dq) < k["rest_velocity_rad_s"]):
-            observation &= ~_AT_REST
-        if not (abs(tau_J) < k["rest_torque_Nm"]):
-            observation &= ~_UNLOADED
-    return observation
-
-
-@compiled
-def _measure_noise(k: Any, m: Any, tau_J: Vector) -> None:
-    """Take one sample at rest into `roughness` (n,): variance of the torque over that of the settings, at least 1."""
-    m["rest_samples"] += 1.0
-    for i in range(tau_J.shape[0]):
-        if m["rest_samples"] > 1.0:
-            m["rest_square"][i] += 0.5 * (tau_J[i] - m["rest_tau"][i]) ** 2
-            variance = m["rest_square"][i] / (m["rest_samples"] - 1.0)
-            m["roughness"][i] = max(variance / max(k["torque_noise_Nm"] ** 2, 1e-12), 1.0)
-        m["rest_tau"][i] = tau_J[i]
 
 
 @compiled
@@ -325,11 +305,11 @@ def _watch(k: Any, m: Any, out: Any, is_fresh: bool) -> int:
     joints = sensitivity.joints_over(m["y"], m["h"])
     if not joints:
         return 0
-    observation = _CONTACT | joints << CONTACT_SHIFT
+    observation = CONTACT | joints << CONTACT_SHIFT
     for c in range(m["r"].shape[0], m["y"].shape[0]):
         for i in range(m["y"].shape[1]):
             if not (abs(m["y"][c, i]) <= max(k["collision_Nm"][i], m["h"][c, i])):
-                observation |= _COLLISION
+                observation |= COLLISION
     return observation
 
 
@@ -361,8 +341,8 @@ def _improve(k: Any, m: Any, out: Any, is_touched: bool, mode: int) -> int:
         fit_check.keep(m, m["W_f"][filter_bank.SLOW], m["tau_f"][filter_bank.SLOW])
     if not (is_free and _gather_evidence(k, m, out)):
         return 0
-    m["withheld_by"] = _contradicted_by(k, m)
-    return _FITTED if m["withheld_by"] == NOTHING else _WITHHELD
+    m["withheld_by"] = certificate.contradicted_by(k, m)
+    return FITTED if m["withheld_by"] == certificate.NOTHING else WITHHELD
 
 
 @compiled
@@ -375,32 +355,6 @@ def _follow_noise(k: Any, m: Any, is_free: bool, mode: int) -> None:
     sensitivity.keep_velocity_noise(k, m)
     if mode & (TEST | REFINE):
         margin.follow_tail(k, m)
-
-
-@compiled
-def _contradicted_by(k: Any, m: Any) -> int:
-    """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
-    cause = NOTHING
-    if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
-        cause = ANCHOR
-    elif not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(k, m)):
-        cause = CHANGED
-    elif not earlier.is_no_more(k, m):
-        cause = MORE
-    if cause != NOTHING:
-        missing = _missing(k, m)
-        return missing if missing != NOTHING and cause == CHANGED else cause
-    if not anchor.is_place_bounded(k, m):
-        return TOO_MUCH_BY_PLACE
-    return NOTHING if last_certificate.is_no_more(k, m) else MORE_THAN_LAST
-
-
-@compiled
-def _missing(k: Any, m: Any) -> int:
-    """Return what the model lacks, by what this adaptation has learnt."""
-    if not missing_torque.is_found(k, m):
-        return NOTHING
-    return ELASTIC if m["is_elastic"] != 0.0 else BY_PLACE
 
 
 @compiled
@@ -417,18 +371,18 @@ def _test(k: Any, m: Any, dq: Vector) -> int:
     for i in range(dq.shape[0]):
         if not (abs(m["r"][filter_bank.SLOW, i]) <= m["test_limit_Nm"]):
             earlier.keep_refuted(m)
-            m["withheld_by"] = _missing(k, m)
-            return _REFUTED if m["withheld_by"] == NOTHING else _REFUTED | _WITHHELD
+            m["withheld_by"] = certificate.missing_cause(k, m)
+            return REFUTED if m["withheld_by"] == certificate.NOTHING else REFUTED | WITHHELD
         fastest = max(m["dq_high"][i], -m["dq_low"][i])
         has_moved = has_moved and fastest >= k["velocity_rad_s"]
     is_long = m["tested"] >= k["test_cycles"][int(m["is_payload"])]
     if not (is_long and has_moved):
         return 0
     if anchor.is_within(k, m, m["theta"], m["P"]):
-        return _CERTIFIED
-    m["withheld_by"] = ANCHOR
+        return CERTIFIED
+    m["withheld_by"] = certificate.ANCHOR
     missing_torque.is_found(k, m)
-    return _REFUTED | _WITHHELD
+    return REFUTED | WITHHELD
 
 
 @compiled
@@ -437,14 +391,14 @@ def _refine(k: Any, m: Any) -> int:
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k["unit_share"])
     sensitivity.relax(k, m)
     margin.follow_sight(k, m)
-    m["withheld_by"] = NOTHING
+    m["withheld_by"] = certificate.NOTHING
     if belief.learn(k, m):
         belief.wander(k["drift_std"], m["W_learnt"], k["period_s"] * k["learn_every"], m["P_belief"])
         if missing_torque.is_found_in_time(k, m):
-            m["withheld_by"] = BY_PLACE
+            m["withheld_by"] = certificate.BY_PLACE
     if belief.test_candidate(k, m):
-        m["withheld_by"] = ANCHOR
-    return 0 if m["withheld_by"] == NOTHING else _WITHHELD
+        m["withheld_by"] = certificate.ANCHOR
+    return 0 if m["withheld_by"] == certificate.NOTHING else WITHHELD
 
 
 @compiled
@@ -480,3 +434,51 @@ def _fill_model(k: Any, m: Any, out: Any) -> None:
     out["condition"][0] = m["condition"]
     out["promotions"][0] = m["promotions"]
     out["quiet_s"][0] = m["tested"] * k["period_s"]
+
+
+@released
+def run_certified(
+    numbers: Numbers,
+    paper: Numbers,
+    samples: Samples,
+    recorded: Recorded,
+    first: int,
+    last: int,
+    mode: int,
+    paper_mode: int,
+    calm: Calm,
+    rows: Vector,
+    written: int,
+    judged: tuple[tuple[float, float], float],
+    promotions: float,
+) -> tuple[int, int]:
+    """Run both schemes as `run_paper` does; return the sample and the paper's next mode.
+
+    rows: of `ContactHistory`; written: how many have been. judged: a way, and the external torque along it, Nm, below
+    which a withdrawal has to be judged. That is not calm, nor is a model that has taken over, so that there are not
+    that many promotions any more.
+    """
+    constants, memory, block, values = numbers
+    m, out = memory[0], block[0]
+    (way_1, way_2), least_Nm = judged
+    passed = 0
+    for k in range(first, last + 1):
+        is_complete, steps = samples.is_complete[k], samples.steps[k]
+        put_sample(block, samples, k)
+        observation = step(constants, memory, block, is_complete, steps, mode)
+        paper_mode = paper_kernel.step_shadow(paper, paper_mode, block, is_complete, steps)
+        take_out(recorded, k, observation, values)
+        passed += samples.periods[k]
+        y = m["y"][filter_bank.WIDE]
+        along_Nm = y[0] * way_1 + y[1] * way_2
+        if (
+            not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k])
+            or out["promotions"][0] != promotions
+            or not (along_Nm >= least_Nm)
+            or k == last
+        ):
+            return k, paper_mode
+        place = written % (rows.shape[0] // 2)
+        contact_report.put_row(rows, place, out["q"], out["tau_ext_wide_hat"], m["wide_sigma"], m["wide_threshold"])
+        written += 1
+    return last, paper_mode

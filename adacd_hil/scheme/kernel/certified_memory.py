@@ -1,6 +1,6 @@
 """What the certified scheme's compiled step works on: constants from the settings, memory, and block.
 
-Three structured arrays of one element, as in `adacd_hil.scheme.kernel.paper_kernel`; the block is
+Three structured arrays of one element, as in `kernel_samples`; the block is
 `records.certified_layout`. The parameters, in order: the dynamic ones, torque offsets, lags, further friction.
 """
 
@@ -12,8 +12,8 @@ import numpy as np
 from adacd_hil.compiled import Structured, packed, zeroed
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector, certified_layout
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
-from adacd_hil.scheme.identify import anchor, belief, doubt, earlier, fit_check, last_certificate, missing_torque
-from adacd_hil.scheme.kernel.paper_kernel import block_dtype, limits_of
+from adacd_hil.scheme.identify import anchor, belief, certificate, doubt, earlier, fit_check, missing_torque
+from adacd_hil.scheme.kernel.kernel_samples import Numbers, block_dtype, limits_of
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.settings.certified_settings import CROSS_TALK, FRICTION_TERMS
 from adacd_hil.settings.configuration import Settings
@@ -135,9 +135,8 @@ def constants_of(settings: Settings) -> Structured:
         **anchor.constants_of(settings),
         **doubt.constants_of(settings, len(names)),
         **earlier.constants_of(settings, prior_std_of(settings)),
-        **last_certificate.constants_of(settings),
-        **margin.tail_constants(settings),
-        **margin.sight_constants(settings),
+        **certificate.constants_of(settings),
+        **margin.constants_of(settings),
         **missing_torque.constants_of(settings, prior_std_of(settings)),
         "model_sigmas": certified.model_sigmas,
         "torque_noise_Nm": certified.torque_noise_Nm,
@@ -159,123 +158,55 @@ def new_memory(settings: Settings) -> Structured:
     waiting = max(round(certified.hold_back_s / learn_s), 1)
     joint, parameter = (JOINTS,), (count,)
     columns, square = (JOINTS, count), (count, count)
+    each_filter, each_channel = (filter_count, JOINTS), (channel_count, JOINTS)
+    ones = ("roughness", "roughness_now", "roughness_kept", "velocity_roughness", "unit", "strain")
     shapes: dict[str, tuple[int, ...]] = {
-        "has_gap": (),
-        "is_steady": (),
+        **dict.fromkeys(("has_gap", "is_steady"), ()),
         # bank
-        "Y_p": columns,
-        "Y_h": columns,
-        "input_old": (filter_count, *columns),
-        "S": (filter_count, *columns),
-        "W_f": (filter_count, *columns),
-        "tau_f": (filter_count, JOINTS),
-        "W_learnt": columns,
-        "tau_learnt": joint,
-        "tau_old": (filter_count, JOINTS),
+        **dict.fromkeys(("Y_p", "Y_h", "W_learnt"), columns),
+        **dict.fromkeys(("input_old", "S", "W_f"), (filter_count, *columns)),
+        **dict.fromkeys(("tau_f", "tau_old"), each_filter),
+        **dict.fromkeys(("last", "between"), (3, JOINTS)),
         "rates": (3, filter_count),
-        "last": (3, JOINTS),
-        "between": (3, JOINTS),
-        # model in use
-        "theta": parameter,
-        "P": square,
+        "tau_learnt": joint,
+        # model in use, the certified one, belief, candidate
+        **dict.fromkeys(("theta", "certified", "belief", "candidate", "v", "K"), parameter),
+        **dict.fromkeys(("P", "P_certified", "P_belief", "P_candidate"), square),
+        **dict.fromkeys(("promotions", "candidate_cycles", "candidate_square", "frozen_square", "candidate_worst"), ()),
         "M": (JOINTS, JOINTS),
-        "promotions": (),
-        "certified": parameter,
-        "P_certified": square,
-        # belief
-        "belief": parameter,
-        "P_belief": square,
-        "v": parameter,
-        "K": parameter,
+        # samples that wait
         "ring_W": (waiting, *columns),
-        "ring_tau": (waiting, JOINTS),
-        "ring_R": (waiting, JOINTS),
-        "ring_still": (waiting, JOINTS),
-        "ring_used": (),
-        "ring_next": (),
-        "since_learnt": (),
-        "are_lags_held": (),
-        "recovering_cycles": (),
+        **dict.fromkeys(("ring_tau", "ring_R", "ring_still"), (waiting, JOINTS)),
+        **dict.fromkeys(("ring_used", "ring_next", "since_learnt", "are_lags_held", "recovering_cycles"), ()),
         # evidence
-        "is_payload": (),
-        "samples": (),
-        "tested": (),
-        "test_limit_Nm": (),
-        "q_low": joint,
-        "q_high": joint,
-        "dq_low": joint,
-        "dq_high": joint,
-        "information": square,
-        "scratch": square,
-        "excitation": (),
-        "condition": (),
-        # candidate
-        "candidate": parameter,
-        "P_candidate": square,
-        "candidate_cycles": (),
-        "candidate_square": (),
-        "frozen_square": (),
-        "candidate_worst": (),
+        **dict.fromkeys(("is_payload", "samples", "tested", "test_limit_Nm", "excitation", "condition"), ()),
+        **dict.fromkeys(("q_low", "q_high", "dq_low", "dq_high"), joint),
+        **dict.fromkeys(("information", "scratch"), square),
+        "withheld_by": (),
         # detection
-        "r": (filter_count, JOINTS),
-        "y": (channel_count, JOINTS),
-        "h": (channel_count, JOINTS),
-        "h_model": (channel_count, JOINTS),
-        "still": (filter_count, JOINTS),
-        "still_smooth": (filter_count, JOINTS),
-        "doubt": (filter_count, JOINTS),
+        **dict.fromkeys(("r", "still", "still_smooth", "doubt", "held"), each_filter),
+        **dict.fromkeys(("y", "h", "h_model"), each_channel),
+        **dict.fromkeys((*ones, "used", "peak_share", "hold", "dq_old", "ddq_old"), joint),
+        **dict.fromkeys(("torque_changes", "torque_change_Nm", "torque_step_Nm", "torque_pull_Nm"), joint),
+        **dict.fromkeys(("rest_tau", "rest_square", "wide_sigma", "wide_threshold"), joint),
+        **dict.fromkeys(("rest_samples", "rest_count", "anchor_age_s"), ()),
         "bent": (2, JOINTS),
-        "rest_samples": (),
-        "rest_tau": joint,
-        "rest_square": joint,
-        "roughness": joint,
-        "torque_changes": joint,
-        "torque_change_Nm": joint,
-        "torque_step_Nm": joint,
-        "torque_pull_Nm": joint,
-        # anchors of the offsets
-        "rest_count": (),
-        "anchor_age_s": (),
-        "anchor_Nm": (anchor.KINDS, *joint),
-        "anchor_std": (anchor.KINDS, *joint),
-        "bound_Nm": (anchor.KINDS, *joint),
-        "judged_Nm": joint,
-        # what was known earlier
+        "history": (external_torque.WIDE_SAMPLES + 1, JOINTS),
+        # of the modules that judge
+        **anchor.shapes_of(),
         **earlier.shapes_of(count),
         **fit_check.shapes_of(count),
-        **last_certificate.shapes_of(),
+        **certificate.shapes_of(),
         **doubt.shapes_of(),
-        **margin.tail_shapes(channel_count),
-        **margin.sight_shapes(),
-        **anchor.place_shapes(),
+        **margin.shapes_of(channel_count),
         **missing_torque.shapes_of(count, waiting),
         **sensitivity.shapes_of(filter_count),
-        "withheld_by": (),
-        "dq_old": joint,
-        "ddq_old": joint,
-        "roughness_now": joint,
-        "roughness_kept": joint,
-        "velocity_roughness": joint,
-        "unit": joint,
-        "strain": joint,
-        "used": joint,
-        "peak_share": joint,
-        "hold": joint,
-        "held": (filter_count, JOINTS),
-        # contact
-        "history": (external_torque.WIDE_SAMPLES + 1, JOINTS),
-        "wide_sigma": joint,
-        "wide_threshold": joint,
     }
     memory = zeroed(shapes)
     memory["has_gap"] = 1.0
     memory["last"] = np.nan
-    memory["roughness"] = 1.0
-    memory["roughness_now"] = 1.0
-    memory["roughness_kept"] = 1.0
-    memory["velocity_roughness"] = 1.0
-    memory["unit"] = 1.0
-    memory["strain"] = 1.0
+    for name in ones:
+        memory[name] = 1.0
     state = memory[0]
     prior, prior_std = prior_of(settings), prior_std_of(settings)
     belief.begin(prior, prior_std, state["belief"], state["P_belief"])
@@ -283,7 +214,7 @@ def new_memory(settings: Settings) -> Structured:
     constants = constants_of(settings)[0]
     anchor.begin(constants, state)
     missing_torque.clear(constants, state)
-    last_certificate.begin(constants, state)
+    certificate.begin(constants, state)
     return memory
 
 
@@ -296,3 +227,9 @@ def new_block(settings: Settings) -> Structured:
     for name in ("threshold", "threshold_bank", "paper_threshold"):
         block[name] = np.inf
     return block
+
+
+def numbers_of(settings: Settings) -> Numbers:
+    """Return what the kernel works on in a run, before the first sample."""
+    block = new_block(settings)
+    return Numbers(constants_of(settings), new_memory(settings), block, block.view(np.float64))

@@ -1,11 +1,6 @@
-"""The numbers of one cycle: filters, both predictions, estimator, evidence and contact in one compiled call.
+"""The numbers of one cycle of the paper's scheme in one call: filters, predictions, estimator, evidence, contact.
 
-Three structured arrays of one element each carry everything, so that fields have names in compiled code and out of it:
-
-- constants: what the settings say, never written here;
-- memory: what lasts from one cycle to the next and is nobody's business outside;
-- block: `records.scheme_layout`, filled in every cycle. q, dq, tau_J and the measured period_s are put there by the
-  caller; a period_s of 0 was not measured.
+Constants, memory and block: as in `kernel_samples`; the block is `records.scheme_layout`.
 
 A cycle without a fresh sample leaves filters and estimate as they were. Up to `MOST_FILLED` samples that are missing
 before one are taken to lie on the straight line between their neighbours, so that a lost frame leaves nothing unseen. A
@@ -26,12 +21,35 @@ from typing import Any
 
 import numpy as np
 
-from adacd_hil.compiled import Structured, compiled, packed, zeroed
-from adacd_hil.records import JOINTS, Layout, Vector, scheme_layout
+from adacd_hil.compiled import Structured, compiled, packed, released, zeroed
+from adacd_hil.records import JOINTS, Vector, scheme_layout
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator, termination
+from adacd_hil.scheme.kernel.kernel_samples import (
+    Numbers,
+    Recorded,
+    Samples,
+    block_dtype,
+    is_filled,
+    keep_sample,
+    limits_of,
+    observe,
+    put_between,
+    put_sample,
+    take_out,
+)
 from adacd_hil.scheme.model import filter_bank, regressor
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation
+from adacd_hil.scheme.supervisor.transitions import (
+    ADAPTED,
+    COLLISION,
+    CONTACT,
+    CONTACT_SHIFT,
+    NOT_A_NUMBER,
+    OVER_LIMIT,
+    UNSEEN,
+    Calm,
+    is_calm,
+)
 from adacd_hil.settings.configuration import Settings
 
 # What a cycle does, as bits: the estimator learns; thresholds are in force; a collision's report is not final yet.
@@ -40,52 +58,11 @@ ARMED = 2
 REPORTING = 4
 
 
-_NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
-_OVER_LIMIT = int(Observation.OVER_LIMIT)
-_AT_REST = int(Observation.AT_REST)
-_UNLOADED = int(Observation.UNLOADED)
-_ADAPTED = int(Observation.ADAPTED)
-_COLLISION = int(Observation.CONTACT | Observation.COLLISION)
-_UNSEEN = int(Observation.UNSEEN)
+_ANY_CONTACT = CONTACT | COLLISION
 
-# Shares of the nominal period: the shortest and the longest interval of two samples that follow each other.
-_SHORTEST_SHARE = 0.5
-_LONGEST_SHARE = 1.5
 MOST_FILLED = 4
 """Missing samples that are put on the line between their neighbours: with one more the model is blind by default. Over
 5 ms the line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
-
-
-@compiled
-def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
-    """Tell whether a sample follows the one before it near enough. steps: periods between them, taking period_s.
-
-    most: missing samples that may be put on the line between them.
-    """
-    if not 1 <= steps <= most + 1:
-        return False
-    return bool(_SHORTEST_SHARE * nominal_s * steps <= period_s <= _LONGEST_SHARE * nominal_s * steps)
-
-
-@compiled
-def put_between(last: Vector, q: Vector, dq: Vector, tau_J: Vector, share: float, between: Vector) -> None:
-    """Fill `between` (3, n) with the sample at a share of the way from `last` (3, n) to q, dq, tau_J (n,)."""
-    for i in range(between.shape[1]):
-        between[0, i] = last[0, i] + share * (q[i] - last[0, i])
-        between[1, i] = last[1, i] + share * (dq[i] - last[1, i])
-        between[2, i] = last[2, i] + share * (tau_J[i] - last[2, i])
-
-
-@compiled
-def keep_sample(q: Vector, dq: Vector, tau_J: Vector, last: Vector) -> None:
-    """Keep q, dq, tau_J (n,) in `last` (3, n)."""
-    for i in range(last.shape[1]):
-        last[0, i], last[1, i], last[2, i] = q[i], dq[i], tau_J[i]
-
-
-def block_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Describe a block as a structure; its bytes are those of the float64 block."""
-    return np.dtype([(field.name, np.float64, (field.size,)) for field in layout.fields])
 
 
 def constants_of(settings: Settings) -> Structured:
@@ -119,16 +96,6 @@ def constants_of(settings: Settings) -> Structured:
     return packed(values)
 
 
-def limits_of(settings: Settings) -> dict[str, Any]:
-    """Return the constants with which measurements alone are judged."""
-    return {
-        "position_limit_rad": settings.arm.position_limit_rad,
-        "velocity_limit_rad_s": settings.arm.velocity_limit_rad_s,
-        "rest_velocity_rad_s": settings.safety.rest_velocity_rad_s,
-        "rest_torque_Nm": settings.safety.rest_torque_Nm,
-    }
-
-
 def new_memory(parameter_count: int) -> Structured:
     """Return the memory before the first sample: a gap, with tau_f = 0, W_f = 0 and theta_hat = 0."""
     joint, parameter = (JOINTS,), (parameter_count,)
@@ -136,32 +103,19 @@ def new_memory(parameter_count: int) -> Structured:
     shapes: dict[str, tuple[int, ...]] = {
         "has_gap": (),
         # filters
-        "Y_p": columns,
-        "Y_h": columns,
-        "input_old": columns,
-        "S": columns,
-        "W_f": columns,
+        **dict.fromkeys(("Y_p", "Y_h", "input_old", "S", "W_f"), columns),
+        **dict.fromkeys(("last", "between"), (3, JOINTS)),
         "tau_old": joint,
-        "last": (3, JOINTS),
-        "between": (3, JOINTS),
         # estimator
+        **dict.fromkeys(("v", "K"), parameter),
         "P": square,
-        "v": parameter,
-        "K": parameter,
         # termination
-        "q_low": joint,
-        "q_high": joint,
-        "dq_low": joint,
-        "dq_high": joint,
-        "information": square,
-        "scratch": square,
-        "samples": (),
-        "quiet_cycles": (),
+        **dict.fromkeys(("q_low", "q_high", "dq_low", "dq_high"), joint),
+        **dict.fromkeys(("information", "scratch"), square),
+        **dict.fromkeys(("samples", "quiet_cycles"), ()),
         # contact
-        "standstill": joint,
+        **dict.fromkeys(("standstill", "integral", "peak"), joint),
         "history": (external_torque.WIDE_SAMPLES + 1, JOINTS),
-        "integral": joint,
-        "peak": joint,
     }
     memory = zeroed(shapes)
     memory["has_gap"] = 1.0
@@ -173,6 +127,13 @@ def new_block(parameter_count: int) -> Structured:
     block = np.zeros(1, block_dtype(scheme_layout(parameter_count)))
     block["threshold"] = np.inf
     return block
+
+
+def numbers_of(settings: Settings) -> Numbers:
+    """Return what the kernel works on in a run, before the first sample."""
+    count = len(settings.estimator.parameter_names)
+    block = new_block(count)
+    return Numbers(constants_of(settings), new_memory(count), block, block.view(np.float64))
 
 
 @compiled
@@ -209,16 +170,16 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     if out["period_s"][0] == 0.0:
         out["period_s"][0] = max(steps, 1) * c["period_s"]
     period_s = c["period_s"]
-    observation = _observe(c, out) | _UNSEEN
-    is_fresh = is_complete != 0 and observation & _NOT_A_NUMBER == 0
+    observation = observe(c, out, OVER_LIMIT) | UNSEEN
+    is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
         is_seen, period_s = _filter(c, m, out, steps)
         if is_seen:
-            observation &= ~_UNSEEN
+            observation &= ~UNSEEN
         if mode & LEARN:
             observation |= _learn(c, m, out, period_s)
         if not (np.all(np.isfinite(out["tau_ext_hat"])) and np.all(np.isfinite(out["theta_hat"]))):
-            observation |= _NOT_A_NUMBER
+            observation |= NOT_A_NUMBER
     elif is_complete != 0:
         m["has_gap"] = 1.0
     if mode & ARMED:
@@ -226,23 +187,6 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     out["threshold"][:] = np.inf
     m["integral"][:] = 0.0
     m["peak"][:] = 0.0
-    return observation
-
-
-@compiled
-def _observe(c: Any, out: Any) -> int:
-    """Return what the measurements alone say."""
-    observation = _AT_REST | _UNLOADED
-    for i in range(JOINTS):
-        q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
-        if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
-            observation |= _NOT_A_NUMBER
-        if not (abs(q) <= c["position_limit_rad"][i] and abs(dq) <= c["velocity_limit_rad_s"][i]):
-            observation |= _OVER_LIMIT
-        if not (abs(dq) < c["rest_velocity_rad_s"]):
-            observation &= ~_AT_REST
-        if not (abs(tau_J) < c["rest_torque_Nm"]):
-            observation &= ~_UNLOADED
     return observation
 
 
@@ -331,7 +275,7 @@ def _learn(c: Any, m: Any, out: Any, period_s: float) -> int:
     )
     R = 1.0 / period_s
     estimator.update(m["W_f"], out["tau_f"], R, c["is_least_squares"] != 0.0, out["theta_hat"], m["P"], m["v"], m["K"])
-    return _ADAPTED if is_over else 0
+    return ADAPTED if is_over else 0
 
 
 @compiled
@@ -350,44 +294,32 @@ def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
             m["peak"],
         )
     joints = external_torque.joints_over(out["tau_ext_hat"], out["threshold"])
-    return _COLLISION | joints << CONTACT_SHIFT if joints else 0
+    return _ANY_CONTACT | joints << CONTACT_SHIFT if joints else 0
 
 
-@compiled
-def step_record(
-    constants: Structured,
-    memory: Structured,
-    q: Vector,
-    dq: Vector,
-    tau_J: Vector,
-    is_complete: Vector,
-    steps: Vector,
-    period_s: Vector,
-    mode: int,
-    blocks: Structured,
-) -> None:
-    """Run `step` over n samples in one mode; fills blocks (n,).
+@released
+def run_paper(
+    numbers: Numbers, samples: Samples, recorded: Recorded, first: int, last: int, mode: int, calm: Calm
+) -> int:
+    """Run `step` from sample `first` to the first that isn't calm, at most to `last`; return which it is.
 
-    q, dq, tau_J (n, 2); is_complete, steps (n,) int64; period_s (n,), 0 where it was not measured.
-
-    blocks[0] must hold the theta_hat to begin with.
+    Compiled at its first call, which no live run makes.
     """
-    for k in range(q.shape[0]):
-        if k > 0:
-            blocks[k] = blocks[k - 1]
-        block = blocks[k : k + 1]
-        block[0]["q"][:] = q[k]
-        block[0]["dq"][:] = dq[k]
-        block[0]["tau_J"][:] = tau_J[k]
-        block[0]["period_s"][0] = period_s[k]
-        step(constants, memory, block, is_complete[k], steps[k], mode)
+    constants, memory, block, values = numbers
+    passed = 0
+    for k in range(first, last + 1):
+        put_sample(block, samples, k)
+        observation = step(constants, memory, block, samples.is_complete[k], samples.steps[k], mode)
+        take_out(recorded, k, observation, values)
+        passed += samples.periods[k]
+        if not is_calm(calm, observation | samples.findings[k], passed, samples.cycle[k]):
+            return k
+    return last
 
 
 @compiled
 def step_shadow(
-    constants: Structured,
-    memory: Structured,
-    block: Structured,
+    paper: Numbers,
     mode: int,
     main: Structured,
     is_complete: int,
@@ -395,14 +327,15 @@ def step_shadow(
 ) -> int:
     """Take in the sample that the main scheme's block has, fill that block's fields, and return the next mode.
 
-    constants, memory, block: of the paper's kernel. main: after the main kernel's step.
+    main: the block, after the main kernel's step.
     """
+    constants, memory, block, _ = paper
     own, out = block[0], main[0]
     for i in range(JOINTS):
         own["q"][i], own["dq"][i], own["tau_J"][i] = out["q"][i], out["dq"][i], out["tau_J"][i]
     own["period_s"][0] = out["period_s"][0]
     observation = step(constants, memory, block, is_complete, steps, mode)
-    if observation & _ADAPTED:
+    if observation & ADAPTED:
         mode = ARMED
     out["paper_is_armed"][0] = 1.0 if mode == ARMED else 0.0
     for i in range(JOINTS):
@@ -417,28 +350,21 @@ class PaperShadow:
     """The paper's scheme on the same stream."""
 
     def __init__(self, settings: Settings) -> None:
-        count = len(settings.estimator.parameter_names)
-        self.constants = constants_of(settings)
-        self.memory = new_memory(count)
-        self.block = new_block(count)
+        self.numbers = numbers_of(settings)
         self.mode = 0
-
-    @property
-    def numbers(self) -> tuple[Structured, Structured, Structured]:
-        """What its kernel works on: constants, memory, block."""
-        return self.constants, self.memory, self.block
 
     def compile(self, main: Structured) -> None:
         """Run every compiled function once, on copies. main: the block of the scheme in charge."""
-        memory, block = self.memory.copy(), self.block.copy()
-        begin_adaptation(self.constants, memory, block)
-        step_shadow(self.constants, memory, block, LEARN, main.copy(), 1, 1)
+        constants, memory, block, values = self.numbers
+        memory, block = memory.copy(), block.copy()
+        begin_adaptation(constants, memory, block)
+        step_shadow(Numbers(constants, memory, block, values), LEARN, main.copy(), 1, 1)
 
     def begin_adaptation(self) -> None:
         """Forget the past, as the scheme does whenever it adapts."""
-        begin_adaptation(self.constants, self.memory, self.block)
+        begin_adaptation(self.numbers.constants, self.numbers.memory, self.numbers.block)
         self.mode = LEARN
 
     def step(self, main: Structured, is_complete: int, steps: int) -> None:
         """Take in one cycle, and put what it comes to into the block of the scheme in charge."""
-        self.mode = step_shadow(self.constants, self.memory, self.block, self.mode, main, is_complete, steps)
+        self.mode = step_shadow(self.numbers, self.mode, main, is_complete, steps)

@@ -8,10 +8,9 @@ import numpy as np
 from adacd_hil.compiled import Structured
 from adacd_hil.records import JOINTS, Event, SchemeState, Vector
 from adacd_hil.scheme.detect import margin
-from adacd_hil.scheme.identify import anchor, earlier, last_certificate, missing_torque
+from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque
+from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import CommonCause
-from adacd_hil.scheme.identify.last_certificate import Certificate
-from adacd_hil.scheme.kernel import certified_kernel
 
 THIS_RUN_ONLY = "friction and inertia: by this run only"
 """A hand that drags, or moves like a mass, from before the first motion is learnt as these: no run alone tells them."""
@@ -41,13 +40,13 @@ class _Cause(Enum):
 
 
 _CAUSES = {
-    certified_kernel.ANCHOR: _Cause.ANCHOR,
-    certified_kernel.CHANGED: _Cause.CHANGED,
-    certified_kernel.MORE: _Cause.MORE,
-    certified_kernel.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
-    certified_kernel.BY_PLACE: _Cause.BY_PLACE,
-    certified_kernel.ELASTIC: _Cause.ELASTIC,
-    certified_kernel.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
+    certificate.ANCHOR: _Cause.ANCHOR,
+    certificate.CHANGED: _Cause.CHANGED,
+    certificate.MORE: _Cause.MORE,
+    certificate.MORE_THAN_LAST: _Cause.MORE_THAN_LAST,
+    certificate.BY_PLACE: _Cause.BY_PLACE,
+    certificate.ELASTIC: _Cause.ELASTIC,
+    certificate.TOO_MUCH_BY_PLACE: _Cause.TOO_MUCH_BY_PLACE,
 }
 
 
@@ -85,7 +84,7 @@ class CertificateWatch:
     @property
     def certificates(self) -> tuple[Certificate, ...]:
         """All that were not taken back, in order."""
-        return tuple(last_certificate.certificate_of(self._constants, *certified) for certified in self._certified)
+        return tuple(certificate.certificate_of(self._constants, *certified) for certified in self._certified)
 
     @property
     def is_refusing(self) -> bool:
@@ -178,7 +177,7 @@ class CertificateWatch:
             case _Cause.TOO_MUCH_BY_PLACE:
                 lines = anchor.describe_place_refused(k, m)
             case _Cause.MORE_THAN_LAST:
-                lines = last_certificate.describe_more(m, self._last_utc)
+                lines = certificate.describe_more(m, self._last_utc)
         return lines
 
     def accept(self) -> Event:
@@ -195,7 +194,7 @@ class CertificateWatch:
                 anchor.accept(self._memory, refusal.torque_Nm, refusal.std_Nm)
                 what = f"the user accepts {torque} Nm as the zero of the sensors"
             case _Cause.MORE_THAN_LAST:
-                last_certificate.forget(self._memory)
+                certificate.forget(self._memory)
                 self._vouched_against = self._last
                 what = f"the user says that nobody touches the arm: {self._last} is not compared"
             case _:

@@ -19,15 +19,26 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.records import ArmBatch, ArmState, FaultReason, Request, SchemeState
+from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
 from adacd_hil.scheme.supervisor.transitions import (
+    ADAPTED,
+    AT_REST,
+    CERTIFIED,
+    COLLISION,
+    CONTACT,
+    FITTED,
     NEVER,
+    NOT_A_NUMBER,
+    OVER_LIMIT,
+    OVER_SPEED,
+    REFUTED,
     TRANSITIONS,
+    UNLOADED,
+    UNSEEN,
+    WITHHELD,
     ArmFinding,
     Calm,
-    Observation,
     SchemeEvent,
-    findings_of,
     next_state,
 )
 from adacd_hil.settings.configuration import Settings
@@ -39,20 +50,8 @@ REST_HOLD_S = 0.05
 UNREST_S = 0.02
 """How long an arm may move while its drives are asked to enable: one whose brakes have opened sags until it is held."""
 
-_NOT_A_NUMBER = int(Observation.NOT_A_NUMBER)
-_OVER_LIMIT = int(Observation.OVER_LIMIT)
-_OVER_SPEED = int(Observation.OVER_SPEED)
-_UNSEEN = int(Observation.UNSEEN)
-_AT_REST = int(Observation.AT_REST)
-_REST_UNLOADED = int(Observation.AT_REST | Observation.UNLOADED)
-_ADAPTED = int(Observation.ADAPTED)
-_FITTED = int(Observation.FITTED)
-_CERTIFIED = int(Observation.CERTIFIED)
-_REFUTED = int(Observation.REFUTED)
-_CONTACT = int(Observation.CONTACT)
-_COLLISION = int(Observation.COLLISION)
-_WITHHELD = int(Observation.WITHHELD)
-_ANY_CONTACT = _CONTACT | _COLLISION
+_REST_UNLOADED = AT_REST | UNLOADED
+_ANY_CONTACT = CONTACT | COLLISION
 
 POWERED = frozenset(
     (
@@ -96,22 +95,20 @@ _FAULT_ASKED = MappingProxyType(
 
 _RAISED_BY = MappingProxyType(
     {
-        SchemeEvent.COLLISION: _COLLISION,
-        SchemeEvent.CONTACT: _CONTACT,
+        SchemeEvent.COLLISION: COLLISION,
+        SchemeEvent.CONTACT: CONTACT,
         SchemeEvent.LATE: int(ArmFinding.LATE),
         SchemeEvent.COMPLETE: int(ArmFinding.COMPLETE),
         SchemeEvent.ENABLED: int(ArmFinding.ENABLED),
-        SchemeEvent.ADAPTED: _ADAPTED,
-        SchemeEvent.FITTED: _FITTED,
-        SchemeEvent.CERTIFIED: _CERTIFIED,
-        SchemeEvent.REFUTED: _REFUTED,
-        SchemeEvent.CONTRADICTED: _WITHHELD,
+        SchemeEvent.ADAPTED: ADAPTED,
+        SchemeEvent.FITTED: FITTED,
+        SchemeEvent.CERTIFIED: CERTIFIED,
+        SchemeEvent.REFUTED: REFUTED,
+        SchemeEvent.CONTRADICTED: WITHHELD,
     }
 )
 """Findings without which an event doesn't come. Those that are not here come by counting, or by a request."""
-_NOT_WELL = (
-    int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | _NOT_A_NUMBER | _OVER_LIMIT | _OVER_SPEED | _UNSEEN
-)
+_NOT_WELL = int(ArmFinding.FAULTY | ArmFinding.OLD | ArmFinding.LATE) | NOT_A_NUMBER | OVER_LIMIT | OVER_SPEED | UNSEEN
 """Findings without which `_check` finds nothing in an arm that is enabled."""
 
 
@@ -127,11 +124,11 @@ def _calm_in(state: SchemeState) -> tuple[int, int]:
     if state in POWERED:
         expected |= int(ArmFinding.ENABLED)
     if state in (SchemeState.COMMISSION, SchemeState.ADAPT):
-        watched |= _WITHHELD
+        watched |= WITHHELD
     if state is SchemeState.COMMISSION:
         expected |= int(ArmFinding.COMPLETE) | _REST_UNLOADED
     if state is SchemeState.ENABLE:
-        expected |= _AT_REST
+        expected |= AT_REST
     return watched | expected, expected
 
 
@@ -147,12 +144,12 @@ def _run_at_end(holds: NDArray[np.bool_], before: int) -> int:
 def _verdict(state: SchemeState, observation: int) -> SchemeEvent:
     """Return what the numbers say of a model that is learnt or tested, or none."""
     if state is SchemeState.ADAPT:
-        if observation & _ADAPTED:
+        if observation & ADAPTED:
             return SchemeEvent.ADAPTED
-        return SchemeEvent.FITTED if observation & _FITTED else SchemeEvent.NONE
-    if observation & _REFUTED:
+        return SchemeEvent.FITTED if observation & FITTED else SchemeEvent.NONE
+    if observation & REFUTED:
         return SchemeEvent.REFUTED
-    return SchemeEvent.CERTIFIED if observation & _CERTIFIED else SchemeEvent.NONE
+    return SchemeEvent.CERTIFIED if observation & CERTIFIED else SchemeEvent.NONE
 
 
 class Supervisor:
@@ -238,10 +235,10 @@ class Supervisor:
         """
         self._phase_cycles += arm.periods
         self._learning_cycles += arm.periods if self._state in LEARNING else 0
-        self._still_cycles = self._still_cycles + 1 if observation & _AT_REST else 0
-        self._moving_cycles = 0 if observation & _AT_REST else self._moving_cycles + 1
+        self._still_cycles = self._still_cycles + 1 if observation & AT_REST else 0
+        self._moving_cycles = 0 if observation & AT_REST else self._moving_cycles + 1
         self._cleared_cycles = 0 if observation & _ANY_CONTACT else self._cleared_cycles + 1
-        self._blind_cycles = self._blind_cycles + 1 if observation & _UNSEEN else 0
+        self._blind_cycles = self._blind_cycles + 1 if observation & UNSEEN else 0
         is_stale = max(*arm.age_q, *arm.age_tau_J) > 1
         self._stale_cycles = self._stale_cycles + 1 if is_stale else 0
         if request is not Request.NONE:
@@ -253,10 +250,6 @@ class Supervisor:
         if event is not SchemeEvent.NONE:
             self._enter(next_state(self._state, event, self._origin), event)
         return self._state
-
-    def findings(self, arms: ArmBatch) -> NDArray[np.int64]:
-        """Return what the arm says of itself in each cycle, bits of `ArmFinding` (n,)."""
-        return findings_of(arms)
 
     def calm(self, is_reporting: bool, goes_on: bool = False) -> Calm:
         """Return bounds within which cycles without a request change nothing here but what `pass_by` counts.
@@ -276,14 +269,14 @@ class Supervisor:
             case SchemeState.STOPPED if Request.RELEARN in self._pending or self._is_told_of_payload:
                 waits_for_rest = True
             case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
-                watched |= _CONTACT
-                expected |= _CONTACT
+                watched |= CONTACT
+                expected |= CONTACT
             case SchemeState.PAYLOAD:
                 waits_for_rest = bool(self._pending)
             case SchemeState.REACT if self._is_latched:
                 waits_for_rest = not is_reporting
             case SchemeState.REACT:
-                watched |= _COLLISION
+                watched |= COLLISION
                 periods = self._patience_cycles - self._phase_cycles
                 to_clear = self._clear_cycles - self._cleared_cycles
                 if to_clear > 1 or goes_on:
@@ -293,7 +286,7 @@ class Supervisor:
         if waits_for_rest and self._still_cycles:
             cycles = self._rest_cycles - self._still_cycles
         elif waits_for_rest:
-            watched |= _AT_REST
+            watched |= AT_REST
         return Calm(watched, expected, cycles - 1, periods)
 
     def pass_by(self, observations: NDArray[np.int64], periods: NDArray[np.int64]) -> None:
@@ -301,17 +294,17 @@ class Supervisor:
         elapsed = int(periods.sum())
         self._phase_cycles += elapsed
         self._learning_cycles += elapsed if self._state in LEARNING else 0
-        self._blind_cycles = _run_at_end(observations & _UNSEEN != 0, self._blind_cycles)
+        self._blind_cycles = _run_at_end(observations & UNSEEN != 0, self._blind_cycles)
         self._stale_cycles = 0  # where it counts, a stale value is not calm
-        self._still_cycles = _run_at_end(observations & _AT_REST != 0, self._still_cycles)
-        self._moving_cycles = _run_at_end(observations & _AT_REST == 0, self._moving_cycles)
+        self._still_cycles = _run_at_end(observations & AT_REST != 0, self._still_cycles)
+        self._moving_cycles = _run_at_end(observations & AT_REST == 0, self._moving_cycles)
         self._cleared_cycles = _run_at_end(observations & _ANY_CONTACT == 0, self._cleared_cycles)
         if self._state is SchemeState.COMMISSION:
             self._commissioned_cycles += observations.size
 
     def _has_grown(self, arm: ArmState, observation: int) -> bool:
         """Tell whether a contact that would clear itself has become one to be acknowledged."""
-        return bool(observation & _COLLISION) or arm.is_late or self._phase_cycles >= self._patience_cycles
+        return bool(observation & COLLISION) or arm.is_late or self._phase_cycles >= self._patience_cycles
 
     def _take(self, request: Request) -> None:
         """Keep a request if this state serves it sooner or later."""
@@ -371,7 +364,7 @@ class Supervisor:
         """Return COLLISION or CONTACT where this state reacts to it, or none; an arm without torque can't react."""
         if not observation & _ANY_CONTACT or not arm.is_enabled:
             return SchemeEvent.NONE
-        event = SchemeEvent.COLLISION if observation & _COLLISION else SchemeEvent.CONTACT
+        event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
         return event if event in TRANSITIONS[self._state] else SchemeEvent.NONE
 
     def _progress(self, arm: ArmState, observation: int, is_reporting: bool, goes_on: bool) -> SchemeEvent:
@@ -379,7 +372,7 @@ class Supervisor:
         event = SchemeEvent.NONE
         is_still = self._still_cycles >= self._rest_cycles
         match self._state:
-            case SchemeState.MONITOR if arm.is_late or observation & _WITHHELD:
+            case SchemeState.MONITOR if arm.is_late or observation & WITHHELD:
                 event = SchemeEvent.LATE if arm.is_late else SchemeEvent.CONTRADICTED
             case SchemeState.MONITOR | SchemeState.STOPPED if self._is_announced:
                 event = SchemeEvent.PAYLOAD_ANNOUNCED
@@ -422,7 +415,7 @@ class Supervisor:
 
         One whose data are not complete doesn't count and breaks nothing: how many may be missing, `_check` says.
         """
-        is_resting = observation & (_REST_UNLOADED | _WITHHELD) == _REST_UNLOADED
+        is_resting = observation & (_REST_UNLOADED | WITHHELD) == _REST_UNLOADED
         is_good = is_resting and self._check(arm, observation) is FaultReason.NONE
         self._commissioned_cycles = self._commissioned_cycles + arm.is_complete if is_good else 0
         return self._commissioned_cycles >= self._commission_cycles
@@ -447,7 +440,7 @@ class Supervisor:
         if fault is not FaultReason.NONE:
             return fault
         is_thrown = self._state is SchemeState.REACT and self._phase_cycles <= self._rebound_cycles
-        if observation & _OVER_LIMIT or (observation & _OVER_SPEED and not is_thrown):
+        if observation & OVER_LIMIT or (observation & OVER_SPEED and not is_thrown):
             return FaultReason.LIMIT
         if self._state in POWERED and not arm.is_enabled:
             return FaultReason.DRIVE
@@ -455,7 +448,7 @@ class Supervisor:
 
     def _check_data(self, arm: ArmState, observation: int) -> FaultReason:
         """Return why the data must not be acted on, or NONE."""
-        if observation & _NOT_A_NUMBER:
+        if observation & NOT_A_NUMBER:
             return FaultReason.NOT_A_NUMBER
         if max(*arm.age_q, *arm.age_tau_J) > self._max_age_cycles or self._stale_cycles > self._blind_limit:
             return FaultReason.DATA_AGE

@@ -164,6 +164,24 @@ class Observation(IntFlag):
     WITHHELD = 4096  # an anchor, a touch or a torque by place excludes what would be certified, or what is
 
 
+(
+    NOT_A_NUMBER,
+    OVER_LIMIT,
+    AT_REST,
+    UNLOADED,
+    ADAPTED,
+    CONTACT,
+    FITTED,
+    CERTIFIED,
+    REFUTED,
+    COLLISION,
+    OVER_SPEED,
+    UNSEEN,
+    WITHHELD,
+) = (int(bit) for bit in Observation)
+"""The same bits as plain numbers, which compiled code can read."""
+
+
 NEVER = 1 << 60
 """More cycles or periods than any run has."""
 

@@ -1,8 +1,9 @@
-"""What the arm's last certificate, of another run, says of friction and inertia: more than that is asked about.
+"""A certificate: what contradicts it, what it says of the arm, and what the last one, of another run, says of the next.
 
-A hand that drags from before the first motion to the end of learning, or moves like a mass, is the arm as far as one
-run can tell. The last certificate knows the arm without it, or with another. As within a run, **less is the arm's**: a
-fit gets no certificate while one of the quantities c of `earlier`, a joint's friction at some speed or an inertia, is
+**The last certificate.** A hand that drags from before the first motion to the end of learning, or moves like a mass,
+is the arm as far as one run can tell. The last certificate knows the arm without it, or with another. As within a run,
+**less is the arm's**: a fit gets no certificate while one of the quantities c of `earlier`, a joint's friction at some
+speed or an inertia, is
 
     c theta > last + floor + SIGMAS sqrt(share² last² + std² + c P c')
 
@@ -18,9 +19,11 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.identify import earlier
+from adacd_hil.scheme.identify import anchor, earlier, missing_torque
 from adacd_hil.settings.configuration import Settings
 
+NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, ELASTIC = range(8)
+"""What contradicts a certificate that is withheld, or taken back: of the kernel's `withheld_by`."""
 SIGMAS = 4.0
 FLOOR_NM, FLOOR_KGM2 = 0.02, 0.006
 """Of friction and of inertia: less is nothing."""
@@ -75,6 +78,32 @@ def begin(k: Any, m: Any) -> None:
 def forget(m: Any) -> None:
     """Compare no more with the last certificate: the user says that nobody touches the arm."""
     m["is_last_believed"] = 0.0
+
+
+@compiled
+def contradicted_by(k: Any, m: Any) -> int:
+    """Return what contradicts the fit: an anchor, the fit itself, what was kept, the last certificate, or nothing."""
+    cause = NOTHING
+    if not anchor.is_within(k, m, m["belief"], m["P_belief"]):
+        cause = ANCHOR
+    elif not (earlier.is_steady(m) and earlier.is_explained(k, m) and earlier.is_borne_out(k, m)):
+        cause = CHANGED
+    elif not earlier.is_no_more(k, m):
+        cause = MORE
+    if cause != NOTHING:
+        missing = missing_cause(k, m)
+        return missing if missing != NOTHING and cause == CHANGED else cause
+    if not anchor.is_place_bounded(k, m):
+        return TOO_MUCH_BY_PLACE
+    return NOTHING if is_no_more(k, m) else MORE_THAN_LAST
+
+
+@compiled
+def missing_cause(k: Any, m: Any) -> int:
+    """Return what the model lacks, by what this adaptation has learnt."""
+    if not missing_torque.is_found(k, m):
+        return NOTHING
+    return ELASTIC if m["is_elastic"] != 0.0 else BY_PLACE
 
 
 @compiled
