@@ -54,6 +54,15 @@ def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
 
 
 @compiled
+def _classic_bits(can_id: int, data: int, length: int) -> int:
+    """Count the bits of a classic frame. data: bytes as one integer."""
+    if can_id <= MAX_STANDARD_ID:
+        return _stuffed(can_id << 7 | length, _HEAD_BITS, data, length) + TAIL_BITS
+    head = ((can_id >> 18) << 2 | 3) << 25 | (can_id & 0x3FFFF) << 7 | length
+    return _stuffed(head, _EXTENDED_HEAD_BITS, data, length) + TAIL_BITS
+
+
+@compiled
 def _fd_stuff_bits(head: int, body: NDArray[np.uint8], code: int) -> tuple[int, int]:
     """Count the dynamic stuff bits of an FD frame: up to BRS, and from there to the end of the data."""
     run = 0
@@ -91,31 +100,24 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     The result raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
     switch and 11-bit identifier.
     """
-    stuffed = _stuffed
+    classic_bits = _classic_bits
     bits_to_ns = _round_up(bitrate)
     whole_ns = 1_000_000_000 // bitrate if 1_000_000_000 % bitrate == 0 else 0
 
-    def other(can_id: int, data: bytes) -> int:
-        length = len(data)
-        if length <= CLASSIC_BYTES:
-            value = int.from_bytes(data, "big", signed=True)
-            if can_id <= MAX_STANDARD_ID:
-                return bits_to_ns(stuffed(can_id << 7 | length, _HEAD_BITS, value, length) + TAIL_BITS)
-            head = ((can_id >> 18) << 2 | 3) << 25 | (can_id & 0x3FFFF) << 7 | length
-            return bits_to_ns(stuffed(head, _EXTENDED_HEAD_BITS, value, length) + TAIL_BITS)
-        plain = unstuffed_fd_bits(length)
+    def fd(can_id: int, data: bytes) -> int:
+        plain = unstuffed_fd_bits(len(data))
         body = np.frombuffer(data, dtype=np.uint8)
-        before, after = _fd_stuff_bits(can_id << 5 | 0b00101, body, FRAME_LENGTHS.index(length))
+        before, after = _fd_stuff_bits(can_id << 5 | 0b00101, body, FRAME_LENGTHS.index(len(data)))
         return bits_to_ns(plain.nominal + before) - (-(plain.data + after) * 1_000_000_000 // data_bitrate)
 
-    def classic(can_id: int, data: bytes, from_bytes: Callable[..., int] = int.from_bytes) -> int:
+    def exact(can_id: int, data: bytes, from_bytes: Callable[..., int] = int.from_bytes) -> int:
         length = len(data)
-        if length > CLASSIC_BYTES or can_id > MAX_STANDARD_ID:
-            return other(can_id, data)
-        bits = stuffed(can_id << 7 | length, _HEAD_BITS, from_bytes(data, "big", signed=True), length)
-        return (bits + TAIL_BITS) * whole_ns
+        if length > CLASSIC_BYTES:
+            return fd(can_id, data)
+        bits = classic_bits(can_id, from_bytes(data, "big", signed=True), length)
+        return bits * whole_ns if whole_ns else bits_to_ns(bits)
 
-    return classic if whole_ns else other
+    return exact
 
 
 def _round_up(bitrate: int) -> Callable[[int], int]:

@@ -72,6 +72,7 @@ class Bench:
         self._is_started = False
         scenario_seed = scenario.seed if seed is None else seed
         self._injector = Injector(scenario, scenario_seed, PLANNED_PERIOD_NS, codec, self._outbox, on_event)
+        self._plan = self._injector.plan
         self._body = self._build_body(scenario, scenario_seed)
         self._rows = TruthFeed(self._fill_truth, on_truth)
         self._nodes = BenchNodes(scenario, codec, self.contract, self._injector, self._body, self._is_wall)
@@ -114,7 +115,7 @@ class Bench:
     @property
     def is_acknowledged(self) -> bool:
         """Whether some device has power and is on the bus, so that what the host sends is acknowledged."""
-        return self._injector.plan.is_acknowledged
+        return self._plan.is_acknowledged
 
     @property
     def is_operational(self) -> bool:
@@ -173,12 +174,16 @@ class Bench:
         if can_id == self._sync_id:
             if self._injector.has_faults:
                 time.advance_faults(t_ns, self._time_to_sync_ns(data))
-            is_heard = self._injector.receive_by_all(can_id, data, self._on_sync, t_ns)
-            if not (is_heard or self._is_wall):
+            if self._plan.is_quiet:
+                self._on_sync(data, t_ns)
+            elif not self._injector.receive_by_all(can_id, data, self._on_sync, t_ns) and not self._is_wall:
                 self._miss_sync(data, t_ns)
         elif can_id in self._nodes.commands:
             for place, take in self._nodes.commands[can_id]:
-                self._injector.receive(place, can_id, data, take, time.now_ns)
+                if self._plan.is_quiet:
+                    take(data, time.now_ns)
+                else:
+                    self._injector.receive(place, can_id, data, take, time.now_ns)
         elif can_id in self._services:
             self._services[can_id](data, time.now_ns)
             time.poll(time.now_ns)
@@ -263,14 +268,14 @@ class Bench:
         late_ticks = late_ns // TICK_NS
         if late_ticks:
             self._nodes.move_arm(late_ticks)
-        is_for_all = self._nodes.listeners.takers(data) == self._nodes.listeners.everybody
-        if self._is_wall or (is_for_all and self._is_plain):
-            self._sample_and_send(data)
+        takers = self._nodes.listeners.takers(data)
+        if self._is_wall or (takers == self._nodes.listeners.everybody and self._is_plain):
+            self._sample_and_send(data, takers)
             if self._is_wall:
                 self._outbox.release(self.time.now_ns)
         else:
             self._outbox.collect(sync_ns + late_ns)
-            self._sample_and_send(data)
+            self._sample_and_send(data, takers)
             self._outbox.close(sync_ns, sync_ns + self._nodes.period_ns)
         self.time.note_sent()
         self._on_answer()
@@ -298,24 +303,23 @@ class Bench:
 
     def _fill_truth(self, block: Vector) -> None:
         self._body.truth(block)
-        block[_FAULTS] = self._injector.plan.mask
+        block[_FAULTS] = self._plan.mask
 
     @property
     def _is_plain(self) -> bool:
         """Whether all cyclic frames, undisturbed and without company, answer this SYNC."""
-        is_undisturbed = self._injector.is_quiet and self._outbox.due_ns >= self.time.now_ns + self._nodes.period_ns
+        is_undisturbed = self._plan.is_quiet and self._outbox.due_ns >= self.time.now_ns + self._nodes.period_ns
         return is_undisturbed and self._nodes.has_all_answers
 
-    def _sample_and_send(self, data: bytes) -> None:
-        """Give the nodes their samples, and let them send."""
+    def _sample_and_send(self, data: bytes, takers: Sequence[int]) -> None:
+        """Give the nodes their samples, and let them send; `takers`: 1 for each that takes this SYNC."""
         now_ns = self.time.now_ns
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
         measured = self._body.sample()
         listeners, order, lost = self._nodes.listeners, self._order, self._lost_syncs
-        takers = listeners.takers(data)
         heard: Sequence[int] = listeners.everybody
-        if self._injector.is_quiet and takers == heard:
+        if self._plan.is_quiet and takers == heard:
             if listeners.is_remembering or lost or order.kind is not SyncKind.RIGHT:
                 listeners.tell(heard, takers, order.kind, lost, now_ns)
             (position1, position2), (velocity1, velocity2), (torque1, torque2) = measured

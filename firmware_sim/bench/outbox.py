@@ -46,7 +46,8 @@ class Outbox:
         if self._is_open:
             self.put_later(self._now_ns, can_id, data)
         else:
-            self._put(can_id, data)
+            self.sent += 1
+            self._send(can_id, data)
 
     def _put(self, can_id: int, data: bytes) -> None:
         self.sent += 1

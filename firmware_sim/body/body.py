@@ -28,7 +28,7 @@ from firmware_sim.body.body_ticks import (
     fill_truth,
     sample_body,
 )
-from firmware_sim.body.motor import believed_torque, error_code, motor_numbers, motor_state, winding_temperature
+from firmware_sim.body.motor import error_code, motor_numbers, motor_state, winding_temperature
 from firmware_sim.body.sensors import (
     NOISE_TICKS,
     EncoderNoise,
@@ -135,6 +135,8 @@ class Body:
         self._number_vector = _pack_numbers(scenario)
         self._numbers: np.void = self._number_vector.view(BODY_NUMBERS)[0]
         motor = self._numbers["motor"]
+        self._gain, self._offset_Nm = motor["gain"].tolist(), motor["offset_Nm"].tolist()
+        self._can_overload = float(motor["can_overload"])
         self._is_never_limited = not motor["has_limits"] and np.array_equal(
             motor["peak_Nm"], scenario.arm.rated_torque_Nm
         )
@@ -156,21 +158,29 @@ class Body:
         self._arm: np.void = state["arm"]
         self._course: np.void = state["course"]
         self._motors: np.void = state["motor"]
+        self._is_limited: Vector = self._motors["is_limited"]
+        self._is_overheated: Vector = self._motors["is_overheated"]
+        self._is_spent: Vector = self._motors["is_spent"]
         self._tau_m: Vector = self._arm["tau_m"]
         self._temperature_C: Vector = self._arm["temperature_C"]
         self._velocity_rad_s: Vector = self._course["velocity_rad_s"]
-        self._arm["q"] = scenario.start_rad
-        state["motor"] = motor_state(scenario.drives)
+        self._put_at_start(REFERENCE_C if is_rigid else scenario.mechanics.ambient_C)
+        self._compile()
+
+    def _put_at_start(self, temperature_C: float) -> None:
+        """Fill the state at power-on."""
+        state: np.void = self._state_vector.view(BODY_STATE)[0]
+        self._arm["q"] = self.scenario.start_rad
+        state["motor"] = motor_state(self.scenario.drives)
         self._course["start_tick"] = -1.0
-        self._arm["temperature_C"] = REFERENCE_C if is_rigid else scenario.mechanics.ambient_C
-        fit_payload(self._arm, self._numbers["arm"], scenario.payload_kg)
+        self._arm["temperature_C"] = temperature_C
+        fit_payload(self._arm, self._numbers["arm"], self.scenario.payload_kg)
         mirror_stiff_joints(self._arm)
         encoder_rad = [read_angle(self._numbers["encoder"], i, self._arm["q_encoder"][i], 0.0) for i in range(2)]
         self._course["encoder_rad"] = self._course["estimate_rad"] = encoder_rad
         settle_transducer(
             self._numbers["transducer"], state["transducer"], *self._arm["tau_J"], *self._arm["temperature_C"]
         )
-        self._compile()
 
     @property
     def parts(self) -> BodyParts:
@@ -211,24 +221,26 @@ class Body:
     @property
     def motor_torque_Nm(self) -> tuple[float, float]:
         """Torque that the drives know from their motor currents, without the sensor's noise; 0x6077."""
-        tau1, tau2 = self._tau_m.tolist()
-        return believed_torque(self._numbers["motor"], 0, tau1), believed_torque(self._numbers["motor"], 1, tau2)
+        (gain1, gain2), (offset1_Nm, offset2_Nm) = self._gain, self._offset_Nm
+        tau1_Nm, tau2_Nm = self._tau_m.tolist()
+        return tau1_Nm / gain1 - offset1_Nm, tau2_Nm / gain2 - offset2_Nm
 
     @property
     def is_torque_limited(self) -> tuple[bool, bool]:
         """Whether each drive wants more torque than current limit, I²t or temperature leave; statusword bit 11."""
         if self._is_never_limited:
             return False, False
-        first, second = self._motors["is_limited"]
-        return bool(first), bool(second)
+        first, second = self._is_limited.tolist()
+        return first != 0.0, second != 0.0
 
     @property
     def motor_error_code(self) -> tuple[int, int]:
         """Error code that each motor's I²t or temperature calls for now, 0 for none; 0x603F."""
         if self._is_never_limited:
             return 0, 0
-        motor, motors = self._numbers["motor"], self._motors
-        return error_code(motor, motors, 0), error_code(motor, motors, 1)
+        heat1, heat2 = self._is_overheated.tolist()
+        spent1, spent2 = self._is_spent.tolist()
+        return error_code(heat1, spent1 * self._can_overload), error_code(heat2, spent2 * self._can_overload)
 
     @property
     def joint_temperature_C(self) -> tuple[float, float]:

@@ -173,15 +173,8 @@ def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> N
             state["is_spent"][joint] = 0.0
 
 
-def believed_torque(numbers: np.void, joint: int, tau_Nm: float) -> float:
-    """Give m above, Nm: what the drive makes of its current while the motor gives `tau_Nm`."""
-    return float(tau_Nm / numbers["gain"][joint] - numbers["offset_Nm"][joint])
-
-
-def error_code(numbers: np.void, state: np.void, joint: int) -> int:
-    """Give the error code that the motor's state calls for now, 0 for none."""
-    if state["is_overheated"][joint]:
+def error_code(is_overheated: float, is_overloaded: float) -> int:
+    """Give the error code that a motor calls for; overloaded: I²t is spent, and that is a fault. 0 for none."""
+    if is_overheated:
         return EXCESS_TEMPERATURE
-    if state["is_spent"][joint] and numbers["can_overload"]:
-        return CONTINUOUS_OVER_CURRENT
-    return 0
+    return CONTINUOUS_OVER_CURRENT if is_overloaded else 0

@@ -64,7 +64,8 @@ class Motors:
         return winding_temperature(self.numbers, self.state, joint)
 
     def error(self, joint: int = 0) -> int:
-        return error_code(self.numbers, self.state, joint)
+        is_overloaded = self.state["is_spent"][joint] * self.numbers["can_overload"]
+        return error_code(self.state["is_overheated"][joint], is_overloaded)
 
 
 def arm(**drives) -> Body:
