@@ -8,7 +8,7 @@ import pytest
 from bench_host import START, BenchHost, quiet_scenario
 from scipy import signal
 
-import firmware_sim.bench.bench
+import firmware_sim.bench.bench_nodes
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.device_settings import SensorSettings
 from firmware_sim.arm.scripted_contact import TICK_S
@@ -332,7 +332,7 @@ def test_a_sensor_of_smaller_range_flags_its_overload_in_the_frame(monkeypatch, 
     def make(device, codec, number, *_ends):
         return SensorNode(device, codec, number, converter_ends(scenario.sensors, number - 1))
 
-    monkeypatch.setattr(firmware_sim.bench.bench, "SensorNode", make)
+    monkeypatch.setattr(firmware_sim.bench.bench_nodes, "SensorNode", make)
     host = BenchHost(scenario)
     host.nmt(START)
     host.take()
@@ -352,5 +352,5 @@ def test_a_sensor_tells_the_temperature_of_its_joint(monkeypatch, temperature_C,
             return SensorNode(device, codec, number)
         return SensorNode(device, codec, number, temperature_C=lambda: temperature_C)
 
-    monkeypatch.setattr(firmware_sim.bench.bench, "SensorNode", make)
+    monkeypatch.setattr(firmware_sim.bench.bench_nodes, "SensorNode", make)
     assert BenchHost().read(3, 0x2111) == centidegrees
