@@ -1,35 +1,19 @@
 """Host and emulator in one process with a scenario's faults, in lockstep or on the real-time grid in virtual time."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from fault_table import Case, Expected, Wire, rows_of
-from queued_bus import QueuedBus
+from rig import CycleRig, Rig, SessionRig, scripted
 
-from adacd_hil.cli.connection import model_time
-from adacd_hil.clock import VirtualClock
-from adacd_hil.control.cycle import Cycle
-from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.pacing import GridPacer
-from adacd_hil.control.session import Session
-from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
-from adacd_hil.device.network import Master
-from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import parse
-from adacd_hil.wire.bus import BusError, EmbeddedBus, Frame, Tap
-from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench.bench import Bench
+from adacd_hil.wire.bus import BusError, Frame
 from firmware_sim.scenario.scenario import Scenario
 
-CODEC = load_codec()
-PERIOD_NS = 1_000_000
 AFTER_S = 1.2  # how long a run of the campaign goes on after the onset
 
 
@@ -130,58 +114,23 @@ def _late(outcome: Outcome, expected: Expected) -> list[str]:
     return lines
 
 
-def settings_of(finish_s: float, acknowledge_faults: int = 0) -> Settings:
-    script = (RequestSettings(at_s=finish_s, request="finish"),)
-    operator = OperatorSettings(
-        script=script,
-        acknowledge_after_s=0.6,
-        acknowledge_faults=acknowledge_faults,
-        acknowledge_fault_after_s=0.25,
-    )
-    return dataclasses.replace(load_settings("paper"), operator=operator)
-
-
 def scenario_of(rows: list[dict[str, Any]], seed: int = 1) -> Scenario:
     return parse(Scenario, {"name": "faults", "start_deg": [-30.0, -60.0], "seed": seed, "faults": rows})
 
 
-class _StepClock(VirtualClock):
-    """Lets the bench live through the time that passes, in steps of at most a period."""
+class _Watched(Rig):
+    """A rig that remembers what both kinds of run are judged by."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.bench: Bench | None = None
-        self.queue: QueuedBus | None = None
-
-    def sleep_until_ns(self, t_ns: int) -> None:
-        while self.now_ns() < t_ns:
-            super().sleep_until_ns(min(t_ns, (self.now_ns() // PERIOD_NS + 1) * PERIOD_NS))
-            if self.bench is not None:
-                self.bench.advance_to(self.now_ns())
-                self.follow()
-
-    def follow(self) -> None:
-        """Let the bus be acknowledged as the faults say."""
-        if self.bench is None or self.queue is None:
-            return
-        if self.queue.is_acknowledged != self.bench.is_acknowledged:
-            self.queue.is_acknowledged = self.bench.is_acknowledged
-
-
-class _Watched:
-    """What both rigs remember of a run."""
-
-    def __init__(self) -> None:
+    def __init__(self, *place: Any, **parts: Any) -> None:
         self.edges: list[tuple[int, str]] = []
         self.masks: list[int] = []
         self.wire: list[tuple[int, int]] = []
-        self.bus: EmbeddedBus
-        self.bench: Bench
         self._syncs = 0
         self._is_in_frame = False
+        super().__init__(*place, on_truth=self._on_truth, on_event=self._on_event, **parts)
 
     @property
-    def cycle(self) -> int:
+    def host_cycle(self) -> int:
         """The host's cycle whose SYNC is on the bus; between two SYNCs, that of the next."""
         return self._syncs - 1 if self._is_in_frame else self._syncs
 
@@ -189,19 +138,19 @@ class _Watched:
         """Pass on what the host sends."""
         self._syncs += frame.can_id == 0x080
         self._is_in_frame = True
-        self.bench.on_frame(frame)
+        super().on_frame(frame)
         self._is_in_frame = False
 
     def deliver(self, can_id: int, data: bytes) -> None:
         """Pass on what a device sends."""
         if self.edges:
-            self.wire.append((self.cycle, can_id))
-        self.bus.deliver(can_id, data)
+            self.wire.append((self.host_cycle, can_id))
+        super().deliver(can_id, data)
 
-    def on_event(self, _t_ns: int, _level: str, _name: str, text: str) -> None:
-        self.edges.append((self.cycle, text))
+    def _on_event(self, _t_ns: int, _level: str, _name: str, text: str) -> None:
+        self.edges.append((self.host_cycle, text))
 
-    def on_truth(self, _cycle: int, _t_ns: int, block: Any) -> None:
+    def _on_truth(self, _cycle: int, _t_ns: int, block: Any) -> None:
         self.masks.append(int(block[-1]))
 
     def outcome(self, fault: str, error: str, log: RunLog) -> Outcome:
@@ -212,66 +161,34 @@ class _Watched:
         return Outcome(fault, error, onsets[0] if onsets else -1, faulted, log, self.edges, self.masks, self.wire)
 
 
+class _WatchedSession(_Watched, SessionRig):
+    """A session on the modelled bus, watched."""
+
+
+class _WatchedCycle(_Watched, CycleRig):
+    """A real-time cycle over a transmit queue, watched."""
+
+
 def run_lockstep(
     folder: Path, rows: list[dict[str, Any]], finish_s: float = 2.0, acknowledge_faults: int = 0, seed: int = 1
 ) -> Outcome:
     """Run a session in lockstep on the embedded bus."""
-    watched = _Watched()
-    settings = settings_of(finish_s, acknowledge_faults)
-    clock = VirtualClock()
-    embedded = watched.bus = EmbeddedBus(clock)
-    watched.bench = Bench(
-        scenario_of(rows, seed), CODEC, watched.deliver, on_truth=watched.on_truth, on_event=watched.on_event
-    )
-    embedded.attach(watched.on_frame)
-    watched.bench.boot()
-    bus = model_time(embedded, clock, CODEC, settings)
-    operator = ScriptedOperator(settings.operator)
-    summary = Session(settings, CODEC, bus, clock, operator, folder, "embedded").run()
-    fault = summary.result.fault.name if summary.result is not None else ""
-    return watched.outcome(fault, summary.error, read_log(summary.log.path))
+    settings = scripted("paper", finish_s, acknowledge_after_s=0.6, acknowledge_faults=acknowledge_faults)
+    rig = _WatchedSession(folder, settings, scenario_of(rows, seed), is_modelled=True)
+    summary, log = rig.run()
+    return rig.outcome(summary.result.fault.name if summary.result is not None else "", summary.error, log)
 
 
 def run_realtime(
     folder: Path, rows: list[dict[str, Any]], finish_s: float = 2.0, seed: int = 1, queue_frames: int = 10
 ) -> Outcome:
     """Run the real-time cycle in virtual time against a bench that goes by the clock, over a transmit queue."""
-    watched = _Watched()
-    settings = settings_of(finish_s)
-    clock = _StepClock()
-    bus = watched.bus = EmbeddedBus(clock)
-    queue = clock.queue = QueuedBus(bus, queue_frames)
-    bench = watched.bench = clock.bench = Bench(
-        scenario_of(rows, seed),
-        CODEC,
-        watched.deliver,
-        clock_mode="wall",
-        on_truth=watched.on_truth,
-        on_event=watched.on_event,
-    )
-
-    def on_frame(frame: Frame) -> None:
-        watched.on_frame(frame)
-        clock.follow()
-
-    bus.attach(on_frame)
-    bench.boot()
-    tap = Tap(queue, clock)
-    arm = Arm(settings, CODEC, tap)
-    master = Master(settings, CODEC, tap)
-    pacer = GridPacer(clock, settings.bus.period_ns)
-    cycle = Cycle(settings, tap, arm, master, pacer, ScriptedOperator(settings.operator), lambda _: None, clock)
-    cycle.compile()
-    path = folder / "run.mcap"
-    fault, error = "", ""
-    with Recorder(path, blocking=True) as recorder:
-        try:
-            master.reset()
-            master.configure()
-            master.start()
-            result = cycle.run(recorder)
-            fault = result.fault.name
-        except (BusError, DeviceError) as failure:
-            error = str(failure)
-            recorder.cycle(clock.now_ns(), [], tap.take())
-    return watched.outcome(fault or FaultReason.NONE.name, error, read_log(path))
+    settings = scripted("paper", finish_s, acknowledge_after_s=0.6)
+    rig = _WatchedCycle(folder, settings, scenario_of(rows, seed), queue_length=queue_frames, is_wall=True)
+    fault, error = FaultReason.NONE.name, ""
+    try:
+        fault = rig.run().fault.name
+    except (BusError, DeviceError) as failure:
+        error = str(failure)
+        rig.recorder.cycle(rig.clock.now_ns(), [], rig.tap.take())
+    return rig.outcome(fault, error, rig.read())

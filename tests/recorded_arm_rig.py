@@ -1,6 +1,5 @@
 """What the arm reported in each cycle of a live run, and what its log says of it."""
 
-import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,21 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from fault_rig import scenario_of
 from numpy.typing import NDArray
+from rig import SessionRig, scripted
 
-from adacd_hil.cli.connection import model_time
-from adacd_hil.clock import VirtualClock
-from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.session import Session
 from adacd_hil.device.arm_watch import ArmWatch
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.log.reader import RunLog
 from adacd_hil.records import ArmBatch, ArmState
-from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.wire.bus import EmbeddedBus
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
-from firmware_sim.bench.bench import Bench
 
 
 class Live(NamedTuple):
@@ -63,22 +56,13 @@ def play(
     folder: Path, rows: list[dict[str, Any]], config: str = "paper", finish_s: float = 1.0, acknowledge_faults: int = 0
 ) -> Live:
     """Run a session in lockstep with a scenario's faults."""
-    operator = OperatorSettings(
-        script=(RequestSettings(at_s=finish_s, request="finish"),),
-        acknowledge_faults=acknowledge_faults,
-        acknowledge_fault_after_s=0.05,
-    )
-    settings = dataclasses.replace(load_settings(config), operator=operator)
+    operator = {"acknowledge_faults": acknowledge_faults, "acknowledge_fault_after_s": 0.05}
+    settings = scripted(config, finish_s, **operator)
     codec = load_contract(settings)
-    clock = VirtualClock()
-    embedded = EmbeddedBus(clock)
-    bench = Bench(scenario_of(rows), codec, embedded.deliver)
-    embedded.attach(bench.on_frame)
-    bench.boot()
-    bus = model_time(embedded, clock, codec, settings)
+    rig = SessionRig(folder, settings, scenario_of(rows), codec=codec, is_modelled=True)
     with live_states() as states:
-        summary = Session(settings, codec, bus, clock, ScriptedOperator(operator), folder, "embedded").run()
-    return Live(settings, codec, states, read_log(summary.log.path))
+        _, log = rig.run()
+    return Live(settings, codec, states, log)
 
 
 def ticks_of(log: RunLog) -> Ticks:

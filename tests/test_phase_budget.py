@@ -6,9 +6,9 @@ SYNC and feedback take 565 µs at worst, the two commands 230, which leaves the 
 from pathlib import Path
 from typing import Any
 
-import lockstep_rig
 import numpy as np
 import pytest
+from rig import play_lockstep
 
 from adacd_hil.log.reader import RunLog
 from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
@@ -19,7 +19,7 @@ def play(folder: Path, schedule: str = "same_cycle", **lockstep: Any) -> tuple[R
     """Run an idle arm for half a second with frames as long as can be; give log, and identifiers as they arrive."""
     operator = OperatorSettings(script=(RequestSettings(at_s=0.5, request="finish"),))
     settings = LockstepSettings(**({"stuffing": "worst"} | lockstep))
-    log, arrived = lockstep_rig.play(folder, operator, settings, bus=BusSettings(schedule=schedule))
+    log, arrived = play_lockstep(folder, operator, settings, bus=BusSettings(schedule=schedule))
     return log, [frame.can_id for frame in arrived]
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lockstep_rig import play
+from rig import play_lockstep
 
 from adacd_hil.log.reader import RunLog
 from adacd_hil.settings.bus_settings import LockstepSettings
@@ -28,7 +28,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunLog, list[Frame
         script=(RequestSettings(at_s=2.0, request="finish"),), acknowledge_faults=1, acknowledge_fault_after_s=0.5
     )
     folder = tmp_path_factory.mktemp("power loss")
-    return play(folder, operator, LockstepSettings(), parse(Scenario, dict(SCENARIO)))
+    return play_lockstep(folder, operator, LockstepSettings(), parse(Scenario, dict(SCENARIO)))
 
 
 def messages(log: RunLog) -> list[str]:

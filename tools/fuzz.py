@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Protocol
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fuzz")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "fuzz")]
 
 from fuzz_frames import CanFrame, damaged, fuzz, record_legal_traffic  # noqa: E402 (they are the tests')
 from fuzz_receivers import (  # noqa: E402

@@ -5,14 +5,13 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from rig import Rig
 
 from adacd_hil.cli.main import cli
 from adacd_hil.clock import Clock
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.settings.schema import parse
-from adacd_hil.wire.bus import Bus, EmbeddedBus
-from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench.bench import Bench
+from adacd_hil.wire.bus import Bus
 from firmware_sim.scenario.scenario import Scenario
 
 USAGE, BUS_MISSING = 2, 5
@@ -36,13 +35,10 @@ class Lab:
         monkeypatch.setattr("adacd_hil.cli.connection.is_virtual", lambda interface, channel: True)
 
     def _open_bus(self, interface: str, channel: str, clock: Clock, *_: object) -> Bus:
-        bus = EmbeddedBus(clock)
-        bench = Bench(parse(Scenario, self.scenario), load_codec(), bus.deliver)
+        rig = Rig(scenario=parse(Scenario, self.scenario), clock=clock)
         for index, serial in self.serials.items():
-            bench.devices[index].serve(0x1018, 4, lambda serial=serial: serial)
-        bus.attach(bench.on_frame)
-        bench.boot()
-        return bus
+            rig.bench.devices[index].serve(0x1018, 4, lambda serial=serial: serial)
+        return rig.bus
 
     def tare(self, *arguments: str) -> Result:
         return CliRunner().invoke(cli, ["tare", *ON_BUS, "--seconds", "0.3", "--out", str(self.tare_file), *arguments])

@@ -4,7 +4,7 @@ import json
 import re
 from pathlib import Path
 
-from bench_bus import BenchBus
+from rig import Rig
 
 from adacd_hil.analysis.report.page import number_text
 from adacd_hil.cli.commands.commtest_command import as_text, describe, write_pictures
@@ -12,7 +12,7 @@ from adacd_hil.commission.communication_test import CommunicationReport, Communi
 from adacd_hil.commission.zero_torque import ZeroTorqueLoop
 
 
-def played(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
+def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
     rig.start()
     rig.tap.take()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
@@ -22,12 +22,12 @@ def played(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, Commu
     return described | {"fault": "NONE", "device_faults": [], "events": []}, test.report()
 
 
-def judged(rig: BenchBus, scheduler: str = "SCHED_FIFO 80") -> dict:
+def judged(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> dict:
     return played(rig, scheduler)[0]
 
 
 def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
-    lines = as_text(judged(BenchBus())).splitlines()
+    lines = as_text(judged(Rig(is_wall=True))).splitlines()
     assert lines[0].startswith("cycles 200, complete 200, overruns 0, period 1000 µs, SCHED_FIFO 80, bus load ")
     assert lines[1] == "Drive1: fresh in 100.00 % of the periods; unprotected, 0 implausible"
     assert lines[3].startswith("Sensor1: fresh in 100.00 % of the periods; 220 OK")
@@ -40,12 +40,12 @@ def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
 
 def test_the_load_is_that_of_the_cyclic_frames() -> None:
     # 657 bits without stuffing, 795 at worst, of 1000 per period; status frames and heartbeats every 100 ms
-    assert 65.0 < judged(BenchBus())["load_percent"] < 81.0
+    assert 65.0 < judged(Rig(is_wall=True))["load_percent"] < 81.0
 
 
 def test_a_silent_device_and_a_missing_priority_are_warned_of() -> None:
-    rig = BenchBus()
-    rig.tamper = lambda can_id, data: None if can_id == 0x184 else data
+    rig = Rig(is_wall=True)
+    rig.tamper = lambda cycle, can_id, data: None if can_id == 0x184 else data
     described = judged(rig, "SCHED_OTHER")
     assert described["warnings"] == [
         "without real-time priority (SCHED_OTHER) the times are those of a busy desktop",
@@ -58,12 +58,12 @@ def test_a_silent_device_and_a_missing_priority_are_warned_of() -> None:
 
 
 def test_the_report_is_json() -> None:
-    described = judged(BenchBus())
+    described = judged(Rig(is_wall=True))
     assert json.loads(json.dumps(described)) == described
 
 
 def test_the_pictures_are_those_of_the_report_with_the_numbers_of_the_test(tmp_path: Path) -> None:
-    described, report = played(BenchBus())
+    described, report = played(Rig(is_wall=True))
     paths = write_pictures(tmp_path, report, described)
     assert [path.name for path in paths] == ["commtest.html", "timing-distributions.png", "timing-line.png"]
     assert {path.read_bytes()[:4] for path in paths[1:]} == {b"\x89PNG"}
@@ -75,6 +75,6 @@ def test_the_pictures_are_those_of_the_report_with_the_numbers_of_the_test(tmp_p
 
 
 def test_a_test_without_a_cycle_has_no_pictures(tmp_path: Path) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     report = CommunicationTest(rig.settings, rig.arm, 1_000_000).report()
     assert write_pictures(tmp_path, report, {}) == []

@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable
 
 import pytest
-from bench_bus import CODEC, BenchBus
+from rig import CODEC, Rig
 
 from adacd_hil.cli.commands.doctor_command import as_json, as_text
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
@@ -21,7 +21,7 @@ PASSED = ("kernel", "interface", "controller")
 EARLIER = [Finding(name, Status.OK, "", "") for name in PASSED]
 
 
-def doctor(rig: BenchBus, ask: Callable[[str], None] | None = None) -> dict[str, Finding]:
+def doctor(rig: Rig, ask: Callable[[str], None] | None = None) -> dict[str, Finding]:
     patient = ArmExamination(
         rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None, ask=ask, cycle_s=0.4, move_s=1.0
     )
@@ -35,7 +35,7 @@ def statuses(findings: dict[str, Finding], status: Status) -> list[str]:
 
 
 def test_a_sound_arm_passes_everything_but_what_it_lacks() -> None:
-    findings = doctor(BenchBus())
+    findings = doctor(Rig(is_wall=True))
     assert statuses(findings, Status.FAILED) == []
     assert statuses(findings, Status.WARNING) == ["protection"]
     assert statuses(findings, Status.SKIPPED) == ["joint 1", "joint 2"]
@@ -44,7 +44,7 @@ def test_a_sound_arm_passes_everything_but_what_it_lacks() -> None:
 
 
 def test_the_drives_are_asked_for_no_voltage_only_and_the_nodes_end_pre_operational() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     doctor(rig)
     commands = [frame for frame in rig.sent if frame.can_id in (0x201, 0x202)]
     assert len(commands) > 800
@@ -53,7 +53,7 @@ def test_the_drives_are_asked_for_no_voltage_only_and_the_nodes_end_pre_operatio
 
 
 def test_another_master_stops_the_examination_before_anything_is_sent() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
     findings = doctor(rig)
@@ -74,7 +74,7 @@ def test_another_master_stops_the_examination_before_anything_is_sent() -> None:
     ],
 )
 def test_each_kind_of_host_frame_shows_another_master(can_id: int, doing: str) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.bus.deliver(can_id, b"\x05\x00\x00\x00\x00\x00")
     assert doctor(rig)["other masters"].reason == f"somebody else {doing}"
 
@@ -92,7 +92,7 @@ def test_each_kind_of_host_frame_shows_another_master(can_id: int, doing: str) -
 )
 def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync: str, can_id: int, status: Status) -> None:
     base = load_settings("paper")
-    rig = BenchBus(dataclasses.replace(base, bus=dataclasses.replace(base.bus, arms=2, sync=sync)))
+    rig = Rig(dataclasses.replace(base, bus=dataclasses.replace(base.bus, arms=2, sync=sync)), is_wall=True)
     patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
     patient.connect()
     rig.bus.deliver(can_id, b"\x01")
@@ -100,7 +100,7 @@ def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync: str, ca
 
 
 def test_a_missing_node_fails_and_nothing_is_reset() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.silence(2)
     findings = doctor(rig)
     assert findings["nodes"].reason == "node 2: missing: Drive2 expected"
@@ -109,7 +109,7 @@ def test_a_missing_node_fails_and_nothing_is_reset() -> None:
 
 
 def test_another_contract_is_told_and_stops_the_set_up(tmp_path) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     other = tmp_path / "other.dbc"
     other.write_bytes(CODEC.text.replace(b"0|32@1- (5.9921124526782858e-06,0)", b"0|32@1- (5e-06,0)"))
     patient = ArmExamination(rig.settings, load_codec(other), rig.clock, lambda: rig.bus, lambda: None)
@@ -119,7 +119,7 @@ def test_another_contract_is_told_and_stops_the_set_up(tmp_path) -> None:
     assert findings["set-up"].reason == "needs `contract`, which failed"
 
 
-def break_pdo_map(rig: BenchBus, index: int, subindex: int, value: int) -> None:
+def break_pdo_map(rig: Rig, index: int, subindex: int, value: int) -> None:
     """Let a device answer SDO with another mapping than it has."""
     rig.bench.devices[0].serve(index, subindex, lambda: value)
 
@@ -135,7 +135,7 @@ def break_pdo_map(rig: BenchBus, index: int, subindex: int, value: int) -> None:
     ],
 )
 def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, value: int, reason: str) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     break_pdo_map(rig, index, subindex, value)
     patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
     patient.connect()
@@ -145,7 +145,7 @@ def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, v
 
 
 def test_an_object_mapped_with_another_width_is_told_though_the_length_is_right() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     break_pdo_map(rig, 0x1A00, 1, 0x60640010)
     break_pdo_map(rig, 0x1A00, 2, 0x606C0030)
     patient = ArmExamination(rig.settings, CODEC, rig.clock, lambda: rig.bus, lambda: None)
@@ -153,12 +153,12 @@ def test_an_object_mapped_with_another_width_is_told_though_the_length_is_right(
     assert "Drive1Feedback.position: 0x6064 with 16 bits at bit 0" in check_pdo_map(patient).reason
 
 
-def change_torque(rig: BenchBus, change: Callable[[int, float], float]) -> None:
+def change_torque(rig: Rig, change: Callable[[int, float], float]) -> None:
     """Let sensor 1 measure something else: `change` of (frame's number, torque)."""
     message = CODEC.message("Sensor1Torque")
     sender, count = message.sender(), [0]
 
-    def tamper(can_id: int, data: bytes) -> bytes:
+    def tamper(cycle: int, can_id: int, data: bytes) -> bytes:
         if can_id != message.can_id:
             return data
         count[0] += 1
@@ -180,7 +180,7 @@ def change_torque(rig: BenchBus, change: Callable[[int, float], float]) -> None:
 def test_a_torque_that_is_not_plausible_at_rest_is_told(
     change: Callable[[int, float], float], name: str, status: Status, text: str
 ) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     change_torque(rig, change)
     finding = doctor(rig)[name]
     assert finding.status is status
@@ -188,10 +188,10 @@ def test_a_torque_that_is_not_plausible_at_rest_is_told(
 
 
 def test_a_saturated_sensor_is_told() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     sender = CODEC.message("Sensor1Torque").sender()
 
-    def saturate(can_id: int, data: bytes) -> bytes:
+    def saturate(cycle: int, can_id: int, data: bytes) -> bytes:
         if can_id == 0x183:  # the header's status nibble
             return sender.protect(bytearray(data[:1] + b"\x20" + data[2:]))
         return b"\x02" + data[1:] if can_id == 0x283 else data
@@ -204,10 +204,10 @@ def test_a_saturated_sensor_is_told() -> None:
 
 
 def test_a_moving_arm_fails_rest_and_leaves_its_torque_unjudged() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     message = CODEC.message("Drive1Feedback")
 
-    def move(can_id: int, data: bytes) -> bytes:
+    def move(cycle: int, can_id: int, data: bytes) -> bytes:
         if can_id != message.can_id:
             return data
         position, _ = message.decode_values(data)
@@ -220,17 +220,17 @@ def test_a_moving_arm_fails_rest_and_leaves_its_torque_unjudged() -> None:
 
 
 def test_a_node_without_heartbeat_is_told() -> None:
-    rig = BenchBus()
-    rig.tamper = lambda can_id, data: None if can_id == 0x704 and data != b"\x00" else data
+    rig = Rig(is_wall=True)
+    rig.tamper = lambda cycle, can_id, data: None if can_id == 0x704 and data != b"\x00" else data
     finding = doctor(rig)["heartbeat"]
     assert (finding.status, finding.reason) == (Status.FAILED, "no heartbeat from Sensor2")
 
 
 def test_lost_feedback_fails_the_rate() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     count = [0]
 
-    def lose(can_id: int, data: bytes) -> bytes | None:
+    def lose(cycle: int, can_id: int, data: bytes) -> bytes | None:
         count[0] += can_id == 0x181
         return None if can_id == 0x181 and count[0] % 5 == 0 else data
 
@@ -240,14 +240,14 @@ def test_lost_feedback_fails_the_rate() -> None:
     assert "80.0 % of the periods complete" in finding.reason
 
 
-def move_by_hand(rig: BenchBus, speed_rad_s: tuple[float, float], torque_Nm: float) -> Callable[[str], None]:
+def move_by_hand(rig: Rig, speed_rad_s: tuple[float, float], torque_Nm: float) -> Callable[[str], None]:
     """Return an `ask` at which, asked for joint 1, the joints begin to move and both sensors see a torque."""
     drives = [CODEC.message(f"Drive{joint}Feedback") for joint in (1, 2)]
     sensors = [CODEC.message(f"Sensor{joint}Torque") for joint in (1, 2)]
     senders = {message.can_id: message.sender() for message in sensors}
     begin_ns: list[int] = []
 
-    def tamper(can_id: int, data: bytes) -> bytes:
+    def tamper(cycle: int, can_id: int, data: bytes) -> bytes:
         if can_id in senders:
             (measured_Nm,) = CODEC.by_id[can_id].decode_values(data)
             pushed_Nm = torque_Nm if begin_ns and rig.clock.now_ns() > begin_ns[0] + 5_000_000 else 0.0
@@ -282,7 +282,7 @@ def move_by_hand(rig: BenchBus, speed_rad_s: tuple[float, float], torque_Nm: flo
 def test_a_joint_moved_by_hand_tells_its_order_and_signs(
     speed_rad_s: tuple[float, float], torque_Nm: float, status: Status, text: str
 ) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     finding = doctor(rig, move_by_hand(rig, speed_rad_s, torque_Nm))["joint 1"]
     assert finding.status is status
     assert text in finding.reason

@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from bench_bus import CODEC, BenchBus
 from click.testing import CliRunner
+from rig import CODEC, Rig
 
 from adacd_hil.cli.commands.monitor_command import Monitor, Screen, as_text
 from adacd_hil.cli.connection import Connection
@@ -12,12 +12,12 @@ from adacd_hil.cli.main import cli
 from adacd_hil.wire.bus import Frame
 
 
-def monitor(rig: BenchBus, node_id: int | None = None) -> Monitor:
+def monitor(rig: Rig, node_id: int | None = None) -> Monitor:
     return Monitor(Connection("embedded", "embedded", None, "paper", None, None), rig.bus, rig.clock, node_id)
 
 
 def test_the_table_shows_nodes_messages_and_load() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
     rig.bus.deliver(0x055, b"\xab\xcd")
@@ -34,7 +34,7 @@ def test_the_table_shows_nodes_messages_and_load() -> None:
 
 
 def test_the_node_filter_shows_one_node() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
     watched = monitor(rig, node_id=3)
@@ -47,7 +47,7 @@ def test_the_node_filter_shows_one_node() -> None:
 
 
 def test_frames_that_this_computer_dropped_are_not_counted_against_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
     inner = rig.bus.receive
@@ -70,7 +70,7 @@ def test_frames_that_this_computer_dropped_are_not_counted_against_the_sensor(mo
 
 
 def test_a_full_bus_ends_in_time_and_misses_nothing() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     inner = rig.bus.receive
 
     def flood(timeout_s: float) -> Frame:  # a frame is always waiting
@@ -116,7 +116,7 @@ def test_json_is_one_snapshot() -> None:
 
 
 def test_every_signal_of_the_contract_can_be_shown() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     watched = monitor(rig)
     for message in CODEC.messages.values():
         data = message.sender().protect(bytearray(message.length)) if message.is_protected else bytes(message.length)

@@ -2,20 +2,20 @@
 
 import json
 
-from bench_bus import CODEC, BenchBus
+from rig import CODEC, Rig
 
 from adacd_hil.cli.commands.scan_command import as_text, describe
 from adacd_hil.device.survey import compare, expected_nodes, survey
 from adacd_hil.wire.codec import Codec, parse_codec
 
 
-def scanned(rig: BenchBus, codec: Codec = CODEC) -> dict:
+def scanned(rig: Rig, codec: Codec = CODEC) -> dict:
     found = survey(rig.bus, rig.clock, contract_ids={1, 2, 3, 4})
     return describe(found, compare(found, expected_nodes(rig.master.slaves, codec)), codec)
 
 
 def test_the_table_shows_nodes_what_they_send_and_whether_they_fit() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
     rig.bus.deliver(0x055, b"\x01")
@@ -32,7 +32,7 @@ def test_the_table_shows_nodes_what_they_send_and_whether_they_fit() -> None:
 
 
 def test_the_table_names_who_is_missing() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.silence(4)
     lines = as_text(scanned(rig)).splitlines()
     assert lines[4].endswith("missing: Sensor2 expected")
@@ -40,7 +40,7 @@ def test_the_table_names_who_is_missing() -> None:
 
 
 def test_nodes_that_only_answer_are_not_taken_for_silence() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.forget()
     text = as_text(scanned(rig))
     assert "nothing was heard" not in text
@@ -53,8 +53,8 @@ def test_nodes_that_only_answer_are_not_taken_for_silence() -> None:
 
 
 def test_an_empty_bus_is_said_to_be() -> None:
-    rig = BenchBus()
-    rig.tamper = lambda can_id, data: None
+    rig = Rig(is_wall=True)
+    rig.tamper = lambda cycle, can_id, data: None
     rig.forget()
     text = as_text(scanned(rig))
     assert "nothing was heard in 1.5 s" in text
@@ -62,7 +62,7 @@ def test_an_empty_bus_is_said_to_be() -> None:
 
 
 def test_the_result_is_json() -> None:
-    described = scanned(BenchBus())
+    described = scanned(Rig(is_wall=True))
     assert json.loads(json.dumps(described)) == described
     assert described["contract"] == {"name": "arm.dbc", "wire_version": 1, "layout_digest": "0xF80FDAE0"}
     assert {node["layout_digest"] for node in described["nodes"]} == {"0xF80FDAE0"}
@@ -73,7 +73,7 @@ def test_nodes_with_another_layout_are_told_apart() -> None:
     text = CODEC.text.replace(b"@1- (1e-06,0)", b"@1- (2e-06,0)")
     other = parse_codec(text, CODEC.path)
     assert other.layout_digest != CODEC.layout_digest
-    described = scanned(BenchBus(), other)
+    described = scanned(Rig(is_wall=True), other)
     digest = f"0x{other.layout_digest:08X}"
     assert [node["verdict"] for node in described["nodes"]] == [
         f"{name} expected; layout digest 0xF80FDAE0, the contract has {digest}"
@@ -85,8 +85,8 @@ def test_nodes_with_another_layout_are_told_apart() -> None:
 
 
 def test_a_node_that_tells_no_digest_is_different() -> None:
-    rig = BenchBus()
-    rig.tamper = lambda can_id, data: None if can_id == 0x583 and data[1:4] == bytes.fromhex("002002") else data
+    rig = Rig(is_wall=True)
+    rig.tamper = lambda cycle, can_id, data: None if can_id == 0x583 and data[1:4] == bytes.fromhex("002002") else data
     described = scanned(rig)
     verdicts = {node["node"]: node["verdict"] for node in described["nodes"]}
     assert verdicts[3] == "Sensor1 expected; does not answer SDO"

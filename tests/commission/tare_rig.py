@@ -5,16 +5,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from rig import CODEC, Rig
 
-from adacd_hil.clock import VirtualClock
 from adacd_hil.commission.tare_session import TareSession
 from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
-from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario
 
-CODEC = load_codec()
 FEEDBACK_IDS, TORQUE_IDS = (0x181, 0x182), (0x183, 0x184)
 WINDOW_S = 0.3
 SETTLED_CYCLE = 200  # the first pose is measured from here on
@@ -32,11 +28,11 @@ def tare_settings(estimator: dict[str, Any] | None = None, arm: dict[str, Any] |
     )
 
 
-class TareRig:
+class TareRig(Rig):
     """A tare session with the emulator. Angles in rad, joint torques in Nm, all in device direction.
 
     `hand`: pose offset (2,) by cycle, added to what the encoders say. `push`: torque (2,) by cycle and pose, added to
-    what the sensors say. `tamper`: drops (None) or changes a frame of the devices.
+    what the sensors say.
     """
 
     def __init__(
@@ -46,42 +42,30 @@ class TareRig:
         old_offset_Nm: tuple[float, float] = (0.0, 0.0),
         **scenario: Any,
     ) -> None:
-        self.settings = settings or tare_settings()
-        clock = VirtualClock()
-        self.bus = EmbeddedBus(clock)
-        self.sent: list[tuple[int, bytes]] = []
         self.lines: list[str] = []
         self.on_line: Callable[[str], None] = lambda line: None
         self.hand: Callable[[int], np.ndarray] = lambda cycle: np.zeros(2)
         self.push: Callable[[int, np.ndarray], np.ndarray] = lambda cycle, q: np.zeros(2)
-        self.tamper: Callable[[int, int, bytes], bytes | None] = lambda cycle, can_id, data: data
         self._senders = [CODEC.message(f"Sensor{joint}Torque").sender() for joint in (1, 2)]
         played = dataclasses.replace(load_scenario("idle", "P"), **scenario)
         self.start_rad = played.start_rad
-        self.bench = Bench(played, CODEC, self._deliver)
-        self.bus.attach(self._on_frame)
-        self.bench.boot()
+        super().__init__(settings or tare_settings(), played)
         self.session = TareSession(
-            self.settings, CODEC, self.bus, clock, "embedded", old_offset_Nm, is_auto_zeroing, self._progress
+            self.settings, CODEC, self.bus, self.clock, "embedded", old_offset_Nm, is_auto_zeroing, self._progress
         )
 
     def _progress(self, line: str) -> None:
         self.lines.append(line)
         self.on_line(line)
 
-    def _on_frame(self, frame: Frame) -> None:
-        self.sent.append((frame.can_id, frame.data))
-        self.bench.on_frame(frame)
-
-    def _deliver(self, can_id: int, data: bytes) -> None:
+    def deliver(self, can_id: int, data: bytes) -> None:
+        """Pass on what a device sends, as the hand and the push make it."""
         cycle = self.bench.cycle
         if can_id in FEEDBACK_IDS:
             data = self._moved(cycle, FEEDBACK_IDS.index(can_id), data)
         elif can_id in TORQUE_IDS:
             data = self._pushed(cycle, TORQUE_IDS.index(can_id), data)
-        kept = self.tamper(cycle, can_id, data)
-        if kept is not None:
-            self.bus.deliver(can_id, kept)
+        super().deliver(can_id, data)
 
     def _moved(self, cycle: int, joint: int, data: bytes) -> bytes:
         message = CODEC.message(f"Drive{joint + 1}Feedback")

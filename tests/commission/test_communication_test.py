@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bench_bus import PERIOD_NS, BenchBus
+from rig import PERIOD_NS, Rig
 
 from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict, judge
 from adacd_hil.commission.zero_torque import ZeroTorqueLoop
@@ -15,7 +15,7 @@ COMMAND = load_codec().message("Drive1Command")
 COMMANDS = (0x201, 0x202)
 
 
-def run(rig: BenchBus, seconds: float = 0.2, is_enabling: bool = False) -> tuple[CommunicationReport, FaultReason]:
+def run(rig: Rig, seconds: float = 0.2, is_enabling: bool = False) -> tuple[CommunicationReport, FaultReason]:
     rig.start()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master, is_enabling)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
@@ -24,26 +24,26 @@ def run(rig: BenchBus, seconds: float = 0.2, is_enabling: bool = False) -> tuple
     return test.report(), fault
 
 
-def commands(rig: BenchBus) -> set[tuple[int, int]]:
+def commands(rig: Rig) -> set[tuple[int, int]]:
     """Return all (controlword, target torque) on the wire."""
     return {tuple(map(int, COMMAND.decode_values(frame.data))) for frame in rig.sent if frame.can_id in COMMANDS}
 
 
 def test_an_undisturbed_connection_is_good_and_complete() -> None:
-    report, fault = run(BenchBus())
+    report, fault = run(Rig(is_wall=True))
     assert (report.cycles, report.complete, report.overruns) == (200, 200, 0)
     assert (report.verdict, report.share, fault) == (Verdict.GOOD, 1.0, FaultReason.NONE)
     assert [device.ages[0] for device in report.devices.values()] == [200] * 4
 
 
 def test_the_drives_are_never_asked_for_more_than_no_voltage() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     run(rig)
     assert commands(rig) == {(0x0000, 0)}
 
 
 def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     report, fault = run(rig, is_enabling=True)
     assert (report.verdict, fault) == (Verdict.GOOD, FaultReason.NONE)
     assert commands(rig) == {(0x0000, 0), (0x0006, 0), (0x0007, 0), (0x000F, 0)}
@@ -53,7 +53,7 @@ def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end() -> None:
 
 
 def test_a_drive_that_drops_out_ends_an_enabled_test_with_quick_stop() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master, is_enabling=True)
     cycles = []
@@ -70,10 +70,10 @@ def test_a_drive_that_drops_out_ends_an_enabled_test_with_quick_stop() -> None:
 
 
 def test_every_fifteenth_torque_frame_lost_is_a_warning_and_told_by_device() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     count = [0]
 
-    def lose(can_id: int, data: bytes) -> bytes | None:
+    def lose(cycle: int, can_id: int, data: bytes) -> bytes | None:
         count[0] += can_id == 0x183
         return None if can_id == 0x183 and count[0] % 15 == 0 else data
 
@@ -87,8 +87,8 @@ def test_every_fifteenth_torque_frame_lost_is_a_warning_and_told_by_device() -> 
 
 
 def test_a_device_that_never_answers_is_not_sufficient() -> None:
-    rig = BenchBus()
-    rig.tamper = lambda can_id, data: None if can_id == 0x182 else data
+    rig = Rig(is_wall=True)
+    rig.tamper = lambda cycle, can_id, data: None if can_id == 0x182 else data
     report, _ = run(rig)
     assert (report.verdict, report.share) == (Verdict.NOT_SUFFICIENT, 0.0)
     assert (report.devices["Drive2"].never, sum(report.devices["Drive2"].ages)) == (200, 0)
@@ -96,7 +96,7 @@ def test_a_device_that_never_answers_is_not_sufficient() -> None:
 
 
 def test_skipped_periods_count_as_without_data() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     begin_ns = rig.clock.now_ns()
     rig.clock.oversleep_ns = lambda t_ns: 20 * PERIOD_NS + 5_000 if t_ns == begin_ns + 51 * PERIOD_NS else 0
@@ -112,7 +112,7 @@ def test_skipped_periods_count_as_without_data() -> None:
 
 
 def test_the_record_of_a_cycle_has_its_queues_and_what_was_lost(monkeypatch) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     monkeypatch.setattr(type(rig.bus), "queue_bytes", lambda bus: QueueBytes(700, 1400))
     monkeypatch.setattr(type(rig.bus), "frames_lost", 3, raising=False)
     rig.start()
@@ -141,7 +141,7 @@ def test_verdicts_change_at_the_bounds(share: float, verdict: Verdict) -> None:
 
 
 def test_an_interrupt_ends_the_loop_and_disables() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
     seen = []

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from long_cases import long_but
-from session_rig import CODEC, TROUBLE_CYCLE, Rig, torques_from
+from rig import CODEC, TROUBLE_CYCLE, SessionRig, torques_from
 
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, Request, SchemeState
@@ -51,8 +51,8 @@ def forged_command() -> bytes:
 def test_a_frame_that_only_this_host_sends_is_named_and_faults_at_once(
     tmp_path: Path, can_id: int, data: bytes, says: str
 ) -> None:
-    rig = Rig(tmp_path)
-    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bus.deliver(can_id, data)
+    rig = SessionRig(tmp_path)
+    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(can_id, data)
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.FOREIGN_FRAMES
@@ -63,8 +63,8 @@ def test_a_frame_that_only_this_host_sends_is_named_and_faults_at_once(
 
 
 def test_who_only_reads_objects_is_named_and_harmless(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
-    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x602, SDO_READ)
+    rig = SessionRig(tmp_path)
+    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x602, SDO_READ)
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.NONE
@@ -75,9 +75,9 @@ def test_who_only_reads_objects_is_named_and_harmless(tmp_path: Path) -> None:
 
 
 def test_an_arm_that_somebody_commands_before_it_is_enabled_is_not_enabled(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     for cycle in range(50, 6000, 500):
-        rig.in_cycle[cycle] = lambda: rig.bus.deliver(0x201, forged_command())
+        rig.before_sync[cycle] = lambda: rig.bus.deliver(0x201, forged_command())
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.COMMISSION_TIMEOUT
@@ -86,7 +86,7 @@ def test_an_arm_that_somebody_commands_before_it_is_enabled_is_not_enabled(tmp_p
 
 
 def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_nmt(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     settings = rig.session.settings
     bus = dataclasses.replace(settings.bus, command_patience_cycles=250)
     rig.session.settings = dataclasses.replace(settings, bus=bus)
@@ -102,7 +102,7 @@ def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_
         is_deaf[0] = True
         rig.tamper = lambda cycle, can_id, data: None if can_id == 0x183 else data
 
-    rig.in_cycle[TROUBLE_CYCLE] = trouble
+    rig.before_sync[TROUBLE_CYCLE] = trouble
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.DATA_AGE
@@ -119,7 +119,7 @@ def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_
 
 
 def test_a_drive_whose_torque_is_not_the_commanded_one_faults(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
 
     def overstate(cycle: int, can_id: int, data: bytes) -> bytes:
         if can_id != 0x281 or cycle < TROUBLE_CYCLE:
@@ -136,11 +136,11 @@ def test_a_drive_whose_torque_is_not_the_commanded_one_faults(tmp_path: Path) ->
 
 
 def test_a_device_that_has_lost_its_set_up_faults(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     settings = rig.session.settings
     devices = dataclasses.replace(settings.devices, reread_ms=2)
     rig.session.settings = dataclasses.replace(settings, devices=devices)
-    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bench.devices[1].take_over(0x2200, 0, 200)
+    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bench.devices[1].take_over(0x2200, 0, 200)
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.TAMPERED
@@ -149,7 +149,7 @@ def test_a_device_that_has_lost_its_set_up_faults(tmp_path: Path) -> None:
 
 
 def test_the_set_up_is_read_again_while_the_arm_runs_and_differs_in_nothing(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     settings = rig.session.settings
     rig.session.settings = dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, reread_ms=2))
     summary, log = rig.run()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from session_rig import Rig
+from rig import SessionRig
 
 from adacd_hil.device.arm_watch import DeadlineWatch
 from adacd_hil.log.reader import RunLog
@@ -89,7 +89,7 @@ def test_a_fault_of_the_arm_keeps_its_name() -> None:
 
 def play(folder: Path, on_misses: str) -> RunLog:
     """Let an arm that is soon adapted move, and its host stall for 5 ms in the middle of it."""
-    rig = Rig(folder, finish_s=0.7)
+    rig = SessionRig(folder, finish_s=0.7)
     settings = rig.session.settings
     rig.session.settings = dataclasses.replace(
         settings,
@@ -102,7 +102,7 @@ def play(folder: Path, on_misses: str) -> RunLog:
         realtime=RealtimeSettings(misses=3, on_misses=on_misses),
     )
     clock = rig.session.clock
-    rig.in_cycle[STALL_CYCLE] = lambda: clock.sleep_until_ns(clock.now_ns() + 5_100_000)
+    rig.before_sync[STALL_CYCLE] = lambda: clock.sleep_until_ns(clock.now_ns() + 5_100_000)
     return rig.run()[1]
 
 

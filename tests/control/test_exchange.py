@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bench_bus import CODEC, PERIOD_NS, BenchBus
+from rig import CODEC, PERIOD_NS, Rig
 
 from adacd_hil.control.exchange import Exchange, say_trouble
 from adacd_hil.control.pacing import GridPacer
@@ -12,11 +12,11 @@ from adacd_hil.records import ArmCommand, ArmState
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 
 
-class Rig:
+class ExchangeRig:
     """An arm in operation; `read` goes through one cycle on the grid."""
 
     def __init__(self) -> None:
-        self.bench = BenchBus()
+        self.bench = Rig(is_wall=True)
         self.bench.start()
         bench = self.bench
         self.pacer = GridPacer(bench.clock, PERIOD_NS)
@@ -34,24 +34,24 @@ def drain(bus: EmbeddedBus) -> list[Frame]:
 
 
 def test_a_duplicate_that_comes_between_two_cycles_stands_for_no_frame_of_the_next() -> None:
-    rig = Rig()
+    rig = ExchangeRig()
     last: dict[int, bytes] = {}
-    rig.bench.tamper = last.setdefault
+    rig.bench.tamper = lambda cycle, can_id, data: last.setdefault(can_id, data)
     assert rig.read().is_complete
     rig.bench.bus.deliver(0x181, last[0x181])  # Drive 1's feedback again, after the cycle is over
-    rig.bench.tamper = lambda can_id, data: None if can_id == 0x181 else data
+    rig.bench.tamper = lambda cycle, can_id, data: None if can_id == 0x181 else data
     state = rig.read()
     assert not state.is_complete
     assert state.age_q == (1, 0)
 
 
 def test_a_frame_that_comes_after_its_cycle_was_given_up_is_of_that_cycle() -> None:
-    rig = Rig()
+    rig = ExchangeRig()
     rig.read()
     kept: list[bytes] = []
-    rig.bench.tamper = lambda can_id, data: kept.append(data) if can_id == 0x183 else data
+    rig.bench.tamper = lambda cycle, can_id, data: kept.append(data) if can_id == 0x183 else data
     assert not rig.read().is_complete
-    rig.bench.tamper = lambda can_id, data: data
+    rig.bench.tamper = lambda cycle, can_id, data: data
     rig.bench.bus.deliver(0x183, kept[0])
     state = rig.read()
     assert state.is_complete
@@ -60,7 +60,7 @@ def test_a_frame_that_comes_after_its_cycle_was_given_up_is_of_that_cycle() -> N
 
 
 def test_the_feedback_is_in_when_its_last_frame_came_not_when_it_was_read() -> None:
-    rig = Rig()
+    rig = ExchangeRig()
     clock = rig.bench.clock
     rig.read()
     receive = rig.bench.bus.receive
@@ -77,13 +77,13 @@ def test_the_feedback_is_in_when_its_last_frame_came_not_when_it_was_read() -> N
 
 
 def test_feedback_that_was_read_with_a_followed_sync_came_when_its_last_frame_did() -> None:
-    rig = Rig()
+    rig = ExchangeRig()
     bus = rig.bench.bus
     rig.read()
     tick = rig.pacer.next()
     bus.send(0x080, bytes((1 + tick.cycle,)))  # for the answers, as they wait beside a SYNC of another host
     ahead = tuple(frame._replace(t_ns=tick.t_ns + 1000 * place) for place, frame in enumerate(drain(bus), 1))
-    rig.bench.tamper = lambda can_id, data: None
+    rig.bench.tamper = lambda cycle, can_id, data: None
     rig.exchange.read(tick._replace(ahead=ahead))
     assert rig.exchange.feedback_ns == ahead[-1].t_ns == tick.t_ns + 4000
 
@@ -91,7 +91,7 @@ def test_feedback_that_was_read_with_a_followed_sync_came_when_its_last_frame_di
 def test_frames_that_the_kernel_dropped_are_counted_and_said_at_most_once_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rig = Rig()
+    rig = ExchangeRig()
     bench = rig.bench
     lost = [0]
     monkeypatch.setattr(EmbeddedBus, "frames_lost", property(lambda _: lost[-1]))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from session_rig import Rig
+from rig import SessionRig
 
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.control.cycle import FINISH_S
@@ -82,7 +82,7 @@ def test_a_payload_announced_where_that_means_nothing_is_not_announced_again(tmp
 @pytest.mark.long
 def test_an_arm_that_cannot_be_parked_is_disabled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("adacd_hil.control.reference.Reference.is_parked", lambda *_: False)
-    rig = Rig(tmp_path, finish_s=0.5)
+    rig = SessionRig(tmp_path, finish_s=0.5)
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.NONE

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from session_rig import ENABLE_OPERATION, TROUBLE_CYCLE, Rig, controlwords, torques_from
+from rig import ENABLE_OPERATION, TROUBLE_CYCLE, SessionRig, controlwords, torques_from
 
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, SchemeState
@@ -15,10 +15,10 @@ pytestmark = pytest.mark.slow
 NMT_PRE_OPERATIONAL_DRIVE_1 = Frame(0x000, bytes((0x80, 1)), 0)
 
 
-def faulting_rig(folder: Path, acknowledge_faults: int) -> Rig:
+def faulting_rig(folder: Path, acknowledge_faults: int) -> SessionRig:
     """Make a run whose drive 1 drops out at the trouble cycle."""
-    rig = Rig(folder, acknowledge_faults=acknowledge_faults)
-    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bench.on_frame(NMT_PRE_OPERATIONAL_DRIVE_1)
+    rig = SessionRig(folder, acknowledge_faults=acknowledge_faults)
+    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bench.on_frame(NMT_PRE_OPERATIONAL_DRIVE_1)
     return rig
 
 
@@ -91,12 +91,12 @@ def test_the_bus_is_emptied_before_the_devices_are_booted_again(tmp_path: Path) 
 def test_a_bus_that_fails_in_operation_is_emptied_at_once_and_comes_back_after_an_acknowledgement(
     tmp_path: Path,
 ) -> None:
-    rig = Rig(tmp_path, acknowledge_faults=1)
+    rig = SessionRig(tmp_path, acknowledge_faults=1)
 
     def fail() -> None:
         raise BusError("transmit queue of can0 stayed full")
 
-    rig.in_cycle[TROUBLE_CYCLE] = fail
+    rig.before_sync[TROUBLE_CYCLE] = fail
     summary, log = rig.run()
     assert (summary.recoveries, summary.error) == (1, "")
     assert messages(log, "run") == ["transmit queue of can0 stayed full"]

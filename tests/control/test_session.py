@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from long_cases import long_but
-from session_rig import (
+from rig import (
     CODEC,
     DISABLE_VOLTAGE,
     ENABLE_OPERATION,
     ENABLED_CYCLE,
     QUICK_STOP,
     TROUBLE_CYCLE,
-    Rig,
+    SessionRig,
     controlwords,
     torques_from,
 )
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_run_that_nothing_disturbs_ends_parked_and_disabled(tmp_path: Path) -> None:
-    summary, log = Rig(tmp_path).run()
+    summary, log = SessionRig(tmp_path).run()
     assert summary.result is not None
     assert (summary.result.fault, summary.result.is_interrupted, summary.error) == (FaultReason.NONE, False, "")
     assert controlwords(log)[-1] == DISABLE_VOLTAGE
@@ -39,14 +39,14 @@ def test_a_run_that_nothing_disturbs_ends_parked_and_disabled(tmp_path: Path) ->
 
 
 def test_the_gate_is_closed_until_the_arm_is_enabled(tmp_path: Path) -> None:
-    _, log = Rig(tmp_path).run()
+    _, log = SessionRig(tmp_path).run()
     assert np.count_nonzero(log.control["tau_c"][:ENABLED_CYCLE]) == 0
     assert set(log.control["gate_flags"][:ENABLED_CYCLE].tolist()) == {int(GateFlag.CLOSED)}
 
 
 @pytest.mark.parametrize("can_id", long_but(1, [0x183, 0x181, 0x182, 0x184]))
 def test_a_device_that_falls_silent_faults_the_run_after_its_age_budget(tmp_path: Path, can_id: int) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == can_id and cycle >= TROUBLE_CYCLE else data
     summary, log = rig.run()
     assert summary.result is not None
@@ -56,7 +56,7 @@ def test_a_device_that_falls_silent_faults_the_run_after_its_age_budget(tmp_path
 
 
 def test_a_device_whose_heartbeat_stops_faults_the_run_and_is_named(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == 0x703 and cycle >= TROUBLE_CYCLE else data
     summary, log = rig.run()
     assert summary.result is not None
@@ -69,9 +69,9 @@ def test_a_device_whose_heartbeat_stops_faults_the_run_and_is_named(tmp_path: Pa
 
 @pytest.mark.long
 def test_error_frames_are_in_the_log_in_words(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     error_passive = bytes((0, 0x20, 0, 0, 0, 0, 130, 0))
-    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x204, error_passive, is_error=True)
+    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x204, error_passive, is_error=True)
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.NONE
@@ -83,8 +83,8 @@ def test_error_frames_are_in_the_log_in_words(tmp_path: Path) -> None:
 
 
 def test_a_frame_that_is_not_what_its_identifier_says_is_dropped_and_counted(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
-    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x081, b"\x01\x02\x03")
+    rig = SessionRig(tmp_path)
+    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bus.deliver(0x081, b"\x01\x02\x03")
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault is FaultReason.NONE
@@ -93,7 +93,7 @@ def test_a_frame_that_is_not_what_its_identifier_says_is_dropped_and_counted(tmp
 
 
 def test_after_a_fault_there_is_no_torque_on_the_wire_and_drives_are_stopped(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle >= TROUBLE_CYCLE else data
     _, log = rig.run()
     assert np.any(torques_from(log, ENABLED_CYCLE)[:700] != 0)
@@ -102,7 +102,7 @@ def test_after_a_fault_there_is_no_torque_on_the_wire_and_drives_are_stopped(tmp
 
 
 def test_a_fault_is_latched_though_the_data_come_back(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     gap = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 20)
     rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle in gap else data
     _, log = rig.run()
@@ -110,7 +110,7 @@ def test_a_fault_is_latched_though_the_data_come_back(tmp_path: Path) -> None:
 
 
 def test_two_lost_torque_frames_are_forgiven(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     gap = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 2)
     rig.tamper = lambda cycle, i, data: None if i == 0x183 and cycle in gap else data
     summary, _ = rig.run()
@@ -120,7 +120,7 @@ def test_two_lost_torque_frames_are_forgiven(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_corrupted_torque_frames_count_as_lost_and_change_no_value(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
 
     def corrupt(cycle: int, can_id: int, data: bytes) -> bytes:
         is_hit = can_id == 0x183 and cycle == TROUBLE_CYCLE
@@ -137,7 +137,7 @@ def test_corrupted_torque_frames_count_as_lost_and_change_no_value(tmp_path: Pat
 
 @pytest.mark.long
 def test_the_log_counts_what_the_checks_said_of_each_frame(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     lost = range(TROUBLE_CYCLE, TROUBLE_CYCLE + 2)
     rig.tamper = lambda cycle, i, data: None if i == 0x184 and cycle in lost else data
     _, log = rig.run()
@@ -150,8 +150,8 @@ def test_the_log_counts_what_the_checks_said_of_each_frame(tmp_path: Path) -> No
 
 
 def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, finish_s=30.0)
-    rig.in_cycle[TROUBLE_CYCLE] = rig.session.interrupt
+    rig = SessionRig(tmp_path, finish_s=30.0)
+    rig.before_sync[TROUBLE_CYCLE] = rig.session.interrupt
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.is_interrupted
@@ -160,9 +160,9 @@ def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Pat
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, finish_s=30.0)
-    rig.in_cycle[TROUBLE_CYCLE] = rig.session.interrupt
-    rig.in_cycle[TROUBLE_CYCLE + 50] = rig.session.interrupt
+    rig = SessionRig(tmp_path, finish_s=30.0)
+    rig.before_sync[TROUBLE_CYCLE] = rig.session.interrupt
+    rig.before_sync[TROUBLE_CYCLE + 50] = rig.session.interrupt
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.cycles < TROUBLE_CYCLE + 50 + 30
@@ -172,7 +172,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
 
 
 def test_an_arm_that_moves_before_it_is_enabled_is_never_enabled(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
+    rig = SessionRig(tmp_path)
     feedback = CODEC.message("Drive1Feedback")
 
     def push(cycle: int, can_id: int, data: bytes) -> bytes:
@@ -189,8 +189,8 @@ def test_an_arm_that_moves_before_it_is_enabled_is_never_enabled(tmp_path: Path)
 
 
 def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
-    rig.in_cycle[TROUBLE_CYCLE] = lambda: rig.bench.on_frame(Frame(0x000, bytes((0x80, 1)), 0))  # NMT to drive 1
+    rig = SessionRig(tmp_path)
+    rig.before_sync[TROUBLE_CYCLE] = lambda: rig.bench.on_frame(Frame(0x000, bytes((0x80, 1)), 0))  # NMT to drive 1
     summary, log = rig.run()
     assert summary.result is not None
     assert summary.result.fault in (FaultReason.DRIVE, FaultReason.DATA_AGE)
@@ -199,7 +199,7 @@ def test_the_log_says_which_drive_faulted_and_why(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_viewers_find_the_arm_and_a_layout_in_the_log_and_beside_it_and_the_address(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, finish_s=0.3)
+    rig = SessionRig(tmp_path, finish_s=0.3)
     said: list[str] = []
     rig.session.live, rig.session.progress = LiveAddress("127.0.0.1", 0), said.append
     summary, log = rig.run()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cycle_rig import CycleRig, torque_of
+from rig import CycleRig, torque_of
 
 from adacd_hil.wire.bus import Frame
 
@@ -18,7 +18,7 @@ def test_a_command_that_comes_later_than_the_age_budget_carries_no_torque(
     tmp_path: Path, stall_ns: int, is_zero: bool
 ) -> None:
     rig = CycleRig(tmp_path)
-    rig.in_cycle[STALL_CYCLE] = lambda: rig.clock.sleep_until_ns(rig.clock.now_ns() + stall_ns)
+    rig.after_sync[STALL_CYCLE] = lambda: rig.clock.sleep_until_ns(rig.clock.now_ns() + stall_ns)
     rig.run()
     log = rig.read()
     (row,) = np.flatnonzero(log.control["cycle"] == STALL_CYCLE)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from cycle_rig import CycleRig, torque_of
+from rig import CycleRig, torque_of
 
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.recovery import Recovery
@@ -21,11 +21,11 @@ def stopped_rig(folder: Path, queue_length: int) -> CycleRig:
     def stop() -> None:
         rig.queue.is_acknowledged = False
 
-    rig.in_cycle[STOP_CYCLE] = stop
+    rig.after_sync[STOP_CYCLE] = stop
     with pytest.raises(TransmitQueueError):
         rig.run()
     assert len(rig.queue.waiting_frames) == queue_length
-    rig.arrived.clear()
+    rig.sent.clear()
     return rig
 
 
@@ -33,8 +33,8 @@ def stopped_rig(folder: Path, queue_length: int) -> CycleRig:
 def test_without_recovery_an_old_torque_would_get_out(tmp_path: Path, queue_length: int) -> None:
     rig = stopped_rig(tmp_path, queue_length)
     rig.queue.is_acknowledged = True
-    assert len(rig.arrived) == queue_length
-    assert any(torque_of(frame) for frame in rig.arrived)
+    assert len(rig.sent) == queue_length
+    assert any(torque_of(frame) for frame in rig.sent)
     rig.read()
 
 
@@ -45,5 +45,5 @@ def test_recovery_leaves_no_old_command_to_get_out(tmp_path: Path, queue_length:
     recovery = Recovery(rig.tap, rig.clock, operator, rig.recorder, lambda _: None, lambda: False)
     assert recovery.empty()
     rig.queue.is_acknowledged = True
-    assert rig.arrived == []
+    assert rig.sent == []
     assert any(entry.event.message == "transmit queue emptied" for entry in rig.read().events)

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
+from rig import Rig
 
-from adacd_hil.clock import VirtualClock
-from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
@@ -12,10 +11,8 @@ from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import parse
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench.bench import Bench
-from firmware_sim.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.slow
 
@@ -24,32 +21,23 @@ PERIOD_NS = 1_000_000
 CONFIGURATIONS = ("paper", "fd", "fd_500us", "stock")
 
 
-class Rig:
-    """Host and emulator in one process; `passed` is every frame on the bus."""
+class NetworkRig(Rig):
+    """Host and emulator in one process; `passed` is every frame on the bus. `table`: what the host believes."""
 
     def __init__(self, table: dict[str, object] | None = None, config: str = "paper") -> None:
-        base = load_settings(config)
-        codec = load_contract(base)
-        self.clock = VirtualClock()
         self.passed: list[tuple[int, bytes]] = []
-        bus = EmbeddedBus(self.clock)
-        self._bench = Bench(load_scenario("idle", "P"), codec, self._deliver)
-        self.bus = bus
-        bus.attach(self._on_frame)
-        self._bench.boot()
-        settings = parse(Settings, table) if table else base
-        self.period_ns = settings.bus.period_ns
-        self.arm = Arm(settings, codec, bus)
-        self.master = Master(settings, codec, bus)
         self.cycle = 0
+        codec = load_contract(load_settings(config))
+        super().__init__(parse(Settings, table) if table else config, codec=codec)
+        self.period_ns = self.settings.bus.period_ns
 
-    def _deliver(self, can_id: int, data: bytes) -> None:
+    def deliver(self, can_id: int, data: bytes) -> None:
         self.passed.append((can_id, bytes(data)))
-        self.bus.deliver(can_id, data)
+        super().deliver(can_id, data)
 
-    def _on_frame(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         self.passed.append((frame.can_id, frame.data))
-        self._bench.on_frame(frame)
+        super().on_frame(frame)
 
     def start(self) -> None:
         self.master.reset()
@@ -72,12 +60,12 @@ class Rig:
         self.cycle += 1
 
 
-def read(rig: Rig, name: str, index: int, sub: int = 0) -> int:
+def read(rig: NetworkRig, name: str, index: int, sub: int = 0) -> int:
     return int(next(slave for slave in rig.master.slaves if slave.name == name).read(index, sub))
 
 
 def test_the_emulated_arm_boots_runs_and_is_watched() -> None:
-    rig = Rig()
+    rig = NetworkRig()
     rig.start()
     for _ in range(300):
         rig.step(enable=True)
@@ -87,7 +75,7 @@ def test_the_emulated_arm_boots_runs_and_is_watched() -> None:
 
 @pytest.mark.parametrize("config", CONFIGURATIONS)
 def test_the_emulated_devices_of_every_contract_are_set_up_enabled_and_moved(config: str) -> None:
-    rig = Rig(config=config)
+    rig = NetworkRig(config=config)
     rig.start()
     for _ in range(400):
         rig.step(0.3, 0.1, enable=True)
@@ -99,14 +87,14 @@ def test_the_emulated_devices_of_every_contract_are_set_up_enabled_and_moved(con
 
 
 def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:
-    rig = Rig({"bus": {"heartbeat_ms": 40}})
+    rig = NetworkRig({"bus": {"heartbeat_ms": 40}})
     rig.start()
     watched = [read(rig, name, 0x1016, 1) for name in ("Drive1", "Drive2", "Sensor1", "Sensor2")]
     assert watched == [127 << 16 | 100] * 4
 
 
 def test_devices_are_not_told_to_watch_a_host_in_lockstep() -> None:
-    rig = Rig()
+    rig = NetworkRig()
     rig.master = Master(load_settings("paper"), CODEC, rig.bus, watch_host=False)
     rig.start()
     assert read(rig, "Drive1", 0x1016, 1) == 0
@@ -114,7 +102,7 @@ def test_devices_are_not_told_to_watch_a_host_in_lockstep() -> None:
 
 @pytest.mark.parametrize(("watch_host", "deadline_ms"), [(True, 10), (False, 0)])
 def test_a_drive_that_counts_ms_has_a_deadline_of_commands_but_in_lockstep(watch_host: bool, deadline_ms: int) -> None:
-    rig = Rig(config="stock")
+    rig = NetworkRig(config="stock")
     settings = load_settings("stock")
     rig.master = Master(settings, load_contract(settings), rig.bus, watch_host=watch_host)
     rig.start()
@@ -122,7 +110,7 @@ def test_a_drive_that_counts_ms_has_a_deadline_of_commands_but_in_lockstep(watch
 
 
 def test_the_same_boot_twice_is_the_same_frames() -> None:
-    rigs = [Rig(), Rig()]
+    rigs = [NetworkRig(), NetworkRig()]
     for rig in rigs:
         rig.start()
         for _ in range(50):
@@ -132,7 +120,7 @@ def test_the_same_boot_twice_is_the_same_frames() -> None:
 
 
 def test_a_second_boot_of_running_nodes_leaves_them_configured() -> None:
-    rig = Rig()
+    rig = NetworkRig()
     rig.start()
     for _ in range(20):
         rig.step(enable=True)
@@ -142,18 +130,18 @@ def test_a_second_boot_of_running_nodes_leaves_them_configured() -> None:
 
 
 def test_an_option_code_of_the_configuration_reaches_the_drives() -> None:
-    rig = Rig({"devices": {"quick_stop_option": 6}})
+    rig = NetworkRig({"devices": {"quick_stop_option": 6}})
     rig.start()
     assert [read(rig, name, 0x605A) for name in ("Drive1", "Drive2")] == [6, 6]
 
 
 def test_a_node_id_that_the_dbc_does_not_have_is_refused() -> None:
     with pytest.raises(DeviceError, match=r"no boot-up from Drive2 \(node 9\)"):
-        Rig({"devices": {"drive_node": [1, 9]}}).start()
+        NetworkRig({"devices": {"drive_node": [1, 9]}}).start()
 
 
 def test_an_emergency_is_an_event_with_name_watchdog_and_time_and_stays_until_reset() -> None:
-    rig = Rig()
+    rig = NetworkRig()
     rig.start()
     rig.master.take_events()
     rig.accept(Frame(0x081, bytes.fromhex("5082 11 02 d2040000"), 0))

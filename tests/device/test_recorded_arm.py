@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cycle_rig import CODEC, CycleRig
-from fault_rig import run_realtime, settings_of
+from fault_rig import run_realtime
 from numpy.typing import NDArray
 from recorded_arm_rig import Live, differences, live_states, play, ticks_of
+from rig import CODEC, CycleRig, scripted
 from test_two_arms import SECOND
 from test_two_arms import Rig as TwoArms
 from test_two_arms import settings_of as two_arms_settings
@@ -162,7 +162,7 @@ def test_frames_that_come_after_their_cycle_in_real_time_are_of_the_cycle_before
     ]
     with live_states() as states:
         outcome = run_realtime(tmp_path, rows, finish_s=0.6)
-    batch = Live(settings_of(0.6), CODEC, states, outcome.log).read()
+    batch = Live(scripted(finish_s=0.6, acknowledge_after_s=0.6), CODEC, states, outcome.log).read()
     assert differences(states, batch) == []
     assert FaultReason.HEARTBEAT in batch.fault
     assert batch.age_tau_J.max() == 1
@@ -171,7 +171,7 @@ def test_frames_that_come_after_their_cycle_in_real_time_are_of_the_cycle_before
 def test_a_host_that_skipped_periods_is_late_in_its_recording_too(tmp_path: Path) -> None:
     rig = CycleRig(tmp_path, finish_s=0.1)
     for cycle, periods in ((230, 2), (240, 3), (250, 9)):
-        rig.in_cycle[cycle] = lambda periods=periods: rig.clock.sleep_until_ns(
+        rig.after_sync[cycle] = lambda periods=periods: rig.clock.sleep_until_ns(
             rig.clock.now_ns() + periods * rig.settings.bus.period_ns
         )
     with live_states() as states:

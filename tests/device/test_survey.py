@@ -3,21 +3,21 @@
 import dataclasses
 
 import pytest
-from bench_bus import CODEC, BenchBus
+from rig import CODEC, Rig
 
 from adacd_hil.device.survey import Survey, compare, expected_nodes, function_name, message_name, survey
 
 
-def look(rig: BenchBus, duration_s: float = 1.5) -> Survey:
+def look(rig: Rig, duration_s: float = 1.5) -> Survey:
     return survey(rig.bus, rig.clock, duration_s)
 
 
-def verdicts(rig: BenchBus, found: Survey) -> dict[int, str]:
+def verdicts(rig: Rig, found: Survey) -> dict[int, str]:
     return compare(found, expected_nodes(rig.master.slaves))
 
 
 def test_every_node_is_found_with_its_identity() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     found = look(rig)
     told = [(n.node_id, n.device_text, n.name, n.vendor, n.product, n.serial, n.error_register) for n in found.nodes]
     assert told == [
@@ -30,7 +30,7 @@ def test_every_node_is_found_with_its_identity() -> None:
 
 
 def test_nothing_but_sdo_uploads_is_sent() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     look(rig)
     assert {frame.can_id & 0x780 for frame in rig.sent} == {0x600}
     uploads = {frame.data[0] & 0xEF for frame in rig.sent}  # initiate and segment, either toggle
@@ -40,7 +40,7 @@ def test_nothing_but_sdo_uploads_is_sent() -> None:
 
 @pytest.mark.parametrize("is_started", [False, True])
 def test_no_node_changes_its_state(is_started: bool) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     if is_started:
         rig.start()
     before = [device.state for device in rig.bench.devices]
@@ -49,7 +49,7 @@ def test_no_node_changes_its_state(is_started: bool) -> None:
 
 
 def test_nodes_in_operation_are_seen_with_what_they_produce() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
     found = look(rig)
@@ -62,43 +62,43 @@ def test_nodes_in_operation_are_seen_with_what_they_produce() -> None:
 
 
 def test_an_operational_node_without_heartbeat_is_told_by_its_pdos() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
-    rig.tamper = lambda can_id, data: None if can_id & 0x780 == 0x700 else data
+    rig.tamper = lambda cycle, can_id, data: None if can_id & 0x780 == 0x700 else data
     rig.forget()
     assert {node.state_text for node in look(rig, 0.5).nodes} == {"operational (sends PDOs)"}
 
 
 def test_a_missing_node_is_named() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.silence(3)
     assert verdicts(rig, look(rig)) == {1: "", 2: "", 3: "missing: Sensor1 expected", 4: ""}
 
 
 def test_a_node_that_is_not_expected_is_said_to_be() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     found = look(rig)
     expected = [node for node in expected_nodes(rig.master.slaves) if node.node_id != 2]
     assert compare(found, expected)[2] == "unexpected"
 
 
 def test_another_product_than_the_expected_one_is_a_difference() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     found = look(rig)
     expected = [dataclasses.replace(node, product=0x403) for node in expected_nodes(rig.master.slaves)]
     assert compare(found, expected)[1] == "Drive1 expected; product is not 0x403"
 
 
 def test_an_identity_that_is_not_expected_to_be_known_is_not_compared() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     found = look(rig)
     expected = [dataclasses.replace(node, vendor=None, product=None) for node in expected_nodes(rig.master.slaves)]
     assert set(compare(found, expected).values()) == {""}
 
 
 def test_a_node_that_is_only_heard_is_found_and_does_not_answer() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.bus.deliver(0x709, b"\x05")
     rig.bus.deliver(0x089, b"\x10\x83\x11\0\0\0\0\0")
     node = next(node for node in look(rig).nodes if node.node_id == 9)
@@ -106,7 +106,7 @@ def test_a_node_that_is_only_heard_is_found_and_does_not_answer() -> None:
 
 
 def test_what_is_not_canopen_is_listed_by_identifier() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.bus.deliver(0x055, b"\x01\x02\x03")
     rig.bus.deliver(0x055, b"\x01")
     (talk,) = look(rig).others
@@ -114,7 +114,7 @@ def test_what_is_not_canopen_is_listed_by_identifier() -> None:
 
 
 def test_an_abort_of_0x1000_still_shows_a_node() -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.bus.deliver(0x58A, bytes.fromhex("8000100000000206"))
     node = next(node for node in look(rig).nodes if node.node_id == 10)
     assert (node.device_type, node.device_text) == (None, "?")
@@ -122,14 +122,14 @@ def test_an_abort_of_0x1000_still_shows_a_node() -> None:
 
 @pytest.mark.parametrize("data", ["43001000", "43001000920000", ""])
 def test_an_answer_that_is_too_short_is_none(data: str) -> None:
-    rig = BenchBus()
+    rig = Rig(is_wall=True)
     rig.bus.deliver(0x58A, bytes.fromhex(data))
     assert [node.node_id for node in look(rig).nodes if node.answers] == [1, 2, 3, 4]
 
 
 def test_an_empty_bus_has_nobody() -> None:
-    rig = BenchBus()
-    rig.tamper = lambda can_id, data: None
+    rig = Rig(is_wall=True)
+    rig.tamper = lambda cycle, can_id, data: None
     rig.forget()
     found = look(rig, 0.2)
     assert (found.nodes, found.others) == ([], [])

@@ -5,7 +5,7 @@ import struct
 
 import pytest
 from bench_host import CODEC, RESET_COMMUNICATION, START
-from lockstep_rig import play
+from rig import play_lockstep
 
 from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
@@ -170,7 +170,7 @@ def test_without_cycles_all_but_sync_is_answered():
 @pytest.mark.slow
 def test_a_host_against_the_recorded_arm_decides_as_it_did(tmp_path):
     operator = OperatorSettings(script=(RequestSettings(at_s=0.05, request="finish"),))
-    log, _ = play(tmp_path / "first", operator, LockstepSettings())
+    log, _ = play_lockstep(tmp_path / "first", operator, LockstepSettings())
     settings = dataclasses.replace(load_settings(), operator=operator, lockstep=LockstepSettings(), bus=BusSettings())
     clock = VirtualClock()
     embedded = EmbeddedBus(clock)

@@ -4,14 +4,12 @@ import random
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from rig import SessionRig
+
 from adacd_hil.clock import VirtualClock
-from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.session import Session, SessionSummary
+from adacd_hil.control.session import SessionSummary
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Frame
-from adacd_hil.wire.codec import load_codec
-from firmware_sim.bench.bench import Bench
-from firmware_sim.scenario.scenario import load_scenario
 
 CanFrame = tuple[int, bytes]
 SHORT_RUN = '[operator]\nscript = [{ at_s = 0.3, request = "finish" }]\n'
@@ -39,11 +37,7 @@ def play_short_run(folder: Path, bus: ListeningBus, clock: VirtualClock) -> Sess
     """Boot, enable and move the emulated arm for 0.3 s, on the bus given; its log is `run.mcap` in the folder."""
     (folder / "short.toml").write_text(SHORT_RUN)
     settings = load_settings(str(folder / "short.toml"))
-    codec = load_codec()
-    bench = Bench(load_scenario("idle"), codec, bus.deliver)
-    bus.attach(bench.on_frame)
-    bench.boot()
-    return Session(settings, codec, bus, clock, ScriptedOperator(settings.operator), folder, "embedded").run()
+    return SessionRig(folder, settings, bus=bus, clock=clock).session.run()
 
 
 def record_legal_traffic(folder: Path) -> list[CanFrame]:

@@ -24,17 +24,14 @@ from typing import Any
 import llvmlite.binding
 import numpy as np
 from numpy.typing import NDArray
+from rig import SessionRig
 
-from adacd_hil.cli.connection import model_time
-from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.device.contract import load_contract
-from adacd_hil.log.reader import RunLog, Series, read_log
+from adacd_hil.log.reader import RunLog, Series
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.bus import EmbeddedBus
-from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario
 
 RUNS = Path(__file__).parent / "runs"
@@ -81,16 +78,10 @@ def play(name: str, folder: Path, cycles: int = 0) -> RunLog:
     settings = load_settings(str(RUNS / f"{name}.config.toml"))
     scenario = load_scenario(str(RUNS / f"{name}.scenario.toml"), settings.arm.profile)
     codec = load_contract(settings)
-    clock = VirtualClock()
-    embedded = EmbeddedBus(clock)
-    bench = Bench(scenario, codec, embedded.deliver)
-    embedded.attach(bench.on_frame)
-    bench.boot()
-    operator = _StoppingOperator(settings.operator)
-    bus = model_time(embedded, clock, codec, settings)
-    session = Session(settings, codec, bus, clock, operator, folder, "embedded")
-    operator.session, operator.cycles_left = session, cycles
-    return read_log(session.run().log.path)
+    rig = SessionRig(folder, settings, scenario, codec=codec, is_modelled=True)
+    rig.session.operator = operator = _StoppingOperator(settings.operator)
+    operator.session, operator.cycles_left = rig.session, cycles
+    return rig.run()[1]
 
 
 @dataclass(frozen=True)

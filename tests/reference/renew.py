@@ -13,6 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
 from reference_runs import RUNS, Reference, bit_differences, decision_differences, names, play
 
 

@@ -68,7 +68,7 @@ def test_uncompiled_code_comes_to_the_same_bits(name: str, tmp_path: Path) -> No
         text=True,
         check=False,
         cwd=root,
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": f"{root}:{RUNS.parent}"},
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": f"{root}:{root / 'tests'}:{RUNS.parent}"},
         timeout=HANG_S,
     )
     assert done.returncode == 0, done.stderr

@@ -14,18 +14,13 @@ import numpy as np
 import pytest
 from experiment_runs import Played, Witness, candump, emulator, run_on_vcan
 from mcap.reader import make_reader
+from rig import SessionRig
 
-from adacd_hil.cli.connection import model_time
-from adacd_hil.clock import VirtualClock
-from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.session import Session
 from adacd_hil.log.log_files import TRUTH_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.bus import EmbeddedBus
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import crc8
-from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 
@@ -144,14 +139,9 @@ def embedded(witnessed: Witnessed, tmp_path_factory: pytest.TempPathFactory) -> 
     folder, files = tmp_path_factory.mktemp("embedded"), witnessed.played.folder
     settings = load_settings(str(files / "settings.toml"))
     scenario = load_scenario(str(files / "scenario.toml"))
-    clock = VirtualClock()
-    bus = EmbeddedBus(clock)
     with TruthLog(folder / TRUTH_NAME, blocking=True, scenario=scenario) as truth:
-        bench = Bench(scenario, CODEC, bus.deliver, on_truth=truth.write, on_event=truth.event)
-        bus.attach(bench.on_frame)
-        bench.boot()
-        modelled = model_time(bus, clock, CODEC, settings)
-        Session(settings, CODEC, modelled, clock, ScriptedOperator(settings.operator), folder, "embedded").run()
+        watched = {"on_truth": truth.write, "on_event": truth.event}
+        SessionRig(folder, settings, scenario, is_modelled=True, **watched).session.run()
     return folder
 
 

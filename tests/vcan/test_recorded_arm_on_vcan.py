@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from experiment_runs import BIN, run_on_vcan
 from hang import HANG_S
-from lockstep_rig import play
+from rig import play_lockstep
 
 from adacd_hil.log.reader import topic_bytes
 from adacd_hil.settings.bus_settings import LockstepSettings
@@ -38,7 +38,7 @@ def recorded_arm(log: Path, said: list[str]) -> Iterator[None]:
 
 def test_a_host_against_the_recorded_arm_logs_the_same_decisions(tmp_path: Path) -> None:
     operator = OperatorSettings(script=(RequestSettings(at_s=AT_S, request="finish"),))
-    first, _ = play(tmp_path / "embedded", operator, LockstepSettings())
+    first, _ = play_lockstep(tmp_path / "embedded", operator, LockstepSettings())
     config = tmp_path / "short.toml"
     config.write_text(f'[operator]\nscript = [{{ at_s = {AT_S}, request = "finish" }}]\n')
     said: list[str] = []
