@@ -74,3 +74,4 @@ bench: $(VENV)/.run
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find adacd_hil firmware_sim tests tools -name __pycache__ -prune -exec rm -r {} +
