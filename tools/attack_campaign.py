@@ -1,4 +1,4 @@
-"""Attacks a running arm in every way of tools/attacks.py and says what was noticed, and how the arm came to rest.
+"""Plays the attacks of tools/attacks.py on a running arm: what the host noticed, and how the arm came to rest.
 
     python tools/attack_campaign.py -j 2                  virtual time: the table on stdout
     python tools/attack_campaign.py command sync          attacks whose names have one of these words

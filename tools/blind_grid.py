@@ -1,4 +1,4 @@
-"""Delays every cyclic frame by every amount in every share of the cycles, pushes meanwhile, and says who was missed.
+"""Delays each cyclic frame by many amounts in many shares of the cycles, pushes the arm, and lists missed pushes.
 
     python tools/blind_grid.py -j 2                      the whole grid, some 3,300 runs of 7 s: hours
     python tools/blind_grid.py --every 20 -j 2           one row in twenty

@@ -1,4 +1,4 @@
-"""A report in headless Chromium: what it complains of, what it asks the network for, when it has been drawn.
+"""Opens a report in headless Chromium: lists its complaints, its requests to the network, and when it was drawn.
 
     python tools/browse_report.py runs/demo/report.html                 what was seen, one line each
     python tools/browse_report.py runs/demo/report.html --out pictures  light.png, dark.png, zoomed.png, print.pdf

@@ -1,4 +1,4 @@
-"""Plays scenarios with host and arm in one process each, and compares what they came to with what they expect.
+"""Plays scenarios with host and arm in one process each, and compares the outcomes with the expectations.
 
     python tools/campaign.py                    all that come with the package
     python tools/campaign.py --only 'clamp*'    those whose name or group fits a pattern

@@ -1,4 +1,4 @@
-"""What no detector can beat: the likelihood ratio of an onset whose instant and shape are known, in the sensors' noise.
+"""The bound of every detector: the likelihood ratio of an onset of known instant and shape, in the sensors' noise.
 
 The residual r (n, 2) with the true parameters, the velocity's lag matched and a filter too fast to matter, holds the
 noise of all sensors and what friction's model leaves. A vector autoregression whitens it:

@@ -1,4 +1,4 @@
-"""The schemes that a campaign compares, each behind one call: a recording in, what the scheme made of it out.
+"""The schemes that a campaign compares, each behind one call: a recording in, an outcome out.
 
 Only the supervisor's rule for a good run is played: adapt from each cycle of `begins` on, armed as soon as the scheme
 says so. Nobody reacts, so a detector goes on after an alarm.

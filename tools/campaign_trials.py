@@ -1,4 +1,4 @@
-"""What a campaign does with one arm and one seed: bring it to armed detection, then leave it alone, push it, touch it.
+"""One trial of a campaign: an arm and a seed, brought to armed detection, then left alone, pushed or touched.
 
 Each trial gives a flat record of plain numbers, which is what the campaign's tables are made of.
 """

@@ -1,4 +1,4 @@
-"""Damages logs and kills runs, and looks at what `log check` and `log recover` make of it.
+"""Damages logs and kills runs, and checks what `log check` and `log recover` do with them.
 
     python tools/damage_campaign.py                      1000 damaged logs, 20 killed runs
     python tools/damage_campaign.py --logs 1000 --kills 0

@@ -1,4 +1,4 @@
-"""What contacts have in common, played: payloads that nobody announced, certificates that have become wrong, touches.
+"""Plays payloads that nobody announced, certificates that become wrong, and touches: which contacts look alike.
 
     python tools/doubt_campaign.py payload --seeds 0:60 -j 2
     python tools/doubt_campaign.py wrong --seeds 0:60

@@ -1,4 +1,4 @@
-"""Arms with errors that the certified scheme may lack: how soon certified, false alarms, thresholds, pushes missed.
+"""Plays arms with errors that the model lacks: time to the certificate, false alarms, thresholds, missed pushes.
 
     python tools/error_campaign.py --minutes 40 --only clean
     python tools/error_campaign.py --profiles P --only 'lugre*,load*,cable*' -j 2

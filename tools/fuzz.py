@@ -1,4 +1,4 @@
-"""Throws random and damaged frames at everything that takes frames, and stops at the first that does what it must not.
+"""Sends random and damaged frames to everything that takes frames, and stops at the first violation.
 
     python tools/fuzz.py --frames 1000000 --seed 1     every frame into codec, end-to-end check, host and devices
     python tools/fuzz.py --cangen 60                   a real bus: runs for 60 s under cangen at full rate, on vcan

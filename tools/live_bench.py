@@ -1,4 +1,4 @@
-"""The cycle with and without somebody who watches, by turns in one run: the ratio of the percentiles.
+"""Measures the cycle with and without a viewer, by turns in one run: the ratio of the percentiles.
 
     python tools/live_bench.py --blocks 10 --block-s 3
 

@@ -1,4 +1,4 @@
-"""A headless viewer: subscribes to a live view and reports what came of each topic, at which rate, and how old.
+"""A headless viewer: subscribes to a live view and reports rate and age of each topic.
 
     python tools/live_client.py ws://127.0.0.1:8765 --seconds 10 --json
 

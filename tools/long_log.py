@@ -1,4 +1,4 @@
-"""Makes a log of any length out of one that is there: the run again and again, stamps and cycles going on.
+"""Makes a log of any length from a short one: repeats the run, with stamps and cycles that go on.
 
     python tools/long_log.py runs/demo --hours 8 --out runs/long
     python tools/long_log.py runs/demo --hours 8 --out runs/long --loop 32 38

@@ -1,4 +1,4 @@
-"""Feeds mutated files of every kind to the commands that read them, and counts what they must not do.
+"""Feeds mutated files of every kind to the commands that read them, and counts violations.
 
     python tools/mutation_campaign.py                            1000 mutations of each kind
     python tools/mutation_campaign.py --kinds mcap blf --count 50 --seed 7

@@ -1,4 +1,4 @@
-"""A run drawn from a seed: which arm, scheme, contract and host, who touches it, what goes wrong, what the user asks.
+"""A run drawn from a seed: arm, scheme, contract, host, touches, faults, and the user's requests.
 
 The same seed draws the same run. Most faults begin after detection is armed, so that most runs get there.
 """

@@ -1,4 +1,4 @@
-"""Peak force and impulse on each body region of ISO/TS 15066, for each reaction: a table and a picture.
+"""Measures peak force and impulse on each body region of ISO/TS 15066 for each reaction: a table and a picture.
 
     python tools/reaction_campaign.py                       all regions, 3 places each, free and clamped
     python tools/reaction_campaign.py --region chest -n 10  one region, 10 places

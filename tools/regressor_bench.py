@@ -1,4 +1,4 @@
-"""Prints what the regressor, its filter and a correction cost per step for 2 and 7 joints, in µs, no verdict.
+"""Measures the regressor, its filter and a correction per step, for 2 and 7 joints, in µs.
 
     python tools/regressor_bench.py
 

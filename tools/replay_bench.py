@@ -1,4 +1,4 @@
-"""Prints what reading a log costs, and its whole replay where there is the command: time, processor time, memory.
+"""Measures what reading and replaying a log costs: time, processor time, memory.
 
     python tools/replay_bench.py                              four lengths, made of one run by repetition; reading
     python tools/replay_bench.py --run runs/demo/run.mcap     the same of a run that is there

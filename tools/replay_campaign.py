@@ -1,4 +1,4 @@
-"""Plays the emulator's scenarios in this process and replays each log: the decisions have to be the same, bit for bit.
+"""Plays the emulator's scenarios in this process and replays each log: the decisions must be the same to the bit.
 
     python tools/replay_campaign.py --config paper                    every scenario that `firmware-sim list` names
     python tools/replay_campaign.py --config certified push-link1 idle

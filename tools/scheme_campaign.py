@@ -1,4 +1,4 @@
-"""Plays the schemes against a thousand arms, a day of motion and two thousand touches, and prints what they came to.
+"""Plays both schemes against a thousand arms, a day of motion and two thousand touches, and prints the figures.
 
     python tools/scheme_campaign.py --quick                 a few minutes' worth
     python tools/scheme_campaign.py --json campaign.json    everything; an hour or so on two CPUs

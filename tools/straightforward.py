@@ -1,4 +1,4 @@
-"""The straightforward loop: what one would write in an afternoon, for comparison with the host.
+"""The straightforward loop: the host's work as one would write it in an afternoon, for comparison.
 
     python tools/straightforward.py -c vcan0 --seconds 10
 

@@ -1,4 +1,4 @@
-"""The wall clock is set while a run goes on: forward, back, and back to 1970. Nobody may notice."""
+"""Sets the wall clock forward, back and to 1970 while a run goes on; nobody may notice."""
 
 import argparse
 import time

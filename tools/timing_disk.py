@@ -1,4 +1,4 @@
-"""A log that can't be written: slow disk, full disk, logger killed, logger stopped. The bus is the witness."""
+"""Runs with a log that can't be written: slow disk, full disk, logger killed or stopped. The bus is the witness."""
 
 import argparse
 import json

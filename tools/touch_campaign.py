@@ -1,4 +1,4 @@
-"""Hands on an arm that learns: what is certified with them, and how soon the arm is back after they let go.
+"""Plays hands on an arm that learns: the certificates' errors, and the time until the arm monitors again.
 
     python tools/touch_campaign.py --seeds 0:200 -j 2
     python tools/touch_campaign.py --untouched --seeds 0:200

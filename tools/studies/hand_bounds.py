@@ -1,4 +1,4 @@
-"""The smallest hand that one run can tell from the arm, by the motion it is asked on.
+"""Computes the smallest hand that one run can tell from the arm, by the motion on which it is asked.
 
     python tools/studies/hand_bounds.py
     python tools/studies/hand_bounds.py --profiles P
