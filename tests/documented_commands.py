@@ -22,7 +22,7 @@ import click
 from documents import ROOT
 
 from adacd_hil.analysis.foreign.recording_import import read_map
-from adacd_hil.analysis.replay.what_if import apply_settings, parse_changes, parse_variations
+from adacd_hil.analysis.replay.changed_settings import apply_settings, parse_changes, parse_variations
 from adacd_hil.cli.main import cli as host_cli
 from adacd_hil.control.tare_file import Tare, read_tare
 from adacd_hil.device.contract import find_contract, load_contract

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from adacd_hil import remedies
-from adacd_hil.analysis.replay.what_if import apply_settings
+from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse

@@ -14,7 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from adacd_hil.analysis.replay.replay import Replay, replay
+from adacd_hil.analysis.replay.replay import replay
+from adacd_hil.analysis.replay.replayed_outcome import Replay
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.scenario.scenario import builtin_scenarios

@@ -11,19 +11,115 @@ begins with the first cycle's number less all whole rounds of the counter. The h
 STOPPED belong to the section that they interrupt. The paper's experiment gives A to E.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.score.timing import CycleColumns, Cycles
 from adacd_hil.device.arm import SYNC_OVERFLOW
-from adacd_hil.log.reader import LoggedEvent
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.time_window import TimeWindow
-from adacd_hil.records import ContactReport, SchemeState, Vector
-from adacd_hil.settings.configuration import Settings
+from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
+from adacd_hil.settings.configuration import Settings, renewed
+from adacd_hil.settings.schema import parse
+from adacd_hil.settings.toml_files import parse_toml
+
+Cycles = NDArray[np.int64]
+
+
+class Quantity(NamedTuple):
+    """A time of each cycle: its column in /cycle, ns. `is_reserve`: it must be large, not small."""
+
+    name: str
+    column: str
+    title: str
+    meaning: str
+    is_reserve: bool = False
+
+
+LATENESS: Final = Quantity("lateness", "lateness_ns", "Lateness", "wake-up after the grid point")
+
+COMPUTE: Final = Quantity("compute", "compute_ns", "Compute", "last cyclic frame received to last command handed over")
+
+SYNC_TO_COMMAND: Final = Quantity(
+    "sync_to_command", "command_ns", "SYNC → command", "SYNC sent to last command handed over"
+)
+
+SLACK: Final = Quantity(
+    "slack", "slack_ns", "Slack", "last command to the next grid point; negative: overrun", is_reserve=True
+)
+
+QUANTITIES: Final = (
+    LATENESS,
+    Quantity("sync_to_feedback", "feedback_ns", "SYNC → feedback", "SYNC sent to last cyclic frame decoded"),
+    COMPUTE,
+    SYNC_TO_COMMAND,
+    SLACK,
+)
+
+
+@dataclass(frozen=True)
+class CycleColumns:
+    """The columns of /cycle over n cycles, int64 (n,); a column that the log does not have is not in `columns`."""
+
+    t_ns: Cycles
+    columns: Mapping[str, Cycles]
+
+    def __len__(self) -> int:
+        return self.t_ns.size
+
+    def __getitem__(self, name: str) -> Cycles:
+        return self.columns[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def rows(self, rows: Cycles) -> "CycleColumns":
+        """Give some of the cycles."""
+        return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
+
+    @staticmethod
+    def joined(parts: "Sequence[CycleColumns]") -> "CycleColumns":
+        """Put parts with the same columns one after the other."""
+        names = parts[0].columns
+        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
+        return CycleColumns(np.concatenate([part.t_ns for part in parts]), columns)
+
+    def times_us(self, quantity: Quantity) -> Vector | None:
+        """Give a time of the cycles that have it, µs; None where the log does not have it."""
+        if quantity.column not in self:
+            return None
+        values_ns = self[quantity.column]
+        if quantity.column == "feedback_ns":
+            values_ns = values_ns[self["frames_missing"] == 0]  # else it is when the host gave up
+        return np.asarray(values_ns / 1000.0, dtype=np.float64)
+
+    def steps(self, name: str, before: int = 0) -> Cycles:
+        """Give what each cycle added to a running count (n,); a count that began anew begins at 0.
+
+        before: the count in the cycle before the first.
+        """
+        count = self[name]
+        added = np.diff(count, prepend=before)
+        return np.where(added < 0, count, added)
+
+
+def columns_of_series(series: Series) -> CycleColumns:
+    """Take the columns out of a log's /cycle; one of an older version lacks some."""
+    names = [name for name in CycleRecord._fields if name in series.fields]
+    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
+
+
+def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:
+    """Make the columns of records at times t_ns."""
+    table = np.array(records, dtype=np.int64).reshape(len(records), len(CycleRecord._fields))
+    columns = {name: table[:, place].copy() for place, name in enumerate(CycleRecord._fields)}
+    return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
+
 
 _BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
 _NEVER: Final = 1 << 62
@@ -348,3 +444,23 @@ def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
     is_last = bool(section.end_s >= end_s)
     first = int(np.searchsorted(time_s, section.start_s))
     return slice(first, int(np.searchsorted(time_s, section.end_s, side="right" if is_last else "left")))
+
+
+def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
+    """Read the settings that a run had. Raises LogError."""
+    if "config.toml" not in attachments:
+        raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
+    try:
+        return parse(Settings, renewed(parse_toml(attachments["config.toml"])))
+    except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
+        raise LogError(f"log {path}, attachment config.toml: {error}") from None
+
+
+def is_realtime(run: Run) -> bool:
+    """Tell whether the host's own clock drove the cycles."""
+    return run.metadata.get("clock") == "realtime"
+
+
+def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Mark the cycles (n,) that begin to react, from the states before them and their own."""
+    return np.asarray((state == SchemeState.REACT) & ~is_interrupted(previous))

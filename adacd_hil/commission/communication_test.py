@@ -12,7 +12,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.score.timing import OLDEST_CYCLES, CycleColumns, columns_of_records
+from adacd_hil.analysis.logged_run import CycleColumns, columns_of_records
+from adacd_hil.analysis.score.timing import OLDEST_CYCLES
 from adacd_hil.commission.zero_torque import ZeroTorqueCycle
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.drive import Drive

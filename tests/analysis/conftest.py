@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from analysis.replay_rig import record
 
-from adacd_hil.analysis.replay.replay import Replay, replay
+from adacd_hil.analysis.replay.replay import replay
+from adacd_hil.analysis.replay.replayed_outcome import Replay
 from adacd_hil.control.operator import ScriptedOperator
 
 

@@ -6,26 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_made_run import (
-    A,
-    C,
-    M,
-    P,
-    R,
-    S,
-    contact_report,
-    make_certified_run,
-    make_run,
-    react,
-    touch,
-)
+from hand_made_run import A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
 
 from adacd_hil.analysis.logged_run import split_sections
 from adacd_hil.analysis.report.report_files import Report
 from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.run_reading import Source
-from adacd_hil.analysis.score.contacts import Channel, two_pole_delay_s
-from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.metrics import Source
+from adacd_hil.analysis.score.touches import Channel, two_pole_delay_s
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns
 
-from adacd_hil.analysis.logged_run import CheckCounts
-from adacd_hil.analysis.score.metrics import evaluate
-from adacd_hil.analysis.score.run_faults import CyclicDataGatherer, data_text, find_faults, gather_data, percent_text
-from adacd_hil.analysis.score.timing import CycleColumns
+from adacd_hil.analysis.logged_run import CheckCounts, CycleColumns
+from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.run_faults import CyclicDataGatherer, find_faults, gather_data
+from adacd_hil.analysis.score.verdict import data_text
+from adacd_hil.analysis.score.wording import percent_text
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
 

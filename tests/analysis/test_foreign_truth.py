@@ -85,7 +85,7 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(
     rows: slice, false_alarms: int, unjudged: str, full_cycles: int, tmp_path: Path
 ) -> None:
     run, gathered, source = read_run(*recorded(tmp_path, with_truth_of(touched_run(), rows)), full_cycles=full_cycles)
-    from adacd_hil.analysis.score.metrics import evaluate
+    from adacd_hil.analysis.score.evaluation import evaluate
 
     assert evaluate(run, gathered).false_alarms == false_alarms
     said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else ""

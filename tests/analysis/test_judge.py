@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from adacd_hil.analysis.score.contacts import contact_rows
+from adacd_hil.analysis.logged_run import enters_react
 from adacd_hil.analysis.score.judge import (
     Alarm,
     Score,
     StreamJudge,
     TouchWindow,
     begins_of,
-    enters_react,
+    contact_bounds,
     explained_until,
     judge,
 )
@@ -134,9 +134,9 @@ def test_reacting_begins_once_until_the_stop_is_over():
 def test_another_index_or_another_attempt_is_another_contact():
     index = np.array([-1.0, 0, 0, 1, 1, -1, 1, 1])
     attempt = np.array([0, 0, 0, 0, 0, 0, 0, 1])
-    assert contact_rows(index, None) == [(1, 3), (3, 5), (6, 8)]
-    assert contact_rows(index, attempt) == [(1, 3), (3, 5), (6, 7), (7, 8)]
-    assert contact_rows(np.zeros(0), None) == []
+    assert contact_bounds(index, None) == [(1, 3), (3, 5), (6, 8)]
+    assert contact_bounds(index, attempt) == [(1, 3), (3, 5), (6, 7), (7, 8)]
+    assert contact_bounds(np.zeros(0), None) == []
 
 
 def test_windows_of_contacts_do_not_overlap():

@@ -7,8 +7,8 @@ import pytest
 from log.recorded_run import make_run, record
 
 from adacd_hil.analysis.replay import log_comparison
+from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.log_comparison import MATCH_S, Detection, compare_logs, match_contacts
-from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.cli.commands.compare_command import _contact as in_words
 from adacd_hil.log.log_files import LogError

@@ -18,7 +18,7 @@ from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.report.timeline import timeline_of
 from adacd_hil.analysis.score import emulator_truth
 from adacd_hil.analysis.score.emulator_truth import TruthRows, read_truth
-from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.verdict import identified_text
 from adacd_hil.cli.main import cli
 from adacd_hil.log import reader

@@ -23,9 +23,9 @@ from adacd_hil.analysis.report.report_files import Entry, Report, index_page
 from adacd_hil.analysis.report.report_tables import timing_tables
 from adacd_hil.analysis.report.run_figures import draw
 from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.run_reading import Source
 from adacd_hil.analysis.report.timing_figures import draw_timing
-from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.metrics import Source
 
 pytestmark = pytest.mark.slow
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
 
+from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.analysis.replay.replay import Replay, replay, replay_many, replay_source
-from adacd_hil.analysis.replay.what_if import apply_settings, side_by_side
+from adacd_hil.analysis.replay.replay import replay, replay_many, replay_source
+from adacd_hil.analysis.replay.replayed_outcome import Replay, side_by_side
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.score.emulator_truth import contacts_beside
+from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.judge import Score
-from adacd_hil.analysis.score.metrics import evaluate
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import begin_of_log, read_log

@@ -12,7 +12,7 @@ from hand_made_run import make_certified_run, make_run, react, touch, touched_ru
 from adacd_hil.analysis.drawing import COLOURS
 from adacd_hil.analysis.report.run_figures import CLOSE_UPS, draw, parameter_label, residuals
 from adacd_hil.analysis.report.timing_figures import draw_timing
-from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.records import SchemeState
 
 pytestmark = pytest.mark.slow

@@ -18,15 +18,11 @@ from parsed_page import Page
 from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.report_files import report_json, write_report, write_run_report
 from adacd_hil.analysis.report.report_tables import timing_tables
-from adacd_hil.analysis.report.run_reading import Source
-from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.metrics import Source
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import (
-    Event,
-    FaultReason,
-    SchemeState,
-)
+from adacd_hil.records import Event, FaultReason, SchemeState
 from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = pytest.mark.slow

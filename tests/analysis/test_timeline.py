@@ -11,7 +11,7 @@ from adacd_hil.analysis.logged_run import Motion
 from adacd_hil.analysis.report.contact_cards import CARDS, Push, contact_cards, draw_arm
 from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.timeline import notices_of, state_key, stays_of, timeline_of
-from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, Location, SchemeState
 

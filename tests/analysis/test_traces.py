@@ -15,8 +15,9 @@ from hypothesis.extra.numpy import arrays
 
 from adacd_hil.analysis.logged_run import Motion
 from adacd_hil.analysis.report.page import render
-from adacd_hil.analysis.report.traces import noise_of, pack, panels_of, step_of, traces_of
-from adacd_hil.analysis.score.metrics import evaluate
+from adacd_hil.analysis.report.timeline import traces_of
+from adacd_hil.analysis.report.traces import noise_of, pack, panels_of, step_of
+from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event
 

@@ -13,15 +13,27 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.analysis.replay.what_if import apply_settings
 from adacd_hil.analysis.score.emulator_truth import contacts_beside
 from adacd_hil.analysis.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.analysis.sweep import tune_roc
-from adacd_hil.analysis.sweep.tune import Candidate, Outcome, Tuning, _best, _problems, base_of, suggested_toml
+from adacd_hil.analysis.sweep.tune import _best, _problems, base_of, suggested_toml
 from adacd_hil.analysis.sweep.tune_candidates import _Shown, candidates, observe_candidates, thresholds_as_changes
 from adacd_hil.analysis.sweep.tune_figures import write_tuning
-from adacd_hil.analysis.sweep.tune_roc import FACTORS, Observed, Touched, Window, choose, delay_ms, read_logs, rising
+from adacd_hil.analysis.sweep.tune_roc import (
+    FACTORS,
+    Candidate,
+    Observed,
+    Outcome,
+    Touched,
+    Tuning,
+    Window,
+    choose,
+    delay_ms,
+    read_logs,
+    rising,
+)
 from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.cli.commands.demo_command import Cast, run_embedded
 from adacd_hil.cli.main import cli

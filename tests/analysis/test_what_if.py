@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from adacd_hil.analysis.replay.what_if import (
+from adacd_hil.analysis.replay.changed_settings import (
     apply_settings,
     changed_keys,
     keep_facts,

@@ -15,8 +15,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.replay.log_source import settings_of
-from adacd_hil.analysis.replay.what_if import changed_keys
+from adacd_hil.analysis.logged_run import settings_of
+from adacd_hil.analysis.replay.changed_settings import changed_keys
 from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream, Series, begin_of_log

@@ -13,14 +13,14 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.logged_run import settings_of
 from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
 from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
 from adacd_hil.records import CERTIFICATE_EVENTS, SchemeState
-from adacd_hil.settings.configuration import Settings, renewed
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
 
@@ -281,16 +281,6 @@ class LogSource:
         if splitter.unpaired:
             notes.append(f"{splitter.unpaired} records of /scheme or /cycle lack the other one of their cycle")
         return notes
-
-
-def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
-    """Read the settings that a run had. Raises LogError."""
-    if "config.toml" not in attachments:
-        raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
-    try:
-        return parse(Settings, renewed(parse_toml(attachments["config.toml"])))
-    except ValueError as error:  # what is wrong with the text, the TOML or a setting is a ValueError each
-        raise LogError(f"log {path}, attachment config.toml: {error}") from None
 
 
 def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:

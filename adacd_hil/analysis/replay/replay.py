@@ -9,7 +9,6 @@ with the stretch; only what lies in it is compared and told.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.replay.log_source import LogSource, Part, Source, Stretch
-from adacd_hil.analysis.replay.replayed_outcome import Adaptation, OutcomeGatherer, Transition
+from adacd_hil.analysis.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.analysis.replay.scheme_comparison import (
     SHOWN,
     TOLERANCE,
@@ -29,10 +28,9 @@ from adacd_hil.analysis.replay.scheme_comparison import (
     different_arithmetic,
 )
 from adacd_hil.analysis.score.emulator_truth import TrueContacts, contacts_beside
-from adacd_hil.analysis.score.judge import Score, unjudged_sentence
+from adacd_hil.analysis.score.wording import unjudged_sentence
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.reader import LoggedContact
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
@@ -46,57 +44,6 @@ _PROGRESS_CYCLES: Final = 200_000
 Progress = Callable[[str], None]
 Watch = Callable[[int, Ticks, SchemeBatch], None]
 """Is shown the decisions of each variant, by its place among them, as they are made."""
-
-
-@dataclass(frozen=True)
-class Replay:
-    """What one replay came to.
-
-    cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
-    are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
-    `mismatched_fields`. parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the
-    truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
-    ending: the last change of state, which may be before the stretch. attempts: from the beginning of the log.
-    """
-
-    settings: Settings
-    cycles: int
-    monitored_s: float
-    compared: int
-    attempts: int
-    states: tuple[Transition, ...]
-    contacts: tuple[LoggedContact, ...]
-    adaptations: tuple[Adaptation, ...]
-    parameters: dict[str, float]
-    score: Score | None
-    detections_ns: tuple[int, ...]
-    mismatches: tuple[Mismatch, ...]
-    mismatch_count: int
-    mismatched_fields: dict[str, int]
-    tolerance: float
-    zero_ns: int
-    ending: Transition | None
-    notes: tuple[str, ...] = ()
-    """What of the log could not be compared or judged, a line each."""
-
-    @property
-    def is_identical(self) -> bool:
-        """Whether something was compared and all of it was the same."""
-        return self.compared > 0 and self.mismatch_count == 0
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether all that the log should have could be compared and judged."""
-        return not self.notes
-
-    @property
-    def adaptation_s(self) -> tuple[float | None, ...]:
-        """How long each adaptation took; None if it came to nothing."""
-        return tuple(adaptation.took_s for adaptation in self.adaptations)
-
-    def time_s(self, t_ns: int) -> float:
-        """Give a time since motion start."""
-        return (t_ns - self.zero_ns) * 1e-9
 
 
 def replay(

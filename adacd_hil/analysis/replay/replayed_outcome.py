@@ -1,19 +1,26 @@
-"""What a replay came to, gathered stretch by stretch in constant memory: states, contacts, adaptations, parameters.
+"""What a replay came to, gathered stretch by stretch in constant memory, and replays set side by side.
 
 Alarms are judged as those of a run (`adacd_hil.analysis.score.judge`). As the arm in the log moved as it did, a scheme
 with other settings may still be in REACT when the next contact comes: the first sample over a threshold then finds it.
 """
 
-from typing import NamedTuple
+import itertools
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.logged_run import host_span
+from adacd_hil.analysis.logged_run import enters_react, host_span
+from adacd_hil.analysis.replay.scheme_comparison import Mismatch
 from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, TrueContacts, windows_of
-from adacd_hil.analysis.score.judge import Alarm, Score, TouchWindow, enters_react, judge
+from adacd_hil.analysis.score.judge import Alarm, Score, TouchWindow, judge
+from adacd_hil.analysis.score.wording import found_text, why_not_found
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
-from adacd_hil.records import FaultReason, SchemeState, Vector
+from adacd_hil.records import PARAMETER_UNITS, FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.settings.configuration import Settings
@@ -147,3 +154,181 @@ class OutcomeGatherer:
         is_known = span.covers(np.array([cycle for cycle, _ in self._alarms], np.int64)).tolist()
         alarms = [alarm._replace(is_known=known) for (_, alarm), known in zip(self._alarms, is_known, strict=True)]
         return judge(self._touches, alarms, self._crossings)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What one replay came to.
+
+    cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
+    are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in
+    `mismatched_fields`. parameters: of the end. score: of contacts and alarms that begin in the stretch, None where the
+    truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0 without one.
+    ending: the last change of state, which may be before the stretch. attempts: from the beginning of the log.
+    """
+
+    settings: Settings
+    cycles: int
+    monitored_s: float
+    compared: int
+    attempts: int
+    states: tuple[Transition, ...]
+    contacts: tuple[LoggedContact, ...]
+    adaptations: tuple[Adaptation, ...]
+    parameters: dict[str, float]
+    score: Score | None
+    detections_ns: tuple[int, ...]
+    mismatches: tuple[Mismatch, ...]
+    mismatch_count: int
+    mismatched_fields: dict[str, int]
+    tolerance: float
+    zero_ns: int
+    ending: Transition | None
+    notes: tuple[str, ...] = ()
+    """What of the log could not be compared or judged, a line each."""
+
+    @property
+    def is_identical(self) -> bool:
+        """Whether something was compared and all of it was the same."""
+        return self.compared > 0 and self.mismatch_count == 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all that the log should have could be compared and judged."""
+        return not self.notes
+
+    @property
+    def adaptation_s(self) -> tuple[float | None, ...]:
+        """How long each adaptation took; None if it came to nothing."""
+        return tuple(adaptation.took_s for adaptation in self.adaptations)
+
+    def time_s(self, t_ns: int) -> float:
+        """Give a time since motion start."""
+        return (t_ns - self.zero_ns) * 1e-9
+
+
+NOTE: Final = (
+    "The arm in the log moved as it did, and the user asked for what was asked: what another scheme would have done "
+    "about a contact, and all that would have followed from it, is not in here."
+)
+
+Row = tuple[str, ...]
+
+
+def side_by_side(replays: Sequence[Replay]) -> list[Row]:
+    """Return a row per quantity: its name, then its value in each replay."""
+    rows = [("contacts detected", *map(_detected, replays))]
+    if any(each.score is None for each in replays):
+        rows.append(("detections at", *(_times(each, each.detections_ns) for each in replays)))
+    rows += _contact_rows(replays)
+    rows += [
+        ("missed", *("–" if each.score is None else str(each.score.missed) for each in replays)),
+        ("false alarms", *map(_false_alarms, replays)),
+        ("median delay, ms", *map(_median_delay, replays)),
+    ]
+    for index in range(max(len(each.adaptation_s) for each in replays)):
+        rows.append((f"adaptation {index + 1}, s", *(_adaptation(each, index) for each in replays)))
+    for name in dict.fromkeys(itertools.chain.from_iterable(each.parameters for each in replays)):
+        unit = PARAMETER_UNITS.get(name, "")
+        rows.append((f"{name}, {unit}", *(_number(each.parameters.get(name)) for each in replays)))
+    rows.append(("ends in", *map(_end, replays)))
+    return rows
+
+
+def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
+    contacts = [
+        {contact.number: contact for contact in (each.score.contacts if each.score else ())} for each in replays
+    ]
+    rows = []
+    for number in sorted(set().union(*contacts)):
+        known = [each.get(number) for each in contacts]
+        first = next(contact for contact in known if contact is not None)
+        name = f"contact {number}, link {first.link}, at {replays[0].time_s(first.onset_ns):.2f} s"
+        cells = (
+            "–" if contact is None
+            else f"after {contact.delay_ms:.1f} ms" if contact.delay_ms is not None
+            else why_not_found(contact.is_armed)
+            for contact in known
+        )  # fmt: skip
+        rows.append((name, *cells))
+    return rows
+
+
+def _detected(found: Replay) -> str:
+    if found.score is None:
+        return str(len(found.detections_ns))
+    return found_text(len(found.score.delays_ms), len(found.score.contacts))
+
+
+def _times(found: Replay, times_ns: Sequence[int]) -> str:
+    return ", ".join(f"{found.time_s(t_ns):.2f} s" for t_ns in times_ns) or "–"
+
+
+def _false_alarms(found: Replay) -> str:
+    if found.score is None:
+        return "–"
+    times_ns = [alarm.t_ns for alarm in found.score.false_alarms]
+    count = len(times_ns)
+    return f"{count}, at {_times(found, times_ns[:3])}{', …' if count > 3 else ''}" if count else "0"
+
+
+def _median_delay(found: Replay) -> str:
+    delays = () if found.score is None else found.score.delays_ms
+    return f"{statistics.median(delays):.1f}" if delays else "–"
+
+
+def _adaptation(found: Replay, index: int) -> str:
+    if index >= len(found.adaptation_s):
+        return "–"
+    took_s = found.adaptation_s[index]
+    return "not finished" if took_s is None else f"{took_s:.3f}"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.6g}"
+
+
+def _end(found: Replay) -> str:
+    last = found.ending
+    if last is None:
+        return SchemeState.INIT.name
+    fault = f" ({last.fault.name})" if last.state is SchemeState.FAULT else ""
+    return f"{last.state.name}{fault} since {found.time_s(last.t_ns):.2f} s"
+
+
+def as_json(found: Replay) -> dict[str, Any]:
+    """Give a replay in plain values; times in s since motion start."""
+    return {
+        "cycles": found.cycles,
+        "attempts": found.attempts,
+        "contacts": None
+        if found.score is None
+        else [
+            {
+                "number": contact.number,
+                "link": contact.link,
+                "onset_s": found.time_s(contact.onset_ns),
+                "is_armed": contact.is_armed,
+                "detected_s": None if contact.detected_ns is None else found.time_s(contact.detected_ns),
+                "delay_ms": contact.delay_ms,
+            }
+            for contact in found.score.contacts
+        ],
+        "detections_s": [found.time_s(t_ns) for t_ns in found.detections_ns],
+        "false_alarms_s": None
+        if found.score is None
+        else [found.time_s(alarm.t_ns) for alarm in found.score.false_alarms],
+        "missed": None if found.score is None else found.score.missed,
+        "adaptation_s": list(found.adaptation_s),
+        "parameters": {name: value if math.isfinite(value) else None for name, value in found.parameters.items()},
+        "states": [
+            {
+                "cycle": each.cycle,
+                "time_s": found.time_s(each.t_ns),
+                "from": each.previous.name,
+                "to": each.state.name,
+                "fault": each.fault.name,
+            }
+            for each in found.states
+        ],
+    }

@@ -7,21 +7,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.analysis.logged_run import Run
-from adacd_hil.analysis.report.page import (
-    CONTACTS,
-    NONE,
-    Cell,
-    Table,
-    contact_rows,
-    make_table,
-    number_text,
-    scaled,
-    shown_contacts,
-    signs_text,
-    uncertain_text,
-)
-from adacd_hil.analysis.score.contacts import Contact, row_at
-from adacd_hil.analysis.score.metrics import Metrics
+from adacd_hil.analysis.report.page import CONTACTS, Cell, Table, contact_rows, make_table, shown_contacts
+from adacd_hil.analysis.score.metrics import Contact, Metrics
+from adacd_hil.analysis.score.touches import row_at
+from adacd_hil.analysis.score.wording import NONE, number_text, scaled, signs_text, uncertain_text
 from adacd_hil.records import Location, Vector
 
 _Point = tuple[float, float]

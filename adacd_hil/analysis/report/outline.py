@@ -17,15 +17,15 @@ from adacd_hil.analysis.logged_run import (
     AttemptBegins,
     CertifiedStream,
     CheckCounts,
+    Cycles,
     Motion,
     PaperStream,
     Run,
     host_cycles,
 )
-from adacd_hil.analysis.score.contacts import true_contacts
 from adacd_hil.analysis.score.emulator_truth import TruthRows, host_truth
 from adacd_hil.analysis.score.margins import SETTLING_TIME_CONSTANTS
-from adacd_hil.analysis.score.timing import Cycles
+from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, contacts_of
 from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
 from adacd_hil.settings.configuration import Settings

@@ -20,9 +20,11 @@ from typing import Any, Final, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from adacd_hil.analysis.logged_run import StretchOfRun
-from adacd_hil.analysis.score.contacts import Contact
-from adacd_hil.analysis.score.judge import why_not_found
-from adacd_hil.analysis.score.metrics import Metrics
+from adacd_hil.analysis.score.metrics import Contact, Metrics
+from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, signs_text, why_not_found, yes_text
+
+TRACED_CONTACTS: Final = 60
+
 
 SECTIONS: Final = 60
 """Sections with a row in the tables of sections and margins."""
@@ -113,32 +115,6 @@ def _environment() -> Environment:
 def _asset(name: str) -> _Asset:
     text = f"\n{resources.files(_PACKAGE).joinpath('assets', name).read_text(encoding='utf-8').strip()}\n"
     return _Asset(text, b64encode(hashlib.sha256(text.encode()).digest()).decode())
-
-
-NONE: Final = "–"
-
-
-def number_text(value: float | None, digits: int, unit: str = "") -> str:
-    """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
-    if value is None or not math.isfinite(value):
-        return NONE
-    text = f"{value:.{digits}f}".replace("-", "−")
-    return f"{text} {unit}" if unit else text
-
-
-def pair_text(values: Sequence[float] | None, digits: int) -> str:
-    """Write the values of both joints; a dash for None."""
-    return NONE if values is None else " / ".join(number_text(value, digits) for value in values)
-
-
-def yes_text(value: bool | None) -> str:
-    """Write yes or no; a dash for None."""
-    return NONE if value is None else "yes" if value else "no"
-
-
-def signs_text(direction: tuple[int, int] | None) -> str:
-    """Write the signs of both joints; a dash for None."""
-    return NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
 
 
 _CONTACT_HEAD: Final = (
@@ -236,20 +212,3 @@ def stretch_text(stretch: StretchOfRun) -> str:
     if stretch.found == stretch.asked:
         return text
     return f"{text}, widened so that no contact and no adaptation is cut"
-
-
-def signed_text(value: float) -> str:
-    """Write a number with its sign and one decimal."""
-    return f"{value:+.1f}".replace("-", "−")
-
-
-def scaled(value: float | None, factor: float) -> float | None:
-    """Multiply what is known."""
-    return None if value is None else factor * value
-
-
-def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
-    """Write a value with its standard deviation; a dash where either is not known."""
-    if value is None or sigma is None:
-        return NONE
-    return f"{number_text(value, digits)} ± {number_text(sigma, digits)} {unit}"

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.drawing import COLOURS, Drawing, style
 from adacd_hil.analysis.logged_run import Run, StretchOfRun, section_at
 from adacd_hil.analysis.report.page import (
-    NONE,
     PRINTED_CONTACTS,
     Heading,
     contact_rows,
@@ -39,12 +38,12 @@ from adacd_hil.analysis.report.page import (
 )
 from adacd_hil.analysis.report.run_figures import draw
 from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.run_reading import Progress, Source, read_run
+from adacd_hil.analysis.report.run_reading import Progress, read_run
 from adacd_hil.analysis.report.timeline import stays_of
 from adacd_hil.analysis.report.timing_figures import draw_timing
-from adacd_hil.analysis.score.contacts import Contact
-from adacd_hil.analysis.score.margins import Evidence
-from adacd_hil.analysis.score.metrics import Gathered, Metrics, evaluate
+from adacd_hil.analysis.score.evaluation import evaluate
+from adacd_hil.analysis.score.metrics import Contact, Evidence, Gathered, Metrics, Source
+from adacd_hil.analysis.score.wording import NONE
 from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import WHOLE, TimeWindow

@@ -5,28 +5,29 @@ from itertools import islice
 from string import ascii_letters
 from typing import Final, NamedTuple
 
-from adacd_hil.analysis.logged_run import Run
+from adacd_hil.analysis.logged_run import QUANTITIES, Quantity, Run
 from adacd_hil.analysis.report.page import (
     ADAPTATIONS,
-    NONE,
     SECTIONS,
     Cell,
     Table,
     make_table,
-    number_text,
-    pair_text,
     paper_cells,
     paper_head,
-    signed_text,
     stretch_text,
 )
-from adacd_hil.analysis.report.run_reading import Source
 from adacd_hil.analysis.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
-from adacd_hil.analysis.score.judge import rate_sentence
-from adacd_hil.analysis.score.margins import ChannelMargin, Evidence, Residual
-from adacd_hil.analysis.score.metrics import Metrics
-from adacd_hil.analysis.score.run_faults import CyclicData, percent_text
-from adacd_hil.analysis.score.timing import OLDEST_CYCLES, QUANTITIES, Quantity, TimingEvidence
+from adacd_hil.analysis.score.metrics import (
+    ChannelMargin,
+    CyclicData,
+    Evidence,
+    Metrics,
+    Residual,
+    Source,
+    TimingEvidence,
+)
+from adacd_hil.analysis.score.timing import OLDEST_CYCLES
+from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, percent_text, rate_sentence, signed_text
 from adacd_hil.records import PARAMETER_UNITS
 
 

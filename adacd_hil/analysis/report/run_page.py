@@ -9,11 +9,10 @@ from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.contact_cards import contact_cards, contacts_table
 from adacd_hil.analysis.report.page import (
     CONTACTS,
-    NONE,
+    TRACED_CONTACTS,
     Heading,
     has_paper,
     left_out_text,
-    number_text,
     render_page,
     stretch_text,
 )
@@ -29,13 +28,10 @@ from adacd_hil.analysis.report.report_tables import (
     sections_table,
     timing_tables,
 )
-from adacd_hil.analysis.report.run_reading import TRACED_CONTACTS, Source
-from adacd_hil.analysis.report.timeline import state_key, timeline_of
-from adacd_hil.analysis.report.traces import SCRIPTS, STYLES, traces_of
-from adacd_hil.analysis.score.margins import Evidence
-from adacd_hil.analysis.score.metrics import Metrics
-from adacd_hil.analysis.score.run_faults import percent_text
+from adacd_hil.analysis.report.timeline import SCRIPTS, STYLES, state_key, timeline_of, traces_of
+from adacd_hil.analysis.score.metrics import Evidence, Metrics, Source
 from adacd_hil.analysis.score.verdict import LISTED
+from adacd_hil.analysis.score.wording import NONE, number_text, percent_text
 
 
 def report_page(

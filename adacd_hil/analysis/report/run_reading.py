@@ -27,25 +27,29 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.logged_run import Rows, Run, StretchOfRun, Truth, extreme_rows, split_sections
-from adacd_hil.analysis.replay.log_source import settings_of
-from adacd_hil.analysis.report.outline import Facts, Outline, SchemeRows, run_of_piece, settling_s, widen
-from adacd_hil.analysis.report.page import ADAPTATIONS
-from adacd_hil.analysis.report.traces import panels_of
-from adacd_hil.analysis.score.contacts import true_contacts
-from adacd_hil.analysis.score.emulator_truth import TruthRows, foreign_truth, host_truth, read_truth
-from adacd_hil.analysis.score.judge import find_detections, unjudged_sentence
-from adacd_hil.analysis.score.margins import UntouchedGatherer
-from adacd_hil.analysis.score.metrics import Gathered, is_realtime
-from adacd_hil.analysis.score.run_faults import CyclicDataGatherer
-from adacd_hil.analysis.score.timing import (
+from adacd_hil.analysis.logged_run import (
     QUANTITIES,
-    QUEUES,
     CycleColumns,
-    TimingGatherer,
+    Rows,
+    Run,
+    StretchOfRun,
+    Truth,
     columns_of_series,
-    find_reactions,
+    extreme_rows,
+    is_realtime,
+    settings_of,
+    split_sections,
 )
+from adacd_hil.analysis.report.outline import Facts, Outline, SchemeRows, run_of_piece, settling_s, widen
+from adacd_hil.analysis.report.page import ADAPTATIONS, TRACED_CONTACTS
+from adacd_hil.analysis.report.traces import panels_of
+from adacd_hil.analysis.score.emulator_truth import TruthRows, foreign_truth, host_truth, read_truth
+from adacd_hil.analysis.score.margins import UntouchedGatherer
+from adacd_hil.analysis.score.metrics import Gathered, Source
+from adacd_hil.analysis.score.run_faults import CyclicDataGatherer
+from adacd_hil.analysis.score.timing import QUEUES, TimingGatherer, find_reactions
+from adacd_hil.analysis.score.touches import find_detections, true_contacts
+from adacd_hil.analysis.score.wording import unjudged_sentence
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, LogError
 from adacd_hil.log.reader import LogStream, Piece, Series, check_states, start_of_log
 from adacd_hil.log.time_window import WHOLE, TimeWindow
@@ -54,7 +58,6 @@ from adacd_hil.terminal import one_line
 
 BUCKETS: Final = 2_500
 TIME_BUCKETS: Final = 4_000
-TRACED_CONTACTS: Final = 60
 ADAPTATION_CYCLES: Final = 10_000
 _AROUND_S: Final = (0.15, 0.6)
 _AFTER_ADAPTATION: Final = 0.1
@@ -172,14 +175,6 @@ _MOST_DIGITS: Final = 18
 Progress = Callable[[str], None]
 Bounds = tuple[int, int]
 """From when, and before when, ns of the run's clock."""
-
-
-class Source(NamedTuple):
-    """The log that a run was read from; `is_complete`: it is whole and nothing was dropped on the way to it."""
-
-    log_name: str
-    problem: str = ""  # what is missing, one line
-    is_complete: bool = True
 
 
 class ReadRun(NamedTuple):

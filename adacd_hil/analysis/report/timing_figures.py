@@ -9,18 +9,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from adacd_hil.analysis.drawing import COLOURS, Drawing, label_below, label_decades, legend_above, note, style
+from adacd_hil.analysis.logged_run import COMPUTE, LATENESS, SLACK, SYNC_TO_COMMAND, CycleColumns, Quantity
 from adacd_hil.analysis.score.distribution import BINS_PER_DECADE
-from adacd_hil.analysis.score.timing import (
-    COMPUTE,
-    LATENESS,
-    QUEUES,
-    SLACK,
-    SYNC_TO_COMMAND,
-    CycleColumns,
-    Quantity,
-    TimeStatistics,
-    TimingEvidence,
-)
+from adacd_hil.analysis.score.metrics import TimeStatistics, TimingEvidence
+from adacd_hil.analysis.score.timing import QUEUES
 from adacd_hil.records import Vector
 
 _SHOWN: Final = (LATENESS, COMPUTE, SYNC_TO_COMMAND, SLACK)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import (
+    Cycles,
     EmulatorSpan,
     Truth,
     extreme_rows,
@@ -27,9 +28,7 @@ from adacd_hil.analysis.logged_run import (
     is_interrupted,
     whole_rounds,
 )
-from adacd_hil.analysis.score.contacts import contact_rows, forgotten_after_s
-from adacd_hil.analysis.score.judge import TouchWindow
-from adacd_hil.analysis.score.timing import Cycles
+from adacd_hil.analysis.score.judge import TouchWindow, contact_bounds, forgotten_after_s
 from adacd_hil.log.editing.log_info import attachment, run_metadata
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
 from adacd_hil.log.reader import LogStream, Series
@@ -393,7 +392,7 @@ def contacts_beside(path: Path, progress: Callable[[str], None] = lambda _: None
 
 def _contacts(rows: TruthRows) -> tuple[TrueContact, ...]:
     found = []
-    for number, (start, end) in enumerate(contact_rows(rows.contact_index, rows.attempt), start=1):
+    for number, (start, end) in enumerate(contact_bounds(rows.contact_index, rows.attempt), start=1):
         stop = end + int(end < len(rows.cycle) and rows.attempt[end] == rows.attempt[start])  # the row after it
         cycle = rows.cycle[start:stop]
         link, tau_ext = int(rows.contact_link[start]), rows.tau_ext[start:stop]

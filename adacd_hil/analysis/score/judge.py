@@ -5,7 +5,7 @@ while it adapts and while it parks, too. While it is in REACT or STOPPED it is s
 without a joint over its threshold and without a report is an arm that is held for another reason, and no alarm.
 
 A true contact explains alarms from its onset until it is forgotten: until one time constant after its true torque,
-filtered, is back within the threshold (`contacts.forgotten_after_s`). An alarm is about the last contact that began
+filtered, is back within the threshold (`forgotten_after_s`). An alarm is about the last contact that began
 before it, as long as that contact, or one before it, is not forgotten; so an alarm is about one contact at most. The
 first alarm about a contact finds it. An alarm about none is *false*, in whatever state it was raised, unless the
 emulator did not record what was true then: nobody knows about such an alarm.
@@ -21,14 +21,14 @@ distribution", Biometrika 28 (1936).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaincinv, gammaincinv
 
-from adacd_hil.analysis.logged_run import Mask, Run, is_interrupted
-from adacd_hil.records import ContactReport, SchemeState
+from adacd_hil.records import Vector
 
 
 class Alarm(NamedTuple):
@@ -39,12 +39,7 @@ class Alarm(NamedTuple):
     is_known: bool = True
 
 
-def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> Mask:
-    """Mark the cycles (n,) that begin to react, from the states before them and their own."""
-    return np.asarray((state == SchemeState.REACT) & ~is_interrupted(previous))
-
-
-def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> Mask:
+def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
     """Mark of samples over a threshold, at ascending times (n,), those that begin an alarm: after more than a pause.
 
     last: the sample before them, of which they may go on; None: there was none.
@@ -53,38 +48,6 @@ def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> Mask
     if last is None:
         begins[:1] = True
     return np.asarray(begins)
-
-
-class Detection(NamedTuple):
-    """An alarm of a run: its row, its time, and the report at the alarm and at the end of the window."""
-
-    row: int
-    detected_s: float
-    raised: Alarm
-    alarm: ContactReport | None
-    final: ContactReport | None
-
-
-def find_detections(run: Run) -> tuple[Detection, ...]:
-    """Find the alarms of a run and the reports that belong to them by their cycle."""
-    rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
-    alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
-    finals = {report.cycle: report for report in run.reports if report.is_final}
-    time_s = run.time_s()
-    detections = []
-    for row in rows.tolist():
-        cycle = int(run.cycle[row])
-        final = finals.get(cycle)
-        alarm = alarms.get(cycle, final)
-        if alarm is None and run.contact_joints is not None and not run.contact_joints[row]:
-            continue
-        raised = Alarm(
-            int(run.t_ns[row]),
-            bool(run.state[row - 1] == SchemeState.MONITOR),
-            run.truth is None or run.truth.covers(cycle),
-        )
-        detections.append(Detection(row, float(time_s[row]), raised, alarm, final))
-    return tuple(detections)
 
 
 CONFIDENCE: Final = 0.95
@@ -264,74 +227,39 @@ def least_rate_per_h(alarms: int, hours: float) -> float:
     return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0
 
 
-def why_not_found(is_armed: bool) -> str:
-    """Say why nothing found a contact."""
-    return "missed" if is_armed else "not armed"
+def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
+    """Give from which row to before which each contact of a truth lasts; index, attempt (m,): of its rows.
+
+    Another index is another contact, though nobody lets go in between. What goes on as an attempt begins is another
+    one, too: the scheme begins anew.
+    """
+    is_edge = index[1:] != index[:-1]
+    if attempt is not None:
+        is_edge |= attempt[1:] != attempt[:-1]
+    bounds = [0, *(np.flatnonzero(is_edge) + 1).tolist(), len(index)]
+    return [(start, end) for start, end in pairwise(bounds) if end > start and index[start] >= 0]
 
 
-def found_text(found: int, contacts: int) -> str:
-    """Say how many contacts were found."""
-    return f"{found} of {contacts}"
+def filtered(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float) -> Vector:
+    """Filter a true torque (n, 2) as an ideal detector would see it: first order, at rest at the first sample.
+
+    Each sample is held until the next one; cycle (n,): when they were taken, in periods.
+    """
+    response = np.zeros_like(tau_ext)
+    decays = np.exp(-a_rad_s * period_s * np.diff(cycle).astype(np.float64)).tolist()
+    for joint in range(tau_ext.shape[1]):
+        value = 0.0
+        for row, (sample, decay) in enumerate(zip(tau_ext[:-1, joint].tolist(), decays, strict=True), start=1):
+            value = sample + (value - sample) * decay
+            response[row, joint] = value
+    return response
 
 
-def number_of(count: int, noun: str) -> str:
-    """Write a count with its noun."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float, threshold: Vector) -> float:
+    """Give how long after its end an alarm may still stem from a contact, s.
 
-
-def score_sentence(score: Score) -> str:
-    """Say what was found within what time, what was missed, and how many alarms were false."""
-    armed = [contact for contact in score.contacts if contact.is_armed]
-    delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
-    within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
-    if not armed:
-        found = "no contact while detection was armed"
-    elif score.missed:
-        found = f"{len(delays_ms)} of {number_of(len(armed), 'contact')} detected{within}, {score.missed} missed"
-    else:
-        found = f"{'the one contact' if len(armed) == 1 else f'all {len(armed)} contacts'} detected{within}"
-    false = number_of(len(score.false_alarms), "false alarm") if score.false_alarms else "none false"
-    if not armed and not score.false_alarms:
-        false = "no false alarm"
-    disarmed = [contact for contact in score.contacts if not contact.is_armed]
-    outside = f", {len(disarmed)} more while it was not armed" if disarmed else ""
-    early = sum(contact.detected_ns is not None for contact in disarmed)
-    outside += f" ({early} of them detected)" if early else ""
-    return f"{found}{outside}, {false}"
-
-
-def unjudged_sentence(count: int) -> str:
-    """Say in one line how many alarms the truth does not cover; "" if none."""
-    return f"the truth doesn't cover {number_of(count, 'detection')}, not judged" if count else ""
-
-
-def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
-    """Say what false alarms there were, and which rate the counting leaves possible."""
-    count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
-    return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at 95 %"
-
-
-def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Give median, 90th percentile and largest."""
-    if not delays_ms:
-        return None, None, None
-    median, p90, largest = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist()
-    return median, p90, largest
-
-
-def delays_phrase(delays_ms: Sequence[float]) -> str:
-    """Say how delays are distributed; nothing of none."""
-    if not delays_ms:
-        return ""
-    return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms))
-
-
-def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
-    """Say how many contacts were found, the bounds of their share, and after what time."""
-    found = found_text(len(delays_ms), contacts)
-    return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
-
-
-def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
-    """Say how many false alarms came in how many hours."""
-    return f"{alarms} false alarms in {hours:.4f} h, 95 % bound {bound_per_h:.3g} per hour"
+    One time constant after its true torque (k, 2), filtered with `a_rad_s`, is back within the threshold (2,).
+    """
+    response = filtered(tau_ext, cycle, period_s, a_rad_s)[-1]
+    excess = float(np.max(np.abs(response) / threshold))
+    return (1.0 + math.log(max(1.0, excess))) / a_rad_s

@@ -1,6 +1,6 @@
-"""What a run achieved, in numbers: adaptation times, residuals, contacts, false alarms, cycle statistics.
+"""What a run achieved, in numbers: adaptation times, residuals, contacts, false alarms, margins, times of the cycle.
 
-Pure functions from a run's arrays to frozen results. Times in s count from *motion start*: the first cycle in ADAPT.
+`evaluation` makes these results of a run's arrays. Times in s count from *motion start*: the first cycle in ADAPT.
 Torques in Nm, joint arrays (2,), histories time-first (n, 2); `tau_ext_hat` has the filter's DC gain taken out, so
 that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
 
@@ -22,24 +22,296 @@ those of the fastest channel of its bank. What else it has: `adacd_hil.analysis.
 scheme that ran beside it on the same stream: `adacd_hil.analysis.score.margins`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from adacd_hil.analysis.logged_run import Run, Section, rows_of, split_sections
-from adacd_hil.analysis.score.contacts import Contact, judge_run, list_contacts, true_contacts
-from adacd_hil.analysis.score.judge import find_detections, rate_bound_per_h
-from adacd_hil.analysis.score.margins import (
-    Evidence,
-    Residual,
-    Untouched,
-    evaluate_certified,
-    gather_untouched,
-    last_row,
-)
-from adacd_hil.analysis.score.run_faults import CyclicData, find_causes, find_faults, gather_data
-from adacd_hil.analysis.score.timing import TimingEvidence, collect_evidence, find_reactions
-from adacd_hil.analysis.score.verdict import PaperRow, compare_with_paper, give_verdict, is_margin_below_1, is_revoked
-from adacd_hil.records import PARAMETER_NAMES
+from adacd_hil.analysis.logged_run import Section
+from adacd_hil.analysis.score.distribution import LogHistogram
+from adacd_hil.analysis.score.judge import rate_bound_per_h
+
+
+@dataclass(frozen=True)
+class TimeStatistics:
+    """Percentiles by name, µs, and the histogram of a time; both empty without a value."""
+
+    percentiles: Mapping[str, float]
+    histogram: LogHistogram
+
+
+class Count(NamedTuple):
+    """How often something happened, in all and per 100 000 cycles; None without a cycle."""
+
+    total: int
+    per_100000: float | None
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """Latency from the decision to the first command that reacts, over `count` reactions; percentiles in µs."""
+
+    count: int
+    percentiles: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class TimingEvidence:
+    """What the times of a run come to; None is what the log does not have, or what lockstep has no meaning for.
+
+    is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. data_age: cycles by
+    the age of the oldest value used; the last entry counts all from OLDEST_CYCLES on.
+    """
+
+    period_us: float
+    is_modelled: bool
+    cycles: int
+    times: Mapping[str, TimeStatistics | None]
+    reaction: Reaction | None
+    data_age: tuple[int, ...] | None
+    queues_bytes: Mapping[str, Mapping[str, float] | None]
+    counts: Mapping[str, Count | None]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give the evidence in plain values."""
+        times = {name: found for name, found in self.times.items() if found is not None}
+        absent = dict.fromkeys(self.times)
+        reaction = self.reaction
+        return {
+            "is_modelled": self.is_modelled,
+            "period_us": self.period_us,
+            "cycles": self.cycles,
+            "times_us": {**absent, **{name: dict(found.percentiles) for name, found in times.items()}},
+            "reaction_us": None if reaction is None else {"count": reaction.count, **reaction.percentiles},
+            "data_age_cycles": None if self.data_age is None else list(self.data_age),
+            "queues_bytes": {name: None if depth is None else dict(depth) for name, depth in self.queues_bytes.items()},
+            "counts": {name: None if count is None else count._asdict() for name, count in self.counts.items()},
+            "histograms_us": {**absent, **{name: found.histogram.as_json() for name, found in times.items()}},
+        }
+
+
+class Fault(NamedTuple):
+    """A stay in FAULT. cause: the log's words for it, "" without any; is_last: the run ended in it."""
+
+    reason: str
+    at_s: float
+    cause: str
+    is_last: bool
+
+
+@dataclass(frozen=True)
+class DeviceShares:
+    """Shares of the cycles of a device, 0…1: without a new frame, with a repeated one, and the worst second of each."""
+
+    cycles: int
+    no_new_data: float
+    repeated: float
+    worst_no_new_data: float
+    worst_repeated: float
+
+
+@dataclass(frozen=True)
+class CyclicData:
+    """Shares of `cycles` cycles with powered drives, 0…1; excesses: over their limit in some second, a line each.
+
+    incomplete, worst_incomplete, aged: None where the log does not say. devices: empty where it does not.
+    """
+
+    cycles: int
+    incomplete: float | None
+    worst_incomplete: float | None
+    aged: float | None
+    devices: dict[str, DeviceShares]
+    excesses: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        devices = {name: vars(shares) for name, shares in self.devices.items()}
+        return {**vars(self), "devices": devices, "excesses": list(self.excesses)}
+
+
+@dataclass(frozen=True)
+class SmallestPush:
+    """Of each joint the percentiles p50, p99, p99.9 and max, Nm, over so many hours of MONITOR without a touch.
+
+    tail_rate_per_h: false alarms to be expected if all channels' residuals have the tail of a Gaussian.
+    """
+
+    push_Nm: tuple[dict[str, float], ...]
+    threshold_Nm: tuple[dict[str, float], ...]
+    hours: float
+    tail_rate_per_h: float
+
+
+@dataclass(frozen=True)
+class BesideContact:
+    """A true contact as the paper's scheme would have seen it; number as in the list of contacts."""
+
+    number: int
+    is_armed: bool
+    detected_s: float | None
+    delay_ms: float | None
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What the paper's scheme would have come to, by the definitions of the module's first lines.
+
+    Without the truth there are no contacts, and false alarms and misses are None.
+    """
+
+    adaptation_s: dict[str, float | None]
+    frozen_residual_max_Nm: dict[str, tuple[float, float] | None]
+    contacts: tuple[BesideContact, ...]
+    false_alarms: int | None
+    false_alarms_s: tuple[float, ...] | None
+    missed: int | None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter at the end of an adaptation and the standard deviation that the scheme gives it, in its unit."""
+
+    value: float
+    std: float
+
+
+@dataclass(frozen=True)
+class ChannelMargin:
+    """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, where nothing touches.
+
+    residual_max_Nm: largest. threshold_Nm: median of the threshold. margin: see the module's first lines.
+    """
+
+    cutoff_rad_s: float
+    smoothing_rad_s: float | None
+    residual_max_Nm: tuple[float, float]
+    threshold_Nm: tuple[float, float]
+    margin: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
+
+    margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
+    says what anchors all its offsets; logs from before there were anchors say nothing. revoked: why certificates were
+    taken back, in order. smallest_push: None where nothing was armed.
+    """
+
+    tests: dict[str, int]
+    test_s: dict[str, float | None]
+    estimates: dict[str, dict[str, Estimate]]
+    margins: dict[str, tuple[ChannelMargin, ...]]
+    promotions: int
+    paper_beside: Beside | None
+    is_anchored: bool
+    revoked: tuple[str, ...]
+    smallest_push: SmallestPush | None
+
+    @property
+    def smallest_margin(self) -> float | None:
+        """The smallest of all margins where the certified model was in force or was learnt."""
+        values = [min(row.margin) for rows in self.margins.values() for row in rows]
+        return min(values, default=None)
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact; None if none."""
+
+    identified: tuple[float, float] | None
+    cad: tuple[float, float] | None
+    cycles: int
+
+
+@dataclass(frozen=True)
+class Untouched:
+    """What was gathered, by section. promotions: refined models that took over; beside: None where none ran.
+
+    smallest_push: None of the paper's scheme, and where nothing was armed.
+    """
+
+    residuals: dict[str, Residual]
+    margins: dict[str, tuple[ChannelMargin, ...]]
+    promotions: int
+    beside: Beside | None
+    smallest_push: SmallestPush | None
+
+
+class PaperRow(NamedTuple):
+    """One line of *paper against measured*.
+
+    paper: None where the run is not of the paper's experiment; beside: the paper's scheme on the same stream, None
+    where none ran.
+    """
+
+    quantity: str
+    paper: str | None
+    beside: str | None
+    measured: str
+
+
+class Source(NamedTuple):
+    """The log that a run was read from; `is_complete`: it is whole and nothing was dropped on the way to it."""
+
+    log_name: str
+    problem: str = ""  # what is missing, one line
+    is_complete: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contact:
+    """A true contact and its detection, or on a real arm a detection alone.
+
+    state: of the scheme at the onset, on a real arm at the detection.
+    law_ms: closed-form delay of a step of the largest torque up to the detection, the faster joint; None if never.
+    ideal_ms: delay that the filter alone gives to the true torque as it was; None if never.
+    link_at_alarm, link_detected: isolated at detection and at the end of the isolation window.
+    torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
+    true_force_N: size of the true force, at whatever angle.
+    level to blind_deg: what the last report says, in the names of `records`; None where it doesn't say. A sigma is a
+    standard deviation.
+    """
+
+    number: int
+    section: str | None = None
+    state: str
+    link: int | None = None
+    onset_s: float | None = None
+    end_s: float | None = None
+    is_armed: bool
+    detected_s: float | None = None
+    delay_ms: float | None = None
+    law_ms: float | None = None
+    ideal_ms: float | None = None
+    link_at_alarm: int | None = None
+    link_detected: int | None = None
+    direction: tuple[int, int] | None = None
+    direction_ok: bool | None = None
+    tau_ext_Nm: tuple[float, float] | None = None
+    tau_ext_peak_hat_Nm: tuple[float, float] | None = None
+    torque_error_ratio: float | None = None
+    true_force_N: float | None = None
+    level: str | None = None
+    kind: str | None = None
+    reaction: str | None = None
+    location: str | None = None
+    is_two_sided: bool | None = None
+    tau_ext_peak_sigma_Nm: tuple[float | None, float | None] | None = None
+    impulse_Nm_s: tuple[float, float] | None = None
+    impulse_sigma_Nm_s: tuple[float | None, float | None] | None = None
+    force_N: float | None = None
+    force_sigma_N: float | None = None
+    lever_m: float | None = None
+    lever_sigma_m: float | None = None
+    blind_deg: float | None = None
+
+    @property
+    def at_s(self) -> float:
+        """Its onset, or its detection where the onset is not known."""
+        at_s = self.onset_s if self.onset_s is not None else self.detected_s
+        assert at_s is not None
+        return at_s
 
 
 @dataclass(frozen=True)
@@ -96,126 +368,3 @@ class Gathered(NamedTuple):
     untouched: Untouched
     timing: TimingEvidence
     data: CyclicData
-
-
-def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
-    """Compute all metrics of a run. gathered: of a run that does not have all of its cycles."""
-    gathered = gathered or Gathered(gather_untouched(run, [run]), timing_evidence(run), gather_data(run))
-    touches = true_contacts(run)
-    detections = find_detections(run)
-    score = judge_run(run, touches, detections)
-    sections = split_sections(run)
-    contacts = list_contacts(run, sections, touches, detections, score)
-    residuals = gathered.untouched.residuals
-    evidence = _evidence(run, sections, gathered.untouched)
-    adaptation_s = {
-        section.label: section.duration_s if section.is_complete else None
-        for section in sections
-        if section.kind == "adaptation"
-    }
-    has_truth = run.truth is not None
-    false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
-    missed = score.missed
-    faults, causes, data = find_faults(run), find_causes(run), gathered.data
-    payload_kg = _payloads(run, sections)
-    is_identified = bool(adaptation_s) and all(value is not None for value in adaptation_s.values())
-    has_false = has_truth and len(false_s) > 0
-    return Metrics(
-        sections=sections,
-        adaptation_s=adaptation_s,
-        frozen_residual_max_Nm=residuals,
-        contacts=contacts,
-        false_alarms=len(false_s) if has_truth else None,
-        false_alarms_s=false_s if has_truth else None,
-        missed=missed if has_truth else None,
-        parameters=_parameters(run, sections),
-        payload_kg=payload_kg,
-        fault=faults[0].reason if faults else None,
-        fault_s=faults[0].at_s if faults else None,
-        cycle=cycle_statistics(run, gathered.timing.cycles),
-        timing=gathered.timing,
-        data=data,
-        frames=run.frames,
-        dropped=run.dropped,
-        evidence=evidence,
-        paper=compare_with_paper(run, sections, adaptation_s, residuals, contacts, len(false_s), payload_kg, evidence),
-        verdict=give_verdict(run, sections, score, adaptation_s, payload_kg, evidence, faults, causes, data),
-        is_clean=is_identified
-        and missed == 0
-        and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
-        armed_false_alarms=score.armed_false_alarms if has_truth else None,
-    )
-
-
-def _evidence(run: Run, sections: tuple[Section, ...], untouched: Untouched) -> Evidence | None:
-    if run.certified is None:
-        return None
-    return evaluate_certified(
-        run,
-        run.certified,
-        sections,
-        untouched.margins,
-        untouched.promotions,
-        untouched.beside,
-        untouched.smallest_push,
-    )
-
-
-def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
-    """Give true and identified parameters at the end of each adaptation."""
-    found = {}
-    for section in sections:
-        if section.kind != "adaptation":
-            continue
-        row = last_row(run, section)
-        theta = true_parameters(run, int(run.cycle[row]))
-        found[section.label] = {
-            name: (theta.get(name), float(run.theta_hat[row, column]))
-            for column, name in enumerate(run.parameter_names)
-        }
-    return found
-
-
-def true_parameters(run: Run, cycle: int) -> dict[str, float]:
-    """Give the true parameters in a cycle by name; empty without the truth."""
-    row = None if run.truth is None else run.truth.model_row(cycle)
-    if run.truth is None or row is None:
-        return {}
-    return dict(zip(PARAMETER_NAMES, run.truth.theta[row].tolist(), strict=True))
-
-
-def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None]:
-    """Give the true payload at the end of each adaptation, kg."""
-    payloads: dict[str, float | None] = {}
-    time_s = run.time_s()
-    for section in sections:
-        if section.kind == "adaptation":
-            row = rows_of(time_s, section, float(time_s[-1])).stop - 1
-            payloads[section.label] = _payload_at(run, int(run.cycle[row]))
-    return payloads
-
-
-def _payload_at(run: Run, cycle: int) -> float | None:
-    row = None if run.truth is None else run.truth.model_row(cycle)
-    return None if run.truth is None or row is None else float(run.truth.payload_kg[row])
-
-
-def is_realtime(run: Run) -> bool:
-    """Tell whether the host's own clock drove the cycles."""
-    return run.metadata.get("clock") == "realtime"
-
-
-def cycle_statistics(run: Run, count: int) -> CycleStatistics:
-    """Give the statistics of all cycles, `count` of them, those before motion start included."""
-    return CycleStatistics(
-        count=count,
-        duration_s=float((run.t_ns[-1] - run.t_ns[0]) * 1e-9) if run.t_ns.size else 0.0,
-        clock=run.metadata.get("clock"),
-        scheduler=run.metadata.get("scheduler"),
-    )
-
-
-def timing_evidence(run: Run) -> TimingEvidence:
-    """Sum up the times of all cycles, those before motion start included."""
-    reactions = find_reactions(run.timing, run.cycle, run.state)
-    return collect_evidence(run.timing, run.settings.bus.period_us, not is_realtime(run), reactions)

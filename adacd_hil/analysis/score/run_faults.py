@@ -7,15 +7,15 @@ how many cycles had no new frame or a repeated one; they are logged once a secon
 fault may have ended, nothing is told.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.logged_run import CheckCounts, Mask, Run
-from adacd_hil.analysis.score.timing import CycleColumns, Cycles
+from adacd_hil.analysis.logged_run import CheckCounts, CycleColumns, Cycles, Mask, Run
+from adacd_hil.analysis.score.metrics import CyclicData, DeviceShares, Fault
+from adacd_hil.analysis.score.wording import percent_text
 from adacd_hil.device.arm_report import SHORTEST_SHARE, WINDOW_S
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.scheme.supervisor.supervisor import POWERED
@@ -30,15 +30,6 @@ _SUPERVISOR = "supervisor"
 _NEAR_NS = 2_000_000
 """How far the event of a fault may lie from its cycle's time."""
 _MOST_LETTERS = 300
-
-
-class Fault(NamedTuple):
-    """A stay in FAULT. cause: the log's words for it, "" without any; is_last: the run ended in it."""
-
-    reason: str
-    at_s: float
-    cause: str
-    is_last: bool
 
 
 def find_faults(run: Run) -> tuple[Fault, ...]:
@@ -80,44 +71,6 @@ def _shortened(text: str) -> str:
 
 
 _POWERED: Final = tuple(int(state) for state in POWERED)
-
-
-@dataclass(frozen=True)
-class DeviceShares:
-    """Shares of the cycles of a device, 0…1: without a new frame, with a repeated one, and the worst second of each."""
-
-    cycles: int
-    no_new_data: float
-    repeated: float
-    worst_no_new_data: float
-    worst_repeated: float
-
-
-@dataclass(frozen=True)
-class CyclicData:
-    """Shares of `cycles` cycles with powered drives, 0…1; excesses: over their limit in some second, a line each.
-
-    incomplete, worst_incomplete, aged: None where the log does not say. devices: empty where it does not.
-    """
-
-    cycles: int
-    incomplete: float | None
-    worst_incomplete: float | None
-    aged: float | None
-    devices: dict[str, DeviceShares]
-    excesses: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
-        devices = {name: vars(shares) for name, shares in self.devices.items()}
-        return {**vars(self), "devices": devices, "excesses": list(self.excesses)}
-
-
-def percent_text(share: float) -> str:
-    """Write a share with two digits that count."""
-    if 0.0 < share < 5e-5:
-        return "less than 0.01 %"
-    return f"{100.0 * share:.2g} %" if share < 0.995 else f"{100.0 * share:.0f} %"
 
 
 class CyclicDataGatherer:
@@ -232,25 +185,3 @@ def _excesses(worst: float | None, devices: dict[str, DeviceShares], limits: Dat
         for name, share, limit in judged
         if share is not None and share > limit
     ]
-
-
-def data_text(data: CyclicData) -> str:
-    """Say in a clause of the verdict how much of the data came; nothing where the drives never had torque."""
-    if not data.cycles:
-        return ""
-    if data.incomplete is None:
-        return "whether cyclic data was late or lost is not in the log"
-    said = []
-    if data.incomplete:
-        said.append(f"{percent_text(data.incomplete)} of the cycles lacked a frame in time")
-    if data.aged:
-        said.append(f"{percent_text(data.aged)} went by older data")
-    missed = {name: shares.no_new_data for name, shares in data.devices.items() if shares.no_new_data}
-    repeated = {name: shares.repeated for name, shares in data.devices.items() if shares.repeated}
-    for what, found in (("no new data of", missed), ("repeated frames of", repeated)):
-        if found:
-            name, share = max(found.items(), key=lambda entry: entry[1])
-            said.append(f"{what} {name} in {percent_text(share)}")
-    if not said:
-        return "no cyclic data was late or lost"
-    return ", ".join(said) + (", more than allowed" if data.excesses else "")

@@ -6,18 +6,15 @@ compute time of each cycle in which the state becomes REACT: from the data that 
 reacts.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.logged_run import COMPUTE, LATENESS, QUANTITIES, CycleColumns, Cycles, Quantity
 from adacd_hil.analysis.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
-from adacd_hil.log.reader import Series
-from adacd_hil.records import CycleRecord, SchemeState, Vector
-
-Cycles = NDArray[np.int64]
+from adacd_hil.analysis.score.metrics import Count, Reaction, TimeStatistics, TimingEvidence
+from adacd_hil.records import SchemeState
 
 OLDEST_CYCLES: Final = 10
 """Data ages from here on are counted as one."""
@@ -25,154 +22,12 @@ PER_CYCLES: Final = 100_000
 """Counts are given per so many cycles, too."""
 
 
-class Quantity(NamedTuple):
-    """A time of each cycle: its column in /cycle, ns. `is_reserve`: it must be large, not small."""
-
-    name: str
-    column: str
-    title: str
-    meaning: str
-    is_reserve: bool = False
-
-
-LATENESS: Final = Quantity("lateness", "lateness_ns", "Lateness", "wake-up after the grid point")
-COMPUTE: Final = Quantity("compute", "compute_ns", "Compute", "last cyclic frame received to last command handed over")
-SYNC_TO_COMMAND: Final = Quantity(
-    "sync_to_command", "command_ns", "SYNC → command", "SYNC sent to last command handed over"
-)
-SLACK: Final = Quantity(
-    "slack", "slack_ns", "Slack", "last command to the next grid point; negative: overrun", is_reserve=True
-)
-QUANTITIES: Final = (
-    LATENESS,
-    Quantity("sync_to_feedback", "feedback_ns", "SYNC → feedback", "SYNC sent to last cyclic frame decoded"),
-    COMPUTE,
-    SYNC_TO_COMMAND,
-    SLACK,
-)
 QUEUES: Final = {"receive": "receive_queue_bytes", "transmit": "transmit_queue_bytes", "log": "log_queue_bytes"}
 """Queues and their columns."""
 _RUNNING: Final = ("overruns", "frames_lost")
 """Columns that count since the run began."""
 _PER_CYCLE: Final = ("frames_missing", "commands_late")
 """Columns that count within a cycle."""
-
-
-@dataclass(frozen=True)
-class CycleColumns:
-    """The columns of /cycle over n cycles, int64 (n,); a column that the log does not have is not in `columns`."""
-
-    t_ns: Cycles
-    columns: Mapping[str, Cycles]
-
-    def __len__(self) -> int:
-        return self.t_ns.size
-
-    def __getitem__(self, name: str) -> Cycles:
-        return self.columns[name]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.columns
-
-    def rows(self, rows: Cycles) -> "CycleColumns":
-        """Give some of the cycles."""
-        return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
-
-    @staticmethod
-    def joined(parts: "Sequence[CycleColumns]") -> "CycleColumns":
-        """Put parts with the same columns one after the other."""
-        names = parts[0].columns
-        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
-        return CycleColumns(np.concatenate([part.t_ns for part in parts]), columns)
-
-    def times_us(self, quantity: Quantity) -> Vector | None:
-        """Give a time of the cycles that have it, µs; None where the log does not have it."""
-        if quantity.column not in self:
-            return None
-        values_ns = self[quantity.column]
-        if quantity.column == "feedback_ns":
-            values_ns = values_ns[self["frames_missing"] == 0]  # else it is when the host gave up
-        return np.asarray(values_ns / 1000.0, dtype=np.float64)
-
-    def steps(self, name: str, before: int = 0) -> Cycles:
-        """Give what each cycle added to a running count (n,); a count that began anew begins at 0.
-
-        before: the count in the cycle before the first.
-        """
-        count = self[name]
-        added = np.diff(count, prepend=before)
-        return np.where(added < 0, count, added)
-
-
-def columns_of_series(series: Series) -> CycleColumns:
-    """Take the columns out of a log's /cycle; one of an older version lacks some."""
-    names = [name for name in CycleRecord._fields if name in series.fields]
-    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
-
-
-def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:
-    """Make the columns of records at times t_ns."""
-    table = np.array(records, dtype=np.int64).reshape(len(records), len(CycleRecord._fields))
-    columns = {name: table[:, place].copy() for place, name in enumerate(CycleRecord._fields)}
-    return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
-
-
-@dataclass(frozen=True)
-class TimeStatistics:
-    """Percentiles by name, µs, and the histogram of a time; both empty without a value."""
-
-    percentiles: Mapping[str, float]
-    histogram: LogHistogram
-
-
-class Count(NamedTuple):
-    """How often something happened, in all and per 100 000 cycles; None without a cycle."""
-
-    total: int
-    per_100000: float | None
-
-
-@dataclass(frozen=True)
-class Reaction:
-    """Latency from the decision to the first command that reacts, over `count` reactions; percentiles in µs."""
-
-    count: int
-    percentiles: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class TimingEvidence:
-    """What the times of a run come to; None is what the log does not have, or what lockstep has no meaning for.
-
-    is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. data_age: cycles by
-    the age of the oldest value used; the last entry counts all from OLDEST_CYCLES on.
-    """
-
-    period_us: float
-    is_modelled: bool
-    cycles: int
-    times: Mapping[str, TimeStatistics | None]
-    reaction: Reaction | None
-    data_age: tuple[int, ...] | None
-    queues_bytes: Mapping[str, Mapping[str, float] | None]
-    counts: Mapping[str, Count | None]
-
-    def as_json(self) -> dict[str, Any]:
-        """Give the evidence in plain values."""
-        times = {name: found for name, found in self.times.items() if found is not None}
-        absent = dict.fromkeys(self.times)
-        reaction = self.reaction
-        return {
-            "is_modelled": self.is_modelled,
-            "period_us": self.period_us,
-            "cycles": self.cycles,
-            "times_us": {**absent, **{name: dict(found.percentiles) for name, found in times.items()}},
-            "reaction_us": None if reaction is None else {"count": reaction.count, **reaction.percentiles},
-            "data_age_cycles": None if self.data_age is None else list(self.data_age),
-            "queues_bytes": {name: None if depth is None else dict(depth) for name, depth in self.queues_bytes.items()},
-            "counts": {name: None if count is None else count._asdict() for name, count in self.counts.items()},
-            "histograms_us": {**absent, **{name: found.histogram.as_json() for name, found in times.items()}},
-        }
 
 
 class TimingGatherer:

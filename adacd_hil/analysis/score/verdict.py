@@ -6,15 +6,14 @@ stands what the paper's scheme makes of the same stream, where it ran beside.
 
 import itertools
 from collections.abc import Sequence
-from typing import Final, NamedTuple, TypeGuard
+from typing import Final, TypeGuard
 
 import numpy as np
 
 from adacd_hil.analysis.logged_run import Run, Section
-from adacd_hil.analysis.score.contacts import Contact
-from adacd_hil.analysis.score.judge import Score, found_text, number_of, score_sentence
-from adacd_hil.analysis.score.margins import Beside, Evidence, Residual
-from adacd_hil.analysis.score.run_faults import CyclicData, Fault, data_text
+from adacd_hil.analysis.score.judge import Score
+from adacd_hil.analysis.score.metrics import Beside, Contact, CyclicData, Evidence, Fault, PaperRow, Residual
+from adacd_hil.analysis.score.wording import found_text, number_of, percent_text, score_sentence
 
 LISTED: Final = 4
 """Adaptations that are listed one by one."""
@@ -131,19 +130,6 @@ def identified_text(
             change = f"{new - old:g} kg" if new > old else f"taking off {old - new:g} kg"
         text += f", but not again after {change}" if time_s is None else f" and again in {time_s:.2f} s after {change}"
     return text
-
-
-class PaperRow(NamedTuple):
-    """One line of *paper against measured*.
-
-    paper: None where the run is not of the paper's experiment; beside: the paper's scheme on the same stream, None
-    where none ran.
-    """
-
-    quantity: str
-    paper: str | None
-    beside: str | None
-    measured: str
 
 
 _EXPERIMENT = "paper"
@@ -324,3 +310,25 @@ def _pair(values: tuple[float, float] | None) -> str:
 def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
     values = frozen[index] if index < len(frozen) else None
     return "–" if values is None else f"{values[0]:.3f} / {values[1]:.3f} Nm"
+
+
+def data_text(data: CyclicData) -> str:
+    """Say in a clause of the verdict how much of the data came; nothing where the drives never had torque."""
+    if not data.cycles:
+        return ""
+    if data.incomplete is None:
+        return "whether cyclic data was late or lost is not in the log"
+    said = []
+    if data.incomplete:
+        said.append(f"{percent_text(data.incomplete)} of the cycles lacked a frame in time")
+    if data.aged:
+        said.append(f"{percent_text(data.aged)} went by older data")
+    missed = {name: shares.no_new_data for name, shares in data.devices.items() if shares.no_new_data}
+    repeated = {name: shares.repeated for name, shares in data.devices.items() if shares.repeated}
+    for what, found in (("no new data of", missed), ("repeated frames of", repeated)):
+        if found:
+            name, share = max(found.items(), key=lambda entry: entry[1])
+            said.append(f"{what} {name} in {percent_text(share)}")
+    if not said:
+        return "no cyclic data was late or lost"
+    return ", ".join(said) + (", more than allowed" if data.excesses else "")

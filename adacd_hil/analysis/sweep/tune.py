@@ -14,24 +14,35 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from adacd_hil import __version__
-from adacd_hil.analysis.replay.replay import Replay, replay_many
-from adacd_hil.analysis.replay.what_if import apply_settings, changed_keys, keep_facts
-from adacd_hil.analysis.score.judge import delay_figures, delays_phrase, least_rate_per_h, rate_phrase, share_phrase
+from adacd_hil.analysis.replay.changed_settings import apply_settings, changed_keys, keep_facts
+from adacd_hil.analysis.replay.replay import replay_many
+from adacd_hil.analysis.replay.replayed_outcome import Replay
+from adacd_hil.analysis.score.judge import least_rate_per_h
+from adacd_hil.analysis.score.wording import delay_figures, delays_phrase, rate_phrase, share_phrase
 from adacd_hil.analysis.sweep.tune_candidates import (
-    Changes,
     candidates,
     name_of,
     observe_candidates,
     observe_detectors,
     thresholds_as_changes,
 )
-from adacd_hil.analysis.sweep.tune_roc import Choice, Found, TunedLog, choose, read_logs
+from adacd_hil.analysis.sweep.tune_roc import (
+    Candidate,
+    Changes,
+    Choice,
+    Found,
+    Outcome,
+    TunedLog,
+    Tuning,
+    choose,
+    free_hours,
+    read_logs,
+)
 from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.clock import wall_ns
 from adacd_hil.log.time_window import WHOLE, TimeWindow
@@ -39,121 +50,8 @@ from adacd_hil.settings.configuration import Settings, builtin_names, load_setti
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import to_toml
 
-LIMITS: Final = (
-    "The arm in the logs moved as its own scheme had it move. After a contact it braked when that scheme found it, the "
-    "excitation was the recorded one, and a payload was changed when it was: what an earlier reaction, another motion "
-    "or another arm would have come to is not in these figures. Delays are on the host's clock, from the true onset."
-)
 FARTHEST: Final = 100.0
 """Extrapolation beyond which filters and gains are not told apart: thresholds of equal ones differ by a factor of 4."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What replays of all logs with the same settings came to. missed, false_alarms: None without the truth.
-
-    armed_false_alarms: of them those in MONITOR, where the hours are counted.
-    """
-
-    adaptation_s: tuple[float, ...]
-    unfinished: int
-    missed: int | None
-    false_alarms: int | None
-    hours: float
-    delays_ms: tuple[float, ...]
-    armed_false_alarms: int
-
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
-        return {
-            "adaptations": len(self.adaptation_s),
-            "unfinished": self.unfinished,
-            "adaptation_s": list(self.adaptation_s),
-            "missed": self.missed,
-            "false_alarms": self.false_alarms,
-            "monitored_h": self.hours,
-            "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
-        }
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A filter and a gain with the thresholds chosen for them, what they come to, and why they are not fit."""
-
-    name: str
-    changes: Changes
-    choice: Choice
-    outcome: Outcome
-    problems: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
-        return {
-            "name": self.name,
-            "changes": self.changes,
-            "problems": list(self.problems),
-            "thresholds": choice_as_json(self.choice),
-            "replayed": self.outcome.as_json(),
-        }
-
-
-@dataclass(frozen=True)
-class Tuning:
-    """What was found. detectors: those of `scheme.detectors`, empty where the motion is too short for them."""
-
-    rate_per_h: float
-    logs: tuple[TunedLog, ...]
-    own: Outcome
-    candidates: tuple[Candidate, ...]
-    best: Candidate | None
-    detectors: tuple[Choice, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def is_shown(self) -> bool:
-        """Whether the other half shows the wanted rate: its upper 95 % bound is not above it."""
-        return self.best is not None and self.best.choice.checked.rate_bound_per_h <= self.rate_per_h
-
-    def as_json(self) -> dict[str, Any]:
-        """Give it in plain values."""
-        return {
-            "rate_per_h": self.rate_per_h,
-            "is_shown": self.is_shown,
-            "logs": [
-                {
-                    "path": str(log.path),
-                    "sha256": log.digest,
-                    "free_h": free_hours(log),
-                    "contacts": None if log.windows is None else len(log.windows),
-                }
-                for log in self.logs
-            ],
-            "own": self.own.as_json(),
-            "suggested": None if self.best is None else self.best.as_json(),
-            "candidates": [candidate.as_json() for candidate in self.candidates],
-            "detectors": [choice_as_json(choice) | {"name": choice.name} for choice in self.detectors],
-            "notes": list(self.notes),
-            "limits": LIMITS,
-        }
-
-
-def free_hours(log: TunedLog) -> float:
-    """Give how long nobody touched the arm while it monitored, h."""
-    return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
-
-
-def choice_as_json(choice: Choice) -> dict[str, Any]:
-    """Give thresholds and their ROC in plain values."""
-    return {
-        "thresholds": choice.thresholds.tolist(),
-        "method": choice.method,
-        "chosen_on": choice.chosen.as_json(),
-        "checked_on": choice.checked.as_json(),
-        "roc": [
-            {"factor": factor, "predicted_per_h": predicted} | found.as_json()
-            for factor, found, predicted in choice.roc
-        ],
-    }
 
 
 def tune(

@@ -16,9 +16,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.replay import Watch, replay_many
-from adacd_hil.analysis.replay.what_if import apply_settings
-from adacd_hil.analysis.sweep.tune_roc import Observed, Touched, TunedLog, Window, rising
+from adacd_hil.analysis.sweep.tune_roc import Changes, Observed, Touched, TunedLog, Window, rising
 from adacd_hil.analysis.thresholds.free_motion import Progress, TorqueStream
 from adacd_hil.analysis.thresholds.recorded_thresholds import Statistics, run_detectors
 from adacd_hil.device.recorded_arm import Ticks
@@ -33,7 +33,6 @@ _GAIN_FACTORS: Final = (1.0, 0.3, 3.0)
 _NOTHING_EXCEEDS_Nm: Final = 100.0
 """The largest threshold that a configuration may have."""
 
-Changes = dict[str, str]
 Places = NDArray[np.int64]
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
-from adacd_hil.analysis.sweep.tune import Tuning
-from adacd_hil.analysis.sweep.tune_roc import Choice
+from adacd_hil.analysis.sweep.tune_roc import Choice, Tuning
 from adacd_hil.analysis.thresholds.detector_comparison import paper_svg
 from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LogError

@@ -20,17 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import AttemptBegins, host_span
+from adacd_hil.analysis.replay.changed_settings import changed_keys, keep_facts
 from adacd_hil.analysis.replay.log_source import LogSource
-from adacd_hil.analysis.replay.what_if import changed_keys, keep_facts
 from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, contacts_beside, windows_of
-from adacd_hil.analysis.score.judge import (
-    Times,
-    TouchWindow,
-    delay_figures,
-    explained_until,
-    rate_bound_per_h,
-    share_bounds,
-)
+from adacd_hil.analysis.score.judge import Times, TouchWindow, explained_until, rate_bound_per_h, share_bounds
+from adacd_hil.analysis.score.wording import delay_figures
 from adacd_hil.analysis.thresholds.false_alarms import (
     Calibration,
     TooLittleMotionError,
@@ -47,6 +41,9 @@ from adacd_hil.log.reader import Series
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.configuration import Settings, load_settings
+
+Changes = dict[str, str]
+
 
 FACTORS: Final = tuple(10.0 ** (k / 12.0) for k in range(-9, 19))
 """Of the thresholds along a ROC: 0.18 to 32."""
@@ -373,3 +370,118 @@ def _windows(touches: Sequence[TouchWindow], t_ns: Times, place: int | None) -> 
         )
         for touch, first, last in zip(touches, firsts, lasts, strict=True)
     )
+
+
+LIMITS: Final = (
+    "The arm in the logs moved as its own scheme had it move. After a contact it braked when that scheme found it, the "
+    "excitation was the recorded one, and a payload was changed when it was: what an earlier reaction, another motion "
+    "or another arm would have come to is not in these figures. Delays are on the host's clock, from the true onset."
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What replays of all logs with the same settings came to. missed, false_alarms: None without the truth.
+
+    armed_false_alarms: of them those in MONITOR, where the hours are counted.
+    """
+
+    adaptation_s: tuple[float, ...]
+    unfinished: int
+    missed: int | None
+    false_alarms: int | None
+    hours: float
+    delays_ms: tuple[float, ...]
+    armed_false_alarms: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "adaptations": len(self.adaptation_s),
+            "unfinished": self.unfinished,
+            "adaptation_s": list(self.adaptation_s),
+            "missed": self.missed,
+            "false_alarms": self.false_alarms,
+            "monitored_h": self.hours,
+            "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
+        }
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A filter and a gain with the thresholds chosen for them, what they come to, and why they are not fit."""
+
+    name: str
+    changes: Changes
+    choice: Choice
+    outcome: Outcome
+    problems: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "name": self.name,
+            "changes": self.changes,
+            "problems": list(self.problems),
+            "thresholds": choice_as_json(self.choice),
+            "replayed": self.outcome.as_json(),
+        }
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """What was found. detectors: those of `scheme.detectors`, empty where the motion is too short for them."""
+
+    rate_per_h: float
+    logs: tuple[TunedLog, ...]
+    own: Outcome
+    candidates: tuple[Candidate, ...]
+    best: Candidate | None
+    detectors: tuple[Choice, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the other half shows the wanted rate: its upper 95 % bound is not above it."""
+        return self.best is not None and self.best.choice.checked.rate_bound_per_h <= self.rate_per_h
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it in plain values."""
+        return {
+            "rate_per_h": self.rate_per_h,
+            "is_shown": self.is_shown,
+            "logs": [
+                {
+                    "path": str(log.path),
+                    "sha256": log.digest,
+                    "free_h": free_hours(log),
+                    "contacts": None if log.windows is None else len(log.windows),
+                }
+                for log in self.logs
+            ],
+            "own": self.own.as_json(),
+            "suggested": None if self.best is None else self.best.as_json(),
+            "candidates": [candidate.as_json() for candidate in self.candidates],
+            "detectors": [choice_as_json(choice) | {"name": choice.name} for choice in self.detectors],
+            "notes": list(self.notes),
+            "limits": LIMITS,
+        }
+
+
+def free_hours(log: TunedLog) -> float:
+    """Give how long nobody touched the arm while it monitored, h."""
+    return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
+
+
+def choice_as_json(choice: Choice) -> dict[str, Any]:
+    """Give thresholds and their ROC in plain values."""
+    return {
+        "thresholds": choice.thresholds.tolist(),
+        "method": choice.method,
+        "chosen_on": choice.chosen.as_json(),
+        "checked_on": choice.checked.as_json(),
+        "roc": [
+            {"factor": factor, "predicted_per_h": predicted} | found.as_json()
+            for factor, found, predicted in choice.roc
+        ],
+    }

@@ -143,7 +143,7 @@ def play(
             pace = played_s / summary.elapsed_s
             progress(f"{played_s:.1f} s played in {summary.elapsed_s:.1f} s: {pace:.1f} x real time")
         progress("drawing the report")
-        from adacd_hil.analysis.report.report_files import write_report  # what draws takes longest to import
+        from adacd_hil.analysis.report.report_files import write_report
 
         try:
             report = write_report(summary.log.path, truth_path, folder.path)
@@ -172,7 +172,7 @@ def _ending(summary: SessionSummary) -> str:
 def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
     """Read the logs of a run that has ended, to be compared with its scenario's `expect`. Raises LogError."""
     from adacd_hil.analysis.report.run_reading import read_run
-    from adacd_hil.analysis.score.metrics import evaluate
+    from adacd_hil.analysis.score.evaluation import evaluate
 
     run, gathered, _ = read_run(summary.log.path, truth_path)
     metrics = evaluate(run, gathered)

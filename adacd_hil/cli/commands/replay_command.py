@@ -14,7 +14,7 @@ from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_source import Source
-    from adacd_hil.analysis.replay.replay import Replay
+    from adacd_hil.analysis.replay.replayed_outcome import Replay
     from adacd_hil.log.time_window import TimeWindow
     from adacd_hil.settings.configuration import Settings
 
@@ -99,14 +99,14 @@ def _replay_one(
     stretch: "TimeWindow",
     progress: Any,
 ) -> _Result:
-    from adacd_hil.analysis.replay.replay import replay_source
-    from adacd_hil.analysis.replay.what_if import (
+    from adacd_hil.analysis.replay.changed_settings import (
         apply_settings,
         keep_facts,
         parse_changes,
         parse_variations,
         refuse_facts,
     )
+    from adacd_hil.analysis.replay.replay import replay_source
     from adacd_hil.analysis.score.emulator_truth import contacts_beside
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.settings.configuration import load_settings
@@ -177,7 +177,7 @@ def _verdict(own: "Replay") -> str:
 
 
 def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow") -> str:
-    from adacd_hil.analysis.replay.what_if import NOTE, side_by_side
+    from adacd_hil.analysis.replay.replayed_outcome import NOTE, side_by_side
     from adacd_hil.cli.output import format_table
 
     own = replays[0]
@@ -206,7 +206,8 @@ def _counts(own: "Replay") -> str:
 def _as_json(
     path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow"
 ) -> dict[str, Any]:
-    from adacd_hil.analysis.replay.what_if import as_json, changed_keys
+    from adacd_hil.analysis.replay.changed_settings import changed_keys
+    from adacd_hil.analysis.replay.replayed_outcome import as_json
 
     own = replays[0]
     return {

@@ -65,7 +65,7 @@ def sweep(
     A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
     """
     from adacd_hil.analysis.sweep.cluster import TLS, TlsFiles, connect
-    from adacd_hil.analysis.sweep.plan import replay_task
+    from adacd_hil.analysis.sweep.rows import replay_task
     from adacd_hil.analysis.sweep.sweep import SweepStore, run_sweep
     from adacd_hil.cli.output import Progress
 
@@ -104,7 +104,7 @@ def _plan(
     logs: Sequence[Path], scenarios: Sequence[str], seeds: str, vary: Sequence[str], config: str, profile: str
 ) -> "Plan":
     from adacd_hil import __version__
-    from adacd_hil.analysis.replay.what_if import apply_settings, parse_variations
+    from adacd_hil.analysis.replay.changed_settings import apply_settings, parse_variations
     from adacd_hil.analysis.sweep.plan import plan_logs, plan_scenarios
     from adacd_hil.compiled import program_digest
     from adacd_hil.settings.configuration import load_settings
@@ -152,9 +152,10 @@ def simulate_task(task: "Task") -> "list[Values]":
 
 
 def _simulate(task: "Task", row: "Row") -> "Values":
+    from adacd_hil.analysis.replay.changed_settings import apply_settings
     from adacd_hil.analysis.replay.replay import replay
-    from adacd_hil.analysis.replay.what_if import apply_settings
-    from adacd_hil.analysis.sweep.plan import REFUSALS, failed, finished
+    from adacd_hil.analysis.sweep.plan import REFUSALS, failed
+    from adacd_hil.analysis.sweep.rows import finished
     from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 
     subject = task.subject

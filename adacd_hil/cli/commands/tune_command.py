@@ -14,8 +14,7 @@ from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.sweep.tune import Candidate, Tuning
-    from adacd_hil.analysis.sweep.tune_roc import Found
+    from adacd_hil.analysis.sweep.tune_roc import Candidate, Found, Tuning
     from adacd_hil.log.time_window import TimeWindow
 
 
@@ -84,7 +83,8 @@ def tune(
 
 
 def _as_text(found: "Tuning") -> str:
-    from adacd_hil.analysis.sweep.tune import LIMITS, free_hours, in_words
+    from adacd_hil.analysis.sweep.tune import in_words
+    from adacd_hil.analysis.sweep.tune_roc import LIMITS, free_hours
     from adacd_hil.cli.output import format_table
 
     hours = sum(map(free_hours, found.logs))
@@ -119,7 +119,7 @@ def _as_text(found: "Tuning") -> str:
 
 def _cells(checked: "Found") -> tuple[str, ...]:
     """Say what thresholds come to in one half, a cell for each figure."""
-    from adacd_hil.analysis.score.judge import delay_figures
+    from adacd_hil.analysis.score.wording import delay_figures
 
     low, high = checked.share_bounds
     return (
@@ -132,7 +132,7 @@ def _cells(checked: "Found") -> tuple[str, ...]:
 
 
 def _row(candidate: "Candidate") -> tuple[str, ...]:
-    from adacd_hil.analysis.score.judge import delay_figures
+    from adacd_hil.analysis.score.wording import delay_figures
 
     outcome = candidate.outcome
     median_ms, _, _ = delay_figures(outcome.delays_ms)

@@ -1,4 +1,4 @@
-"""What if: other settings for the same log. What a change means, and how results are set side by side.
+"""Other settings for a log: keys that change, variations, and what a log's own settings keep.
 
 A key is dotted, `detector.threshold_Nm`; a value is TOML, where a word may go without quotes and a number stands for a
 list of such numbers.
@@ -6,16 +6,11 @@ list of such numbers.
 
 import dataclasses
 import itertools
-import math
-import statistics
 import tomllib
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from adacd_hil.analysis.replay.replay import Replay
-from adacd_hil.analysis.score.judge import found_text, why_not_found
-from adacd_hil.records import PARAMETER_UNITS, SchemeState
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
@@ -23,11 +18,6 @@ from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", "rated_torque_Nm")
 """Settings of the arm that made the numbers of a log."""
-NOTE: Final = (
-    "The arm in the log moved as it did, and the user asked for what was asked: what another scheme would have done "
-    "about a contact, and all that would have followed from it, is not in here."
-)
-Row = tuple[str, ...]
 
 
 def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
@@ -176,122 +166,3 @@ def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, str]:
         else:
             flat[f"{prefix}{key}"] = repr(value)
     return flat
-
-
-def side_by_side(replays: Sequence[Replay]) -> list[Row]:
-    """Return a row per quantity: its name, then its value in each replay."""
-    rows = [("contacts detected", *map(_detected, replays))]
-    if any(each.score is None for each in replays):
-        rows.append(("detections at", *(_times(each, each.detections_ns) for each in replays)))
-    rows += _contact_rows(replays)
-    rows += [
-        ("missed", *("–" if each.score is None else str(each.score.missed) for each in replays)),
-        ("false alarms", *map(_false_alarms, replays)),
-        ("median delay, ms", *map(_median_delay, replays)),
-    ]
-    for index in range(max(len(each.adaptation_s) for each in replays)):
-        rows.append((f"adaptation {index + 1}, s", *(_adaptation(each, index) for each in replays)))
-    for name in dict.fromkeys(itertools.chain.from_iterable(each.parameters for each in replays)):
-        unit = PARAMETER_UNITS.get(name, "")
-        rows.append((f"{name}, {unit}", *(_number(each.parameters.get(name)) for each in replays)))
-    rows.append(("ends in", *map(_end, replays)))
-    return rows
-
-
-def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
-    contacts = [
-        {contact.number: contact for contact in (each.score.contacts if each.score else ())} for each in replays
-    ]
-    rows = []
-    for number in sorted(set().union(*contacts)):
-        known = [each.get(number) for each in contacts]
-        first = next(contact for contact in known if contact is not None)
-        name = f"contact {number}, link {first.link}, at {replays[0].time_s(first.onset_ns):.2f} s"
-        cells = (
-            "–" if contact is None
-            else f"after {contact.delay_ms:.1f} ms" if contact.delay_ms is not None
-            else why_not_found(contact.is_armed)
-            for contact in known
-        )  # fmt: skip
-        rows.append((name, *cells))
-    return rows
-
-
-def _detected(found: Replay) -> str:
-    if found.score is None:
-        return str(len(found.detections_ns))
-    return found_text(len(found.score.delays_ms), len(found.score.contacts))
-
-
-def _times(found: Replay, times_ns: Sequence[int]) -> str:
-    return ", ".join(f"{found.time_s(t_ns):.2f} s" for t_ns in times_ns) or "–"
-
-
-def _false_alarms(found: Replay) -> str:
-    if found.score is None:
-        return "–"
-    times_ns = [alarm.t_ns for alarm in found.score.false_alarms]
-    count = len(times_ns)
-    return f"{count}, at {_times(found, times_ns[:3])}{', …' if count > 3 else ''}" if count else "0"
-
-
-def _median_delay(found: Replay) -> str:
-    delays = () if found.score is None else found.score.delays_ms
-    return f"{statistics.median(delays):.1f}" if delays else "–"
-
-
-def _adaptation(found: Replay, index: int) -> str:
-    if index >= len(found.adaptation_s):
-        return "–"
-    took_s = found.adaptation_s[index]
-    return "not finished" if took_s is None else f"{took_s:.3f}"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.6g}"
-
-
-def _end(found: Replay) -> str:
-    last = found.ending
-    if last is None:
-        return SchemeState.INIT.name
-    fault = f" ({last.fault.name})" if last.state is SchemeState.FAULT else ""
-    return f"{last.state.name}{fault} since {found.time_s(last.t_ns):.2f} s"
-
-
-def as_json(found: Replay) -> dict[str, Any]:
-    """Give a replay in plain values; times in s since motion start."""
-    return {
-        "cycles": found.cycles,
-        "attempts": found.attempts,
-        "contacts": None
-        if found.score is None
-        else [
-            {
-                "number": contact.number,
-                "link": contact.link,
-                "onset_s": found.time_s(contact.onset_ns),
-                "is_armed": contact.is_armed,
-                "detected_s": None if contact.detected_ns is None else found.time_s(contact.detected_ns),
-                "delay_ms": contact.delay_ms,
-            }
-            for contact in found.score.contacts
-        ],
-        "detections_s": [found.time_s(t_ns) for t_ns in found.detections_ns],
-        "false_alarms_s": None
-        if found.score is None
-        else [found.time_s(alarm.t_ns) for alarm in found.score.false_alarms],
-        "missed": None if found.score is None else found.score.missed,
-        "adaptation_s": list(found.adaptation_s),
-        "parameters": {name: value if math.isfinite(value) else None for name, value in found.parameters.items()},
-        "states": [
-            {
-                "cycle": each.cycle,
-                "time_s": found.time_s(each.t_ns),
-                "from": each.previous.name,
-                "to": each.state.name,
-                "fault": each.fault.name,
-            }
-            for each in found.states
-        ],
-    }
