@@ -259,7 +259,7 @@ def _font(value: str) -> list[tuple[str, str]]:
 SIGMAS = 2.0
 
 
-class Panel(NamedTuple):
+class HistoryPanel(NamedTuple):
     """One panel: values and their deviations (n, m), a curve for each of m names."""
 
     title: str
@@ -268,7 +268,7 @@ class Panel(NamedTuple):
     std: Vector
 
 
-def history_figure(dates_utc: Sequence[str], panels: Sequence[Panel]) -> Drawing:
+def history_figure(dates_utc: Sequence[str], panels: Sequence[HistoryPanel]) -> Drawing:
     """Draw panels over the dates of n certificates, ISO 8601, with two deviations."""
     at = np.array([date.removesuffix("Z") for date in dates_utc], dtype="datetime64[s]")
     with style():

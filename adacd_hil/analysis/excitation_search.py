@@ -73,7 +73,7 @@ class Figures:
         return _cost_of(self.excitation_Nm2s, self.condition, self.inertia_Nm2s)
 
 
-class Limits(NamedTuple):
+class ExcitationLimits(NamedTuple):
     """What a motion has to keep; pairs are joints. travel: largest |q|; torque: infinite without a CAD model."""
 
     travel_rad: Vector
@@ -122,7 +122,7 @@ class Search:
                 f"`excitation` has {counts} harmonics; the same number for both joints, at least 2, expected"
             )
         self._amplitude = np.radians(settings.trajectory.amplitude_deg)
-        self.limits = Limits(
+        self.limits = ExcitationLimits(
             self._amplitude,
             np.minimum(np.radians(settings.reaction.velocity_limit_deg_s), arm.velocity_limit_rad_s),
             np.radians(settings.reaction.acceleration_limit_deg_s2),

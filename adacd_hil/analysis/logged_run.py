@@ -240,7 +240,7 @@ class PaperStream:
 
 
 @dataclass(frozen=True)
-class Motion:
+class MeasuredMotion:
     """What was measured over n cycles: q rad, dq rad/s, tau_J Nm, each (n, 2)."""
 
     q: Vector
@@ -295,7 +295,7 @@ class Run:
     contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
     certified: CertifiedStream | None = None  # None of the paper's scheme
     beside: PaperStream | None = None
-    motion: Motion | None = None
+    motion: MeasuredMotion | None = None
     events: tuple[LoggedEvent, ...] = ()
     motion_start_ns: int | None = None  # None: the first cycle in ADAPT, else the first cycle
     all_cycles: int | None = None  # of a long run: how many there are, of which the n are kept

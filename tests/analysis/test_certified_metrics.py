@@ -12,8 +12,8 @@ from adacd_hil.analysis.logged_run import split_sections
 from adacd_hil.analysis.report.report_files import Report
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import Source
-from adacd_hil.analysis.score.touches import Channel, two_pole_delay_s
+from adacd_hil.analysis.score.metrics import ReportSource
+from adacd_hil.analysis.score.touches import FilterChannel, two_pole_delay_s
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
 
@@ -258,7 +258,7 @@ def test_a_step_below_the_threshold_never_passes_two_low_passes(tau_ext_Nm):
 
 
 def test_a_fast_second_low_pass_changes_next_to_nothing():
-    bare, smoothed = (Channel(10.0, b, np.array([0.15, 0.15])) for b in (None, 1e5))
+    bare, smoothed = (FilterChannel(10.0, b, np.array([0.15, 0.15])) for b in (None, 1e5))
     step = np.array([1.0, 0.1])
     assert smoothed.step_delay_s(step) == pytest.approx(bare.step_delay_s(step), abs=2e-5)
 
@@ -274,7 +274,7 @@ def test_the_law_is_that_of_the_fastest_channel():
 def report_of(run):
     """Make a report without figures and files."""
     folder = Path("nowhere")
-    return Report(evaluate(run), run.metadata, Source("run.mcap"), folder / "a.html", folder / "a.json", ())
+    return Report(evaluate(run), run.metadata, ReportSource("run.mcap"), folder / "a.html", folder / "a.json", ())
 
 
 def reported_run():
@@ -292,7 +292,7 @@ def test_the_text_puts_three_columns_side_by_side():
 
 def test_the_page_has_a_card_for_the_contact():
     run = reported_run()
-    html = report_page(evaluate(run), run, Source("run.mcap"), [], [])
+    html = report_page(evaluate(run), run, ReportSource("run.mcap"), [], [])
     assert "<dt>force</dt><dd>≥ 14.2 N</dd>" in html
     assert "<dt>truth</dt><dd>link 1, 0.0 N</dd>" in html
     assert "only the moment is known" in html
@@ -312,13 +312,13 @@ def test_a_force_is_told_as_far_as_it_is_known(location, words):
     run = touched_beside(3000, 3005)
     made = contact_report(int(run.cycle[3001]), location=location, force_N=-14.2, force_sigma=0.5)
     run = replace(run, reports=(made,))
-    assert f"<dt>{words}</dd>" in report_page(evaluate(run), run, Source("run.mcap"), [], [])
+    assert f"<dt>{words}</dd>" in report_page(evaluate(run), run, ReportSource("run.mcap"), [], [])
 
 
 def test_the_page_marks_a_margin_below_one():
     run = make_certified_run()
     run.certified.tau_ext[3000, 4] = 0.2
-    assert '<td class="bad">0.5 / 0.5</td>' in report_page(evaluate(run), run, Source("run.mcap"), [], [])
+    assert '<td class="bad">0.5 / 0.5</td>' in report_page(evaluate(run), run, ReportSource("run.mcap"), [], [])
 
 
 def test_a_margin_without_bound_is_null_in_the_table():

@@ -11,7 +11,7 @@ from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.report_files import write_report
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.score import emulator_truth
-from adacd_hil.analysis.score.emulator_truth import TruthRows, config_digest, contacts_beside, foreign_truth
+from adacd_hil.analysis.score.emulator_truth import TruthTable, config_digest, contacts_beside, foreign_truth
 from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
 from adacd_hil.log.recording.recorder import Recorder
@@ -115,7 +115,7 @@ def test_a_demo_writes_logs_of_one_run(tmp_path: Path) -> None:
 
 def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() -> None:
     nothing = np.zeros(1, np.int64)
-    rows = TruthRows(
+    rows = TruthTable(
         nothing, nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), None, nothing, nothing, np.zeros(1),
         np.zeros((1, 7)), {}, "", True, ((0, 3), (1, 50)),
     )  # fmt: skip

@@ -8,7 +8,7 @@ from log.recorded_run import make_run, record
 
 from adacd_hil.analysis.replay import log_comparison
 from adacd_hil.analysis.replay.changed_settings import apply_settings
-from adacd_hil.analysis.replay.log_comparison import MATCH_S, Detection, compare_logs, match_contacts
+from adacd_hil.analysis.replay.log_comparison import MATCH_S, ComparedContact, compare_logs, match_contacts
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.cli.commands.compare_command import _contact as in_words
 from adacd_hil.log.log_files import LogError
@@ -28,8 +28,8 @@ def write(folder: Path, count: int = 40, change=None, settings=SETTINGS) -> Path
     return folder / "run.mcap"
 
 
-def contact(time_s: float) -> Detection:
-    return Detection(time_s, 1, 2, 0, (0.0, 0.0), 0.0)
+def contact(time_s: float) -> ComparedContact:
+    return ComparedContact(time_s, 1, 2, 0, (0.0, 0.0), 0.0)
 
 
 def test_a_place_that_a_later_version_may_have_is_no_trouble() -> None:

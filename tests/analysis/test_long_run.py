@@ -17,7 +17,7 @@ from adacd_hil.analysis.report.report_files import report_json, write_run_report
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.report.timeline import timeline_of
 from adacd_hil.analysis.score import emulator_truth
-from adacd_hil.analysis.score.emulator_truth import TruthRows, read_truth
+from adacd_hil.analysis.score.emulator_truth import TruthTable, read_truth
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.verdict import identified_text
 from adacd_hil.cli.main import cli
@@ -198,7 +198,7 @@ def test_a_truth_says_from_when_on_the_payload_is_another(certified):
 
 
 def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s():
-    rows = TruthRows(
+    rows = TruthTable(
         attempt=np.zeros(5, np.int64),
         cycle=np.arange(98, 103),
         tau_ext=np.arange(10.0).reshape(5, 2),
@@ -307,7 +307,7 @@ def scheme_of(cycles, state=SchemeState.MONITOR):
 def truth_at(cycles, attempt=0):
     nothing = np.zeros(len(cycles))
     cycle, attempts = np.array(cycles), np.full(len(cycles), attempt)
-    return TruthRows(attempts, cycle, np.zeros((len(cycles), 2)), nothing, nothing, None, attempts, cycle, nothing,
+    return TruthTable(attempts, cycle, np.zeros((len(cycles), 2)), nothing, nothing, None, attempts, cycle, nothing,
                      nothing, {}, "", True)  # fmt: skip
 
 

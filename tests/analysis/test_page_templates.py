@@ -16,16 +16,16 @@ from jinja2 import UndefinedError
 from parsed_page import Page
 
 from adacd_hil.analysis.drawing import Drawing
-from adacd_hil.analysis.logged_run import Motion, Run
+from adacd_hil.analysis.logged_run import MeasuredMotion, Run
 from adacd_hil.analysis.report import page
 from adacd_hil.analysis.report.page import Heading, render, render_page
-from adacd_hil.analysis.report.report_files import Entry, Report, index_page
+from adacd_hil.analysis.report.report_files import IndexEntry, Report, index_page
 from adacd_hil.analysis.report.report_tables import timing_tables
 from adacd_hil.analysis.report.run_figures import draw
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.report.timing_figures import draw_timing
 from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import Source
+from adacd_hil.analysis.score.metrics import ReportSource
 
 pytestmark = pytest.mark.slow
 
@@ -68,20 +68,20 @@ def certified_run() -> Run:
     touch(run, 3000, 250, (5.0, 1.0), link=2)
     run = react(run, 3005, link=2, force_N=-9.0, force_sigma=0.5, lever_m=0.2, lever_sigma=0.01)
     still = np.full((len(run.cycle), 2), 0.25)
-    return replace(run, motion=Motion(still, still, still), log_start_ns=0)
+    return replace(run, motion=MeasuredMotion(still, still, still), log_start_ns=0)
 
 
 def page_of(run: Run) -> str:
     metrics = evaluate(run)
     timing = draw_timing(run.timing, metrics.timing, run.zero_ns)[:1]
-    return report_page(metrics, run, Source("run.mcap", "cut"), draw(run, metrics)[:1], timing)
+    return report_page(metrics, run, ReportSource("run.mcap", "cut"), draw(run, metrics)[:1], timing)
 
 
 def page_of_a_folder(_: Run) -> str:
     run = touched_run()
     where = Path("runs/a/report.html")
-    report = Report(evaluate(run), run.metadata, Source("run.mcap", "cut"), where, where, ())
-    return index_page(Path("runs"), [Entry("a", report), Entry("b", None, "no log")])
+    report = Report(evaluate(run), run.metadata, ReportSource("run.mcap", "cut"), where, where, ())
+    return index_page(Path("runs"), [IndexEntry("a", report), IndexEntry("b", None, "no log")])
 
 
 def page_of_a_communication_test(run: Run) -> str:

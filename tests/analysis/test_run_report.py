@@ -19,7 +19,7 @@ from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.report_files import report_json, write_report, write_run_report
 from adacd_hil.analysis.report.report_tables import timing_tables
 from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import Source
+from adacd_hil.analysis.score.metrics import ReportSource
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
-    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), Source("run.mcap"))
+    return write_run_report(touched_run(), tmp_path_factory.mktemp("report"), ReportSource("run.mcap"))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_a_report_is_a_page_tables_and_three_pictures(report):
 
 @pytest.mark.long
 def test_a_printed_report_has_the_same_on_paper_and_as_one_picture(tmp_path):
-    report = write_run_report(make_run((A, 10)), tmp_path, Source("run.mcap"), is_printed=True)
+    report = write_run_report(make_run((A, 10)), tmp_path, ReportSource("run.mcap"), is_printed=True)
     pdf, png = (tmp_path / "report.pdf").read_bytes(), (tmp_path / "report.png").read_bytes()
     assert (pdf[:5], png[:8]) == (b"%PDF-", b"\x89PNG\r\n\x1a\n")
     assert b"CreationDate" not in pdf
@@ -174,7 +174,7 @@ def test_the_table_in_the_file_is_the_reports(report, table):
 
 
 def table_of(run):
-    return report_json(evaluate(run), run.metadata, Source("run.mcap"))
+    return report_json(evaluate(run), run.metadata, ReportSource("run.mcap"))
 
 
 def test_a_real_arm_has_null_where_only_the_truth_could_tell():
@@ -208,7 +208,7 @@ def test_the_text_ends_with_the_place_of_the_page(report):
 
 
 def test_the_text_says_what_the_log_lacks(report):
-    text = replace(report, source=Source("run.mcap", "cut after 12 s")).as_text()
+    text = replace(report, source=ReportSource("run.mcap", "cut after 12 s")).as_text()
     assert text.splitlines()[1] == "The log is not whole: cut after 12 s"
 
 
@@ -259,7 +259,7 @@ def test_the_policy_allows_the_pages_own_styles_and_scripts_and_nothing_else(htm
 @pytest.mark.long
 def test_a_page_without_traces_allows_no_script(tmp_path):
     run = make_run((A, 1))
-    html = write_run_report(run, tmp_path, Source("run.mcap")).html_path.read_text(encoding="utf-8")
+    html = write_run_report(run, tmp_path, ReportSource("run.mcap")).html_path.read_text(encoding="utf-8")
     assert ("script-src" in policy_of(html), "<script" in html) == (False, False)
 
 
@@ -277,7 +277,7 @@ def test_a_run_with_a_missed_contact_looks_bad(html):
 
 
 def test_a_run_without_fault_looks_good(tmp_path):
-    html = write_run_report(make_run(), tmp_path, Source("run.mcap")).html_path.read_text(encoding="utf-8")
+    html = write_run_report(make_run(), tmp_path, ReportSource("run.mcap")).html_path.read_text(encoding="utf-8")
     assert '<header class="good">' in html
 
 
@@ -335,13 +335,13 @@ def test_a_run_without_a_reaction_has_dashes_for_its_latency():
 
 @pytest.mark.long
 def test_the_page_says_what_the_log_lacks(tmp_path):
-    report = write_run_report(make_run((A, 10)), tmp_path, Source("run.mcap", "cut after 12 s"))
+    report = write_run_report(make_run((A, 10)), tmp_path, ReportSource("run.mcap", "cut after 12 s"))
     assert "The log is not whole: cut after 12 s" in report.html_path.read_text(encoding="utf-8")
 
 
 @pytest.mark.long
 def test_the_page_says_how_many_packets_were_dropped(tmp_path):
-    report = write_run_report(replace(make_run((A, 10)), dropped=3), tmp_path, Source("run.mcap"))
+    report = write_run_report(replace(make_run((A, 10)), dropped=3), tmp_path, ReportSource("run.mcap"))
     assert "3 packets are not in the log" in report.html_path.read_text(encoding="utf-8")
 
 
@@ -350,7 +350,7 @@ def test_texts_of_a_log_cannot_become_markup(tmp_path):
     evil = '</title></script><script>alert("1")</script>'
     events = (LoggedEvent(int(run.t_ns[3]), Event("error", evil, evil)),)
     run = replace(run, metadata={**run.metadata, "config": evil, "profile": evil, evil: evil}, events=events)
-    html = write_run_report(run, tmp_path, Source(evil, evil)).html_path.read_text(encoding="utf-8")
+    html = write_run_report(run, tmp_path, ReportSource(evil, evil)).html_path.read_text(encoding="utf-8")
     page = Page(html)
     assert (evil in html, page.unbalanced, html.count("alert(")) == (False, [], html.count("alert(&#34;1&#34;)"))
 
@@ -359,13 +359,13 @@ def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
     run = make_run((A, 1))
     names = ("cycle", "t_ns", "state", "fault", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
     run = replace(run, **{name: getattr(run, name)[:0] for name in names})
-    page = Page(write_run_report(run, tmp_path, Source("run.mcap")).html_path.read_text(encoding="utf-8"))
+    page = Page(write_run_report(run, tmp_path, ReportSource("run.mcap")).html_path.read_text(encoding="utf-8"))
     assert page.unbalanced == []
 
 
 @pytest.mark.long
 def test_the_same_run_gives_the_same_page(html, tmp_path):
-    again = write_run_report(touched_run(), tmp_path, Source("run.mcap"))
+    again = write_run_report(touched_run(), tmp_path, ReportSource("run.mcap"))
     assert again.html_path.read_text(encoding="utf-8") == html
 
 
@@ -377,7 +377,7 @@ def test_the_page_is_small(html):
 def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(LogError, match=r"report in .*taken can't be written"):
-        write_run_report(make_run((A, 10)), tmp_path / "taken", Source("run.mcap"))
+        write_run_report(make_run((A, 10)), tmp_path / "taken", ReportSource("run.mcap"))
 
 
 def without_cycle_times(table):
@@ -392,7 +392,7 @@ def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
     record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
     record_truth(tmp_path / "truth.mcap", run)
     from_files = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path / "a").as_json()
-    from_memory = write_run_report(run, tmp_path / "b", Source("run.mcap")).as_json()
+    from_memory = write_run_report(run, tmp_path / "b", ReportSource("run.mcap")).as_json()
     assert without_cycle_times(from_files) == without_cycle_times(from_memory)
 
 

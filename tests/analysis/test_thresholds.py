@@ -15,7 +15,7 @@ from adacd_hil.analysis.thresholds import free_motion as module
 from adacd_hil.analysis.thresholds.detector_comparison import (
     STEPS_NM,
     Comparison,
-    Row,
+    DelayRow,
     compare_detectors,
     step_shape,
     write_comparison,
@@ -287,7 +287,7 @@ def test_a_detector_that_is_registered_is_in_the_thresholds_and_in_the_report(tm
 def test_never_is_a_dash_and_null_and_the_worst_rank():
     never = (math.inf,) * len(STEPS_NM)
     fast, slow = (
-        Row(name, 1, delay, (0.0,) * len(STEPS_NM), (0.5,))
+        DelayRow(name, 1, delay, (0.0,) * len(STEPS_NM), (0.5,))
         for name, delay in (("b", never), ("a", (3.0,) * len(never)))
     )
     comparison = Comparison(1.0, 2.0, (0.1,), (fast, slow), ())

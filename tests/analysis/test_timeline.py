@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hand_made_run import A, M, make_run, react, touch, touched_run
 
-from adacd_hil.analysis.logged_run import Motion
+from adacd_hil.analysis.logged_run import MeasuredMotion
 from adacd_hil.analysis.report.contact_cards import CARDS, Push, contact_cards, draw_arm
 from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.timeline import notices_of, state_key, stays_of, timeline_of
@@ -144,7 +144,7 @@ def carded(run):
 
 def moved(run):
     still = np.zeros((len(run.cycle), 2))
-    return replace(run, motion=Motion(still + 0.25, still, still))
+    return replace(run, motion=MeasuredMotion(still + 0.25, still, still))
 
 
 def test_each_contact_has_a_card_with_the_arm_at_its_moment():

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from adacd_hil.analysis.logged_run import Motion
+from adacd_hil.analysis.logged_run import MeasuredMotion
 from adacd_hil.analysis.report.page import render
 from adacd_hil.analysis.report.timeline import traces_of
 from adacd_hil.analysis.report.traces import noise_of, pack, panels_of, step_of
@@ -95,7 +95,7 @@ def moved(run):
     """Give a run measured motion."""
     rows = np.arange(len(run.cycle), dtype=np.float64)
     q = np.column_stack((np.sin(rows / 400.0), np.cos(rows / 300.0)))
-    return replace(run, motion=Motion(q, 2.0 * q, 3.0 * q))
+    return replace(run, motion=MeasuredMotion(q, 2.0 * q, 3.0 * q))
 
 
 def names_of(run):

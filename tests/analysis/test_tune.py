@@ -25,9 +25,9 @@ from adacd_hil.analysis.sweep.tune_roc import (
     FACTORS,
     Candidate,
     Observed,
-    Outcome,
     Touched,
     Tuning,
+    TuningOutcome,
     Window,
     choose,
     delay_ms,
@@ -270,7 +270,7 @@ def test_the_certified_scheme_s_statistic_is_the_largest_ratio_to_its_thresholds
 
 
 def outcome(**changes):
-    return dataclasses.replace(Outcome((5.0, 6.0), 0, 0, 0, 0.01, (2.0, 4.0), 0), **changes)
+    return dataclasses.replace(TuningOutcome((5.0, 6.0), 0, 0, 0, 0.01, (2.0, 4.0), 0), **changes)
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, plot, style
-from adacd_hil.analysis.foreign.recording_import import Recording, RecordingMap, Stretch
+from adacd_hil.analysis.foreign.recording_import import ForeignRecording, RecordingMap, RecordingStretch
 from adacd_hil.analysis.score.judge import explained_until, owners
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
@@ -38,7 +38,7 @@ class Spell(NamedTuple):
 class Watched:
     """What was found in a recording that the model has not seen."""
 
-    recording: Recording
+    recording: ForeignRecording
     tau_ext_hat: tuple[Vector, ...]  # per stretch (k, n), Nm
     threshold: tuple[Vector, ...]
     contacts: tuple[Spell, ...]
@@ -108,9 +108,9 @@ class Identified:
 
 def identify(
     described: RecordingMap,
-    fitted: Sequence[Recording],
-    tested: Recording | None,
-    watched: Sequence[Recording] = (),
+    fitted: Sequence[ForeignRecording],
+    tested: ForeignRecording | None,
+    watched: Sequence[ForeignRecording] = (),
 ) -> Identified:
     """Fit recordings one after the other, test on another, and look for contacts in further ones.
 
@@ -151,7 +151,7 @@ def identify(
     )
 
 
-def _joined(parts: list[OfflineCertificate], tested: Recording) -> OfflineCertificate:
+def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
     """Join the certificates of all stretches, each by its length."""
     weights = np.array([len(stretch.record.q) for stretch in tested.stretches], np.float64)
     weights /= weights.sum()
@@ -171,7 +171,11 @@ def _explained(test: Watched) -> Vector:
 
 
 def watch(
-    model: offline.ArmModel, settings: OfflineSettings, estimate: ModelEstimate, lack_Nm: Vector, recording: Recording
+    model: offline.ArmModel,
+    settings: OfflineSettings,
+    estimate: ModelEstimate,
+    lack_Nm: Vector,
+    recording: ForeignRecording,
 ) -> Watched:
     """Look for contacts in a recording, and compare them with its touches where these are known."""
     detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]
@@ -202,7 +206,7 @@ def watch(
     )
 
 
-def _touches(stretch: Stretch) -> NDArray[np.int64]:
+def _touches(stretch: RecordingStretch) -> NDArray[np.int64]:
     """Return the first and the last sample of each touch (k, 2)."""
     if stretch.is_touched is None:
         return np.zeros((0, 2), np.int64)
@@ -211,7 +215,7 @@ def _touches(stretch: Stretch) -> NDArray[np.int64]:
 
 
 def _owners(
-    stretch: Stretch, samples: NDArray[np.int64], recording: Recording, settings: OfflineSettings
+    stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
 ) -> NDArray[np.int64]:
     """Return which touch each contact is about, -1 for none, as far as the touches' times are known."""
     firsts, lasts = _touches(stretch).T

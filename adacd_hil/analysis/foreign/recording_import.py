@@ -218,7 +218,7 @@ _MEDIAN_TO_SIGMA = 1.4826 / np.sqrt(6.0)  # of the second difference of white no
 
 
 @dataclass(frozen=True)
-class Stretch:
+class RecordingStretch:
     """Samples without a gap: when the first was, and, if known, whether somebody touched the arm at each (k,)."""
 
     start_s: float
@@ -227,7 +227,7 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Recording:
+class ForeignRecording:
     """A recording, time-first. `noise_Nm` (n,), `velocity_noise_rad_s`: rms of what looks like white noise in it.
 
     `blur_s`: how far a derived velocity looks ahead and back.
@@ -235,7 +235,7 @@ class Recording:
 
     path: Path
     period_s: float
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[RecordingStretch, ...]
     noise_Nm: tuple[float, ...]
     velocity_noise_rad_s: float
     blur_s: float
@@ -245,18 +245,18 @@ class Recording:
         """Sum of the stretches."""
         return sum(len(stretch.record.q) for stretch in self.stretches) * self.period_s
 
-    def between(self, start_s: float, end_s: float) -> "Recording":
+    def between(self, start_s: float, end_s: float) -> "ForeignRecording":
         """Return what lies in a span of the recording's time, which begins with 0."""
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
         kept = tuple(part for part in parts if len(part.record.q) >= _SHORTEST_SAMPLES)
         return replace(self, stretches=kept)
 
     @property
-    def free(self) -> "Recording":
+    def free(self) -> "ForeignRecording":
         """What nobody touched, as far as that is known."""
         return replace(self, stretches=tuple(part for stretch in self.stretches for part in self._untouched(stretch)))
 
-    def _untouched(self, stretch: Stretch) -> list[Stretch]:
+    def _untouched(self, stretch: RecordingStretch) -> list[RecordingStretch]:
         """Split a stretch at its touches, with what is blurred around them."""
         if stretch.is_touched is None:
             return [stretch]
@@ -271,7 +271,7 @@ class Recording:
 
 def read_recording(
     path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
-) -> Recording:
+) -> ForeignRecording:
     """Read a CSV file. period_s: of the samples, where neither the map nor the recording is to say.
 
     span: what has to be read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError when
@@ -303,12 +303,12 @@ def read_recording(
         is_touched = None
         if touched is not None:
             is_touched = touched[rows][np.searchsorted(time_s[rows], grid_s, side="right") - 1]
-        stretches.append(Stretch(float(grid_s[0]), Record(q, dq, tau_J), is_touched))
+        stretches.append(RecordingStretch(float(grid_s[0]), Record(q, dq, tau_J), is_touched))
     if not stretches:
         raise LogError(f"{path}: no {shortest} samples of {period_s:g} s without a gap")
     noise_Nm = _noise([stretch.record.tau_J for stretch in stretches])
     velocity = _noise([stretch.record.dq for stretch in stretches]) if described.columns.dq else np.zeros(n)
-    return Recording(
+    return ForeignRecording(
         path=path,
         period_s=period_s,
         stretches=tuple(stretches),
@@ -442,13 +442,13 @@ def _noise(parts: list[Vector]) -> Vector:
     return np.asarray(_MEDIAN_TO_SIGMA * np.median(seconds, axis=0))
 
 
-def _cut(stretch: Stretch, period_s: float, start_s: float, end_s: float) -> Stretch:
+def _cut(stretch: RecordingStretch, period_s: float, start_s: float, end_s: float) -> RecordingStretch:
     time_s = stretch.start_s + period_s * np.arange(len(stretch.record.q))
     first, last = np.searchsorted(time_s, (start_s, end_s))
     return _part(stretch, period_s, int(first), int(last))
 
 
-def _part(stretch: Stretch, period_s: float, first: int, last: int) -> Stretch:
+def _part(stretch: RecordingStretch, period_s: float, first: int, last: int) -> RecordingStretch:
     record, touched = stretch.record, stretch.is_touched
     kept = Record(record.q[first:last], record.dq[first:last], record.tau_J[first:last])
-    return Stretch(stretch.start_s + first * period_s, kept, None if touched is None else touched[first:last])
+    return RecordingStretch(stretch.start_s + first * period_s, kept, None if touched is None else touched[first:last])

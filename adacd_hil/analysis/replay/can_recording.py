@@ -22,10 +22,10 @@ from adacd_hil.analysis.replay.log_source import (
     FRAME_TOPICS,
     NMT_ID,
     RESET_COMMUNICATION,
+    CycleStretch,
     LogSource,
     Part,
     Places,
-    Stretch,
 )
 from adacd_hil.device.arm import FEEDBACK_SHARE, SYNC_OVERFLOW
 from adacd_hil.device.drive import DISABLE_CYCLES
@@ -43,7 +43,7 @@ _CYCLIC: Final = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2T
 _NOWHERE: Final = np.int64(2**62)
 
 
-class Recording(NamedTuple):
+class CanRecording(NamedTuple):
     """A recording in the order in which the host met it.
 
     frames (m,); owner (m,): the cycle in which the host met each, increasing, and below the first one before that;
@@ -75,7 +75,7 @@ def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
     return np.where(is_known, t_ns[np.minimum(place, len(number) - 1)], before)
 
 
-def load_recording(path: Path, settings: Settings, codec: Codec) -> Recording:
+def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording:
     """Read a recording and put it in order. Raises LogError."""
     found = read_frames(path)
     sync_id = codec.message("Sync").can_id
@@ -102,7 +102,7 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> Recording:
     numbers = np.concatenate(([number[0] - 1], number, [number[-1] + 1]))
     owner = numbers[before + 1 + is_moved]
     order = np.argsort(owner, kind="stable")
-    return Recording(
+    return CanRecording(
         frames[order], owner[order], number[since][order], offset_ns[order], number, t_ns, is_realtime, found.problem
     )
 
@@ -187,7 +187,7 @@ class RecordingAgainstLog(LogSource):
         return notes
 
 
-def _find_cycle(recording: Recording, codec: Codec, against: Path) -> int:
+def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
     """Return the cycle of the run that a recording begins with: where the devices answered the same, bit for bit.
 
     The counter tells the cycle but for multiples of 240. Where no cycle fits, it is the nearest to the run's first.
@@ -242,7 +242,7 @@ class RecordingAlone:
         """Give one part."""
         yield Part(list(self._stretches()), {}, (), frozenset())
 
-    def _stretches(self) -> Iterator[Stretch]:
+    def _stretches(self) -> Iterator[CycleStretch]:
         recording = self._recording
         number, t_ns = recording.number, self._t_ns()
         frames = recording.in_time(number, t_ns, slice(None))
@@ -259,7 +259,7 @@ class RecordingAlone:
                 ticks = Ticks(
                     number[start:kept], t_ns[start:kept], np.diff(number[start:kept], prepend=number[start] - 1)
                 )
-                yield Stretch(
+                yield CycleStretch(
                     attempt=attempt, is_begin=True, is_exact=False, ticks=ticks, frames=mine, requests=None, scheme=None
                 )
 

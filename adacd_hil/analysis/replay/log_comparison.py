@@ -29,7 +29,7 @@ _TIMES: Final = ("lateness_ns", "feedback_ns", "command_ns", "compute_ns", "slac
 _NOT_METADATA: Final = ("epoch_ns",)
 
 
-class Detection(NamedTuple):
+class ComparedContact(NamedTuple):
     """What a run reported of a contact in the end; time since motion start."""
 
     time_s: float
@@ -51,7 +51,7 @@ class RunDigest:
     problem: str
     cycles: int
     states: list[tuple[float, str]]
-    contacts: list[Detection]
+    contacts: list[ComparedContact]
     parameters: dict[str, list[float]]
     timing_us: dict[str, dict[str, float]]
 
@@ -66,7 +66,7 @@ class RunReader:
         self.settings = settings_of(path, self._stream.attachments)
         self.cycles = 0
         self._states: list[tuple[float, str]] = []
-        self._contacts: dict[int, Detection] = {}
+        self._contacts: dict[int, ComparedContact] = {}
         self._parameters: dict[str, list[float]] = {}
         self._times = {name: Distribution() for name in _TIMES}
         self._bounds: tuple[int, int] | None = None
@@ -132,7 +132,7 @@ class RunReader:
         names = record.dtype.names or ()
         told = ("level", "kind", "force_N", "location")
         level, kind, force, location = (record[name].item() if name in names else 0 for name in told)
-        self._contacts[key] = Detection(
+        self._contacts[key] = ComparedContact(
             time_s if before is None else before.time_s,
             int(record["link"]),
             int(level),
@@ -210,8 +210,8 @@ class FieldDifference(NamedTuple):
 class ContactPair(NamedTuple):
     """A contact in both runs, or in one."""
 
-    first: Detection | None
-    second: Detection | None
+    first: ComparedContact | None
+    second: ComparedContact | None
 
 
 @dataclass(frozen=True)
@@ -382,7 +382,7 @@ def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
     return next((rows for rows in stream if len(rows)), None)
 
 
-def match_contacts(first: list[Detection], second: list[Detection]) -> list[ContactPair]:
+def match_contacts(first: list[ComparedContact], second: list[ComparedContact]) -> list[ContactPair]:
     """Match detections by time, the nearest ones first; what has no counterpart stands alone. In order of time."""
     order = sorted(range(len(second)), key=lambda k: second[k].time_s)
     times_s = [second[k].time_s for k in order]

@@ -31,7 +31,7 @@ SYNC_ID = 0x080
 Places = NDArray[np.int64]
 
 
-class Stretch(NamedTuple):
+class CycleStretch(NamedTuple):
     """Cycles of one attempt that follow each other without a gap in the log.
 
     `attempt`: its number in the run, from 0; `is_begin`: it begins with this. `is_exact`: nothing of it is missing so
@@ -48,7 +48,7 @@ class Stretch(NamedTuple):
     scheme: Series | None
 
 
-class Gap(NamedTuple):
+class LogGap(NamedTuple):
     """Cycles that the log lacks, before the one given."""
 
     cycle: int
@@ -60,7 +60,7 @@ class AttemptSplitter:
     """Splits the pieces of a log, in order."""
 
     def __init__(self, epoch_ns: int) -> None:
-        self.gaps: list[Gap] = []
+        self.gaps: list[LogGap] = []
         self.headless_cycles = 0
         """Cycles at the beginning of the log, of an attempt that had begun before: there is nothing to replay from."""
         self.unpaired = 0
@@ -73,7 +73,7 @@ class AttemptSplitter:
         self._last = (-1, 0, int(SchemeState.INIT))  # cycle, overruns and state before
         self._tail = np.zeros(0, np.uint8)  # counters of the SYNCs after that cycle
 
-    def split(self, piece: Piece) -> Iterator[Stretch]:
+    def split(self, piece: Piece) -> Iterator[CycleStretch]:
         """Give the stretches of the next piece."""
         scheme, cycle = _paired(piece)
         self.unpaired += len(piece.series["/scheme"]) + len(piece.series["/cycle"]) - 2 * len(cycle)
@@ -110,7 +110,7 @@ class AttemptSplitter:
 
     def _stretches(
         self, t_ns: Places, scheme: NDArray[Any], cycle: NDArray[Any], frames: NDArray[Any], begins: dict[int, int]
-    ) -> Iterator[Stretch]:
+    ) -> Iterator[CycleStretch]:
         number = cycle["cycle"].astype(np.int64)
         overruns = cycle["overruns"].astype(np.int64)
         skipped = np.diff(overruns, prepend=self._last[1])
@@ -139,12 +139,12 @@ class AttemptSplitter:
                 self._attempt += 1
             if is_gap[start]:
                 self._is_exact = False
-                self.gaps.append(Gap(int(number[start]), int(t_ns[start]), int(steps[start] - 1 - skipped[start])))
+                self.gaps.append(LogGap(int(number[start]), int(t_ns[start]), int(steps[start] - 1 - skipped[start])))
             if not self._has_begun:
                 self.headless_cycles += end - start
                 self._attempt = 0
                 continue
-            yield Stretch(
+            yield CycleStretch(
                 attempt=self._attempt,
                 is_begin=bool(is_begin[start]),
                 is_exact=self._is_exact,
@@ -204,7 +204,7 @@ _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
 """Names of the events that the scheme itself says."""
 
 
-class Source(Protocol):
+class ReplaySource(Protocol):
     """Where stretches come from: a log of ours, or a recording by others. Iterated once; notes are complete then."""
 
     settings: Settings
@@ -225,7 +225,7 @@ class Source(Protocol):
 class Part(NamedTuple):
     """What one piece of a log holds. contacts: logged reports by time, ns; events: of the names in `said`."""
 
-    stretches: Iterable[Stretch]
+    stretches: Iterable[CycleStretch]
     contacts: Mapping[int, Mapping[str, Any]]
     events: Sequence[LoggedEvent]
     said: frozenset[str]

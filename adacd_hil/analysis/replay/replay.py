@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.replay.log_source import LogSource, Part, Source, Stretch
+from adacd_hil.analysis.replay.log_source import CycleStretch, LogSource, Part, ReplaySource
 from adacd_hil.analysis.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.analysis.replay.scheme_comparison import (
     SHOWN,
@@ -104,7 +104,7 @@ class _Player:
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
 
-    def play(self, stretch: Stretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
+    def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
         """Take in a stretch of a part; return what the scheme decided. is_told: it is compared and counted."""
         ticks = stretch.ticks
         if stretch.is_begin:
@@ -124,7 +124,7 @@ class _Player:
 
     def _compare(
         self,
-        stretch: Stretch,
+        stretch: CycleStretch,
         batch: SchemeBatch,
         asked: NDArray[np.uint8] | None,
         part: Part,
@@ -152,7 +152,7 @@ class _Player:
         if self._asking is not None:
             self._asking.begin()
 
-    def _run(self, stretch: Stretch, arms: ArmBatch) -> SchemeBatch:
+    def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
         """Run the scheme; where nobody knows what was asked, the script says it cycle by cycle."""
         if stretch.requests is not None:
             return self._pipeline.run(arms, _known(stretch.requests))
@@ -191,7 +191,7 @@ def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
 
 
 def replay_source(
-    source: Source,
+    source: ReplaySource,
     variants: Sequence[Settings],
     truth: TrueContacts | None = None,
     progress: Progress = lambda _: None,
@@ -268,7 +268,7 @@ def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:
     return ArmBatch(*(column[rows] for column in columns))
 
 
-def _split(stretch: Stretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[Stretch, slice, bool]]:
+def _split(stretch: CycleStretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[CycleStretch, slice, bool]]:
     """Part a stretch at the beginning of what is told; also give the rows of each part and whether it is told.
 
     What comes after the end of that is left out. The frames stay with the whole.
@@ -279,7 +279,7 @@ def _split(stretch: Stretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[Stret
             yield _rows_of(stretch, rows), rows, is_told
 
 
-def _rows_of(stretch: Stretch, rows: slice) -> Stretch:
+def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
     scheme, requests = stretch.scheme, stretch.requests
     return stretch._replace(
         is_begin=stretch.is_begin and rows.start == 0,
@@ -298,7 +298,7 @@ class _Decoders:
         self._settings = dict(zip(self._keys, variants, strict=True))
         self._arms: dict[Any, RecordedArm] = {}
 
-    def read(self, stretch: Stretch) -> list[ArmBatch]:
+    def read(self, stretch: CycleStretch) -> list[ArmBatch]:
         """Return the states of a stretch, for each of the variants."""
         if stretch.is_begin:
             self._arms = {key: RecordedArm(settings, self._codec) for key, settings in self._settings.items()}
@@ -313,7 +313,7 @@ def _decoding_key(settings: Settings) -> Any:
     return (*shape, settings.bus, settings.devices, settings.realtime)
 
 
-def _result(player: _Player, source: Source, tolerance: float, first_ns: int) -> Replay:
+def _result(player: _Player, source: ReplaySource, tolerance: float, first_ns: int) -> Replay:
     """Sum up what a player came to from a time on."""
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source.notes())
     gatherer.end()

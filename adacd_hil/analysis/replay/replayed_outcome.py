@@ -26,7 +26,7 @@ from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.settings.configuration import Settings
 
 
-class Transition(NamedTuple):
+class StateChange(NamedTuple):
     """A change of state."""
 
     cycle: int
@@ -48,7 +48,7 @@ class OutcomeGatherer:
     """Takes in the decisions of one replay. `truth`: the true contacts, None where nobody knows them."""
 
     def __init__(self, settings: Settings, truth: TrueContacts | None) -> None:
-        self.transitions: list[Transition] = []
+        self.transitions: list[StateChange] = []
         self.reports: list[LoggedContact] = []
         self.adaptations: list[Adaptation] = []
         self.theta_hat: tuple[float, ...] = ()
@@ -82,7 +82,7 @@ class OutcomeGatherer:
             self._alarms.append((int(ticks.cycle[row]), Alarm(int(ticks.t_ns[row]), is_armed)))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
             self._enter(
-                Transition(
+                StateChange(
                     int(ticks.cycle[row]),
                     int(ticks.t_ns[row]),
                     SchemeState(batch.previous_state[row]),
@@ -106,7 +106,7 @@ class OutcomeGatherer:
         threshold = batch.block[rows, self._threshold]
         self._kept.append(HostCycles(ticks.cycle[rows], ticks.t_ns[rows], batch.previous_state[rows], threshold))
 
-    def _enter(self, transition: Transition, theta_hat: Vector) -> None:
+    def _enter(self, transition: StateChange, theta_hat: Vector) -> None:
         self.transitions.append(transition)
         state = transition.state
         if state is SchemeState.ADAPT and self._began is None:
@@ -172,7 +172,7 @@ class Replay:
     monitored_s: float
     compared: int
     attempts: int
-    states: tuple[Transition, ...]
+    states: tuple[StateChange, ...]
     contacts: tuple[LoggedContact, ...]
     adaptations: tuple[Adaptation, ...]
     parameters: dict[str, float]
@@ -183,7 +183,7 @@ class Replay:
     mismatched_fields: dict[str, int]
     tolerance: float
     zero_ns: int
-    ending: Transition | None
+    ending: StateChange | None
     notes: tuple[str, ...] = ()
     """What of the log could not be compared or judged, a line each."""
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.page import CONTACTS, Cell, Table, contact_rows, make_table, shown_contacts
-from adacd_hil.analysis.score.metrics import Contact, Metrics
+from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
 from adacd_hil.analysis.score.touches import row_at
 from adacd_hil.analysis.score.wording import NONE, number_text, scaled, signs_text, uncertain_text
 from adacd_hil.records import Location, Vector
@@ -150,7 +150,7 @@ _PLACES: Final = {
 }
 
 
-def _card(contact: Contact, run: Run, strongest_N: float) -> ContactCard:
+def _card(contact: ReportedContact, run: Run, strongest_N: float) -> ContactCard:
     entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
     entries += _torques(contact)
     if contact.link is not None:
@@ -169,17 +169,17 @@ def _card(contact: Contact, run: Run, strongest_N: float) -> ContactCard:
     )
 
 
-def _kind(contact: Contact) -> str:
+def _kind(contact: ReportedContact) -> str:
     words = [contact.level, contact.kind if contact.kind != "UNKNOWN" else None, contact.reaction]
     kind = " · ".join(word.lower().replace("_", " ") for word in words if word)
     return kind + (" · two-sided" if contact.is_two_sided else "")
 
 
-def _why_not(contact: Contact) -> str:
+def _why_not(contact: ReportedContact) -> str:
     return "missed" if contact.is_armed else f"not armed in {contact.state}"
 
 
-def _found(contact: Contact) -> list[tuple[str, str]]:
+def _found(contact: ReportedContact) -> list[tuple[str, str]]:
     """Give what the report says."""
     lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
     return [
@@ -192,7 +192,7 @@ def _found(contact: Contact) -> list[tuple[str, str]]:
     ]
 
 
-def _force(contact: Contact) -> tuple[str, str]:
+def _force(contact: ReportedContact) -> tuple[str, str]:
     """Give the force as far as it is known: with its deviation, as a lower bound, or not at all."""
     location = Location[contact.location or Location.NOT_SOUGHT.name]
     if contact.force_N is None:
@@ -205,7 +205,7 @@ def _force(contact: Contact) -> tuple[str, str]:
     return "force at right angles", uncertain_text(contact.force_N, contact.force_sigma_N, 1, "N")
 
 
-def _torques(contact: Contact) -> list[tuple[str, str]]:
+def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
     """Give each joint's peak and impulse; a peak without its deviation where that is not told."""
     unknown = (None, None)
     impulses = contact.impulse_Nm_s or unknown
@@ -220,7 +220,7 @@ def _torques(contact: Contact) -> list[tuple[str, str]]:
     return entries
 
 
-def _arm(contact: Contact, run: Run, strongest_N: float) -> ArmDrawing | None:
+def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> ArmDrawing | None:
     """Draw the arm where it was when the contact was found, or began; None without measured positions."""
     if run.motion is None:
         return None
@@ -233,7 +233,7 @@ def _arm(contact: Contact, run: Run, strongest_N: float) -> ArmDrawing | None:
     return draw_arm(q, run.settings.arm.link_length_m, push, ", ".join(words))
 
 
-def _push(contact: Contact, strongest_N: float, length1_m: float) -> Push | None:
+def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Push | None:
     """Say where the force of a contact is drawn: as reported, else as true, else not at all."""
     link = contact.link if contact.link_detected is None else contact.link_detected
     if link is None:

@@ -18,12 +18,12 @@ from adacd_hil.analysis.logged_run import (
     CertifiedStream,
     CheckCounts,
     Cycles,
-    Motion,
+    MeasuredMotion,
     PaperStream,
     Run,
     host_cycles,
 )
-from adacd_hil.analysis.score.emulator_truth import TruthRows, host_truth
+from adacd_hil.analysis.score.emulator_truth import TruthTable, host_truth
 from adacd_hil.analysis.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.analysis.score.touches import true_contacts
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, contacts_of
@@ -114,7 +114,7 @@ def _joined(parts: list[CheckCounts]) -> CheckCounts | None:
 class TruthClock:
     """Finds the host's time of each row of the truth, as the log is read: between the cycles that it lies between."""
 
-    def __init__(self, truth: TruthRows) -> None:
+    def __init__(self, truth: TruthTable) -> None:
         self.t_ns = np.zeros(len(truth.cycle), np.int64)
         self._truth = truth
         self._pending = np.arange(len(truth.cycle))
@@ -156,7 +156,7 @@ class TruthClock:
 class Outline:
     """One reading of a log, piece by piece."""
 
-    def __init__(self, shell: Run, empty: Series, truth: TruthRows | None) -> None:
+    def __init__(self, shell: Run, empty: Series, truth: TruthTable | None) -> None:
         """`shell`: what is known of the run before, a truth on the host's cycles included; its arrays are empty.
 
         empty: a piece of /scheme without records; truth: whose place on the host's cycles is to be found.
@@ -295,7 +295,7 @@ def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, A
     """Give the fields of a run."""
     arrays: dict[str, Any] = {name: columns[name] for name in _PLAIN}
     arrays |= {"cycle": columns["cycle"].astype(np.int64), _TIME: columns[_TIME]}
-    arrays["motion"] = Motion(*(columns[name] for name in _MOTION))
+    arrays["motion"] = MeasuredMotion(*(columns[name] for name in _MOTION))
     if "tau_ext_bank" in columns:
         shape = (-1, settings.channel_count, JOINTS)
         arrays["certified"] = CertifiedStream(

@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from adacd_hil.analysis.logged_run import StretchOfRun
-from adacd_hil.analysis.score.metrics import Contact, Metrics
+from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
 from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, signs_text, why_not_found, yes_text
 
 TRACED_CONTACTS: Final = 60
@@ -123,7 +123,7 @@ _CONTACT_HEAD: Final = (
 )  # fmt: skip
 
 
-def _contact_words(contact: Contact) -> tuple[str, ...]:
+def _contact_words(contact: ReportedContact) -> tuple[str, ...]:
     delay = number_text(contact.delay_ms, 0)
     if contact.detected_s is None:
         delay = why_not_found(contact.is_armed)
@@ -145,13 +145,13 @@ def _contact_words(contact: Contact) -> tuple[str, ...]:
     )
 
 
-def shown_contacts(metrics: Metrics, most: int) -> tuple[Contact, ...]:
+def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
     """Choose the first contacts to be listed, and of the others as many that went wrong."""
     later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
     return (*metrics.contacts[:most], *later[:most])
 
 
-def went_wrong(contact: Contact) -> bool:
+def went_wrong(contact: ReportedContact) -> bool:
     """Tell whether a contact was missed, or its link or direction is not the true one."""
     is_missed = contact.is_armed and contact.detected_s is None
     is_wrong_link = contact.link is not None and contact.link_detected not in (None, contact.link)
@@ -167,7 +167,9 @@ def left_out_text(metrics: Metrics, most: int) -> str:
     return f"The first {most}{wrong} of {count} contacts; all are in contacts.csv."
 
 
-def contact_rows(metrics: Metrics, contacts: Sequence[Contact]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def contact_rows(
+    metrics: Metrics, contacts: Sequence[ReportedContact]
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Give head and rows of a list of contacts, where it is known with the delay of the paper's scheme beside."""
     rows = [_contact_words(contact) for contact in contacts]
     beside = None if metrics.evidence is None else metrics.evidence.paper_beside

@@ -42,7 +42,7 @@ from adacd_hil.analysis.report.run_reading import Progress, read_run
 from adacd_hil.analysis.report.timeline import stays_of
 from adacd_hil.analysis.report.timing_figures import draw_timing
 from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import Contact, Evidence, Gathered, Metrics, Source
+from adacd_hil.analysis.score.metrics import CertifiedEvidence, Gathered, Metrics, ReportedContact, ReportSource
 from adacd_hil.analysis.score.wording import NONE
 from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import LogError
@@ -61,7 +61,7 @@ class Report:
 
     metrics: Metrics
     metadata: Mapping[str, str]
-    source: Source
+    source: ReportSource
     html_path: Path
     json_path: Path
     figure_paths: tuple[Path, ...]
@@ -82,7 +82,7 @@ class Report:
         return "\n".join([*lines, "", in_line(f"Report: {self.html_path}")])
 
 
-def _tables(metrics: Metrics, source: Source, width: int | None = None) -> list[str]:
+def _tables(metrics: Metrics, source: ReportSource, width: int | None = None) -> list[str]:
     """Give what the log lacks, what the paper had and the contacts, line by line."""
     lines = [in_line(f"The log is not whole: {source.problem}")] if source.problem else []
     lines += ["", *fit_table([paper_head(metrics), *paper_cells(metrics)], width=width)]
@@ -111,7 +111,7 @@ def write_report(
 
 
 def write_run_report(
-    run: Run, out_dir: Path, source: Source, gathered: Gathered | None = None, *, is_printed: bool = False
+    run: Run, out_dir: Path, source: ReportSource, gathered: Gathered | None = None, *, is_printed: bool = False
 ) -> Report:
     """Write the report of a run that is in memory. Raises LogError when it can't be written.
 
@@ -157,7 +157,7 @@ _DIGITS: Final = 6
 
 
 def report_json(
-    metrics: Metrics, metadata: Mapping[str, str], source: Source, stretch: StretchOfRun | None = None
+    metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
 ) -> dict[str, Any]:
     """Give the content of report.json; the keys are described in `adacd_hil.analysis.score.metrics`."""
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
@@ -213,7 +213,7 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
     }
 
 
-def _evidence_json(evidence: Evidence) -> dict[str, Any]:
+def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
     """Give what only the certified scheme has; the keys are described in `adacd_hil.analysis.score.margins`."""
     return {**dataclasses.asdict(evidence), "smallest_margin": evidence.smallest_margin}
 
@@ -236,7 +236,7 @@ _CSV_DIGITS: Final = 9
 
 def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
     """Write each table, by its file's name."""
-    names = [field.name for field in dataclasses.fields(Contact)]
+    names = [field.name for field in dataclasses.fields(ReportedContact)]
     pairs = [name for name in names if any(isinstance(getattr(c, name), tuple) for c in metrics.contacts)]
     head = [column for name in names for column in ((f"{name}_1", f"{name}_2") if name in pairs else (name,))]
     contacts = ([cell for name in names for cell in _cells(getattr(c, name), name in pairs)] for c in metrics.contacts)
@@ -368,7 +368,7 @@ _ORIGIN: Final = ("config", "profile", "interface")
 """Metadata with a column each."""
 
 
-class Entry(NamedTuple):
+class IndexEntry(NamedTuple):
     """A run of the folder: its name there, and its report, or why it has none."""
 
     name: str
@@ -389,7 +389,7 @@ class Entry(NamedTuple):
         return self.report.metrics.verdict + missing
 
 
-def count_text(entries: Sequence[Entry]) -> str:
+def count_text(entries: Sequence[IndexEntry]) -> str:
     """Say how many runs there are and how many of them are not good."""
     bad = sum(not entry.is_clean for entry in entries)
     runs = "1 run" if len(entries) == 1 else f"{len(entries)} runs"
@@ -399,13 +399,13 @@ def count_text(entries: Sequence[Entry]) -> str:
 class _IndexRow(NamedTuple):
     """A run in the table: the place of its report, how long it lasted, and what it was made with."""
 
-    entry: Entry
+    entry: IndexEntry
     place: str
     lasts: str
     origin: Sequence[str]
 
 
-def index_page(folder: Path, entries: Sequence[Entry]) -> str:
+def index_page(folder: Path, entries: Sequence[IndexEntry]) -> str:
     """Write the page, which lies in `folder`."""
     count = count_text(entries)
     heading = Heading("adacd-hil run reports", f"{count}.", (), all(entry.is_clean for entry in entries))
@@ -413,7 +413,7 @@ def index_page(folder: Path, entries: Sequence[Entry]) -> str:
     return render_page("index_page.html.j2", f"{count} – run reports", heading, rows=rows)
 
 
-def _row(folder: Path, entry: Entry) -> _IndexRow:
+def _row(folder: Path, entry: IndexEntry) -> _IndexRow:
     if entry.report is None:
         return _IndexRow(entry, "", NONE, [NONE] * len(_ORIGIN))
     place = quote(entry.report.html_path.relative_to(folder).as_posix())

@@ -18,12 +18,12 @@ from adacd_hil.analysis.report.page import (
 )
 from adacd_hil.analysis.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
 from adacd_hil.analysis.score.metrics import (
+    CertifiedEvidence,
     ChannelMargin,
     CyclicData,
-    Evidence,
     Metrics,
+    ReportSource,
     Residual,
-    Source,
     TimingEvidence,
 )
 from adacd_hil.analysis.score.timing import OLDEST_CYCLES
@@ -38,7 +38,7 @@ def paper_table(metrics: Metrics) -> Table:
     return make_table(head, rows, left=range(len(head)))
 
 
-def margins_table(evidence: Evidence | None) -> Table | None:
+def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
     """List threshold over residual of each channel and section."""
     if evidence is None or not evidence.margins:
         return None
@@ -55,7 +55,7 @@ def margins_table(evidence: Evidence | None) -> Table | None:
     return make_table(head, rows, left=(0, 2))
 
 
-def push_table(evidence: Evidence | None) -> Table | None:
+def push_table(evidence: CertifiedEvidence | None) -> Table | None:
     """Give how small a push is found, and the threshold in force."""
     push = None if evidence is None else evidence.smallest_push
     if push is None:
@@ -77,7 +77,7 @@ def counted_sentence(metrics: Metrics) -> str:
     return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
 
 
-def _first_and_worst(evidence: Evidence) -> dict[str, tuple[ChannelMargin, ...]]:
+def _first_and_worst(evidence: CertifiedEvidence) -> dict[str, tuple[ChannelMargin, ...]]:
     """Choose the first sections, and the one with the smallest margin."""
     labels = list(evidence.margins)
     worst = min(labels, key=lambda label: min(min(row.margin) for row in evidence.margins[label]))
@@ -85,7 +85,7 @@ def _first_and_worst(evidence: Evidence) -> dict[str, tuple[ChannelMargin, ...]]
     return {label: margins for label, margins in evidence.margins.items() if label in shown}
 
 
-def further_table(evidence: Evidence | None) -> Table | None:
+def further_table(evidence: CertifiedEvidence | None) -> Table | None:
     """List all parameters of the certified scheme with the standard deviations that it gives them."""
     if evidence is None or not evidence.estimates:
         return None
@@ -189,7 +189,7 @@ def _share(share: float | None) -> str:
     return NONE if share is None else percent_text(share)
 
 
-def origin_table(metrics: Metrics, run: Run, source: Source) -> Table:
+def origin_table(metrics: Metrics, run: Run, source: ReportSource) -> Table:
     """List where the run comes from."""
     log = [("log", source.log_name), ("frames", metrics.frames), ("packets dropped", metrics.dropped)]
     if run.stretch is not None:

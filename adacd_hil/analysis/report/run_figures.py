@@ -28,7 +28,7 @@ from adacd_hil.analysis.drawing import (
 from adacd_hil.analysis.logged_run import Run, Section
 from adacd_hil.analysis.report.page import ADAPTATIONS
 from adacd_hil.analysis.score.judge import filtered
-from adacd_hil.analysis.score.metrics import Contact, Metrics
+from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
 from adacd_hil.analysis.score.touches import row_at
 from adacd_hil.analysis.score.wording import why_not_found
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, SchemeState, Vector
@@ -410,7 +410,7 @@ def close_ups(run: Run, metrics: Metrics) -> Drawing:
     return Drawing("contacts", "Contacts close up", caption, figure)
 
 
-class _View(NamedTuple):
+class _CloseUp(NamedTuple):
     """The residual that close-ups show (n, 2), with its threshold (n, 2) and its filter's cut-off."""
 
     tau_ext_hat: Vector
@@ -418,17 +418,17 @@ class _View(NamedTuple):
     a_rad_s: float
 
 
-def _view(run: Run) -> _View:
+def _view(run: Run) -> _CloseUp:
     """Choose the fastest bare channel of the bank, or the paper's one."""
     if run.certified is None:
         fixed = np.broadcast_to(np.array(run.settings.detector.threshold_Nm), run.tau_ext_hat.shape)
-        return _View(run.tau_ext_hat, fixed, run.a_rad_s)
+        return _CloseUp(run.tau_ext_hat, fixed, run.a_rad_s)
     cutoff, _ = channels_of(run.settings)[-1]
-    return _View(run.certified.tau_ext[:, -1], run.certified.threshold[:, -1], cutoff)
+    return _CloseUp(run.certified.tau_ext[:, -1], run.certified.threshold[:, -1], cutoff)
 
 
 def _close_up(
-    axes: Axes, run: Run, contact: Contact, time_s: Vector, view: _View, paper_detected_s: float | None
+    axes: Axes, run: Run, contact: ReportedContact, time_s: Vector, view: _CloseUp, paper_detected_s: float | None
 ) -> None:
     at_s = contact.at_s
     delay_s = (contact.delay_ms or 0.0) * 1e-3
@@ -485,7 +485,7 @@ def _ideal(run: Run, onset_s: float, after_s: float, a_rad_s: float) -> tuple[Ve
     return (time_s[rows] - onset_s) * 1e3, ideal
 
 
-def _describe(axes: Axes, contact: Contact) -> None:
+def _describe(axes: Axes, contact: ReportedContact) -> None:
     number = f"{contact.number}"
     if contact.link is not None:
         number += f"  link {contact.link}"

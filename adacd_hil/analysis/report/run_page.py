@@ -29,13 +29,13 @@ from adacd_hil.analysis.report.report_tables import (
     timing_tables,
 )
 from adacd_hil.analysis.report.timeline import SCRIPTS, STYLES, state_key, timeline_of, traces_of
-from adacd_hil.analysis.score.metrics import Evidence, Metrics, Source
+from adacd_hil.analysis.score.metrics import CertifiedEvidence, Metrics, ReportSource
 from adacd_hil.analysis.score.verdict import LISTED
 from adacd_hil.analysis.score.wording import NONE, number_text, percent_text
 
 
 def report_page(
-    metrics: Metrics, run: Run, source: Source, drawings: Sequence[Drawing], timing: Sequence[Drawing]
+    metrics: Metrics, run: Run, source: ReportSource, drawings: Sequence[Drawing], timing: Sequence[Drawing]
 ) -> str:
     """Write the page. drawings, timing: the figures of the run and of its times."""
     figures = {drawing.name: drawing for drawing in drawings}
@@ -77,12 +77,12 @@ def report_page(
     )
 
 
-def _name(run: Run, source: Source) -> str:
+def _name(run: Run, source: ReportSource) -> str:
     words = [run.metadata.get("config", ""), run.metadata.get("profile", "")]
     return " ".join(filter(None, words)) or source.log_name
 
 
-def _heading(metrics: Metrics, run: Run, source: Source) -> Heading:
+def _heading(metrics: Metrics, run: Run, source: ReportSource) -> Heading:
     meta = [
         ("configuration", "config"), ("profile", "profile"), ("clock", "clock"), ("interface", "interface"),
         ("version", "version"),
@@ -127,7 +127,7 @@ def _share_number(share: float | None) -> str:
     return NONE if share is None else percent_text(share).removesuffix(" %")
 
 
-def _beside_times(evidence: Evidence | None) -> str:
+def _beside_times(evidence: CertifiedEvidence | None) -> str:
     if evidence is None or evidence.paper_beside is None:
         return NONE
     times_s = [number_text(time_s, 2) for time_s in evidence.paper_beside.adaptation_s.values()]

@@ -43,9 +43,9 @@ from adacd_hil.analysis.logged_run import (
 from adacd_hil.analysis.report.outline import Facts, Outline, SchemeRows, run_of_piece, settling_s, widen
 from adacd_hil.analysis.report.page import ADAPTATIONS, TRACED_CONTACTS
 from adacd_hil.analysis.report.traces import panels_of
-from adacd_hil.analysis.score.emulator_truth import TruthRows, foreign_truth, host_truth, read_truth
+from adacd_hil.analysis.score.emulator_truth import TruthTable, foreign_truth, host_truth, read_truth
 from adacd_hil.analysis.score.margins import UntouchedGatherer
-from adacd_hil.analysis.score.metrics import Gathered, Source
+from adacd_hil.analysis.score.metrics import Gathered, ReportSource
 from adacd_hil.analysis.score.run_faults import CyclicDataGatherer
 from adacd_hil.analysis.score.timing import QUEUES, TimingGatherer, find_reactions
 from adacd_hil.analysis.score.touches import find_detections, true_contacts
@@ -182,7 +182,7 @@ class ReadRun(NamedTuple):
 
     run: Run
     gathered: Gathered | None
-    source: Source
+    source: ReportSource
 
 
 def read_run(
@@ -208,7 +208,7 @@ def read_run(
 class _Reading:
     """Reads one log, as often as it takes."""
 
-    def __init__(self, path: Path, truth: TruthRows | None, progress: Progress, truth_problem: str = "") -> None:
+    def __init__(self, path: Path, truth: TruthTable | None, progress: Progress, truth_problem: str = "") -> None:
         self._path = path
         self._truth_problem = truth_problem
         self._truth = truth
@@ -278,7 +278,7 @@ class _Reading:
         of_truth = self._truth_problem or _unjudged(run)
         problems = [stream.problem, "" if truth is None else truth.problem, of_truth]
         is_complete = stream.is_complete and not of_truth and (truth is None or truth.is_complete)
-        source = Source(self._path.name, "; ".join(filter(None, problems)), is_complete)
+        source = ReportSource(self._path.name, "; ".join(filter(None, problems)), is_complete)
         if run.stretch is None:
             run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
         return ReadRun(run, gathered, source)

@@ -12,8 +12,8 @@ import numpy as np
 
 from adacd_hil.analysis.logged_run import Run
 from adacd_hil.analysis.report.page import MARKS
-from adacd_hil.analysis.report.traces import Packed, Panel, pack, panels_of, step_of
-from adacd_hil.analysis.score.metrics import Contact, Metrics
+from adacd_hil.analysis.report.traces import Packed, TracePanel, pack, panels_of, step_of
+from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
 from adacd_hil.analysis.score.wording import number_text
 from adacd_hil.records import SchemeState
 
@@ -204,7 +204,7 @@ def _contact_marks(metrics: Metrics, scale: _Scale) -> Iterator[Mark]:
         yield Mark(at_s - 0.15, max(at_s + 0.6, end_s + 0.15), title, left, width, look, label)
 
 
-def _contact_title(contact: Contact, at_s: float) -> str:
+def _contact_title(contact: ReportedContact, at_s: float) -> str:
     words = [f"contact {contact.number} at {number_text(at_s, 2, 's')}"]
     if contact.link is not None:
         words.append(f"on link {contact.link}")
@@ -247,7 +247,7 @@ _TIME_STEP_S: Final = 1e-5
 class Traces(NamedTuple):
     """The data of the traces. blocks: the series as text, by name; plan: what the script draws of them."""
 
-    panels: tuple[Panel, ...]
+    panels: tuple[TracePanel, ...]
     blocks: dict[str, str]
     plan: dict[str, Any]
 

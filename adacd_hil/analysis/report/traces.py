@@ -44,7 +44,7 @@ class Trace(NamedTuple):
     is_mirrored: bool = False
 
 
-class Panel(NamedTuple):
+class TracePanel(NamedTuple):
     """Curves on one ordinate. levels: values with a line of their own; near: half the range near zero, if any."""
 
     name: str
@@ -55,12 +55,12 @@ class Panel(NamedTuple):
     near: float | None = None
 
 
-def panels_of(run: Run) -> tuple[Panel, ...]:
+def panels_of(run: Run) -> tuple[TracePanel, ...]:
     """List the panels that the run has something for."""
     return (*_motion(run), *_residuals(run), *_channels(run), *_parameters(run))
 
 
-def _motion(run: Run) -> Iterator[Panel]:
+def _motion(run: Run) -> Iterator[TracePanel]:
     if run.motion is None:
         return
     for name, title, unit in (
@@ -70,10 +70,10 @@ def _motion(run: Run) -> Iterator[Panel]:
     ):
         values = getattr(run.motion, name)
         traces = (Trace(f"joint {j + 1}", values[:, j], FINEST[unit], f"joint{j + 1}") for j in range(JOINTS))
-        yield Panel(name, title, unit, tuple(traces))
+        yield TracePanel(name, title, unit, tuple(traces))
 
 
-def _residuals(run: Run) -> Iterator[Panel]:
+def _residuals(run: Run) -> Iterator[TracePanel]:
     """Give each joint's residual of every model against the thresholds."""
     finest = FINEST["Nm"]
     ours = "identified" if run.certified is None else "certified"
@@ -92,7 +92,7 @@ def _residuals(run: Run) -> Iterator[Panel]:
         finite = bound[np.isfinite(bound)]
         near = _NEAR * float(np.median(finite)) if finite.size else None
         title = f"Estimated external torque tau_ext_hat, joint {joint + 1}"
-        yield Panel(f"residual{joint + 1}", title, "Nm", tuple(traces), near=near)
+        yield TracePanel(f"residual{joint + 1}", title, "Nm", tuple(traces), near=near)
 
 
 def _in_view(threshold: Vector, residual: Vector) -> Vector:
@@ -103,7 +103,7 @@ def _in_view(threshold: Vector, residual: Vector) -> Vector:
     return np.where(threshold <= ceiling, threshold, np.nan)
 
 
-def _channels(run: Run) -> Iterator[Panel]:
+def _channels(run: Run) -> Iterator[TracePanel]:
     """Give the channels of the certified scheme's bank, and the largest part of its threshold that any reaches."""
     stream = run.certified
     if stream is None:
@@ -116,11 +116,11 @@ def _channels(run: Run) -> Iterator[Panel]:
             Trace(label, stream.tau_ext[:, channel, joint], FINEST["Nm"], _BANK_COLOURS[channel % len(_BANK_COLOURS)])
             for channel, label in enumerate(labels)
         )
-        yield Panel(f"channels{joint + 1}", f"Residual channels, joint {joint + 1}", "Nm", traces[::-1])
+        yield TracePanel(f"channels{joint + 1}", f"Residual channels, joint {joint + 1}", "Nm", traces[::-1])
     shares = _shares(stream)
     traces = tuple(Trace(f"joint {j + 1}", shares[:, j], FINEST["×"], f"joint{j + 1}") for j in range(JOINTS))
     title = "Largest residual over its threshold, any channel (an alarm at 1)"
-    yield Panel("share", title, "×", traces, levels=(1.0,), near=1.5)
+    yield TracePanel("share", title, "×", traces, levels=(1.0,), near=1.5)
 
 
 def _shares(stream: CertifiedStream) -> Vector:
@@ -131,7 +131,7 @@ def _shares(stream: CertifiedStream) -> Vector:
     return shares
 
 
-def _parameters(run: Run) -> Iterator[Panel]:
+def _parameters(run: Run) -> Iterator[TracePanel]:
     """Give the estimates theta_hat, a panel per unit."""
     names = run.parameter_names
     for unit in dict.fromkeys(PARAMETER_UNITS[name] for name in names):
@@ -140,7 +140,7 @@ def _parameters(run: Run) -> Iterator[Panel]:
             Trace(name, run.theta_hat[:, names.index(name)], _PARAMETER_STEP, colour)
             for name, colour in zip(chosen, _BANK_COLOURS, strict=False)
         )
-        yield Panel(f"theta-{chosen[0]}", f"Identified parameters theta_hat: {', '.join(chosen)}", unit, traces)
+        yield TracePanel(f"theta-{chosen[0]}", f"Identified parameters theta_hat: {', '.join(chosen)}", unit, traces)
 
 
 STEPS_PER_SIGMA: Final = 2.0

@@ -46,7 +46,7 @@ _HELD: Final = 30_000
 """Rows of one contact that wait at most until those in the middle are chosen."""
 
 
-class TruthRows(NamedTuple):
+class TruthTable(NamedTuple):
     """Kept rows of the truth (m,), on the emulator's own cycles; attempt (m,): of the run, from 0.
 
     model_attempt, model_cycle (k,): from when on payload and parameters are as they are. metadata: of the log; problem:
@@ -78,7 +78,7 @@ _ROW: Final = np.dtype(
 _MODEL: Final = ("payload", "theta")
 
 
-def read_truth(path: Path, most_rows: int) -> TruthRows:
+def read_truth(path: Path, most_rows: int) -> TruthTable:
     """Read the emulator's log; of one with more than `most_rows` cycles the contacts. Raises LogError."""
     stream = LogStream(path, ("/truth",))
     rows = _Gathering(most_rows)
@@ -167,7 +167,7 @@ class _Gathering:
         self._kept_rows += len(done)
         self._contact = _OneContact(_BEGINNING[self._kept_rows > _PLENTY])
 
-    def done(self, stream: LogStream) -> TruthRows:
+    def done(self, stream: LogStream) -> TruthTable:
         """Give what was kept."""
         if self._is_long:
             self._kept.append(self._contact.rows())
@@ -175,7 +175,7 @@ class _Gathering:
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
         models = zip(nothing, *self._models, strict=True)
         attempt, cycle, payload, theta = (np.concatenate(column) for column in models)
-        return TruthRows(
+        return TruthTable(
             attempt=rows["attempt"].copy(),
             cycle=rows["cycle"].copy(),
             tau_ext=rows["tau_ext"].copy(),
@@ -234,7 +234,7 @@ class _OneContact:
         return np.concatenate([*self._chosen, self._waiting])
 
 
-def host_truth(rows: TruthRows, begins: Cycles, last: int, time_s: Vector | None) -> Truth | None:
+def host_truth(rows: TruthTable, begins: Cycles, last: int, time_s: Vector | None) -> Truth | None:
     """Give the truth on the host's cycles; None where the emulator never cycled.
 
     begins: first cycle of each attempt of the run; last: of the run; time_s: of the rows (m,).
@@ -390,7 +390,7 @@ def contacts_beside(path: Path, progress: Callable[[str], None] = lambda _: None
     return None if rows.span is None else TrueContacts(_contacts(rows), rows.span)
 
 
-def _contacts(rows: TruthRows) -> tuple[TrueContact, ...]:
+def _contacts(rows: TruthTable) -> tuple[TrueContact, ...]:
     found = []
     for number, (start, end) in enumerate(contact_bounds(rows.contact_index, rows.attempt), start=1):
         stop = end + int(end < len(rows.cycle) and rows.attempt[end] == rows.attempt[start])  # the row after it

@@ -9,19 +9,19 @@ from adacd_hil.analysis.logged_run import Run, Section, is_realtime, rows_of, se
 from adacd_hil.analysis.score.judge import JudgedContact, Score
 from adacd_hil.analysis.score.margins import evaluate_certified, gather_untouched, last_row
 from adacd_hil.analysis.score.metrics import (
-    Contact,
+    CertifiedEvidence,
     CycleStatistics,
-    Evidence,
     Gathered,
     Metrics,
+    ReportedContact,
     TimingEvidence,
     Untouched,
 )
 from adacd_hil.analysis.score.run_faults import find_causes, find_faults, gather_data
 from adacd_hil.analysis.score.timing import collect_evidence, find_reactions
 from adacd_hil.analysis.score.touches import (
-    Detection,
-    Touch,
+    LoggedDetection,
+    TruthTouch,
     channels_at,
     find_detections,
     ideal_response,
@@ -83,7 +83,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     )
 
 
-def _evidence(run: Run, sections: tuple[Section, ...], untouched: Untouched) -> Evidence | None:
+def _evidence(run: Run, sections: tuple[Section, ...], untouched: Untouched) -> CertifiedEvidence | None:
     if run.certified is None:
         return None
     return evaluate_certified(
@@ -155,10 +155,10 @@ def timing_evidence(run: Run) -> TimingEvidence:
 def list_contacts(
     run: Run,
     sections: tuple[Section, ...],
-    touches: tuple[Touch, ...],
-    detections: tuple[Detection, ...],
+    touches: tuple[TruthTouch, ...],
+    detections: tuple[LoggedDetection, ...],
     score: Score,
-) -> tuple[Contact, ...]:
+) -> tuple[ReportedContact, ...]:
     """List the true contacts with the detection that found each; without the truth the detections."""
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
@@ -169,7 +169,7 @@ def list_contacts(
     )
 
 
-def _reported(detection: Detection | None) -> dict[str, Any]:
+def _reported(detection: LoggedDetection | None) -> dict[str, Any]:
     """Give what the reports of a detection say."""
     if detection is None:
         return {}
@@ -214,8 +214,8 @@ def _state_at(run: Run, time_s: float) -> SchemeState:
     return SchemeState(run.state[max(row_at(run, time_s) - 1, 0)])
 
 
-def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: Detection) -> Contact:
-    return Contact(
+def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: LoggedDetection) -> ReportedContact:
+    return ReportedContact(
         number=number,
         section=section_at(sections, detection.detected_s),
         state=_state_at(run, detection.detected_s).name,
@@ -225,8 +225,8 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: D
 
 
 def _contact(
-    run: Run, sections: tuple[Section, ...], touch: Touch, judged: JudgedContact, detection: Detection | None
-) -> Contact:
+    run: Run, sections: tuple[Section, ...], touch: TruthTouch, judged: JudgedContact, detection: LoggedDetection | None
+) -> ReportedContact:
     truth = run.truth
     assert truth is not None
     rows = slice(touch.first, touch.last + 1)
@@ -247,7 +247,7 @@ def _contact(
         ideal_ms = float(run.truth_time_s(slice(crossing, crossing + 1))[0] - touch.onset_s) * 1e3
     peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
     reported = _reported(detection)
-    return Contact(
+    return ReportedContact(
         number=judged.number,
         section=section_at(sections, touch.onset_s),
         state=_state_at(run, touch.onset_s).name,

@@ -30,14 +30,14 @@ from adacd_hil.analysis.score.judge import StreamJudge
 from adacd_hil.analysis.score.metrics import (
     Beside,
     BesideContact,
+    CertifiedEvidence,
     ChannelMargin,
-    Estimate,
-    Evidence,
+    ParameterEstimate,
     Residual,
     SmallestPush,
     Untouched,
 )
-from adacd_hil.analysis.score.touches import Detection, Touch, find_detections, touch_window, true_contacts
+from adacd_hil.analysis.score.touches import LoggedDetection, TruthTouch, find_detections, touch_window, true_contacts
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.detect import margin as detect_margin
@@ -62,7 +62,7 @@ def larger(largest: Vector | None, values: Vector) -> Vector | None:
 class BesideGatherer:
     """Gathers what the paper's scheme reached, piece by piece."""
 
-    def __init__(self, run: Run, sections: Sequence[Section], touches: Sequence[Touch]) -> None:
+    def __init__(self, run: Run, sections: Sequence[Section], touches: Sequence[TruthTouch]) -> None:
         assert run.beside is not None
         a = run.settings.filter.a_rad_s
         threshold = np.array(run.settings.detector.threshold_Nm)
@@ -157,11 +157,11 @@ def evaluate_certified(
     promotions: int,
     beside: Beside | None,
     smallest_push: SmallestPush | None,
-) -> Evidence:
+) -> CertifiedEvidence:
     """Judge a run of the certified scheme. margins, promotions, smallest_push: of all its cycles, see `untouched`."""
     adaptations = [section for section in sections if section.kind == "adaptation"]
     stays = {section.label: _tests(run, section) for section in adaptations}
-    return Evidence(
+    return CertifiedEvidence(
         tests={label: len(lengths_s) for label, lengths_s in stays.items()},
         test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
         estimates={section.label: _estimates(run, stream, section) for section in adaptations},
@@ -191,12 +191,12 @@ def _tests(run: Run, section: Section) -> list[float]:
     return [float(time_s[end] - time_s[start]) for start, end in edges.reshape(-1, 2)]
 
 
-def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str, Estimate]:
+def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str, ParameterEstimate]:
     row = last_row(run, section)
     values = np.concatenate((run.theta_hat[row], stream.theta_further[row]))
     names = run.parameter_names + run.settings.further_names
     return {
-        name: Estimate(float(value), float(std))
+        name: ParameterEstimate(float(value), float(std))
         for name, value, std in zip(names, values, stream.theta_std[row], strict=True)
     }
 
@@ -354,7 +354,7 @@ def _pair(values: Vector | None) -> tuple[float, float] | None:
 class _Free:
     """Tells which cycles are free of contact, piece by piece."""
 
-    def __init__(self, run: Run, touches: Sequence[Touch], detections: Sequence[Detection]) -> None:
+    def __init__(self, run: Run, touches: Sequence[TruthTouch], detections: Sequence[LoggedDetection]) -> None:
         self._settling_s = SETTLING_TIME_CONSTANTS / run.a_rad_s
         if run.truth is None:
             around = [(d.detected_s - self._settling_s, d.detected_s + self._settling_s) for d in detections]

@@ -47,7 +47,7 @@ class Count(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Reaction:
+class ReactionLatency:
     """Latency from the decision to the first command that reacts, over `count` reactions; percentiles in µs."""
 
     count: int
@@ -66,7 +66,7 @@ class TimingEvidence:
     is_modelled: bool
     cycles: int
     times: Mapping[str, TimeStatistics | None]
-    reaction: Reaction | None
+    reaction: ReactionLatency | None
     data_age: tuple[int, ...] | None
     queues_bytes: Mapping[str, Mapping[str, float] | None]
     counts: Mapping[str, Count | None]
@@ -168,7 +168,7 @@ class Beside:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ParameterEstimate:
     """A parameter at the end of an adaptation and the standard deviation that the scheme gives it, in its unit."""
 
     value: float
@@ -190,7 +190,7 @@ class ChannelMargin:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class CertifiedEvidence:
     """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
 
     margins: by section. promotions: refined models that took over in the run. is_anchored: whether each certificate
@@ -200,7 +200,7 @@ class Evidence:
 
     tests: dict[str, int]
     test_s: dict[str, float | None]
-    estimates: dict[str, dict[str, Estimate]]
+    estimates: dict[str, dict[str, ParameterEstimate]]
     margins: dict[str, tuple[ChannelMargin, ...]]
     promotions: int
     paper_beside: Beside | None
@@ -251,7 +251,7 @@ class PaperRow(NamedTuple):
     measured: str
 
 
-class Source(NamedTuple):
+class ReportSource(NamedTuple):
     """The log that a run was read from; `is_complete`: it is whole and nothing was dropped on the way to it."""
 
     log_name: str
@@ -260,7 +260,7 @@ class Source(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contact:
+class ReportedContact:
     """A true contact and its detection, or on a real arm a detection alone.
 
     state: of the scheme at the onset, on a real arm at the detection.
@@ -334,7 +334,7 @@ class Metrics:
     sections: tuple[Section, ...]
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, Residual]
-    contacts: tuple[Contact, ...]
+    contacts: tuple[ReportedContact, ...]
     false_alarms: int | None
     false_alarms_s: tuple[float, ...] | None
     missed: int | None
@@ -347,7 +347,7 @@ class Metrics:
     data: CyclicData
     frames: int | None
     dropped: int | None
-    evidence: Evidence | None
+    evidence: CertifiedEvidence | None
     paper: tuple[PaperRow, ...]
     verdict: str
     is_clean: bool

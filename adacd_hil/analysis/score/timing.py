@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import COMPUTE, LATENESS, QUANTITIES, CycleColumns, Cycles, Quantity
 from adacd_hil.analysis.score.distribution import EXACT, Distribution, LogHistogram, log_histogram
-from adacd_hil.analysis.score.metrics import Count, Reaction, TimeStatistics, TimingEvidence
+from adacd_hil.analysis.score.metrics import Count, ReactionLatency, TimeStatistics, TimingEvidence
 from adacd_hil.records import SchemeState
 
 OLDEST_CYCLES: Final = 10
@@ -83,7 +83,7 @@ class TimingGatherer:
             is_modelled=self._is_modelled,
             cycles=self._cycles,
             times={quantity.name: self._statistics(quantity) for quantity in QUANTITIES},
-            reaction=None if reactions is None else Reaction(reactions.count, reactions.percentiles()),
+            reaction=None if reactions is None else ReactionLatency(reactions.count, reactions.percentiles()),
             data_age=None if self._ages is None else tuple(self._ages.tolist()),
             queues_bytes={name: self._depths[name].percentiles() if name in self._depths else None for name in QUEUES},
             counts={name: self._count(name) for name in (*_RUNNING, *_PER_CYCLE)},

@@ -14,7 +14,7 @@ from adacd_hil.records import JOINTS, ContactReport, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 
 
-class Detection(NamedTuple):
+class LoggedDetection(NamedTuple):
     """An alarm of a run: its row, its time, and the report at the alarm and at the end of the window."""
 
     row: int
@@ -24,7 +24,7 @@ class Detection(NamedTuple):
     final: ContactReport | None
 
 
-def find_detections(run: Run) -> tuple[Detection, ...]:
+def find_detections(run: Run) -> tuple[LoggedDetection, ...]:
     """Find the alarms of a run and the reports that belong to them by their cycle."""
     rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
@@ -42,11 +42,11 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
             bool(run.state[row - 1] == SchemeState.MONITOR),
             run.truth is None or run.truth.covers(cycle),
         )
-        detections.append(Detection(row, float(time_s[row]), raised, alarm, final))
+        detections.append(LoggedDetection(row, float(time_s[row]), raised, alarm, final))
     return tuple(detections)
 
 
-class Touch(NamedTuple):
+class TruthTouch(NamedTuple):
     """A true contact: its number, its rows [first, last] of the truth, and times since motion start."""
 
     number: int
@@ -57,14 +57,14 @@ class Touch(NamedTuple):
     end_s: float
 
 
-def true_contacts(run: Run) -> tuple[Touch, ...]:
+def true_contacts(run: Run) -> tuple[TruthTouch, ...]:
     """Find the true contacts in the truth record; without one there are none to be known."""
     truth = run.truth
     if truth is None or truth.cycle.size == 0 or run.cycle.size == 0:
         return ()
     time_s, last = run.truth_time_s(), truth.cycle.size - 1
     return tuple(
-        Touch(
+        TruthTouch(
             number, start, end - 1, int(truth.contact_link[start]), float(time_s[start]), float(time_s[min(end, last)])
         )
         for number, (start, end) in enumerate(contact_bounds(truth.contact_index, truth.attempt), run.first_contact)
@@ -95,7 +95,7 @@ def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_r
 
 
 @dataclass(frozen=True)
-class Channel:
+class FilterChannel:
     """A filter with its threshold, Nm (2,): first order, and with `smoothing_rad_s` a second one behind it."""
 
     cutoff_rad_s: float
@@ -135,18 +135,18 @@ def row_at(run: Run, time_s: float) -> int:
     return min(row, len(t_ns) - 1)
 
 
-def channels_at(run: Run, time_s: float) -> tuple[Channel, ...]:
+def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
     """Give what detects at a time: the paper's one filter, or the bank with its thresholds."""
     if run.certified is None:
-        return (Channel(run.a_rad_s, None, threshold_at(run, time_s)),)
+        return (FilterChannel(run.a_rad_s, None, threshold_at(run, time_s)),)
     thresholds = run.certified.threshold[row_at(run, time_s)]
     return tuple(
-        Channel(cutoff, smoothing, threshold)
+        FilterChannel(cutoff, smoothing, threshold)
         for (cutoff, smoothing), threshold in zip(channels_of(run.settings), thresholds, strict=True)
     )
 
 
-def ideal_response(run: Run, touch: Touch, channel: Channel) -> Vector:
+def ideal_response(run: Run, touch: TruthTouch, channel: FilterChannel) -> Vector:
     """Filter a contact's true torque by a channel, from its first row to the one after its last (k, 2)."""
     truth = run.truth
     assert truth is not None
@@ -154,7 +154,7 @@ def ideal_response(run: Run, touch: Touch, channel: Channel) -> Vector:
     return channel.respond(truth.tau_ext[rows], truth.cycle[rows], run.settings.bus.period_s)
 
 
-def touch_window(run: Run, touch: Touch, a_rad_s: float, threshold: Vector, armed: Mask) -> TouchWindow:
+def touch_window(run: Run, touch: TruthTouch, a_rad_s: float, threshold: Vector, armed: Mask) -> TouchWindow:
     """Give a contact as it is judged; armed (n,): the cycles of the run in which detection is armed."""
     truth = run.truth
     assert truth is not None
@@ -166,7 +166,7 @@ def touch_window(run: Run, touch: Touch, a_rad_s: float, threshold: Vector, arme
     return TouchWindow(touch.number, touch.link, onset_ns, forgotten_ns, is_armed)
 
 
-def judge_run(run: Run, touches: Sequence[Touch], detections: Sequence[Detection]) -> Score:
+def judge_run(run: Run, touches: Sequence[TruthTouch], detections: Sequence[LoggedDetection]) -> Score:
     """Judge the alarms of a run's own scheme."""
     armed = run.state == SchemeState.MONITOR
     windows = [touch_window(run, touch, run.a_rad_s, threshold_at(run, touch.onset_s), armed) for touch in touches]

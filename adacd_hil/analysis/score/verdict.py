@@ -12,7 +12,15 @@ import numpy as np
 
 from adacd_hil.analysis.logged_run import Run, Section
 from adacd_hil.analysis.score.judge import Score
-from adacd_hil.analysis.score.metrics import Beside, Contact, CyclicData, Evidence, Fault, PaperRow, Residual
+from adacd_hil.analysis.score.metrics import (
+    Beside,
+    CertifiedEvidence,
+    CyclicData,
+    Fault,
+    PaperRow,
+    ReportedContact,
+    Residual,
+)
 from adacd_hil.analysis.score.wording import found_text, number_of, percent_text, score_sentence
 
 LISTED: Final = 4
@@ -25,7 +33,7 @@ def give_verdict(
     score: Score,
     adaptation_s: dict[str, float | None],
     payload_kg: dict[str, float | None],
-    evidence: Evidence | None,
+    evidence: CertifiedEvidence | None,
     faults: tuple[Fault, ...],
     causes: tuple[str, ...],
     data: CyclicData,
@@ -53,17 +61,17 @@ def give_verdict(
     return text[:1].upper() + text[1:] + "."
 
 
-def is_margin_below_1(evidence: Evidence | None) -> bool:
+def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
     """Tell whether some residual was over its threshold while nobody touched the arm."""
     return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
 
 
-def is_revoked(evidence: Evidence | None) -> TypeGuard[Evidence]:
+def is_revoked(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
     """Tell whether some certificate was taken back."""
     return evidence is not None and bool(evidence.revoked)
 
 
-def _margin_text(evidence: Evidence | None) -> str:
+def _margin_text(evidence: CertifiedEvidence | None) -> str:
     margin = None if evidence is None else evidence.smallest_margin
     return "" if margin is None else f"smallest margin {margin:.2f}"
 
@@ -156,10 +164,10 @@ def compare_with_paper(
     sections: tuple[Section, ...],
     adaptation_s: dict[str, float | None],
     residuals: dict[str, Residual],
-    contacts: tuple[Contact, ...],
+    contacts: tuple[ReportedContact, ...],
     false_alarms: int,
     payload_kg: dict[str, float | None],
-    evidence: Evidence | None,
+    evidence: CertifiedEvidence | None,
 ) -> tuple[PaperRow, ...]:
     """Set what was measured beside what the paper printed, where it is the same experiment."""
     settings = run.settings
@@ -274,13 +282,13 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
     )
 
 
-def _threshold_text(evidence: Evidence, detections: list[str]) -> str:
+def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
     """Say where the thresholds of the slowest channel lie: the smallest and the largest median of a section."""
     found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
     return f"{min(found):.3f} to {max(found):.3f} Nm" if found else "–"
 
 
-def _push_text(evidence: Evidence) -> str:
+def _push_text(evidence: CertifiedEvidence) -> str:
     """Say how small a push is found, in the middle and at the worst moment."""
     if evidence.smallest_push is None:
         return "–"

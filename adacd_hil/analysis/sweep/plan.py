@@ -28,7 +28,7 @@ class Subject(NamedTuple):
     seed: int = 0
 
 
-class Row(NamedTuple):
+class SweepRow(NamedTuple):
     """One run or replay of the sweep."""
 
     key: str
@@ -42,7 +42,7 @@ class Task:
     subject: Subject
     config: str  # name or file; empty: the log's own
     profile: str
-    rows: tuple[Row, ...]
+    rows: tuple[SweepRow, ...]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Plan:
     def tasks(self, done: frozenset[str], rows_per_task: int) -> Iterator[Task]:
         """Give the tasks whose rows are not done, lazily, subject by subject."""
         for subject in self.subjects:
-            rows = [Row(self._key(subject, changes), changes) for changes in self.variants]
+            rows = [SweepRow(self._key(subject, changes), changes) for changes in self.variants]
             rows = [row for row in rows if row.key not in done]
             for start in range(0, len(rows), rows_per_task):
                 yield Task(subject, self.config, self.profile, tuple(rows[start : start + rows_per_task]))
@@ -119,7 +119,7 @@ Value = str | int | float | bool | None
 Values = dict[str, Value]
 
 
-def row_labels(subject: Subject, row: Row) -> Values:
+def row_labels(subject: Subject, row: SweepRow) -> Values:
     """Name a row: its key, its subject, and the settings that are varied."""
     changes: Mapping[str, str] = dict(row.changes)
     return {
@@ -131,6 +131,6 @@ def row_labels(subject: Subject, row: Row) -> Values:
     }
 
 
-def failed(subject: Subject, row: Row, error: str) -> Values:
+def failed(subject: Subject, row: SweepRow, error: str) -> Values:
     """Make a row that says why there is no result."""
     return row_labels(subject, row) | {"status": "failed", "error": " ".join(error.split())}

@@ -7,7 +7,7 @@ from adacd_hil.analysis.replay.changed_settings import apply_settings, keep_fact
 from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.replay.replay import replay_many
 from adacd_hil.analysis.replay.replayed_outcome import Replay
-from adacd_hil.analysis.sweep.plan import REFUSALS, Row, Subject, Task, Values, failed, row_labels
+from adacd_hil.analysis.sweep.plan import REFUSALS, Subject, SweepRow, Task, Values, failed, row_labels
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.schema import ConfigError
@@ -45,7 +45,7 @@ def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
     return [result for settings in variants for result in _replay_all(path, [settings])]
 
 
-def finished(subject: Subject, row: Row, found: Replay) -> Values:
+def finished(subject: Subject, row: SweepRow, found: Replay) -> Values:
     """Make a row of a replay."""
     score = found.score
     delays_ms = () if score is None else score.delays_ms

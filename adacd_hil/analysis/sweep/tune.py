@@ -36,9 +36,9 @@ from adacd_hil.analysis.sweep.tune_roc import (
     Changes,
     Choice,
     Found,
-    Outcome,
     TunedLog,
     Tuning,
+    TuningOutcome,
     choose,
     free_hours,
     read_logs,
@@ -113,7 +113,9 @@ def _choices(
     return [changes for changes, _ in chosen], [choice for _, choice in chosen]
 
 
-def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Callable[[str], None]) -> list[Outcome]:
+def replay_all(
+    logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Callable[[str], None]
+) -> list[TuningOutcome]:
     """Replay all logs with each of the variants. Raises LogError, ConfigError, CodecError."""
     results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
     for log in logs:
@@ -125,7 +127,7 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
     return [_outcome(gathered) for gathered in results]
 
 
-def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> Outcome:
+def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
     took_s = [each for _, found in replays for each in found.adaptation_s]
     judged = [(found, found.score) for _, found in replays if found.score is not None]
     armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
@@ -136,7 +138,7 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> Outcome:
         if (log.path, contact.number) in armed
     ]
     delays = [contact.delay_ms for contact in contacts if contact.delay_ms is not None]
-    return Outcome(
+    return TuningOutcome(
         adaptation_s=tuple(each for each in took_s if each is not None),
         unfinished=sum(each is None for each in took_s),
         missed=len(armed) - len(delays) if judged else None,
@@ -147,7 +149,7 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> Outcome:
     )
 
 
-def _problems(choice: Choice, outcome: Outcome, own: Outcome, rate_per_h: float) -> tuple[str, ...]:
+def _problems(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
     """Say why a candidate is not fit."""
     problems = []
     if choice.calibration is None:

@@ -26,7 +26,7 @@ from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, con
 from adacd_hil.analysis.score.judge import Times, TouchWindow, explained_until, rate_bound_per_h, share_bounds
 from adacd_hil.analysis.score.wording import delay_figures
 from adacd_hil.analysis.thresholds.false_alarms import (
-    Calibration,
+    TailCalibration,
     TooLittleMotionError,
     calibrate_detector,
     clusters,
@@ -134,7 +134,7 @@ class Choice:
 
     name: str
     thresholds: Vector
-    calibration: Calibration | None
+    calibration: TailCalibration | None
     chosen: Found
     checked: Found
     roc: tuple[tuple[float, Found, float | None], ...]
@@ -192,7 +192,7 @@ def _half(touches: tuple[Touched, ...] | None, is_chosen_on: bool) -> tuple[Touc
     return None if touches is None else tuple(each for each in touches if each.is_chosen_on == is_chosen_on)
 
 
-def _predicted(calibration: Calibration | None, factor: float) -> float | None:
+def _predicted(calibration: TailCalibration | None, factor: float) -> float | None:
     """Give the tail's rate at a factor on the thresholds, None below its level."""
     if calibration is None:
         return None
@@ -380,7 +380,7 @@ LIMITS: Final = (
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TuningOutcome:
     """What replays of all logs with the same settings came to. missed, false_alarms: None without the truth.
 
     armed_false_alarms: of them those in MONITOR, where the hours are counted.
@@ -414,7 +414,7 @@ class Candidate:
     name: str
     changes: Changes
     choice: Choice
-    outcome: Outcome
+    outcome: TuningOutcome
     problems: tuple[str, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -434,7 +434,7 @@ class Tuning:
 
     rate_per_h: float
     logs: tuple[TunedLog, ...]
-    own: Outcome
+    own: TuningOutcome
     candidates: tuple[Candidate, ...]
     best: Candidate | None
     detectors: tuple[Choice, ...]

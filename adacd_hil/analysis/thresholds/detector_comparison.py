@@ -39,7 +39,7 @@ _LATE: Final = math.inf
 
 
 @dataclass(frozen=True)
-class Row:
+class DelayRow:
     """One detector and joint: median delay of each step of `STEPS_NM`, ms, and the share found within the horizon."""
 
     detector: str
@@ -56,7 +56,7 @@ class Comparison:
     rate_per_h: float
     hours: float
     rates_per_h: tuple[float, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[DelayRow, ...]
     missing: tuple[str, ...]
     """Detectors whose tail the motion can't tell."""
 
@@ -149,7 +149,7 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
         for i in range(JOINTS):
             delays = delays_ms[:, place, :, i]
             rows.append(
-                Row(
+                DelayRow(
                     name,
                     i + 1,
                     tuple(float(np.median(delay)) for delay in delays),

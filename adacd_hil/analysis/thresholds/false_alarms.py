@@ -135,7 +135,7 @@ def fit_tail(peaks: Vector, block_s: float) -> Tail:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class TailCalibration:
     """A threshold for a wanted rate."""
 
     threshold: float
@@ -146,7 +146,9 @@ class Calibration:
     tail: Tail
 
 
-def calibrate(peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95, seed: int = 0) -> Calibration:
+def calibrate(
+    peaks: Vector, block_s: float, rate_per_h: float, confidence: float = 0.95, seed: int = 0
+) -> TailCalibration:
     """Find the threshold for a rate, with one-sided confidence bounds, from block maxima (B,).
 
     Raises TooLittleMotionError.
@@ -158,7 +160,7 @@ def calibrate(peaks: Vector, block_s: float, rate_per_h: float, confidence: floa
         threshold = threshold_by_count(peaks, block_s, alarms)
         deviation = 1.6448536269514722 * math.sqrt(alarms)
         bound = threshold_by_count(peaks, block_s, max(alarms - deviation, 0.0))
-        return Calibration(threshold, bound, rate_per_h, (alarms + deviation) / tail.hours, False, tail)
+        return TailCalibration(threshold, bound, rate_per_h, (alarms + deviation) / tail.hours, False, tail)
     threshold = tail.threshold_at(rate_per_h)
     excesses = clusters(peaks, tail.level, block_s) - tail.level
     drawn = np.sort(generator.choice(excesses, (_RESAMPLES, tail.count)), axis=1)
@@ -170,7 +172,7 @@ def calibrate(peaks: Vector, block_s: float, rate_per_h: float, confidence: floa
     ]
     bound = float(np.quantile([other.threshold_at(rate_per_h) for other in others], confidence))
     rate_bound = float(np.quantile([other.rate_at(threshold) for other in others], confidence))
-    return Calibration(
+    return TailCalibration(
         threshold, max(bound, threshold), rate_per_h, max(rate_bound, rate_per_h), rate_per_h * tail.hours < 1.0, tail
     )
 
@@ -180,7 +182,7 @@ class DetectorCalibration:
     """The thresholds of a detector: per channel and joint, and what all of them together do."""
 
     thresholds: Vector  # (channels, n)
-    calibration: Calibration  # of the largest ratio of statistic to threshold; `threshold` is 1
+    calibration: TailCalibration  # of the largest ratio of statistic to threshold; `threshold` is 1
 
     def ratio(self, peaks: Vector) -> Vector:
         """Give the largest ratio of statistic to threshold per block (B,), of block maxima (B, channels, n)."""
@@ -240,7 +242,7 @@ def compare_with(peaks: Vector, held_out: Vector, block_s: float, rates_per_h: S
 
 
 @dataclass(frozen=True)
-class Source:
+class ThresholdSource:
     """One thing that keeps a threshold up."""
 
     name: str
@@ -298,7 +300,7 @@ def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
 class Limits:
     """What keeps the threshold of one low-pass channel and joint up, largest first, for a wanted rate."""
 
-    sources: tuple[Source, ...]
+    sources: tuple[ThresholdSource, ...]
     achievable_Nm: float
     """All noise and resolution together: what is left if the model, the lag and the friction were exact."""
 
@@ -351,12 +353,12 @@ def find_limits(
     unexplained = max(mean_square(x) - sum(rms_Nm**2 for rms_Nm in random.values()), 0.0)
     random["velocity noise"] = min(momentum * sensing.momentum_noise_Nms, math.sqrt(unexplained))
     model = math.sqrt(max(unexplained - random["velocity noise"] ** 2, 0.0))
-    sources = [Source(name, factor * rms_Nm) for name, rms_Nm in random.items()]
+    sources = [ThresholdSource(name, factor * rms_Nm) for name, rms_Nm in random.items()]
     achievable = math.sqrt(sum(source.peak_Nm**2 for source in sources))
     sources += [
-        Source("model", factor * model),
-        Source("lag", abs(sensing.lag_error_s) * float(np.abs(slope).max())),
-        Source("friction", abs(sensing.friction_error_Nm)),
+        ThresholdSource("model", factor * model),
+        ThresholdSource("lag", abs(sensing.lag_error_s) * float(np.abs(slope).max())),
+        ThresholdSource("friction", abs(sensing.friction_error_Nm)),
     ]
     return Limits(tuple(sorted(sources, key=lambda source: -source.peak_Nm)), achievable)
 

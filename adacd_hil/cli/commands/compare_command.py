@@ -16,7 +16,7 @@ from adacd_hil.records import Location
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.replay.log_comparison import Detection, LogComparison
+    from adacd_hil.analysis.replay.log_comparison import ComparedContact, LogComparison
     from adacd_hil.log.time_window import TimeWindow
 
 _EPILOG = (
@@ -79,7 +79,7 @@ def _as_text(found: "LogComparison") -> str:
     return "\n".join(lines)
 
 
-def _contact(contact: "Detection | None") -> str:
+def _contact(contact: "ComparedContact | None") -> str:
     if contact is None:
         return "–"
     is_known = contact.location in Location.__members__.values()  # a later version may have others

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.analysis.excitation_search import Figures, Limits, NoExcitationError, Search
+from adacd_hil.analysis.excitation_search import ExcitationLimits, Figures, NoExcitationError, Search
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.output import Progress, format_table
 from adacd_hil.clock import MonotonicClock
@@ -30,7 +30,7 @@ class ExcitationOutcome(NamedTuple):
     config: str
     present: Figures | None
     found: Figures
-    limits: Limits
+    limits: ExcitationLimits
     excitation: ExcitationSettings
 
 

@@ -47,14 +47,14 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
 def _as_png(found: "History") -> bytes:
     import numpy as np
 
-    from adacd_hil.analysis.drawing import Panel, history_figure
+    from adacd_hil.analysis.drawing import HistoryPanel, history_figure
 
     shown = found.certificates
     joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))
 
-    def panel(title: str, names: tuple[str, ...], values: str, std: str) -> Panel:
+    def panel(title: str, names: tuple[str, ...], values: str, std: str) -> HistoryPanel:
         columns = [np.array([getattr(certificate, name) for certificate in shown]) for name in (values, std)]
-        return Panel(title, names, *columns)
+        return HistoryPanel(title, names, *columns)
 
     friction = panel("Friction at 0.6 rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
     panels = (

@@ -15,7 +15,7 @@ from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.foreign.recording_identification import Identified, Watched
-    from adacd_hil.analysis.foreign.recording_import import Recording
+    from adacd_hil.analysis.foreign.recording_import import ForeignRecording
 
 
 @click.command(
@@ -56,7 +56,7 @@ def identify(
     described = read_map(map_path)
     progress = Progress()
     try:
-        read: list[Recording] = []
+        read: list[ForeignRecording] = []
         for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
             # From 0 s on: nothing is left out before.

@@ -13,7 +13,7 @@ from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.replay.log_source import Source
+    from adacd_hil.analysis.replay.log_source import ReplaySource
     from adacd_hil.analysis.replay.replayed_outcome import Replay
     from adacd_hil.log.time_window import TimeWindow
     from adacd_hil.settings.configuration import Settings
@@ -132,7 +132,7 @@ def _replay_one(
 
 def _open(
     given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
-) -> "tuple[Source, bool]":
+) -> "tuple[ReplaySource, bool]":
     """Open a log or a recording; also say whether it is a recording alone."""
     from adacd_hil.analysis.replay.can_recording import RecordingAgainstLog, RecordingAlone
     from adacd_hil.analysis.replay.log_source import LogSource

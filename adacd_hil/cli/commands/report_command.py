@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.analysis.report.report_files import INDEX_NAME, Entry, Report, count_text, index_page, write_report
+from adacd_hil.analysis.report.report_files import INDEX_NAME, IndexEntry, Report, count_text, index_page, write_report
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.output import Progress
 from adacd_hil.file_access import replace_file
@@ -22,7 +22,7 @@ class Index(NamedTuple):
     """What was reported of a folder of runs, and the page over it."""
 
     path: Path
-    entries: tuple[Entry, ...]
+    entries: tuple[IndexEntry, ...]
 
     def as_text(self) -> str:
         """Give a line for each run."""
@@ -91,10 +91,10 @@ def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWind
         name = run.relative_to(given)
         progress(f"{number} of {len(runs)}: {run}")
         try:
-            entries.append(Entry(name.as_posix(), _report_one(run / LOG_NAME, out / name, stretch, progress)))
+            entries.append(IndexEntry(name.as_posix(), _report_one(run / LOG_NAME, out / name, stretch, progress)))
         except (LogError, ConfigError) as error:
             progress(one_line(error))
-            entries.append(Entry(name.as_posix(), None, one_line(error)))
+            entries.append(IndexEntry(name.as_posix(), None, one_line(error)))
     index = Index(out / INDEX_NAME, tuple(entries))
     try:
         out.mkdir(parents=True, exist_ok=True)  # as after no run could be reported
@@ -108,7 +108,7 @@ def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
     """Give the content of each report.json; of a run that could not be reported its folder and why."""
     tables = []
     for each in reported:
-        for entry in each.entries if isinstance(each, Index) else (Entry("", each),):
+        for entry in each.entries if isinstance(each, Index) else (IndexEntry("", each),):
             table = {"problem": entry.problem} if entry.report is None else entry.report.as_json()
             tables.append({"folder": entry.name, **table} if isinstance(each, Index) else table)
     return tables

@@ -16,7 +16,7 @@ from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.analysis.sweep.plan import Plan, Row, Task, Values
+    from adacd_hil.analysis.sweep.plan import Plan, SweepRow, Task, Values
 
 _SIMULATED_CONFIG = "certified"
 """Of simulated runs where no --config is given."""
@@ -151,7 +151,7 @@ def simulate_task(task: "Task") -> "list[Values]":
     return [_simulate(task, row) for row in task.rows]
 
 
-def _simulate(task: "Task", row: "Row") -> "Values":
+def _simulate(task: "Task", row: "SweepRow") -> "Values":
     from adacd_hil.analysis.replay.changed_settings import apply_settings
     from adacd_hil.analysis.replay.replay import replay
     from adacd_hil.analysis.sweep.plan import REFUSALS, failed
