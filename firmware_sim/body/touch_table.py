@@ -16,9 +16,6 @@ from firmware_sim.scenario.scenario import Scenario
 _POSES: Final = 181
 _POINTS: Final = 61
 """Grid on which the smallest effective mass of the arm is searched: 1° of the elbow, 1/60 of the link."""
-_LARGEST_TURN_RAD: Final = 0.1
-"""Largest rate times step. RK4 then gets a blow's impulse to 3e-4 and its energy to 8e-4, wherever in a step it begins;
-with a tenth (a third) of critical damping, whose force jumps, its impulse to 3e-3 (6e-3). At 0.17 rad: 6e-4, 2e-3."""
 _FASTEST_BLOW_M_S: Final = 2.0
 """Fastest blow that `largest_rate_rad_s` covers: the tip of both links, straight, at 180 deg/s."""
 
@@ -119,8 +116,3 @@ def largest_rate_rad_s(things: Structured) -> float:
             largest, math.sqrt(float(np.sum(there["stiff_rate_rad_s"] ** 2))), float(np.sum(there["damped_rate_1_s"]))
         )
     return largest
-
-
-def touch_substeps(things: Structured) -> int:
-    """Say into how many steps a tick of 100 µs must be cut for classical RK4."""
-    return max(1, math.ceil(largest_rate_rad_s(things) * TICK_S / _LARGEST_TURN_RAD))

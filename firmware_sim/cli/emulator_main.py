@@ -166,14 +166,7 @@ def run(
             epoch_ns = wall_ns() - clock.now_ns()
             bench.on_truth = _stamp_truth(truth, bench, epoch_ns)
             bench.on_event = _stamp_events(truth, bench, epoch_ns)
-        service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
-        # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
-        for line in request_realtime().missing:
-            _complain(f"not granted: {line}")
-        freeze_garbage()
-        service.boot()
-        print("ready", file=sys.stderr, flush=True)
-        service.run()
+        _serve(Service(bench, bus, departure, clock, clock_mode, stop, is_once))
         return _report(bench, resolved, clock_mode, truth, as_json)
 
 
@@ -225,13 +218,7 @@ def play(
             contract=chosen,
             on_answer=departure.go,
         )
-        service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
-        for line in request_realtime().missing:
-            _complain(f"not granted: {line}")
-        freeze_garbage()
-        service.boot()
-        print("ready", file=sys.stderr, flush=True)
-        service.run()
+        _serve(Service(bench, bus, departure, clock, clock_mode, stop, is_once))
         return _report_played(bench, cycles, as_json)
 
 
@@ -296,6 +283,17 @@ def _stamp_events(truth: TruthLog, bench: Bench, epoch_ns: int) -> OnEvent:
         truth.event(t_ns if bench.is_paced else t_ns + epoch_ns, level, name, text)
 
     return write
+
+
+def _serve(service: Service) -> None:
+    """Announce the nodes, say so, and serve until it ends."""
+    # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
+    for line in request_realtime().missing:
+        _complain(f"not granted: {line}")
+    freeze_garbage()
+    service.boot()
+    print("ready", file=sys.stderr, flush=True)
+    service.run()
 
 
 def _make_folder(path: Path) -> None:

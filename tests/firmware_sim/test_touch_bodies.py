@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from touched_arm import TouchedArm
 
+from firmware_sim.arm.arms import ARMS
+from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table, contact_torque
 from firmware_sim.arm.touch_forces import ENERGY, touch
 from firmware_sim.arm.touch_settings import BODY_REGIONS, BodySettings, HandSettings, WallSettings
-from firmware_sim.body.touch_table import initial_touch_state, largest_rate_rad_s, touch_substeps, touch_table
+from firmware_sim.body.touch_table import initial_touch_state, largest_rate_rad_s, touch_table
 
 POSE = (0.3, 0.7)
 SOFT = {"mass_kg": 1.5, "stiffness_N_m": 2000.0}
@@ -373,13 +375,16 @@ def test_things_that_are_never_there_together_do_not_add_up():
     assert largest_rate_rad_s(TouchedArm(bodies=(one, also)).things) == pytest.approx(math.sqrt(2.0) * alone)
 
 
-@pytest.mark.parametrize(("stiffness_N_m", "substeps"), [(150_000.0, 1), (400_000.0, 2), (1e6, 3)])
+@pytest.mark.parametrize(("stiffness_N_m", "substeps"), [(150_000.0, 2), (400_000.0, 3), (1e6, 5)])
 def test_a_stiffer_body_is_stepped_more_finely(stiffness_N_m, substeps):
     body = BodySettings(at_s=1.0, link=2, x_m=9.0, y_m=9.0, mass_kg=4.4, stiffness_N_m=stiffness_N_m)
     things = TouchedArm(bodies=(body,)).things
-    assert touch_substeps(things) == substeps
-    assert largest_rate_rad_s(things) * TICK_S / substeps <= 0.1
-    assert touch_substeps(things[:0]) == 1
+    found = [
+        MechanicsSettings().substeps(ARMS["P"], [(0.0, (0.0, 0.0), 0.0)], largest_rate_rad_s(one))
+        for one in (things, things[:0])
+    ]
+    assert found == [substeps, 1]
+    assert largest_rate_rad_s(things) * TICK_S / substeps <= 0.05
 
 
 # ISO/TS 15066:2016: m_H kg and K N/mm of table A.3; F N and the lowest p N/cm² of table A.2, quasi-static.
