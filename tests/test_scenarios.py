@@ -9,9 +9,8 @@ from adacd_hil.cli.commands.demo_command import outcome_of, resolve, run_embedde
 from adacd_hil.log.reader import read_log
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import to_short_toml, to_toml
-from firmware_sim.scenario.expectation import deviations
 from firmware_sim.scenario.faults import KINDS
-from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario
+from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, deviations, load_scenario
 
 NAMES = builtin_scenarios()
 GROUPS = {"experiment", "people", "mechanics", "measurement", "faults", "minutes"}

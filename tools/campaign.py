@@ -27,8 +27,7 @@ from campaign_loop import play_trials
 from adacd_hil.cli.output import format_table
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
-from firmware_sim.scenario.expectation import deviations
-from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
+from firmware_sim.scenario.scenario import builtin_scenarios, deviations, load_scenario
 
 CONFIGS = ("paper", "certified")
 

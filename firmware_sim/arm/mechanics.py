@@ -2,9 +2,9 @@
 
 Link side, with the mass matrix and centrifugal terms of `firmware_sim.arm.plant`:
 
-    M(q) q̈ + centrifugal = τ_J + τ_ext − τ_gravity − friction          friction: `firmware_sim.arm.joint_mechanics`
+    M(q) q̈ + centrifugal = τ_J + τ_ext − τ_gravity − friction          friction: `firmware_sim.arm.joint_forces`
 
-An elastic joint has τ_J = τ_s and a motor side of its own (`firmware_sim.arm.joint_mechanics`). A stiff joint turns
+An elastic joint has τ_J = τ_s and a motor side of its own (`firmware_sim.arm.joint_forces`). A stiff joint turns
 with its rotor: M gets the rotor's inertia R, motor-side friction adds to the joint's, and what the sensor sees follows:
 τ_J = τ_m + ripple − R q̈ − motor-side friction. While a stiff joint sticks, motor-side and joint friction share the load
 in the ratio of their levels; rigid bodies leave it open.
@@ -39,13 +39,14 @@ from firmware_sim.arm.joint_forces import (
     Slips,
     Surroundings,
     accelerate_links,
+    advance_bristle,
     collect_forces,
     decide,
     find_friction,
     is_free,
     set_drift,
+    warm,
 )
-from firmware_sim.arm.joint_mechanics import advance_bristle, warm
 from firmware_sim.arm.plant import follow_target
 
 # Rows of the work space; only the touch state has the last one.

@@ -1,7 +1,7 @@
 """Section `[mechanics]` of a scenario: what the arm does beyond rigid links with viscous and Coulomb friction.
 
 Everything is off by default, and a scenario without this section runs the rigid plant. Pairs are (joint 1, joint 2).
-Equations: `firmware_sim.arm.joint_mechanics`, `firmware_sim.arm.mechanics`.
+Equations: `firmware_sim.arm.joint_forces`, `firmware_sim.arm.mechanics`.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 
 from adacd_hil.settings.schema import ConfigError, setting
 from firmware_sim.arm.arms import STOP_DAMPING_NM_S, STOP_STIFFNESS_NM_RAD, ArmProfile
-from firmware_sim.arm.joint_mechanics import MECHANICS_NUMBERS, REFERENCE_C
+from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS, REFERENCE_C
 from firmware_sim.arm.plant import MECHANICAL_STATE, fit_payload, mass_matrix
 from firmware_sim.arm.scripted_contact import TICK_S
 

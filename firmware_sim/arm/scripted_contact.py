@@ -23,6 +23,9 @@ from adacd_hil.settings.schema import ConfigError, setting
 TICK_S: Final = 1e-4
 """The drives' inner period, and the grid of everything that happens to the arm."""
 
+PAIR: Final = (2,)
+"""Shape of what both joints have."""
+
 SHAPES: Final = ("step", "half_sine", "push")
 FRAMES: Final = ("link", "world")
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import Structured
 from adacd_hil.records import TRUTH_LAYOUT, Vector
-from firmware_sim.arm.joint_mechanics import REFERENCE_C
+from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.mechanics import work_space
 from firmware_sim.arm.plant import fit_payload, mirror_stiff_joints
 from firmware_sim.arm.scripted_contact import TICK_S, contact_table, ticks

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import Structured, compiled, float_fields
 from adacd_hil.records import TRUTH_LAYOUT, Vector
-from firmware_sim.arm.joint_mechanics import PAIR
 from firmware_sim.arm.mechanics import integrate_mechanics, observe
 from firmware_sim.arm.plant import (
     ARM_NUMBERS,
@@ -27,7 +26,7 @@ from firmware_sim.arm.plant import (
     integrate,
     mirror_stiff_joints,
 )
-from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.scripted_contact import PAIR, TICK_S
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, VELOCITY_LSB_RAD_S, DriveMode, to_counts, track
 from firmware_sim.arm.touch_forces import TOUCH_TRUTH, add_prescribed_work, change_touch, describe_touch
 from firmware_sim.body.motor import MOTOR_NUMBERS, MOTOR_STATE, command_torque, heat_motor

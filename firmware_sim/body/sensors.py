@@ -33,8 +33,8 @@ import numpy as np
 from adacd_hil.compiled import compiled, float_fields
 from adacd_hil.records import Vector
 from firmware_sim.arm.device_settings import SensorSettings
-from firmware_sim.arm.joint_mechanics import PAIR, REFERENCE_C
-from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.joint_forces import REFERENCE_C
+from firmware_sim.arm.scripted_contact import PAIR, TICK_S
 from firmware_sim.arm.sensing import torque_counts
 
 ENCODER_NUMBERS: Final = float_fields(

@@ -3,8 +3,7 @@
 import pytest
 
 from adacd_hil.settings.schema import ConfigError, parse
-from firmware_sim.scenario.expectation import ExpectSettings, ScenarioOutcome, deviations
-from firmware_sim.scenario.scenario import Scenario
+from firmware_sim.scenario.scenario import ExpectSettings, Scenario, ScenarioOutcome, deviations
 
 EXPECTED = ExpectSettings(
     adaptations=1, contacts=2, false_alarms=1, false_alarms_most=3, adaptation_s=(5.0, 6.0), delay_ms=30.0, force_N=80.0

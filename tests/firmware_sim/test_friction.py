@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from general_arm import GeneralArm, one_joint
 
-from firmware_sim.arm.joint_mechanics import advance_bristle, bristle_rate
+from firmware_sim.arm.joint_forces import advance_bristle, bristle_rate
 from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.scripted_contact import TICK_S
 

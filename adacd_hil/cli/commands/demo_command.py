@@ -25,8 +25,7 @@ from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.canopen.contracts import playable_contract
-from firmware_sim.scenario.expectation import ScenarioOutcome
-from firmware_sim.scenario.scenario import Scenario, load_scenario, named_profile
+from firmware_sim.scenario.scenario import Scenario, ScenarioOutcome, load_scenario, named_profile
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.report.report_files import Report
@@ -194,7 +193,7 @@ def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
 
 
 def _end(summary: SessionSummary) -> str:
-    """Say how the run ended, by the names of `firmware_sim.scenario.expectation`."""
+    """Say how the run ended, by the names of `firmware_sim.scenario.scenario`."""
     if not summary.has_started:
         return "refused"
     if summary.result is None:
