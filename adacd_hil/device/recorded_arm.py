@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_batch import FrameColumns, columns_of
 from adacd_hil.device.arm_watch import ArmWatch, follow_devices
 from adacd_hil.device.network import RESET_COMMUNICATION, START
-from adacd_hil.device.ordinary_cycles import NotOrdinaryError, OrdinaryCycles
+from adacd_hil.device.ordinary_cycles import FrameColumns, NotOrdinaryError, OrdinaryCycles, columns_of
 from adacd_hil.device.profile import place_devices
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
 from adacd_hil.settings.configuration import Settings

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.compiled import Structured, compiled
+from adacd_hil.compiled import Structured, compiled, released
 from adacd_hil.wire.e2e import TABLE_8, Protection
 
 MOST_DATA_IDS = 16
@@ -94,6 +94,35 @@ def read_cycle(
             counters[row] = counter_of(data, row, messages[row]["profile"])
         last[row] = values[row, messages[row]["main"]]
     return True
+
+
+@released
+def read_frames(
+    data: NDArray[np.uint8],
+    lengths: NDArray[np.uint8],
+    places: NDArray[np.int64],
+    chosen: tuple[Structured, Structured, int],
+    before: tuple[int, float],
+    elapsed_s: float,
+    values: NDArray[np.float64],
+) -> int:
+    """Decode a message's frames of one cycle after the other into `values`; return how many are right in a row.
+
+    places: of the frames in `data`. chosen: messages, their rows, and which message. before: counter and main value of
+    the frame before the first.
+    """
+    messages, rows, number = chosen
+    counter, last = before
+    message = messages[number]
+    for n in range(len(places)):
+        row = places[n]
+        length = int(lengths[row])
+        if not read_frame(data, row, length, message, rows, counter, last, elapsed_s, values[n]):
+            return n
+        if message["profile"] > 0:
+            counter = counter_of(data, row, message["profile"])
+        last = values[n, message["main"]]
+    return len(places)
 
 
 @compiled
