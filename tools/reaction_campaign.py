@@ -13,10 +13,13 @@ quasi-static limit of its region. Exit status: 0 no withdrawal is worse than a s
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from campaign_loop import add_jobs, play_trials
 from contact_rig import Rig, Sample, rig_settings
 
 from adacd_hil.analysis import drawing
@@ -111,18 +114,17 @@ def reacting(reaction: Reaction) -> Settings:
 Harms = dict[tuple[str, bool], dict[Reaction, list[Harm]]]
 
 
-def measure(regions: Sequence[str], count: int, seed: int) -> Harms:
-    """Let each reaction meet the same bodies; progress goes to stderr."""
-    settings = {reaction: reacting(reaction) for reaction in Reaction}
-    found: Harms = {}
-    for region in regions:
-        for is_clamped in (False, True):
-            same = meetings(settings[Reaction.NONE], region, is_clamped, count, seed)
-            found[region, is_clamped] = {
-                reaction: [meet(chosen, meeting) for meeting in same] for reaction, chosen in settings.items()
-            }
-        print(region, file=sys.stderr, flush=True)
-    return found
+def measure(regions: Sequence[str], count: int, seed: int, jobs: int) -> Harms:
+    """Let each reaction meet the same bodies, of each region free and clamped."""
+    pairs = list(product(regions, (False, True)))
+    results = play_trials(partial(_measure_pair, count=count, seed=seed), pairs, jobs)
+    return dict(zip(pairs, results, strict=True))
+
+
+def _measure_pair(pair: tuple[str, bool], count: int, seed: int) -> dict[Reaction, list[Harm]]:
+    region, is_clamped = pair
+    same = meetings(reacting(Reaction.NONE), region, is_clamped, count, seed)
+    return {reaction: [meet(reacting(reaction), meeting) for meeting in same] for reaction in Reaction}
 
 
 def limit_N(region: str, is_clamped: bool) -> float | None:
@@ -202,8 +204,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("-n", "--places", type=int, default=3, help="places per region; default %(default)s")
     parser.add_argument("--seed", type=int, default=1, help="default %(default)s")
     parser.add_argument("--out", type=Path, default=Path("runs/reactions"), help="folder; default %(default)s")
+    add_jobs(parser)
     chosen = parser.parse_args(argv)
-    harms = measure(chosen.region or list(BODY_REGIONS), chosen.places, chosen.seed)
+    harms = measure(chosen.region or list(BODY_REGIONS), chosen.places, chosen.seed, chosen.jobs)
     chosen.out.mkdir(parents=True, exist_ok=True)
     table = as_table(harms)
     print("peak N / impulse N s (contacts), mean over the places")

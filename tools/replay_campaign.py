@@ -2,7 +2,7 @@
 
     python tools/replay_campaign.py --config paper                    every scenario that `firmware-sim list` names
     python tools/replay_campaign.py --config certified push-link1 idle
-    python tools/replay_campaign.py --logs runs/*/run.mcap            replay logs that are there
+    python tools/replay_campaign.py --logs runs/*/run.mcap -j 2       replay logs that are there
 
 A scenario that doesn't get so far that the scheme decides anything counts as refused. Lines go to stdout as they come.
 Exit status: 0 all are identical, 1 one is not, 2 wrong usage.
@@ -12,7 +12,11 @@ import argparse
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
+
+from campaign_loop import add_jobs, play_trials
 
 from adacd_hil.analysis.replay.replay import replay
 from adacd_hil.analysis.replay.replayed_outcome import Replay
@@ -23,6 +27,13 @@ from firmware_sim.scenario.scenario import builtin_scenarios
 _SHOWN = 3
 
 
+class Verdict(NamedTuple):
+    """What came of one log. `is_identical`: None where there was nothing to compare."""
+
+    text: str
+    is_identical: bool | None
+
+
 def main() -> int:
     """Play and replay."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -30,55 +41,50 @@ def main() -> int:
     parser.add_argument("--config", default="paper", help="configuration, such as paper or certified")
     parser.add_argument("--logs", action="store_true", help="replay these logs, play nothing")
     parser.add_argument("--keep", type=Path, help="keep the logs in this folder")
+    add_jobs(parser)
     arguments = parser.parse_args()
-    if arguments.logs:
-        return _sum_up([_judge(name, Path(name), 0.0) for name in arguments.names])
     known = builtin_scenarios()
     for name in arguments.names:
-        if name not in known:
+        if not arguments.logs and name not in known:
             parser.error(f"no scenario {name!r}")
     with tempfile.TemporaryDirectory() as scratch:
-        folder = arguments.keep or Path(scratch)
-        return _sum_up([_play(name, arguments.config, folder) for name in arguments.names or known])
-
-
-def _play(name: str, config: str, folder: Path) -> bool | None:
-    begin_s = time.monotonic()
-    out = folder / f"{config}-{name}"
-    try:
-        summary, _ = run_embedded(resolve(config, name, None, None), "lockstep", out)
-    except ConfigError as error:
-        print(f"{name}: refused: {error}", flush=True)
-        return None
-    return _judge(name, summary.log.path, time.monotonic() - begin_s)
-
-
-def _judge(name: str, path: Path, played_s: float) -> bool | None:
-    """Replay a log and say how it compares; None where there was nothing to compare."""
-    begin_s = time.monotonic()
-    found = replay(path)
-    spent = f"{played_s:.1f} s played, {time.monotonic() - begin_s:.1f} s replayed"
-    if found.cycles == 0:
-        print(f"{name}: no cycles; {spent}", flush=True)
-        return None
-    print(f"{name}: {_verdict(found)}; {spent}", flush=True)
-    for mismatch in found.mismatches[:_SHOWN]:
-        print(f"    {mismatch.line(found.zero_ns)}", flush=True)
-    return found.is_identical and found.is_whole
-
-
-def _verdict(found: Replay) -> str:
-    what = "identical" if found.is_identical else f"{found.mismatch_count} mismatches"
-    attempts = f" in {found.attempts} attempts" if found.attempts > 1 else ""
-    return (
-        f"{what}, {found.compared} of {found.cycles} cycles compared{attempts}{''.join(f'; {n}' for n in found.notes)}"
-    )
-
-
-def _sum_up(verdicts: list[bool | None]) -> int:
+        play = partial(_play, config=arguments.config, folder=arguments.keep or Path(scratch))
+        names = arguments.names if arguments.logs else arguments.names or known
+        verdicts = []
+        for verdict in play_trials(_judge if arguments.logs else play, names, arguments.jobs):
+            print(verdict.text, flush=True)
+            verdicts.append(verdict.is_identical)
     judged = [verdict for verdict in verdicts if verdict is not None]
     print(f"{sum(judged)} of {len(judged)} identical, {len(verdicts) - len(judged)} without cycles", flush=True)
     return 0 if all(judged) else 1
+
+
+def _play(name: str, config: str, folder: Path) -> Verdict:
+    begin_s = time.monotonic()
+    try:
+        summary, _ = run_embedded(resolve(config, name, None, None), "lockstep", folder / f"{config}-{name}")
+    except ConfigError as error:
+        return Verdict(f"{name}: refused: {error}", None)
+    return _judge(name, summary.log.path, time.monotonic() - begin_s)
+
+
+def _judge(name: str, path: Path | None = None, played_s: float = 0.0) -> Verdict:
+    """Replay a log, by default the one of this name, and say how it compares."""
+    begin_s = time.monotonic()
+    found = replay(path or Path(name))
+    spent = f"{played_s:.1f} s played, {time.monotonic() - begin_s:.1f} s replayed"
+    if found.cycles == 0:
+        return Verdict(f"{name}: no cycles; {spent}", None)
+    mismatches = [f"    {mismatch.line(found.zero_ns)}" for mismatch in found.mismatches[:_SHOWN]]
+    text = "\n".join([f"{name}: {_describe(found)}; {spent}", *mismatches])
+    return Verdict(text, found.is_identical and found.is_whole)
+
+
+def _describe(found: Replay) -> str:
+    what = "identical" if found.is_identical else f"{found.mismatch_count} mismatches"
+    attempts = f" in {found.attempts} attempts" if found.attempts > 1 else ""
+    notes = "".join(f"; {note}" for note in found.notes)
+    return f"{what}, {found.compared} of {found.cycles} cycles compared{attempts}{notes}"
 
 
 if __name__ == "__main__":
