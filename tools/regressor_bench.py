@@ -41,10 +41,10 @@ def by_chain(arm, place, first_friction, q, dq, scratch, Y_p, Y_h):
 
 
 @compiled
-def filtered(count, decay, old, new, cutoff, Y_p, Y_h, input_old, S, W_f):
+def filtered(count, hold, cutoff, Y_p, Y_h, input_old, S, W_f):
     """Filter the regressor `count` times."""
     for _ in range(count):
-        filter_bank.advance_regressor(decay, old, new, cutoff, cutoff, Y_p, Y_h, input_old, S, W_f)
+        filter_bank.advance_regressor(hold, cutoff, cutoff, Y_p, Y_h, input_old, S, W_f)
 
 
 @compiled
@@ -80,7 +80,7 @@ def show_rest(named: str, Y_p: np.ndarray, Y_h: np.ndarray) -> None:
     hold = filter_bank.first_order_hold(CUTOFF_RAD_S, CUTOFF_RAD_S, PERIOD_S)
     input_old, S, W_f, WP = (np.zeros((n, p)) for _ in range(4))
     P, noise = np.eye(p), np.full(n, 0.02)
-    show(f"{named}: one filter of it", lambda: filtered(BLOCK, *hold, CUTOFF_RAD_S, Y_p, Y_h, input_old, S, W_f), BLOCK)
+    show(f"{named}: one filter of it", lambda: filtered(BLOCK, hold, CUTOFF_RAD_S, Y_p, Y_h, input_old, S, W_f), BLOCK)
     show(f"{named}: w P w'", lambda: looked_at(BLOCK, W_f, P, noise, WP, np.zeros(n)), BLOCK)
     theta_hat, v, K = (np.zeros(p) for _ in range(3))
     show(f"{named}: one correction", lambda: corrected(BLOCK, W_f, np.zeros(n), theta_hat, P, v, K), BLOCK)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from adacd_hil.compiled import packed, zeroed
 from adacd_hil.scheme.model import filter_bank
 
 T = 1e-3
@@ -15,18 +16,22 @@ class Bank:
     """Filters at rest, for two joints and COLUMNS parameters."""
 
     def __init__(self):
-        self.rates = np.zeros((3, 3))
-        filter_bank.discretise(CUTOFF, T, *self.rates)
-        self.tau_old, self.tau_f = np.zeros((3, 2)), np.zeros((3, 2))
-        self.input_old, self.S, self.W_f = (np.zeros((3, 2, COLUMNS)) for _ in range(3))
+        columns = (2, COLUMNS)
+        shapes = {"rates": (3, 3), "Y_p": columns, "Y_h": columns}
+        shapes |= dict.fromkeys(("tau_old", "tau_f"), (3, 2)) | dict.fromkeys(("input_old", "S", "W_f"), (3, *columns))
+        self.k, self.m = packed({"cutoff": CUTOFF})[0], zeroed(shapes)[0]
+        filter_bank.discretise(CUTOFF, T, *self.m["rates"])
+        self.tau_f, self.W_f = self.m["tau_f"], self.m["W_f"]
+
+    def take(self, Y_p, Y_h, tau_J, is_seen):
+        self.m["Y_p"], self.m["Y_h"] = Y_p, Y_h
+        filter_bank.take_sample(self.k, self.m, tau_J, is_seen)
 
     def resume(self, Y_p, Y_h, tau_J):
-        filter_bank.resume_bank(CUTOFF, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.W_f)
+        self.take(Y_p, Y_h, tau_J, False)
 
     def advance(self, Y_p, Y_h, tau_J):
-        filter_bank.advance_bank(
-            CUTOFF, *self.rates, Y_p, Y_h, tau_J, self.tau_old, self.input_old, self.S, self.tau_f, self.W_f
-        )
+        self.take(Y_p, Y_h, tau_J, True)
 
     def run(self, Y_p, Y_h, tau_J):
         """Go over samples (n, ...), the first of them after a gap; return tau_f (n, C, 2) and W_f (n, C, 2, p)."""
@@ -77,8 +82,8 @@ def test_the_filters_do_not_know_of_each_other():
         input_old, S, W_alone = (np.zeros((2, COLUMNS)) for _ in range(3))
         filter_bank.resume(a, a, Y_p[0], Y_h[0], tau_J[0], input_old, tau_old, S, W_alone)
         for k in range(1, len(tau_J)):
-            filter_bank.advance_torque(*hold, tau_old, tau_J[k], alone_f)
-            filter_bank.advance_regressor(*hold, a, a, Y_p[k], Y_h[k], input_old, S, W_alone)
+            filter_bank.advance_torque(hold, tau_old, tau_J[k], alone_f)
+            filter_bank.advance_regressor(hold, a, a, Y_p[k], Y_h[k], input_old, S, W_alone)
         np.testing.assert_array_equal(tau_f[-1, c], alone_f)
         np.testing.assert_array_equal(W_f[-1, c], W_alone)
 

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from adacd_hil.records import ContactKind
-from adacd_hil.scheme.contact.contact_report import WINDOW_S, classify, share_left
+from adacd_hil.scheme.contact.contact_report import KIND_S, classify, share_left
 
 SIGMA = np.array([0.03, 0.015])
 PERIOD_S = 1e-3
 
 
 def window(shape, force_Nm=2.0, threshold_Nm=0.15, seed=0):
-    """Return the torques (n, 2) of a contact from its onset to WINDOW_S after it was over a threshold."""
+    """Return the torques (n, 2) of a contact from its onset to KIND_S after it was over a threshold."""
     t_s = np.arange(600) * PERIOD_S
     tau = np.outer(shape(t_s), [force_Nm, 0.4 * force_Nm]) + np.random.default_rng(seed).normal(size=(600, 2)) * SIGMA
     detected = int(np.argmax(shape(t_s) * force_Nm > threshold_Nm))
-    return tau[: detected + round(WINDOW_S / PERIOD_S)]
+    return tau[: detected + round(KIND_S / PERIOD_S)]
 
 
 def half_sine(duration_s):

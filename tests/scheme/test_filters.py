@@ -13,7 +13,7 @@ def filter_torque(hold, samples):
     tau_old, tau_f = samples[0].copy(), np.zeros(2)
     filtered = [tau_f.copy()]
     for sample in samples[1:]:
-        advance_torque(*hold, tau_old, sample.copy(), tau_f)
+        advance_torque(hold, tau_old, sample.copy(), tau_f)
         filtered.append(tau_f.copy())
     return np.array(filtered)
 
@@ -65,7 +65,7 @@ class RegressorFilter:
 
     def advance(self, y_p, y_h):
         advance_regressor(
-            *self.hold,
+            self.hold,
             self.a,
             self.b,
             np.full((2, 1), y_p),

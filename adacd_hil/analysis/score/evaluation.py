@@ -31,7 +31,7 @@ from adacd_hil.analysis.score.touches import (
 )
 from adacd_hil.analysis.score.verdict import compare_with_paper, give_verdict, is_margin_below_1, is_revoked
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
-from adacd_hil.scheme.contact.contact_report import WINDOW_S
+from adacd_hil.scheme.contact.contact_report import KIND_S
 
 
 def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
@@ -268,7 +268,7 @@ def _contact(
 
 def _window_s(run: Run) -> float:
     """Give how long after the detection a report is made final."""
-    return run.settings.detector.isolation_window_s if run.certified is None else WINDOW_S
+    return run.settings.detector.isolation_window_s if run.certified is None else KIND_S
 
 
 def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> bool | None:

@@ -222,7 +222,7 @@ class RecalledContact(ContactEvidence):
         self, settings: Settings, q: Vector, tau_ext_wide_hat: Vector, sigma: Vector, threshold: Vector
     ) -> None:
         period_s = settings.bus.period_s
-        window_cycles = round(WINDOW_S / period_s)
+        window_cycles = round(KIND_S / period_s)
         self.due_cycles = (0, round(LINK_S / period_s), window_cycles)
         self.tau_ext = tau_ext_wide_hat
         self._q, self._sigma, self._threshold = q, sigma, threshold
@@ -303,7 +303,7 @@ def _pair(values: Vector) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-WINDOW_S = 0.1
+KIND_S = 0.1
 """From detection to the decision."""
 END_S = 0.01
 """What is left is the mean of this at the end of the window."""

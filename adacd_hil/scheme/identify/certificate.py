@@ -5,7 +5,7 @@ is the arm as far as one run can tell. The last certificate knows the arm withou
 **less is the arm's**: a fit gets no certificate while one of the quantities c of `earlier`, a joint's friction at some
 speed or an inertia, is
 
-    c theta > last + floor + SIGMAS sqrt(share² last² + std² + c P c')
+    c theta > last + floor + LAST_SIGMAS sqrt(share² last² + std² + c P c')
 
 until the user says that nobody touches the arm. share: `history.friction_share`, `inertia_share`, how far one run
 differs from another. Not asked with a payload that was announced. It judges the fit, and never pulls it.
@@ -24,7 +24,7 @@ from adacd_hil.settings.configuration import Settings
 
 NOTHING, ANCHOR, CHANGED, MORE, MORE_THAN_LAST, BY_PLACE, TOO_MUCH_BY_PLACE, ELASTIC = range(8)
 """What contradicts a certificate that is withheld, or taken back: of the kernel's `withheld_by`."""
-SIGMAS = 4.0
+LAST_SIGMAS = 4.0
 FLOOR_NM, FLOOR_KGM2 = 0.02, 0.006
 """Of friction and of inertia: less is nothing."""
 
@@ -120,7 +120,9 @@ def is_no_more(k: Any, m: Any) -> bool:
             now += row[j] * m["belief"][j]
         fitted = earlier.split(earlier.variance_of(row, m["P_belief"]), k["compared_prior"][q], unit)
         m["last_change"][q] = now - k["last_certified"][q]
-        m["last_limit"][q] = k["last_certified_floor"][q] + SIGMAS * np.sqrt(k["last_certified_std"][q] ** 2 + fitted)
+        m["last_limit"][q] = k["last_certified_floor"][q] + LAST_SIGMAS * np.sqrt(
+            k["last_certified_std"][q] ** 2 + fitted
+        )
         is_agreed = is_agreed and m["last_change"][q] <= m["last_limit"][q]
     return bool(is_agreed)
 

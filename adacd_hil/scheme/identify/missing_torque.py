@@ -22,7 +22,7 @@ gain of -10 to 10, elastic joints that swing at 8 Hz to 380 and more, at 15 Hz t
 Asked of an adaptation as a whole, when it refuses a fit. A torque by place is asked for while the arm monitors, too: of
 the first 2 s, the next 4, 8, 16 s and then of each 16 s of learnt samples. Not of longer ones: the drift of a sensor
 over a minute looks like this. There one stretch is not enough, since on one way much depends on the place: what it says
-must explain AGREES of the squares that the basic model leaves in a later one.
+must explain SAID_SHARE of the squares that the basic model leaves in a later one.
 
 Shapes: p parameters, n joints, t = PLACE_TERMS, f = p + n t + n; evidence_L (n, f, f): by the joint of the row, lower
 half; evidence_b, _basic, _full, _row, _scale (f,); evidence_M (f, f); evidence_said (n t,): coefficients of the last
@@ -48,7 +48,7 @@ EXPECTED_RAD_NM = 3e-3
 GAIN, SHARE, LEAST_NM = 8.0, 0.6, 0.01
 """Of one stretch."""
 ELASTIC_GAIN = 20.0
-AGREES = 0.4
+SAID_SHARE = 0.4
 LEAST_BACK = 0.2
 """Share of a joint's samples that are of its less frequent direction: on a way in one direction what depends on speed,
 or on time, depends on the place."""
@@ -281,7 +281,7 @@ def _is_said_again(k: Any, m: Any) -> bool:
     full[count : count + said.shape[0]] = said
     left = _squares_left(m, basic)
     explained = left - _squares_left(m, full)
-    is_agreed = 0.5 * explained > GAIN and explained > AGREES * left
+    is_agreed = 0.5 * explained > GAIN and explained > SAID_SHARE * left
     if is_agreed:
         _fill_missing(m)
     return bool(is_agreed)

@@ -369,28 +369,16 @@ def _run(
     """
     n = q.shape[1]
     F_c = theta[friction_column + n : friction_column + 2 * n]
+    a = cutoff_rad_s
     for k in range(q.shape[0]):
         chain.fill(arm, place, q[k], dq[k], scratch, m.Y_p, m.Y_h)
         chain.fill_friction(dq[k], friction_column, m.Y_h)
         _fill_rotors(dq[k], rotor_column, m.Y_p)
         if k == 0:
-            filter_bank.resume(
-                cutoff_rad_s, cutoff_rad_s, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f
-            )  # fmt: skip
+            filter_bank.resume(a, a, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f)
         else:
-            filter_bank.advance_torque(hold.decay, hold.weight_old, hold.weight_new, m.tau_old, tau_J[k], m.tau_f)
-            filter_bank.advance_regressor(
-                hold.decay,
-                hold.weight_old,
-                hold.weight_new,
-                cutoff_rad_s,
-                cutoff_rad_s,
-                m.Y_p,
-                m.Y_h,
-                m.input_old,
-                m.S,
-                m.W_f,
-            )
+            filter_bank.advance_torque(hold, m.tau_old, tau_J[k], m.tau_f)
+            filter_bank.advance_regressor(hold, a, a, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
         external_torque.follow_standstill(dq[k], standstill_rad_s, hold.decay, m.standstill)
         external_torque.predict(m.W_f, theta, m.tau_f_hat)
         external_torque.estimate_external(m.tau_f, m.tau_f_hat, 1.0, trace.tau_ext_hat[k])

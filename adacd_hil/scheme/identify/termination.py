@@ -44,6 +44,16 @@ _SWEEPS = 12
 
 
 @compiled
+def begin(m: Any) -> None:
+    """Forget the evidence: where and how fast the joints have been, and what motion has shown."""
+    m["q_low"][:] = np.inf
+    m["q_high"][:] = -np.inf
+    m["dq_low"][:] = np.inf
+    m["dq_high"][:] = -np.inf
+    m["information"][:] = 0.0
+
+
+@compiled
 def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
     """Tell whether eq. (15) holds in this sample; a value that is not a number violates it."""
     is_within = True

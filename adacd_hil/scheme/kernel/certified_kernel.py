@@ -71,10 +71,6 @@ REFINE = 16  # correct the belief, and let its mean take over after a test
 WEIGH = 32  # weigh what a contact of the certified model looks like
 
 
-_EIGENVALUE_EVERY = 64
-"""Samples between two looks at the eigenvalues: they take about as long as a step."""
-
-
 @compiled
 def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool, is_first: bool) -> None:
     """Begin to learn: from the prior, or with a payload on top of the arm as it was certified.
@@ -112,11 +108,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     m["unit"][:] = 1.0
     m["samples"] = 0.0
     m["recovering_cycles"] = 0.0
-    m["q_low"][:] = np.inf
-    m["q_high"][:] = -np.inf
-    m["dq_low"][:] = np.inf
-    m["dq_high"][:] = -np.inf
-    m["information"][:] = 0.0
+    termination.begin(m)
     m["excitation"] = 0.0
     m["condition"] = np.inf
 
@@ -162,9 +154,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     is_complete: 1 if it is a fresh sample. steps: periods since the fresh sample before it. mode: MEASURE to REFINE.
     """
     k, m, out = constants[0], memory[0], block[0]
-    observation = observe(k, out, OVER_SPEED) | UNSEEN
-    if out["period_s"][0] == 0.0:
-        out["period_s"][0] = max(steps, 1) * k["period_s"]
+    observation = observe(k, out, steps, OVER_SPEED)
     is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
         m["anchor_age_s"] += out["period_s"][0]
@@ -256,14 +246,7 @@ def _take_sample(
     cutoff = k["cutoff"]
     regressor.bend_bristles(dq, period_s, k["still_rad_s"], k["dahl_rad"], m["bent"])
     _fill_regressor(k, m, q, dq, tau_J)
-    if is_seen:
-        decay, old, new = m["rates"][0], m["rates"][1], m["rates"][2]
-        filter_bank.advance_bank(
-            cutoff, decay, old, new, m["Y_p"], m["Y_h"], tau_J,
-            m["tau_old"], m["input_old"], m["S"], m["tau_f"], m["W_f"],
-        )  # fmt: skip
-    else:
-        filter_bank.resume_bank(cutoff, m["Y_p"], m["Y_h"], tau_J, m["tau_old"], m["input_old"], m["S"], m["W_f"])
+    filter_bank.take_sample(k, m, tau_J, is_seen)
     missing_torque.follow(m, q, m["rates"][:, filter_bank.LEARNT], k["smoothing"], is_seen)
     filter_bank.fill_lag(cutoff, tau_J, m["tau_f"], int(k["base"]) + q.shape[0], m["W_f"])
     if k["has_cross_talk"] != 0.0:
@@ -407,7 +390,7 @@ def _gather_evidence(k: Any, m: Any, out: Any) -> bool:
     termination.widen(out["q"], m["q_low"], m["q_high"])
     termination.widen(out["dq"], m["dq_low"], m["dq_high"])
     termination.add_information(m["W_f"][filter_bank.SLOW], k["period_s"], m["information"])
-    if m["samples"] % _EIGENVALUE_EVERY == _EIGENVALUE_EVERY - 1:
+    if m["samples"] % termination.EXCITATION_EVERY == termination.EXCITATION_EVERY - 1:
         smallest, largest = termination.eigenvalue_range(m["information"], k["scale"], m["scratch"])
         m["excitation"] = smallest
         m["condition"] = largest / smallest if smallest > 0.0 else np.inf

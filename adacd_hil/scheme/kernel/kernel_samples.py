@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.compiled import Structured, compiled
 from adacd_hil.records import ArmBatch, Layout, Vector
-from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED
+from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED, UNSEEN
 from adacd_hil.settings.configuration import Settings
 
 _SHORTEST_SHARE, _LONGEST_SHARE = 0.5, 1.5
@@ -95,9 +95,14 @@ def limits_of(settings: Settings) -> dict[str, Any]:
 
 
 @compiled
-def observe(k: Any, out: Any, too_fast: int) -> int:
-    """Return what the measurements alone say. too_fast: the bit of a joint beyond its velocity limit."""
-    observation = AT_REST | UNLOADED
+def observe(k: Any, out: Any, steps: int, too_fast: int) -> int:
+    """Return what the measurements alone say, and UNSEEN; fill period_s with the nominal one where not measured.
+
+    steps: periods since the fresh sample before it. too_fast: the bit of a joint beyond its velocity limit.
+    """
+    if out["period_s"][0] == 0.0:
+        out["period_s"][0] = max(steps, 1) * k["period_s"]
+    observation = AT_REST | UNLOADED | UNSEEN
     for i in range(out["q"].shape[0]):
         q, dq, tau_J = out["q"][i], out["dq"][i], out["tau_J"][i]
         if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):

@@ -41,8 +41,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
-    COLLISION,
-    CONTACT,
+    ANY_CONTACT,
     CONTACT_SHIFT,
     NOT_A_NUMBER,
     OVER_LIMIT,
@@ -57,8 +56,6 @@ LEARN = 1
 ARMED = 2
 REPORTING = 4
 
-
-_ANY_CONTACT = CONTACT | COLLISION
 
 MOST_FILLED = 4
 """Missing samples that are put on the line between their neighbours: with one more the model is blind by default. Over
@@ -148,11 +145,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     out["tau_f"][:] = 0.0
     m["history"][:] = 0.0
     estimator.reset_gain(c["P0"], m["P"])
-    m["q_low"][:] = np.inf
-    m["q_high"][:] = -np.inf
-    m["dq_low"][:] = np.inf
-    m["dq_high"][:] = -np.inf
-    m["information"][:] = 0.0
+    termination.begin(m)
     m["samples"] = 0.0
     m["quiet_cycles"] = 0.0
     out["quiet_s"][0] = 0.0
@@ -167,10 +160,8 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
     REPORTING.
     """
     c, m, out = constants[0], memory[0], block[0]
-    if out["period_s"][0] == 0.0:
-        out["period_s"][0] = max(steps, 1) * c["period_s"]
     period_s = c["period_s"]
-    observation = observe(c, out, OVER_LIMIT) | UNSEEN
+    observation = observe(c, out, steps, OVER_LIMIT)
     is_fresh = is_complete != 0 and observation & NOT_A_NUMBER == 0
     if is_fresh:
         is_seen, period_s = _filter(c, m, out, steps)
@@ -202,15 +193,15 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
     is_seen = m["has_gap"] == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
-        decay, old, new = c["decay"], c["weight_old"], c["weight_new"]
+        hold = filter_bank.FirstOrderHold(c["decay"], c["weight_old"], c["weight_new"])
         if step_s != nominal_s:
-            decay, old, new = filter_bank.first_order_hold(a, b, step_s)
+            hold = filter_bank.first_order_hold(a, b, step_s)
         for k in range(1, steps):
             put_between(m["last"], out["q"], out["dq"], out["tau_J"], k / steps, m["between"])
-            _advance(m, m["between"][0], m["between"][1], m["between"][2], a, b, decay, old, new, out["tau_f"])
-            _compare(c, m, m["between"][1], decay, out)
-        _advance(m, out["q"], out["dq"], out["tau_J"], a, b, decay, old, new, out["tau_f"])
-        _compare(c, m, out["dq"], decay, out)
+            _advance(c, m, m["between"][0], m["between"][1], m["between"][2], hold, out["tau_f"])
+            _compare(c, m, m["between"][1], hold.decay, out)
+        _advance(c, m, out["q"], out["dq"], out["tau_J"], hold, out["tau_f"])
+        _compare(c, m, out["dq"], hold.decay, out)
     else:
         period_s = nominal_s
         regressor.fill_momentum(out["q"], out["dq"], m["Y_p"])
@@ -224,24 +215,14 @@ def _filter(c: Any, m: Any, out: Any, steps: int) -> tuple[bool, float]:
 
 @compiled
 def _advance(
-    m: Any,
-    q: Vector,
-    dq: Vector,
-    tau_J: Vector,
-    a: float,
-    b: float,
-    decay: float,
-    weight_old: float,
-    weight_new: float,
-    tau_f: Vector,
+    c: Any, m: Any, q: Vector, dq: Vector, tau_J: Vector, hold: filter_bank.FirstOrderHold, tau_f: Vector
 ) -> None:
     """Take the filters over one period to a sample."""
+    a, b = c["a_rad_s"], c["b_rad_s"]
     regressor.fill_momentum(q, dq, m["Y_p"])
     regressor.fill_remainder(q, dq, m["Y_h"])
-    filter_bank.advance_torque(decay, weight_old, weight_new, m["tau_old"], tau_J, tau_f)
-    filter_bank.advance_regressor(
-        decay, weight_old, weight_new, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"]
-    )
+    filter_bank.advance_torque(hold, m["tau_old"], tau_J, tau_f)
+    filter_bank.advance_regressor(hold, a, b, m["Y_p"], m["Y_h"], m["input_old"], m["S"], m["W_f"])
 
 
 @compiled
@@ -294,7 +275,7 @@ def _watch(c: Any, m: Any, out: Any, period_s: float, is_fresh: bool, is_reporti
             m["peak"],
         )
     joints = external_torque.joints_over(out["tau_ext_hat"], out["threshold"])
-    return _ANY_CONTACT | joints << CONTACT_SHIFT if joints else 0
+    return ANY_CONTACT | joints << CONTACT_SHIFT if joints else 0
 
 
 @released

@@ -51,7 +51,7 @@ tau_f (C, n); S, W_f, input_old (C, n, p); W_learnt (n, p), tau_learnt (n,). Uni
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
@@ -76,41 +76,33 @@ def first_order_hold(a_rad_s: float, b_rad_s: float, period_s: float) -> FirstOr
 
 
 @compiled
-def advance_torque(
-    decay: float, weight_old: float, weight_new: float, tau_old: Vector, tau_new: Vector, tau_f: Vector
-) -> None:
+def advance_torque(hold: FirstOrderHold, tau_old: Vector, tau_new: Vector, tau_f: Vector) -> None:
     """Take tau_f (2,) over one period in place; tau_new becomes tau_old."""
     for i in range(tau_f.shape[0]):
-        tau_f[i] = decay * tau_f[i] + (weight_old * tau_old[i] + weight_new * tau_new[i])
+        tau_f[i] = hold.decay * tau_f[i] + (hold.weight_old * tau_old[i] + hold.weight_new * tau_new[i])
         tau_old[i] = tau_new[i]
 
 
 @compiled
 def advance_regressor(
-    decay: float,
-    weight_old: float,
-    weight_new: float,
-    a_rad_s: float,
-    b_rad_s: float,
-    Y_p: Vector,
-    Y_h: Vector,
-    input_old: Vector,
-    S: Vector,
-    W_f: Vector,
+    hold: FirstOrderHold, a: float, b: float, Y_p: Vector, Y_h: Vector, input_old: Vector, S: Vector, W_f: Vector
 ) -> None:
-    """Take S and W_f (2, p) over one period in place; input_old (2, p) becomes Y_h - a Y_p of this sample."""
+    """Take S and W_f (2, p) over one period in place; input_old (2, p) becomes Y_h - a Y_p of this sample.
+
+    a, b: of F(s), rad/s.
+    """
     for i in range(W_f.shape[0]):
         for j in range(W_f.shape[1]):
-            input_new = Y_h[i, j] - a_rad_s * Y_p[i, j]
-            S[i, j] = decay * S[i, j] + (weight_old * input_old[i, j] + weight_new * input_new)
-            W_f[i, j] = b_rad_s * Y_p[i, j] + S[i, j]
+            input_new = Y_h[i, j] - a * Y_p[i, j]
+            S[i, j] = hold.decay * S[i, j] + (hold.weight_old * input_old[i, j] + hold.weight_new * input_new)
+            W_f[i, j] = b * Y_p[i, j] + S[i, j]
             input_old[i, j] = input_new
 
 
 @compiled
 def resume(
-    a_rad_s: float,
-    b_rad_s: float,
+    a: float,
+    b: float,
     Y_p: Vector,
     Y_h: Vector,
     tau_new: Vector,
@@ -119,12 +111,12 @@ def resume(
     S: Vector,
     W_f: Vector,
 ) -> None:
-    """Start again from this sample after a gap, with W_f (2, p) and tau_f as they were."""
+    """Start again from this sample after a gap, with W_f (2, p) and tau_f as they were. a, b: of F(s), rad/s."""
     for i in range(W_f.shape[0]):
         tau_old[i] = tau_new[i]
         for j in range(W_f.shape[1]):
-            S[i, j] = W_f[i, j] - b_rad_s * Y_p[i, j]
-            input_old[i, j] = Y_h[i, j] - a_rad_s * Y_p[i, j]
+            S[i, j] = W_f[i, j] - b * Y_p[i, j]
+            input_old[i, j] = Y_h[i, j] - a * Y_p[i, j]
 
 
 SLOW = 0
@@ -169,43 +161,20 @@ def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old:
 
 
 @compiled
-def advance_bank(
-    cutoff_rad_s: Vector,
-    decay: Vector,
-    weight_old: Vector,
-    weight_new: Vector,
-    Y_p: Vector,
-    Y_h: Vector,
-    tau_J: Vector,
-    tau_old: Vector,
-    input_old: Vector,
-    S: Vector,
-    tau_f: Vector,
-    W_f: Vector,
-) -> None:
-    """Take all filters over one period in place; tau_J (n,) becomes tau_old."""
-    for c in range(cutoff_rad_s.shape[0]):
-        advance_torque(decay[c], weight_old[c], weight_new[c], tau_old[c], tau_J, tau_f[c])
-        a = cutoff_rad_s[c]
-        advance_regressor(
-            decay[c], weight_old[c], weight_new[c], a, a, Y_p, Y_h, input_old[c], S[c], W_f[c]
-        )  # fmt: skip
+def take_sample(k: Any, m: Any, tau_J: Vector, is_seen: bool) -> None:
+    """Take all filters over one period to a sample, Y_p, Y_h of `m` and tau_J (n,); after a gap they resume from it.
 
-
-@compiled
-def resume_bank(
-    cutoff_rad_s: Vector,
-    Y_p: Vector,
-    Y_h: Vector,
-    tau_J: Vector,
-    tau_old: Vector,
-    input_old: Vector,
-    S: Vector,
-    W_f: Vector,
-) -> None:
-    """Start again from this sample after a gap, with tau_f and W_f as they were."""
-    for c in range(cutoff_rad_s.shape[0]):
-        resume(cutoff_rad_s[c], cutoff_rad_s[c], Y_p, Y_h, tau_J, input_old[c], tau_old[c], S[c], W_f[c])
+    `rates` (3, C) of `m`: what the period does to each filter, see `FirstOrderHold`.
+    """
+    rates = m["rates"]
+    for c in range(k["cutoff"].shape[0]):
+        a, tau_old, input_old, S, W_f = k["cutoff"][c], m["tau_old"][c], m["input_old"][c], m["S"][c], m["W_f"][c]
+        if is_seen:
+            hold = FirstOrderHold(rates[0, c], rates[1, c], rates[2, c])
+            advance_torque(hold, tau_old, tau_J, m["tau_f"][c])
+            advance_regressor(hold, a, a, m["Y_p"], m["Y_h"], input_old, S, W_f)
+        else:
+            resume(a, a, m["Y_p"], m["Y_h"], tau_J, input_old, tau_old, S, W_f)
 
 
 @compiled

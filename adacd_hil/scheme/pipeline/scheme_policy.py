@@ -24,8 +24,9 @@ from adacd_hil.settings.configuration import Settings
 class SchemePolicy(ABC):
     """What a pipeline asks its scheme: the numbers of a cycle, and what a state begins and ends with.
 
-    contacts: of the arm. tau_ext_hat (2,): external torque that is reported in each cycle, Nm, a view. theta_ff: what
-    the last finished adaptation left, for the feedforward, zeros before. is_model_valid: theta_ff may be fed forward.
+    supervisor: of the pipeline. contacts: of the arm. tau_ext_hat (2,): external torque that is reported in each cycle,
+    Nm, a view. theta_ff: what the last finished adaptation left, for the feedforward, zeros before. is_model_valid:
+    theta_ff may be fed forward.
     """
 
     supervisor: Supervisor

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
+    ANY_CONTACT,
     AT_REST,
     CERTIFIED,
     COLLISION,
@@ -51,7 +52,6 @@ UNREST_S = 0.02
 """How long an arm may move while its drives are asked to enable: one whose brakes have opened sags until it is held."""
 
 _REST_UNLOADED = AT_REST | UNLOADED
-_ANY_CONTACT = CONTACT | COLLISION
 
 POWERED = frozenset(
     (
@@ -237,7 +237,7 @@ class Supervisor:
         self._learning_cycles += arm.periods if self._state in LEARNING else 0
         self._still_cycles = self._still_cycles + 1 if observation & AT_REST else 0
         self._moving_cycles = 0 if observation & AT_REST else self._moving_cycles + 1
-        self._cleared_cycles = 0 if observation & _ANY_CONTACT else self._cleared_cycles + 1
+        self._cleared_cycles = 0 if observation & ANY_CONTACT else self._cleared_cycles + 1
         self._blind_cycles = self._blind_cycles + 1 if observation & UNSEEN else 0
         is_stale = max(*arm.age_q, *arm.age_tau_J) > 1
         self._stale_cycles = self._stale_cycles + 1 if is_stale else 0
@@ -298,7 +298,7 @@ class Supervisor:
         self._stale_cycles = 0  # where it counts, a stale value is not calm
         self._still_cycles = _run_at_end(observations & AT_REST != 0, self._still_cycles)
         self._moving_cycles = _run_at_end(observations & AT_REST == 0, self._moving_cycles)
-        self._cleared_cycles = _run_at_end(observations & _ANY_CONTACT == 0, self._cleared_cycles)
+        self._cleared_cycles = _run_at_end(observations & ANY_CONTACT == 0, self._cleared_cycles)
         if self._state is SchemeState.COMMISSION:
             self._commissioned_cycles += observations.size
 
@@ -362,7 +362,7 @@ class Supervisor:
 
     def _touch(self, arm: ArmState, observation: int) -> SchemeEvent:
         """Return COLLISION or CONTACT where this state reacts to it, or none; an arm without torque can't react."""
-        if not observation & _ANY_CONTACT or not arm.is_enabled:
+        if not observation & ANY_CONTACT or not arm.is_enabled:
             return SchemeEvent.NONE
         event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
         return event if event in TRANSITIONS[self._state] else SchemeEvent.NONE
@@ -381,7 +381,7 @@ class Supervisor:
             case SchemeState.STOPPED if Request.RELEARN in self._pending:
                 event = SchemeEvent.REVOKED if is_still and not arm.is_late else SchemeEvent.NONE
             case SchemeState.STOPPED if Request.ACKNOWLEDGE in self._pending:
-                if not (observation & _ANY_CONTACT or arm.is_late):
+                if not (observation & ANY_CONTACT or arm.is_late):
                     event = SchemeEvent.REVOKED if self._is_doubted else SchemeEvent.ACKNOWLEDGED
             case SchemeState.ADAPT | SchemeState.CERTIFY:
                 event = _verdict(self._state, observation)

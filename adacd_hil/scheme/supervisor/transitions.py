@@ -180,6 +180,7 @@ class Observation(IntFlag):
     WITHHELD,
 ) = (int(bit) for bit in Observation)
 """The same bits as plain numbers, which compiled code can read."""
+ANY_CONTACT = CONTACT | COLLISION
 
 
 NEVER = 1 << 60
