@@ -10,7 +10,6 @@ import subprocess
 import sys
 import termios
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -67,7 +66,7 @@ def test_what_is_within_a_line_ends_none() -> None:
 
 
 def test_progress_is_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
-    with closing(Progress()) as progress:
+    with Progress() as progress:
         progress("arm \n0.000 s  forged")
     assert capsys.readouterr().err == "arm \\u000a0.000 s  forged\n"
 

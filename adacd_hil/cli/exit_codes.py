@@ -1,9 +1,18 @@
-"""What the commands' exit statuses mean; the same numbers in every command."""
+"""How a command ends: by an exit status, the same in every command, and where it fails by one line."""
 
+import functools
+import sys
+from collections.abc import Callable
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from adacd_hil.file_access import in_words, is_disk_full
+from adacd_hil.log.log_files import LogError, LogExistsError
 from adacd_hil.records import FaultReason
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.terminal import one_line
+from adacd_hil.wire.bus import BusError, BusMissingError
+from adacd_hil.wire.codec import CodecError
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import SessionSummary  # it compiles: seconds that a command without a run can spare
@@ -45,3 +54,44 @@ def exit_code(summary: "SessionSummary") -> ExitCode:
     if not summary.log.is_complete:
         return ExitCode.PARTIAL
     return ExitCode.INTERRUPTED if summary.result.is_interrupted else ExitCode.OK
+
+
+_CODES = (
+    (ConfigError, ExitCode.USAGE),
+    (CodecError, ExitCode.USAGE),
+    (BusMissingError, ExitCode.BUS_MISSING),
+    (BusError, ExitCode.SAFETY_STOP),
+    (LogExistsError, ExitCode.USAGE),
+    (LogError, ExitCode.FAILURE),
+    (OSError, ExitCode.FAILURE),
+    (MemoryError, ExitCode.FAILURE),
+)
+_EXPECTED = (KeyboardInterrupt, CommandError, *(kind for kind, _ in _CODES))
+
+
+def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
+    """Turn what a command raises into one line and its exit code."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            code = command(*args, **kwargs)
+        except _EXPECTED as error:
+            code = complain(error)
+        sys.exit(code)
+
+    return run
+
+
+def complain(error: BaseException) -> ExitCode:
+    """Say in one line what ended a command; return its exit code."""
+    is_interrupted = isinstance(error, KeyboardInterrupt)
+    line = "interrupted" if is_interrupted else in_words(error) or type(error).__name__
+    print(f"adacd-hil: {one_line(line)}", file=sys.stderr)
+    if is_interrupted:
+        return ExitCode.INTERRUPTED
+    if is_disk_full(error):
+        return ExitCode.PARTIAL
+    if isinstance(error, CommandError):
+        return error.code
+    return next(code for kind, code in _CODES if isinstance(error, kind))

@@ -16,12 +16,10 @@ from adacd_hil.cli.commands.play_command import play
 from adacd_hil.cli.commands.replay_command import replay
 from adacd_hil.cli.commands.sweep_command import sweep
 from adacd_hil.cli.commands.tune_command import tune
-from adacd_hil.cli.exit_codes import EPILOG, ExitCode
+from adacd_hil.cli.exit_codes import EPILOG, ExitCode, complain, explained
 from adacd_hil.cli.options import (
     clock_option,
-    complain,
     config_option,
-    explained,
     json_option,
     live_options,
     on_bus,

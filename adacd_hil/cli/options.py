@@ -1,8 +1,7 @@
-"""Options and error handling that the commands share."""
+"""Options that the commands share."""
 
 import functools
 import math
-import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,61 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.file_access import in_words, is_disk_full
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.log.log_files import LogError, LogExistsError
 from adacd_hil.log.recording.processes import MOST_VIEWERS
 from adacd_hil.remedies import install_command
 from adacd_hil.settings.configuration import builtin_names
-from adacd_hil.settings.schema import ConfigError
-from adacd_hil.terminal import one_line
-from adacd_hil.wire.bus import BusError, BusMissingError
-from adacd_hil.wire.codec import CodecError
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import LiveAddress
-
-_CODES = (
-    (ConfigError, ExitCode.USAGE),
-    (CodecError, ExitCode.USAGE),
-    (BusMissingError, ExitCode.BUS_MISSING),
-    (BusError, ExitCode.SAFETY_STOP),
-    (LogExistsError, ExitCode.USAGE),
-    (LogError, ExitCode.FAILURE),
-    (OSError, ExitCode.FAILURE),
-    (MemoryError, ExitCode.FAILURE),
-)
-_EXPECTED = (KeyboardInterrupt, CommandError, *(kind for kind, _ in _CODES))
-
-
-def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Turn what a command raises into one line and its exit code."""
-
-    @functools.wraps(command)
-    def run(*args: Any, **kwargs: Any) -> None:
-        try:
-            code = command(*args, **kwargs)
-        except _EXPECTED as error:
-            code = complain(error)
-        sys.exit(code)
-
-    return run
-
-
-def complain(error: BaseException) -> ExitCode:
-    """Say in one line what ended a command; return its exit code."""
-    is_interrupted = isinstance(error, KeyboardInterrupt)
-    line = "interrupted" if is_interrupted else in_words(error) or type(error).__name__
-    print(f"adacd-hil: {one_line(line)}", file=sys.stderr)
-    if is_interrupted:
-        return ExitCode.INTERRUPTED
-    if is_disk_full(error):
-        return ExitCode.PARTIAL
-    if isinstance(error, CommandError):
-        return error.code
-    return next(code for kind, code in _CODES if isinstance(error, kind))
-
 
 config_option = click.option(
     "--config",

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Self
 
 from adacd_hil.cli.exit_codes import CommandError
 from adacd_hil.clock import wall_ns
@@ -26,7 +27,7 @@ def format_table(head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequ
 
 
 class Progress:
-    """Lines on stderr about work in progress; `close` waits for the last one, but not for ever.
+    """Lines on stderr about work in progress; their end waits for the last one, but not for ever.
 
     A thread of their own prints them: a stuck terminal must not stop the arm.
     """
@@ -46,7 +47,10 @@ class Progress:
         while (line := self._lines.get()) is not None:
             print(in_line(line), file=sys.stderr, flush=True)
 
-    def close(self) -> None:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """Print what is queued and end."""
         self._lines.put(None)
         self._thread.join(self.CLOSE_TIMEOUT_S)

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.cli.commands.demo_command import USER, resolve
-from adacd_hil.cli.commands.play import may_move_an_arm
+from adacd_hil.cli.commands.play_command import may_move_an_arm
 from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
 from adacd_hil.cli.exit_codes import CommandError, ExitCode
 from adacd_hil.cli.main import cli

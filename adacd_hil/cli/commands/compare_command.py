@@ -1,15 +1,14 @@
 """`adacd-hil compare`: two logs beside each other."""
 
 import json
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.cli.options import explained, json_option, stretch_options
-from adacd_hil.cli.output import Progress
+from adacd_hil.cli.exit_codes import ExitCode, explained
+from adacd_hil.cli.options import json_option, stretch_options
+from adacd_hil.cli.output import Progress, format_table
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.records import Location
@@ -41,7 +40,7 @@ def compare(first: Path, second: Path, as_json: bool, stretch: "TimeWindow") -> 
     """
     from adacd_hil.analysis.replay.log_comparison import compare_logs
 
-    with closing(Progress()) as progress:
+    with Progress() as progress:
         found = compare_logs(log_in(first), log_in(second), progress, stretch)
     print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
     if not found.is_same:
@@ -50,8 +49,6 @@ def compare(first: Path, second: Path, as_json: bool, stretch: "TimeWindow") -> 
 
 
 def _as_text(found: "LogComparison") -> str:
-    from adacd_hil.cli.output import format_table
-
     names = [str(found.first.path), str(found.second.path)]
     lines = [in_line(line) for line in (f"1: {names[0]}", f"2: {names[1]}", "", *found.notes)]
     if not found.stretch.is_whole:

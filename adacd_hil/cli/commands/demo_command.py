@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -133,7 +132,7 @@ def play(
     cast = resolve(config, scenario_name, profile, seed)
     settings, scenario = cast
     what = "experiment" if scenario_name == SCENARIO else f"scenario {scenario.name}"
-    with run_folder(out, (LOG_NAME, TRUTH_NAME), "demo") as folder, closing(Progress()) as progress:
+    with run_folder(out, (LOG_NAME, TRUTH_NAME), "demo") as folder, Progress() as progress:
         progress(f"{what} of configuration {settings.name}, profile {settings.arm.profile}, in {folder.path}")
         on_started = functools.partial(folder.link, progress)
         summary, truth_path = run_embedded(cast, clock_name, folder.path, progress, live, on_started)

@@ -39,14 +39,13 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
     task = Search(load_settings(config, profile))
-    clock, progress = MonotonicClock(), Progress()
+    clock = MonotonicClock()
     end_ns = clock.now_ns() + round(1e9 * seconds)
     try:
-        found = task.run(seed, lambda _: clock.now_ns() < end_ns, progress)
+        with Progress() as progress:
+            found = task.run(seed, lambda _: clock.now_ns() < end_ns, progress)
     except NoExcitationError as error:
         raise CommandError(str(error)) from None
-    finally:
-        progress.close()
     present = task.figures(task.present) if task.present.period_s else None
     return ExcitationOutcome(config, present, task.figures(found), task.limits, found)
 

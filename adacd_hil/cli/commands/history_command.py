@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option
+from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode, explained
+from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import format_table
 from adacd_hil.file_access import is_anothers, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
@@ -66,8 +67,6 @@ def _as_png(found: "History") -> bytes:
 
 
 def _as_text(found: "History") -> str:
-    from adacd_hil.cli.output import format_table
-
     devices = ", ".join(f"{device.name} {device.serial}" for device in found.devices)
     head = ("certified", "F1 Nm", "F2 Nm", "a1 kg m²", "a2 kg m²", "a3 kg m²", "offset Nm", "payload", "known by")
     rows = []

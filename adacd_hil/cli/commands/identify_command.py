@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
+from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import Progress, format_table
 from adacd_hil.file_access import replace_file
 from adacd_hil.given_path import GIVEN_FILE, WrittenPath
 from adacd_hil.terminal import in_line
@@ -48,14 +49,12 @@ def identify(
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
     from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
-    from adacd_hil.cli.output import Progress
     from adacd_hil.log.time_window import TimeWindow
 
     if not start_s < end_s:
         raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)
     described = read_map(map_path)
-    progress = Progress()
-    try:
+    with Progress() as progress:
         read: list[ForeignRecording] = []
         for place, path in enumerate((*recordings, *((test,) if test else ()), *watch)):
             progress(f"reading {path}")
@@ -69,8 +68,6 @@ def identify(
         if out is not None:
             _write(found, out)
             progress(f"pictures in {out}")
-    finally:
-        progress.close()
     print(json.dumps(found.as_json(), indent=2) if as_json else _as_text(found))
     return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
 
@@ -86,8 +83,6 @@ def _write(found: "Identified", out: Path) -> None:
 
 
 def _as_text(found: "Identified") -> str:
-    from adacd_hil.cli.output import format_table
-
     certificate = found.certificate
     deviation = found.estimate.P.diagonal() ** 0.5
     parameters = [

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.commands.log_export import export
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option, stretch_options
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
+from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import format_table
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line

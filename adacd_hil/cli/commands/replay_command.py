@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option, profile_option, stretch_options
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
+from adacd_hil.cli.options import json_option, profile_option, stretch_options
+from adacd_hil.cli.output import Progress, format_table
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
@@ -66,16 +67,11 @@ def replay(
     With --from and --until, only that stretch is compared and told. The replay begins with the log all the same: its
     filters and its model know what came before.
     """
-    from adacd_hil.cli.output import Progress
-
-    progress = Progress()
-    try:
+    with Progress() as progress:
         results = [
             _replay_one(path, changes, vary, (config, profile, dbc), against, tolerance, shown, stretch, progress)
             for path in logs
         ]
-    finally:
-        progress.close()
     if as_json:
         print(json.dumps([_as_json(*result, shown, stretch) for result in results], indent=2, allow_nan=False))
     else:
@@ -178,7 +174,6 @@ def _verdict(own: "Replay") -> str:
 
 def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow") -> str:
     from adacd_hil.analysis.replay.replayed_outcome import NOTE, side_by_side
-    from adacd_hil.cli.output import format_table
 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""

@@ -51,10 +51,9 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
         if folder in places:
             raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
         places[folder] = given, runs
-    progress = Progress()
     reported: list[Reported] = []
     codes = []
-    try:
+    with Progress() as progress:
         for folder, (given, runs) in places.items():
             if runs:
                 index = _report_runs(given, runs, folder, stretch, progress)
@@ -64,8 +63,6 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
                 report = _report_one(log_in(given), folder, stretch, progress)
                 reported.append(report)
                 codes.append(_code(report))
-    finally:
-        progress.close()
     return reported, ExitCode.OK if set(codes) <= {ExitCode.OK} else ExitCode.PARTIAL
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import signal
 import sys
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ def run_on_bus(
         operator: Operator = ScriptedOperator(settings.operator)
         if sys.stdin is not None and sys.stdin.isatty():
             operator = ConsoleOperator(ScriptedOperator(settings.operator))
-        progress = stack.enter_context(closing(Progress()))
+        progress = stack.enter_context(Progress())
         session = Session(
             settings,
             codec,

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option, profile_option
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
+from adacd_hil.cli.options import json_option, profile_option
+from adacd_hil.cli.output import Progress
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
@@ -67,25 +68,21 @@ def sweep(
     from adacd_hil.analysis.sweep.cluster import TLS, TlsFiles, connect
     from adacd_hil.analysis.sweep.rows import replay_task
     from adacd_hil.analysis.sweep.sweep import SweepStore, run_sweep
-    from adacd_hil.cli.output import Progress
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
     plan = _plan(logs, scenarios, seeds, vary, config, profile or "")
     work = replay_task if logs else simulate_task
     store = SweepStore(out)
-    progress = Progress()
-    progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
     tls = TlsFiles(tls_ca_file, tls_cert, tls_key)
-    if scheduler and not scheduler.startswith(TLS) and not any(tls):
-        progress(f"{scheduler} is open: it runs whatever anybody sends who reaches it (docs/sweep.md)")
-    try:
+    with Progress() as progress:
+        progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
+        if scheduler and not scheduler.startswith(TLS) and not any(tls):
+            progress(f"{scheduler} is open: it runs whatever anybody sends who reaches it (docs/sweep.md)")
         with connect(scheduler, workers or os.cpu_count() or 1, tls) as client:
             outcome = run_sweep(plan, work, store, client, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)
-    finally:
-        progress.close()
     result = {
         "table": str(table),
         "rows": plan.size,

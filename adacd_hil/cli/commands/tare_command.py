@@ -2,6 +2,7 @@
 
 import dataclasses
 import signal
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,13 +78,13 @@ def tare_on_bus(
     codec = load_contract(settings)
     clock = make_clock(clock_name)
     bus = connection.open(clock, codec, settings)
-    progress = Progress()
     try:
-        if not isinstance(clock, VirtualClock):
-            refuse_company(bus, clock, settings, codec)
-        session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
-        with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
-            tare = session.run()
+        with Progress() as progress, closing(bus):
+            if not isinstance(clock, VirtualClock):
+                refuse_company(bus, clock, settings, codec)
+            session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
+            with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
+                tare = session.run()
     except TareRefusedError as reason:
         raise CommandError(f"tare refused: {reason}", ExitCode.FAILURE) from None
     except TareInterruptedError as reason:
@@ -92,9 +93,6 @@ def tare_on_bus(
         raise CommandError(str(reason), ExitCode.BUS_MISSING) from None
     except SilenceError as reason:
         raise CommandError(str(reason), ExitCode.SAFETY_STOP) from None
-    finally:
-        bus.close()
-        progress.close()
     return StoredTare(tare, out, write_tare(tare, out))
 
 

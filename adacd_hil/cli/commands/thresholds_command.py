@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from contextlib import closing
 from pathlib import Path
 
 from adacd_hil.analysis.thresholds.detector_comparison import Comparison, compare_detectors
@@ -20,7 +19,7 @@ def find(
     """Find the thresholds, and compare the detectors where asked for. Raises LogError, CommandError."""
     paths = [log_in(given) for given in logs]
     try:
-        with closing(Progress()) as progress:
+        with Progress() as progress:
             thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
         comparison = compare_detectors(statistics, rate_per_h) if is_compared else None
     except TooLittleMotionError as error:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.options import explained, json_option, stretch_options
-from adacd_hil.cli.output import tell, tried
+from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
+from adacd_hil.cli.options import json_option, stretch_options
+from adacd_hil.cli.output import Progress, format_table, tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
@@ -56,20 +56,17 @@ def tune(
     from adacd_hil.analysis.sweep.tune import base_of, suggested_toml
     from adacd_hil.analysis.sweep.tune import tune as find
     from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
-    from adacd_hil.cli.output import Progress
 
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
         raise CommandError("a log is given twice: what is chosen on it can't be checked on it", ExitCode.USAGE)
     with tried(out):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
-        progress = Progress()
         try:
-            found = find(paths, rate_per_h, config, progress, stretch)
+            with Progress() as progress:
+                found = find(paths, rate_per_h, config, progress, stretch)
         except TooLittleMotionError as error:
             raise CommandError(str(error), ExitCode.FAILURE) from None
-        finally:
-            progress.close()
         said = json.dumps(found.as_json(), indent=2, allow_nan=False) if as_json else _as_text(found)
         if base is None or found.best is None:
             print(said)
@@ -85,7 +82,6 @@ def tune(
 def _as_text(found: "Tuning") -> str:
     from adacd_hil.analysis.sweep.tune import in_words
     from adacd_hil.analysis.sweep.tune_roc import LIMITS, free_hours
-    from adacd_hil.cli.output import format_table
 
     hours = sum(map(free_hours, found.logs))
     lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of motion that nobody touched", ""]
