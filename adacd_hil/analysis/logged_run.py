@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.device.arm import SYNC_OVERFLOW
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.time_window import TimeWindow

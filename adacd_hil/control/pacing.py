@@ -11,11 +11,11 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 
 from adacd_hil.clock import Clock, VirtualClock
-from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.settings.bus_settings import LockstepSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import BusError, Frame, Tap
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 
 _BLOCK: Final = 1024
 _TAIL: Final = 3.090232306167813

@@ -20,14 +20,12 @@ from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameCh
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import EMERGENCY_ID
+from adacd_hil.wire.contract_frames import EMERGENCY_ID, SYNC_OVERFLOW
 from adacd_hil.wire.e2e import E2eStatus
 
 FEEDBACK_SHARE = 0.7
 """Part of the period in which feedback is awaited in real time. On a classic bus at 1 Mbit/s it is in after 565 µs at
 the worst, and two commands need 230 µs before the next SYNC."""
-SYNC_OVERFLOW = 240
-"""0x1019: the SYNC counter runs 1…240."""
 
 _Take = Callable[[bytes, int], bool]
 """What takes a frame's data and its cycle, and says whether something cyclic came of it."""

@@ -7,7 +7,6 @@ Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects); Ci
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, follow_devices
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError
 from adacd_hil.device.device_setup import ParameterWatch, Slave, command_deadline_ms, set_up_drive, set_up_sensor
@@ -18,7 +17,7 @@ from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Frame
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, SYNC_ID
+from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, SYNC_ID, SYNC_OVERFLOW
 
 START, ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION = 0x01, 0x80, 0x82
 """NMT commands."""

@@ -26,6 +26,8 @@ HOST_HEARTBEAT = "HostHeartbeat"
 NMT_ID, SYNC_ID, EMERGENCY_ID, HEARTBEAT_ID = 0x000, 0x080, 0x080, 0x700
 SDO_RESPONSE_ID, SDO_REQUEST_ID = 0x580, 0x600
 """Identifiers of the predefined connection set; all but the first two plus the node id."""
+SYNC_OVERFLOW = 240
+"""0x1019: the SYNC counter runs 1…240, as long as CiA 301 lets it."""
 NOT_VALID = 1 << 31
 """Of a COB-ID, CiA 301 clause 7.5.2.35: the PDO or EMCY is switched off."""
 ASSUMED_INTERVAL_MS = 100

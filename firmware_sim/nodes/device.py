@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from adacd_hil.wire.codec import MessageCodec
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.canopen.error_control import ErrorReporter, HeartbeatConsumer, HeartbeatProducer, Watchdog, Watchdogs
 from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, refuse
@@ -21,7 +22,6 @@ from firmware_sim.canopen.sync_order import SyncCounts, SyncKind
 _GENERIC, _COMMUNICATION = 0x01, 0x10  # bits of 0x1001
 _RECOVERED_FROM_BUS_OFF = 0x8140
 _CLEAR_HISTORY = (0x1003, 0)
-_LONGEST_OVERFLOW = 240
 
 
 class NmtState(IntEnum):
@@ -267,7 +267,7 @@ class EmulatedDevice(ObjectDictionary):
 
     def _check_overflow(self, overflow: int) -> None:
         """Accept 0 and 2 to 240, and a change at period 0 only: CiA 301, 7.5.2.22."""
-        if overflow == 1 or overflow > _LONGEST_OVERFLOW:
+        if overflow == 1 or overflow > SYNC_OVERFLOW:
             refuse(Abort.VALUE_RANGE)
         if overflow != self.value(0x1019) and self.value(0x1006) != 0:
             refuse(Abort.DEVICE_STATE)
@@ -352,7 +352,7 @@ class SyncListeners:
         self._nobody = (0,) * len(devices)
         self._unheard = [0] * len(devices)
         self._takers: dict[int, tuple[int, ...]] = {}
-        self.overflow = _LONGEST_OVERFLOW
+        self.overflow = SYNC_OVERFLOW
         """The last SYNC counter before 1."""
         self.is_remembering = False
         """Whether a device remembers a SYNC that was odd or lost, and wants to be told of right ones, too."""
@@ -402,4 +402,4 @@ class SyncListeners:
             0: tuple(int(not overflow) for overflow in overflows),
             1: tuple(int(overflow != 0) for overflow in overflows),
         }
-        self.overflow = next((overflow for overflow in overflows if overflow), _LONGEST_OVERFLOW)
+        self.overflow = next((overflow for overflow in overflows if overflow), SYNC_OVERFLOW)

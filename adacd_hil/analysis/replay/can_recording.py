@@ -27,7 +27,7 @@ from adacd_hil.analysis.replay.log_source import (
     Part,
     Places,
 )
-from adacd_hil.device.arm import FEEDBACK_SHARE, SYNC_OVERFLOW
+from adacd_hil.device.arm import FEEDBACK_SHARE
 from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.formats.frame_log import read_frames
@@ -36,6 +36,7 @@ from adacd_hil.log.reader import LogStream, Piece, Series
 from adacd_hil.log.types.record_arrays import as_logged
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 
 _REALTIME: Final = (0.9, 1.1)
 """Median interval of SYNC over the period, of a bus that runs in real time; in lockstep it runs as fast as it can."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from adacd_hil.analysis.logged_run import settings_of
 from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
-from adacd_hil.device.arm import SYNC_OVERFLOW
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
@@ -23,6 +22,7 @@ from adacd_hil.records import CERTIFICATE_EVENTS, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 
 NMT_ID, RESET_COMMUNICATION = 0x000, 0x82
 """What an attempt begins with on the bus. Source: CiA 301 (4.2), clause 7.2.8.3.1."""
