@@ -19,7 +19,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.time_window import TimeWindow
@@ -27,6 +26,7 @@ from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings, renewed
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 
 Cycles = NDArray[np.int64]
 
