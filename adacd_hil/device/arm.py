@@ -92,8 +92,8 @@ class Arm:
     def _build_handlers(self) -> dict[int, tuple[_Take, int]]:
         handlers: dict[int, tuple[_Take, int]] = {}
         for joint, (drive, sensor) in enumerate(zip(self.drives, self.sensors, strict=True)):
-            handlers[drive.feedback_message.can_id] = (drive.accept_feedback, joint)
-            handlers[sensor.torque_message.can_id] = (sensor.accept_torque, JOINTS + joint)
+            handlers[drive.feedback_message.can_id] = (drive.accept_cyclic, joint)
+            handlers[sensor.torque_message.can_id] = (sensor.accept_cyclic, JOINTS + joint)
             if drive.status_message is not None:
                 handlers[drive.status_message.can_id] = (drive.accept_status, _STATUS)
             if sensor.status_message is not None:

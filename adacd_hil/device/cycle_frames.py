@@ -1,4 +1,4 @@
-"""The cyclic frames of one SYNC, held until all are in and then read in one call of the compiled codec.
+"""Devices with one frame per SYNC, and the frames of one SYNC: held until all are in, then read in one compiled call.
 
 That is possible where nothing is unusual: every device has answered every SYNC of late, and each frame is the next
 right one. Whatever else comes, the frames held so far go through the classes of each device, one by one, in the order
@@ -6,17 +6,16 @@ in which they came; the result is the same.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import Structured
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import MessageCodec
+from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.codec_columns import SIGNAL_ROW, signal_rows
 from adacd_hil.wire.cyclic_codec import CYCLIC_MESSAGE, NO_SPEED, PROFILE_NUMBERS, read_cycle
-from adacd_hil.wire.e2e import E2eReceiver
 
 NO_CYCLE = -2
 """Before any, the first of which is 0: the one before it is no cycle either."""
@@ -37,23 +36,100 @@ class CyclicFrame(NamedTuple):
     rate: float = 0.0
 
 
-class CyclicDevice(Protocol):
-    """A device that answers every SYNC with one frame."""
+class CyclicDevice:
+    """A device that answers every SYNC with one frame, and may send its status in another.
 
-    end_to_end: E2eReceiver
-    sample_cycle: int
+    is_protected: whether the cyclic frame carries an end-to-end header; else it is checked by plausibility.
+    sample_cycle: of the values in use; -1 before the first.
+    """
 
-    @property
-    def cyclic_frame(self) -> CyclicFrame:
-        """Describe its frame."""
+    def __init__(self, codec: Codec, name: str, frame: CyclicFrame, period_s: float) -> None:
+        """Raise CodecError when the contract lacks a signal."""
+        message = frame.message
+        self.name = name
+        self.node_id = codec.node_id(message.name)
+        self.cyclic_frame = frame
+        self.cyclic_length = message.length
+        """Bytes of its cyclic frame."""
+        self.is_protected = message.is_protected
+        self.end_to_end = message.receiver()
+        self.status_message = codec.messages.get(f"{name}Status")
+        self._status_receiver = None if self.status_message is None else self.status_message.receiver()
+        self.sample_cycle = -1
+        self.implausible_frames = 0
+        self._period_s = period_s
+        self._main_at = message.place(frame.main)
+        self._received: float | None = None  # main value of the last frame that came
+        self._received_cycle = 0
+
+    def accept_cyclic(self, data: bytes, cycle: int) -> bool:
+        """Take one cyclic frame of `cycle`; False when a check fails and it changes nothing."""
+        if len(data) != self.cyclic_length:
+            self.implausible_frames += 1
+            return False
+        if self.is_protected:
+            if not self.end_to_end.check(data).is_valid:
+                return False
+            values = self.cyclic_frame.message.decode_values(data)
+        else:
+            values = self.cyclic_frame.message.decode_values(data)
+            last, self._received = self._received, values[self._main_at]
+            cycles, self._received_cycle = cycle - self._received_cycle, cycle
+            if last is not None and not self._is_plausible(values, last, cycles):
+                self.implausible_frames += 1
+                return False
+        self._use(data, values, cycle)
+        return True
+
+    def follow(self, data: bytes, values: Sequence[float], cycle: int) -> None:
+        """Take the values of the cyclic frame that follows the last one and was checked elsewhere."""
+        if self.is_protected:
+            self.end_to_end.follow()
+        else:
+            self._received, self._received_cycle = values[self._main_at], cycle
+        self._use(data, values, cycle)
+
+    def accept_status(self, data: bytes, cycle: int) -> bool:
+        """Take one status frame of `cycle`; False when its length or check is wrong and it changes nothing."""
+        message, receiver = self.status_message, self._status_receiver
+        if message is None or receiver is None or len(data) != message.length:
+            return False
+        is_valid = receiver.check(data).is_valid
+        if is_valid:
+            self._use_status(message.decode_values(data), cycle)
+        return is_valid
 
     @property
     def values(self) -> tuple[float, ...]:
-        """What is in use of it, the main value first."""
+        """What is in use, the main value first."""
+        raise NotImplementedError
+
+    def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
+        """Say whether a frame may come so many cycles after one with the main value `last`."""
+        raise NotImplementedError
+
+    def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:
+        raise NotImplementedError
+
+    def _use_status(self, values: Sequence[float], cycle: int) -> None:
+        raise NotImplementedError
 
     @property
     def is_steady(self) -> bool:
-        """Whether the last frame that came is in use, and the next is to follow it without loss."""
+        """Whether the last cyclic frame that came is in use, and the next is to follow it without loss."""
+        if self.is_protected:
+            return self.end_to_end.counter is not None
+        return self._received == self.values[0] and self._received_cycle == self.sample_cycle
+
+    def skip(self, count: int) -> None:
+        """Take so many cyclic frames for right that were taken elsewhere; the next one is compared with none."""
+        if self.is_protected:
+            self.end_to_end.skip(count)
+        self._received = None
+
+    def miss(self) -> None:
+        """Note a cycle in which no cyclic frame came."""
+        self.end_to_end.miss()
 
 
 def lay_out_frames(frames: Sequence[CyclicFrame], is_brief: bool = False) -> tuple[Structured, Structured]:

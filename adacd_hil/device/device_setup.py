@@ -132,7 +132,7 @@ def _check_resolution(slave: Slave, codec: Codec) -> None:
     increments, motor_revs = slave.read(0x608F, 1), slave.read(0x608F, 2)
     gear_in, gear_out = slave.read(0x6091, 1), slave.read(0x6091, 2)
     feedback = codec.message(f"{slave.name}Feedback")
-    position = next(signal for signal in feedback.values if signal.name == "position")
+    position = feedback.values[feedback.place("position")]
     expected = round(2.0 * math.pi / position.scale)
     if motor_revs * gear_out == 0 or increments * gear_in != expected * motor_revs * gear_out:
         slave.fail(
@@ -160,7 +160,7 @@ def set_up_sensor(slave: Slave, codec: Codec) -> str:
     Raises DeviceError.
     """
     torque = codec.message(f"{slave.name}Torque")
-    scale = next(signal.scale for signal in torque.values if signal.name == "torque")
+    scale = torque.values[torque.place("torque")].scale
     channel = _channel(slave)
     prefix = 0
     if slave.has(0x6131, channel):

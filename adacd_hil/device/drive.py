@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
-from adacd_hil.device.cycle_frames import CyclicFrame
+from adacd_hil.device.cycle_frames import CyclicDevice, CyclicFrame
 from adacd_hil.device.profile import ProfileSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
@@ -188,7 +188,7 @@ def decode_statusword(statusword: int) -> Cia402State:
     return Cia402State.NOT_READY_TO_SWITCH_ON
 
 
-class Drive:
+class Drive(CyclicDevice):
     """One drive of the arm, joint 1 or 2. Its status may be in a frame of its own or in the feedback."""
 
     def __init__(
@@ -205,26 +205,17 @@ class Drive:
         Raises CodecError when the contract lacks a message or signal.
         """
         name = f"Drive{joint}"
-        self.name = name
-        self.node_id = codec.node_id(f"{name}Feedback")
         self.feedback_message = codec.message(f"{name}Feedback")
-        self.status_message = codec.messages.get(f"{name}Status")
+        frame = CyclicFrame(self.feedback_message, "position", "velocity", jump=position_jump_rad)
+        super().__init__(codec, name, frame, period_s)
         self.command_message = codec.message(f"{name}Command")
         self.command_id = self.command_message.can_id
-        self.end_to_end = self.feedback_message.receiver()
         self._sender = self.command_message.sender()
-        self._period_s = period_s
         self._quick_stop_option = quick_stop_option
-        self.position_jump_rad = position_jump_rad
-        self._position_at = find_signal(self.feedback_message, "position")
-        self._velocity_at = find_signal(self.feedback_message, "velocity")
+        self._position_jump_rad = position_jump_rad
+        self._velocity_at = self.feedback_message.place("velocity")
         self._feedback_status = _status_places(self.feedback_message)
         self._status_places = _NO_STATUS if self.status_message is None else _status_places(self.status_message)
-        self._status_receiver = None if self.status_message is None else self.status_message.receiver()
-        self.cyclic_length = self.feedback_message.length
-        """Bytes of its cyclic frame."""
-        self.is_protected = self.feedback_message.header_bytes > 0
-        """Whether the feedback carries an end-to-end header; else it is checked by plausibility."""
         self._command, self._controlword_at, self._torque_at = _command_template(
             self.command_message, max_torque_permille
         )
@@ -232,18 +223,13 @@ class Drive:
         """Whether the status comes in a frame of its own."""
         if max(self._feedback_status.statusword, self._status_places.statusword) < 0:
             raise CodecError(f"{name}: no message carries signal statusword")
-        self._received_position_rad: float | None = None
-        self._received_cycle = 0
         self._last_controlword = int(Controlword.DISABLE_VOLTAGE)
         self.recent_permille: deque[int] = deque([0], maxlen=_RECENT_COMMANDS)
         """Commanded torque of the last cycles, per mille of rated torque."""
         self.position_rad = 0.0
         self.velocity_rad_s = 0.0
-        self.sample_cycle = -1
-        """Cycle of the position and velocity in use; -1 before the first."""
         self.status_cycle = -1
         """Cycle in which the status in use came; -1 before the first."""
-        self.implausible_frames = 0
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         # Where no frame shows the mode, the master has compared 0x6061 before the start.
@@ -257,42 +243,19 @@ class Drive:
         self.error_register = 0
         self.acted_commands = 0
 
-    def accept_feedback(self, data: bytes, cycle: int) -> bool:
-        """Take one feedback frame of `cycle`; False when a check fails and it changes nothing."""
-        if len(data) != self.feedback_message.length:
-            self.implausible_frames += 1
-            return False
-        if self.is_protected and not self.end_to_end.check(data).is_valid:
-            return False
-        values = self.feedback_message.decode_values(data)
-        if not (self.is_protected or self._is_plausible(values[self._position_at], values[self._velocity_at], cycle)):
-            return False
-        self._use(values, cycle)
-        return True
+    def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
+        travel = values[self._velocity_at] * (cycles * self._period_s)
+        return abs(values[self._main_at] - last - travel) <= self._position_jump_rad
 
-    def follow(self, _data: bytes, values: Sequence[float], cycle: int) -> None:
-        """Take the values of the feedback that follows the last one and was checked elsewhere."""
-        if self.is_protected:
-            self.end_to_end.follow()
-        else:
-            self._received_position_rad, self._received_cycle = values[self._position_at], cycle
-        self._use(values, cycle)
-
-    def _use(self, values: Sequence[float], cycle: int) -> None:
-        self.position_rad = values[self._position_at]
+    def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:  # noqa: ARG002 (as of all devices)
+        self.position_rad = values[self._main_at]
         self.velocity_rad_s = values[self._velocity_at]
         self.sample_cycle = cycle
         if not self.has_status_frame:
             self._take_status(values, self._feedback_status, cycle)
 
-    def _is_plausible(self, position: float, velocity: float, cycle: int) -> bool:
-        last, self._received_position_rad = self._received_position_rad, position
-        elapsed_s = (cycle - self._received_cycle) * self._period_s
-        self._received_cycle = cycle
-        if last is not None and not abs(position - last - velocity * elapsed_s) <= self.position_jump_rad:
-            self.implausible_frames += 1
-            return False
-        return True
+    def _use_status(self, values: Sequence[float], cycle: int) -> None:
+        self._take_status(values, self._status_places, cycle)
 
     @property
     def shows_torque(self) -> bool:
@@ -311,43 +274,11 @@ class Drive:
 
     def position_error(self, data: bytes, periods: int) -> float:
         """Say by how much a frame's position is off, rad, if so many periods lie between it and the last that came."""
-        if self._received_position_rad is None or len(data) != self.feedback_message.length:
+        if self._received is None or len(data) != self.feedback_message.length:
             return 0.0
         values = self.feedback_message.decode_values(data)
         travel = values[self._velocity_at] * periods * self._period_s
-        return abs(values[self._position_at] - self._received_position_rad - travel)
-
-    @property
-    def cyclic_frame(self) -> CyclicFrame:
-        """Describe the feedback."""
-        return CyclicFrame(self.feedback_message, "position", "velocity", jump=self.position_jump_rad)
-
-    @property
-    def is_steady(self) -> bool:
-        """Whether the last feedback that came is in use, and the next is to follow it without loss."""
-        if self.is_protected:
-            return self.end_to_end.counter is not None
-        return self._received_position_rad == self.position_rad and self._received_cycle == self.sample_cycle
-
-    def skip(self, count: int) -> None:
-        """Take so many feedback frames for right that were taken elsewhere; the next one is compared with none."""
-        if self.is_protected:
-            self.end_to_end.skip(count)
-        self._received_position_rad = None
-
-    def miss(self) -> None:
-        """Note a cycle in which no feedback came."""
-        self.end_to_end.miss()
-
-    def accept_status(self, data: bytes, cycle: int) -> bool:
-        """Take one status frame of `cycle`; False when its length or check is wrong and it changes nothing."""
-        message, receiver = self.status_message, self._status_receiver
-        if message is None or receiver is None or len(data) != message.length:
-            return False
-        is_valid = receiver.check(data).is_valid
-        if is_valid:
-            self._take_status(message.decode_values(data), self._status_places, cycle)
-        return is_valid
+        return abs(values[self._main_at] - self._received - travel)
 
     def _take_status(self, values: Sequence[float], at: _StatusPlaces, cycle: int) -> None:
         self.status_cycle = cycle
@@ -414,14 +345,6 @@ class Drive:
         return not is_halted
 
 
-def find_signal(message: MessageCodec, name: str) -> int:
-    """Return the place of a signal among a message's values. Raises CodecError when it isn't there."""
-    for place, signal in enumerate(message.values):
-        if signal.name == name:
-            return place
-    raise CodecError(f"{message.name} has no signal {name}")
-
-
 def _status_places(message: MessageCodec) -> _StatusPlaces:
     places = {signal.name: place for place, signal in enumerate(message.values)}
     return _StatusPlaces(**{name: places[name] for name in _StatusPlaces._fields if name in places})
@@ -435,4 +358,4 @@ def _command_template(message: MessageCodec, max_torque_permille: int) -> tuple[
         if signal.name not in constants:
             raise CodecError(f"{message.name}: signal {signal.name} is none that the host can fill")
         template.append(constants[signal.name])
-    return template, find_signal(message, "controlword"), find_signal(message, "target_torque")
+    return template, message.place("controlword"), message.place("target_torque")

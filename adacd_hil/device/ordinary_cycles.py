@@ -215,7 +215,7 @@ class OrdinaryCycles:
 
     def _watch_status(self, number: int, found: MessageCodec, sensor: TorqueSensor) -> None:
         """Watch the bits of a sensor's status."""
-        signal = next(signal for signal in found.values if signal.name == "status")
+        signal = found.values[found.place("status")]
         if signal.scale != 1.0 or signal.offset != 0.0:
             raise NotOrdinaryError(f"{found.name}.status is scaled")
         self._watch(number, self._place_of(found, signal)[0], STATUS_BITS, lambda: sensor.status)

@@ -28,7 +28,7 @@ HOLD_S = 1.0
 """How long after such a frame the arm counts as somebody else's, too: ten heartbeats of a host."""
 CONTRADICTIONS = 2
 """Second frames of a device that are no accident."""
-WINDOW_S = 0.1
+CONTRADICTION_WINDOW_S = 0.1
 """In which they are counted."""
 _NMT_WORDS = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset node", 130: "reset communication"}
 _READING = (2, 3, 5)
@@ -89,7 +89,7 @@ class Strangers(RateLimitedEvents):
         self._nodes = {0, *(device.node_id for device in place_devices(settings))}
         self.can_ids = frozenset(self._doing)
         self._hold_cycles = round(HOLD_S / settings.bus.period_s)
-        self._window_cycles = max(1, round(WINDOW_S / settings.bus.period_s))
+        self._window_cycles = max(1, round(CONTRADICTION_WINDOW_S / settings.bus.period_s))
         self._until_cycle = -2  # before any, the first of which is -1: none begun
         self._complaints: dict[str, int] = {}
         self._contradictions: dict[str, deque[int]] = {}

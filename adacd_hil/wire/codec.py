@@ -87,6 +87,13 @@ class MessageCodec(MessageTable):
         """Whether the frames are CAN FD: those of up to 8 bytes are classic on every bus."""
         return self.length > CLASSIC_BYTES
 
+    def place(self, name: str) -> int:
+        """Return the place of a signal among `values`. Raises CodecError when it isn't there."""
+        for place, signal in enumerate(self.values):
+            if signal.name == name:
+                return place
+        raise CodecError(f"{self.name} has no signal {name}")
+
     def sender(self) -> E2eSender:
         """Make the end-to-end sender of this message; without protection it changes nothing."""
         if self.protection is Protection.PROFILE_2:

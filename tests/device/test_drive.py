@@ -118,35 +118,35 @@ def test_a_faulted_drive_gets_rising_edges_of_fault_reset() -> None:
 
 def test_plausible_feedback_is_taken_with_its_cycle() -> None:
     arm = drive()
-    arm.accept_feedback(feedback_frame(0.5, 1.0), 7)
+    arm.accept_cyclic(feedback_frame(0.5, 1.0), 7)
     assert (round(arm.position_rad, 5), arm.velocity_rad_s, arm.sample_cycle) == (0.5, 1.0, 7)
 
 
 def test_a_jump_of_position_changes_nothing() -> None:
     arm = drive()
-    arm.accept_feedback(feedback_frame(0.5, 1.0), 0)
-    arm.accept_feedback(feedback_frame(0.5 + 2 * IMPLAUSIBLE_JUMP_RAD, 1.0), 1)
+    arm.accept_cyclic(feedback_frame(0.5, 1.0), 0)
+    arm.accept_cyclic(feedback_frame(0.5 + 2 * IMPLAUSIBLE_JUMP_RAD, 1.0), 1)
     assert (round(arm.position_rad, 5), arm.sample_cycle, arm.implausible_frames) == (0.5, 0, 1)
 
 
 def test_fast_motion_is_no_jump() -> None:
     arm = drive()
-    arm.accept_feedback(feedback_frame(0.0, 30.0), 0)
-    assert arm.accept_feedback(feedback_frame(0.03, 30.0), 1)
+    arm.accept_cyclic(feedback_frame(0.0, 30.0), 0)
+    assert arm.accept_cyclic(feedback_frame(0.03, 30.0), 1)
 
 
 def test_a_gap_of_cycles_is_no_jump() -> None:
     arm = drive()
-    arm.accept_feedback(feedback_frame(0.0, 5.0), 0)
-    assert arm.accept_feedback(feedback_frame(0.05, 5.0), 10)
+    arm.accept_cyclic(feedback_frame(0.0, 5.0), 0)
+    assert arm.accept_cyclic(feedback_frame(0.05, 5.0), 10)
 
 
 @pytest.mark.parametrize("length", [0, 7])
 def test_a_frame_of_the_wrong_length_changes_nothing(length: int) -> None:
     arm = drive()
-    arm.accept_feedback(feedback_frame(0.5, 1.0), 0)
+    arm.accept_cyclic(feedback_frame(0.5, 1.0), 0)
     arm.accept_status(bytes(length - 1) if length else b"", 0)
-    assert arm.accept_feedback(bytes(length), 1) is False
+    assert arm.accept_cyclic(bytes(length), 1) is False
 
 
 # IEC 61800-7-201, table of transitions: what each command does in each state; nothing where it isn't listed.
@@ -282,7 +282,7 @@ def test_quick_stop_is_left_as_its_option_code_demands(
     option: int | None, statusword: int, velocity: float, controlword: int
 ) -> None:
     arm = Drive(CODEC, 1, PERIOD_S, option)
-    arm.accept_feedback(feedback_frame(0.0, velocity), 0)
+    arm.accept_cyclic(feedback_frame(0.0, velocity), 0)
     arm.accept_status(status_frame(statusword), 0)
     assert command_of(arm.command(500, enable=True, quick_stop=False)) == (controlword, 0)
 
@@ -340,7 +340,7 @@ def test_the_status_may_travel_in_the_feedback(tmp_path: Path) -> None:
     codec = wide_contract(tmp_path, STATUS + MODE)
     arm = Drive(codec, 1, PERIOD_S)
     frame = bytes(codec.message("Drive1Feedback").encode(0.5, 1.0, 0x0237, 10, 0x81))
-    assert arm.accept_feedback(frame, 7)
+    assert arm.accept_cyclic(frame, 7)
     assert (arm.state, arm.mode, arm.error_register, arm.status_cycle) == (Cia402State.OPERATION_ENABLED, 10, 0x81, 7)
     assert (arm.has_status_frame, arm.status_message, arm.is_enabled) == (False, None, True)
 
@@ -349,8 +349,8 @@ def test_an_implausible_frame_changes_no_status_either(tmp_path: Path) -> None:
     codec = wide_contract(tmp_path, STATUS + MODE)
     arm = Drive(codec, 1, PERIOD_S)
     feedback = codec.message("Drive1Feedback")
-    arm.accept_feedback(bytes(feedback.encode(0.5, 0.0, 0x0237, 10, 0)), 0)
-    assert not arm.accept_feedback(bytes(feedback.encode(1.5, 0.0, 0x0218, 10, 0)), 1)
+    arm.accept_cyclic(bytes(feedback.encode(0.5, 0.0, 0x0237, 10, 0)), 0)
+    assert not arm.accept_cyclic(bytes(feedback.encode(1.5, 0.0, 0x0218, 10, 0)), 1)
     assert arm.state is Cia402State.OPERATION_ENABLED
 
 
@@ -358,7 +358,7 @@ def test_without_a_mode_in_any_frame_the_masters_check_stands(tmp_path: Path) ->
     codec = wide_contract(tmp_path, STATUS + ERROR)
     arm = Drive(codec, 1, PERIOD_S)
     assert not arm.is_enabled
-    arm.accept_feedback(bytes(codec.message("Drive1Feedback").encode(0.0, 0.0, 0x0237, 0)), 0)
+    arm.accept_cyclic(bytes(codec.message("Drive1Feedback").encode(0.0, 0.0, 0x0237, 0)), 0)
     assert arm.is_enabled
 
 
@@ -366,7 +366,7 @@ def test_the_command_carries_limit_and_offset_where_the_contract_has_them(tmp_pa
     extra = '{ object = "0x60B2", signal = "torque_offset" }, { object = "0x6072", signal = "max_torque" },'
     codec = wide_contract(tmp_path, STATUS + ERROR, extra)
     arm = Drive(codec, 1, PERIOD_S, max_torque_permille=750)
-    arm.accept_feedback(bytes(codec.message("Drive1Feedback").encode(0.0, 0.0, 0x0237, 0)), 0)
+    arm.accept_cyclic(bytes(codec.message("Drive1Feedback").encode(0.0, 0.0, 0x0237, 0)), 0)
     frame = arm.command(-300, enable=True, quick_stop=False)
     assert codec.message("Drive1Command").decode_values(frame) == (0x0F, -300, 0, 750)
 

@@ -11,7 +11,6 @@ from adacd_hil.device.drive import (
     Controlword,
     Drive,
     Goal,
-    find_signal,
     torque_limit_permille,
 )
 from adacd_hil.settings.configuration import load_settings
@@ -43,7 +42,7 @@ class Sender:
 
 def test_protected_feedback_brings_motion_and_status() -> None:
     seen = drive()
-    assert seen.accept_feedback(Sender().frame(), 7) is True
+    assert seen.accept_cyclic(Sender().frame(), 7) is True
     assert (seen.position_rad, seen.velocity_rad_s) == pytest.approx((0.25, -0.5), abs=1e-5)
     assert (seen.sample_cycle, seen.status_cycle) == (7, 7)
     assert (seen.state, seen.mode, seen.statusword) == (Cia402State.OPERATION_ENABLED, 10, OPERATION_ENABLED)
@@ -56,7 +55,7 @@ def test_a_frame_that_fails_its_check_changes_nothing() -> None:
     seen = drive()
     frame = bytearray(Sender().frame())
     frame[5] ^= 0x40
-    assert seen.accept_feedback(bytes(frame), 7) is False
+    assert seen.accept_cyclic(bytes(frame), 7) is False
     assert (seen.position_rad, seen.sample_cycle, seen.status_cycle, seen.statusword) == (0.0, -1, -1, 0)
     assert dict(seen.end_to_end.tally())[E2eStatus.WRONG_CRC] == 1
     assert seen.implausible_frames == 0
@@ -64,13 +63,13 @@ def test_a_frame_that_fails_its_check_changes_nothing() -> None:
 
 def test_protected_feedback_needs_no_plausibility() -> None:
     seen, sender = drive(), Sender()
-    seen.accept_feedback(sender.frame(), 0)
-    assert seen.accept_feedback(sender.frame(0.25 + 10 * IMPLAUSIBLE_JUMP_RAD, 0.0, *VALUES[2:]), 1) is True
+    seen.accept_cyclic(sender.frame(), 0)
+    assert seen.accept_cyclic(sender.frame(0.25 + 10 * IMPLAUSIBLE_JUMP_RAD, 0.0, *VALUES[2:]), 1) is True
 
 
 def test_a_cycle_without_feedback_is_counted() -> None:
     seen = drive()
-    seen.accept_feedback(Sender().frame(), 0)
+    seen.accept_cyclic(Sender().frame(), 0)
     seen.miss()
     assert dict(seen.end_to_end.tally())[E2eStatus.NO_NEW_DATA] == 1
 
@@ -78,8 +77,8 @@ def test_a_cycle_without_feedback_is_counted() -> None:
 def test_an_implausible_frame_is_refused_by_a_plain_no() -> None:
     seen = drive(CLASSIC)
     message = CLASSIC.message("Drive1Feedback")
-    seen.accept_feedback(bytes(message.encode(0.0, 0.0)), 0)
-    assert seen.accept_feedback(bytes(message.encode(1.0, 0.0)), 1) is False
+    seen.accept_cyclic(bytes(message.encode(0.0, 0.0)), 0)
+    assert seen.accept_cyclic(bytes(message.encode(1.0, 0.0)), 1) is False
 
 
 @pytest.mark.parametrize("codec", [FD, CLASSIC], ids=["fd", "classic"])
@@ -103,14 +102,14 @@ def test_a_command_carries_limit_and_no_offset_and_is_zero_until_it_is_more() ->
 
 def test_leading_up_without_a_torque_leaves_zero() -> None:
     seen = drive()
-    seen.accept_feedback(Sender().frame(), 0)
+    seen.accept_cyclic(Sender().frame(), 0)
     assert command_of(seen.lead(Goal.OPERATION_ENABLED)) == (Controlword.ENABLE_OPERATION, 0, 0, 1000)
     assert command_of(seen.lead(Goal.OPERATION_ENABLED, 55))[1] == 55
 
 
 def test_the_first_fault_reset_is_a_rising_edge() -> None:
     seen, sender = drive(), Sender()
-    seen.accept_feedback(sender.frame(0.0, 0.0, 0x0218, *VALUES[3:]), 0)
+    seen.accept_cyclic(sender.frame(0.0, 0.0, 0x0218, *VALUES[3:]), 0)
     words = [command_of(seen.lead(Goal.OPERATION_ENABLED))[0] for _ in range(3)]
     assert words == [Controlword.FAULT_RESET, Controlword.DISABLE_VOLTAGE, Controlword.FAULT_RESET]
 
@@ -133,7 +132,7 @@ def test_a_contract_without_a_statusword_is_refused() -> None:
 
 def test_a_signal_that_is_missing_is_named() -> None:
     with pytest.raises(CodecError, match="Drive1Feedback has no signal torque"):
-        find_signal(FEEDBACK, "torque")
+        FEEDBACK.place("torque")
 
 
 def test_the_torque_limit_fits_its_object() -> None:

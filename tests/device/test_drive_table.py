@@ -114,10 +114,10 @@ def test_a_status_frame_of_the_wrong_length_says_nothing(length: int) -> None:
 @pytest.mark.parametrize("length", [0, 7, 9])
 def test_feedback_of_the_wrong_length_is_counted_and_leaves_the_next_frame_as_good_as_it_was(length: int) -> None:
     drive = Drive(CODEC, 1, PERIOD_S)
-    assert drive.accept_feedback(feedback(0.5, 0.0), 0) is True
-    assert drive.accept_feedback((feedback(0.5, 0.0) + b"\x00")[:length], 1) is False
+    assert drive.accept_cyclic(feedback(0.5, 0.0), 0) is True
+    assert drive.accept_cyclic((feedback(0.5, 0.0) + b"\x00")[:length], 1) is False
     assert drive.implausible_frames == 1
-    assert drive.accept_feedback(feedback(0.5, 0.0), 2) is True
+    assert drive.accept_cyclic(feedback(0.5, 0.0), 2) is True
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -133,8 +133,8 @@ def test_a_step_is_plausible_up_to_its_bound_off_what_the_velocity_says(
         (IMPLAUSIBLE_JUMP_RAD + 2 * lsb_rad, False),
     ):
         drive = Drive(CODEC, 1, PERIOD_S)
-        drive.accept_feedback(feedback(start_rad, velocity_rad_s), 5)
-        taken = drive.accept_feedback(feedback(expected_rad + sign * off_rad, velocity_rad_s), 5 + periods)
+        drive.accept_cyclic(feedback(start_rad, velocity_rad_s), 5)
+        taken = drive.accept_cyclic(feedback(expected_rad + sign * off_rad, velocity_rad_s), 5 + periods)
         assert taken is is_plausible
         assert (drive.sample_cycle, drive.implausible_frames) == ((5 + periods, 0) if is_plausible else (5, 1))
 
@@ -142,7 +142,7 @@ def test_a_step_is_plausible_up_to_its_bound_off_what_the_velocity_says(
 def test_every_implausible_frame_is_counted() -> None:
     drive = Drive(CODEC, 1, PERIOD_S)
     for cycle, position_rad in enumerate((0.0, 1.0, 2.0, 3.0)):
-        drive.accept_feedback(feedback(position_rad, 0.0), cycle)
+        drive.accept_cyclic(feedback(position_rad, 0.0), cycle)
     assert drive.implausible_frames == 3
 
 

@@ -35,34 +35,34 @@ def int32(torque: float) -> bytes:
 
 def test_a_valid_frame_is_taken_with_its_cycle() -> None:
     rig = Protected()
-    assert rig.sensor.accept_torque(rig.frame(1.5), 7)
+    assert rig.sensor.accept_cyclic(rig.frame(1.5), 7)
     assert (rig.sensor.torque_Nm, rig.sensor.sample_cycle, rig.sensor.status) == (1.5, 7, 0)
 
 
 def test_the_status_in_the_header_counts_in_the_very_frame() -> None:
     rig = Protected()
-    rig.sensor.accept_torque(rig.frame(20.0, status=3), 0)
+    rig.sensor.accept_cyclic(rig.frame(20.0, status=3), 0)
     assert rig.sensor.status == OVERLOADED
 
 
 def test_a_saturated_sensor_is_fresh_and_overloaded() -> None:
     rig = Protected()
     for cycle in range(20):
-        rig.sensor.accept_torque(rig.frame(20.0, status=3), cycle)
+        rig.sensor.accept_cyclic(rig.frame(20.0, status=3), cycle)
     assert (rig.sensor.sample_cycle, rig.sensor.is_overloaded, rig.sensor.torque_Nm) == (19, True, 20.0)
 
 
 def test_a_sensor_that_repeats_its_frame_ages() -> None:
     rig = Protected()
     frame = rig.frame(1.5)
-    taken = [rig.sensor.accept_torque(frame, cycle) for cycle in range(5)]
+    taken = [rig.sensor.accept_cyclic(frame, cycle) for cycle in range(5)]
     assert taken == [True, False, False, False, False]
     assert (rig.sensor.sample_cycle, rig.sensor.is_overloaded) == (0, False)
 
 
 def test_a_silent_sensor_is_counted_as_no_new_data() -> None:
     rig = Protected()
-    rig.sensor.accept_torque(rig.frame(1.5), 0)
+    rig.sensor.accept_cyclic(rig.frame(1.5), 0)
     rig.sensor.miss()
     rig.sensor.miss()
     assert rig.sensor.end_to_end.counts[E2eStatus.NO_NEW_DATA] == 2
@@ -71,34 +71,34 @@ def test_a_silent_sensor_is_counted_as_no_new_data() -> None:
 
 def test_a_jump_of_unprotected_torque_changes_nothing() -> None:
     sensor = unprotected()
-    sensor.accept_torque(int32(1.0), 0)
-    assert not sensor.accept_torque(int32(1.0 + 2**21 * 1e-5), 1)  # a flipped bit
+    sensor.accept_cyclic(int32(1.0), 0)
+    assert not sensor.accept_cyclic(int32(1.0 + 2**21 * 1e-5), 1)  # a flipped bit
     assert (sensor.torque_Nm, sensor.sample_cycle, sensor.implausible_frames) == (1.0, 0, 1)
 
 
 def test_a_true_step_of_unprotected_torque_is_taken_with_the_second_frame() -> None:
     sensor = unprotected()
-    sensor.accept_torque(int32(0.0), 0)
-    assert [sensor.accept_torque(int32(25.0), cycle) for cycle in (1, 2)] == [False, True]
+    sensor.accept_cyclic(int32(0.0), 0)
+    assert [sensor.accept_cyclic(int32(25.0), cycle) for cycle in (1, 2)] == [False, True]
 
 
 def test_a_gap_of_cycles_widens_the_bound() -> None:
     sensor = unprotected()
-    sensor.accept_torque(int32(0.0), 0)
-    assert sensor.accept_torque(int32(25.0), 2)
+    sensor.accept_cyclic(int32(0.0), 0)
+    assert sensor.accept_cyclic(int32(25.0), 2)
 
 
 def test_a_late_frame_and_the_next_may_share_a_cycle() -> None:
     sensor = unprotected()
-    sensor.accept_torque(int32(0.0), 5)
-    assert sensor.accept_torque(int32(0.5), 5)
+    sensor.accept_cyclic(int32(0.0), 5)
+    assert sensor.accept_cyclic(int32(0.5), 5)
 
 
 def test_the_end_of_its_range_is_the_overload_of_a_sensor_without_status() -> None:
     sensor = unprotected(range_Nm=20.0)
     states = []
     for cycle, torque in enumerate((19.9, 20.0, 19.9, 10.0, 0.0, -10.0, -20.0)):
-        sensor.accept_torque(int32(torque), cycle)
+        sensor.accept_cyclic(int32(torque), cycle)
         states.append(sensor.status)
     negative = SensorStatus.NEGATIVE_OVERLOAD | SensorStatus.NOT_VALID
     assert states == [0, OVERLOADED, 0, 0, 0, 0, negative]
@@ -106,6 +106,6 @@ def test_the_end_of_its_range_is_the_overload_of_a_sensor_without_status() -> No
 
 def test_a_frame_of_the_wrong_length_changes_nothing() -> None:
     sensor = unprotected()
-    assert not sensor.accept_torque(bytes(3), 0)
+    assert not sensor.accept_cyclic(bytes(3), 0)
     sensor.accept_status(bytes(2), 0)  # this sensor has no status frame
     assert (sensor.sample_cycle, sensor.implausible_frames, sensor.status) == (-1, 1, 0)
