@@ -10,12 +10,13 @@ These are the defaults. What a scenario changes of them is in `torque_transducer
 
 import math
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
+from adacd_hil.records import Vector
 
 ENCODER_COUNTS: Final = 1 << 20
 """Per revolution, 0x608F."""
@@ -107,3 +108,26 @@ class TorqueNoise:
         sample: NDArray[np.float64] = self._block[self._next]
         self._next += 1
         return sample
+
+
+class Measurement(NamedTuple):
+    """What the devices measure at one SYNC, as raw counts of the two joints; the properties give SI units."""
+
+    position_counts: tuple[int, int]
+    velocity_counts: tuple[int, int]
+    torque_counts: tuple[int, int]
+
+    @property
+    def q(self) -> Vector:
+        """Measured joint position, rad (2,)."""
+        return np.array(self.position_counts) * POSITION_LSB_RAD
+
+    @property
+    def dq(self) -> Vector:
+        """Measured joint velocity, rad/s (2,)."""
+        return np.array(self.velocity_counts) * VELOCITY_LSB_RAD_S
+
+    @property
+    def tau_J(self) -> Vector:
+        """Measured joint torque, Nm (2,)."""
+        return np.array(self.torque_counts) * TORQUE_LSB_NM

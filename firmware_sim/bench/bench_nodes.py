@@ -7,8 +7,8 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.time_marks import answers_to_sync
 from firmware_sim.arm.scripted_contact import TICK_S
+from firmware_sim.arm.sensing import Measurement
 from firmware_sim.bench.injector import Handler, Injector
-from firmware_sim.body.body import Measurement
 from firmware_sim.body.sensors import converter_ends
 from firmware_sim.canopen.contracts import EmulatedContract, longest_pdo
 from firmware_sim.canopen.object_dictionary import Abort, refuse

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import NEVER_NS, MarkKind
+from firmware_sim.arm.sensing import Measurement
 from firmware_sim.bench.fault_plan import ActionKind, FaultPlan, NodeAction
 from firmware_sim.bench.fault_rows import EVERYBODY
 from firmware_sim.bench.outbox import Outbox
-from firmware_sim.body.body import Measurement
 from firmware_sim.canopen.object_dictionary import Send
 from firmware_sim.nodes.device import EmulatedDevice
 from firmware_sim.nodes.drive_node import DriveNode

@@ -18,7 +18,7 @@ from firmware_sim.arm.joint_forces import REFERENCE_C
 from firmware_sim.arm.mechanics import work_space
 from firmware_sim.arm.plant import fit_payload, mirror_stiff_joints
 from firmware_sim.arm.scripted_contact import TICK_S, contact_table, ticks
-from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, TorqueNoise
+from firmware_sim.arm.sensing import Measurement, TorqueNoise
 from firmware_sim.arm.touch_forces import TOUCH_TRUTH
 from firmware_sim.body.body_ticks import (
     BODY_NUMBERS,
@@ -54,29 +54,6 @@ def payload_table(payloads: tuple[PayloadSettings, ...]) -> Structured:
     """Pack payload changes (n,), rows of PAYLOAD_CHANGE."""
     rows = [(change.tick, change.mass_kg, *change.center_m, change.inertia_kg_m2) for change in payloads]
     return np.array(rows, dtype=PAYLOAD_CHANGE)
-
-
-class Measurement(NamedTuple):
-    """What the devices measure at one SYNC, as raw counts of the two joints; the properties give SI units."""
-
-    position_counts: tuple[int, int]
-    velocity_counts: tuple[int, int]
-    torque_counts: tuple[int, int]
-
-    @property
-    def q(self) -> Vector:
-        """Measured joint position, rad (2,)."""
-        return np.array(self.position_counts) * POSITION_LSB_RAD
-
-    @property
-    def dq(self) -> Vector:
-        """Measured joint velocity, rad/s (2,)."""
-        return np.array(self.velocity_counts) * VELOCITY_LSB_RAD_S
-
-    @property
-    def tau_J(self) -> Vector:
-        """Measured joint torque, Nm (2,)."""
-        return np.array(self.torque_counts) * TORQUE_LSB_NM
 
 
 class BodyParts(NamedTuple):
