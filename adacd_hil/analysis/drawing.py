@@ -175,6 +175,12 @@ def _decade_text(value: float) -> str:
     return f"{value:g}" if power < 3 else "10" + str(power).translate(_SUPERSCRIPTS)
 
 
+def mark_lane(axes: Axes, times: Sequence[float] | Vector, height: float, **marker: Any) -> None:
+    """Mark times on a lane of the axes, at a part of their height; marker: of `Axes.plot`."""
+    where = np.full(len(times), height)
+    axes.plot(times, where, transform=axes.get_xaxis_transform(), linestyle="none", **marker)
+
+
 def note(axes: Axes, text: str, colour: str = COLOURS["muted"]) -> None:
     """Write above the right end of a panel."""
     axes.annotate(

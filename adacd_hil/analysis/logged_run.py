@@ -11,7 +11,7 @@ begins with the first cycle's number less all whole rounds of the counter. The h
 STOPPED belong to the section that they interrupt. The paper's experiment gives A to E.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -123,6 +123,25 @@ def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> C
 
 _BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
 _NEVER: Final = 1 << 62
+
+PROGRESS_CYCLES: Final = 1_000_000
+"""Between two lines of progress."""
+Progress = Callable[[str], None]
+"""Is told a line now and then."""
+
+
+class Milestones:
+    """Calls `tell` with a count whenever `step` more have been reached, or `PROGRESS_CYCLES`."""
+
+    def __init__(self, tell: Callable[[int], None], step: int = 0) -> None:
+        self._tell, self._step, self._told = tell, step or PROGRESS_CYCLES, 0
+
+    def reach(self, count: int) -> None:
+        """Take note of the count so far."""
+        if count - self._told >= self._step:
+            self._told = count
+            self._tell(count)
+
 
 EmulatorSpan = tuple[tuple[int, int], tuple[int, int]]
 """Attempt and cycle, as the emulator counts, of the first and the last one that it recorded."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from log.recorded_run import make_run, record
 
-from adacd_hil.analysis.replay import log_comparison
+from adacd_hil.analysis import logged_run
 from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.log_comparison import MATCH_S, ComparedContact, compare_logs, match_contacts
 from adacd_hil.analysis.report.run_reading import read_run
@@ -127,6 +127,6 @@ def test_a_long_comparison_says_how_far_it_is(paths: tuple[Path, Path], monkeypa
     lines: list[str] = []
     compare_logs(paths[0], paths[0], lines.append)
     assert lines == []
-    monkeypatch.setattr(log_comparison, "PROGRESS_CYCLES", 10)
+    monkeypatch.setattr(logged_run, "PROGRESS_CYCLES", 10)
     found = compare_logs(paths[0], paths[0], lines.append)
     assert lines == [f"{found.cycles} cycles compared"]

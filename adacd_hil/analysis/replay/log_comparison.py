@@ -7,7 +7,7 @@ each run is kept.
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.logged_run import settings_of
+from adacd_hil.analysis.logged_run import Milestones, Progress, settings_of
 from adacd_hil.analysis.replay.changed_settings import changed_keys
 from adacd_hil.analysis.score.distribution import Distribution
 from adacd_hil.log.log_files import LogError
@@ -185,7 +185,6 @@ def _motion_start(path: Path) -> tuple[int, int]:
     return first
 
 
-PROGRESS_CYCLES: Final = 1_000_000
 MATCH_S: Final = 0.5
 """Detections of one contact in two runs lie closer together than this."""
 
@@ -310,7 +309,7 @@ def _fields(records: NDArray[Any]) -> list[str]:
 
 
 def compare_logs(
-    first: Path, second: Path, progress: Callable[[str], None] = lambda _: None, stretch: TimeWindow = WHOLE
+    first: Path, second: Path, progress: Progress = lambda _: None, stretch: TimeWindow = WHOLE
 ) -> LogComparison:
     """Compare two logs. Raises LogError, ConfigError.
 
@@ -350,12 +349,13 @@ def compare_logs(
 
 
 def _walk_together(
-    readers: tuple[RunReader, RunReader], differences: _Differences, progress: Callable[[str], None]
+    readers: tuple[RunReader, RunReader], differences: _Differences, progress: Progress
 ) -> tuple[int, tuple[int, int]]:
     """Compare what both logs have; return how many cycles that were, and how many only one of them has."""
     streams = iter(readers[0]), iter(readers[1])
     first, second = (_next_rows(stream) for stream in streams)
-    common = told = 0
+    common = 0
+    milestones = Milestones(lambda count: progress(f"{count} cycles compared"))
     while first is not None and second is not None:
         mine, theirs = (
             rows["cycle"].astype(np.int64) - reader.zero_cycle
@@ -366,9 +366,7 @@ def _walk_together(
         common += len(numbers)
         if len(numbers):
             differences.take(first[ours], second[others], numbers)
-        if common - told >= PROGRESS_CYCLES:
-            told = common
-            progress(f"{common} cycles compared")
+        milestones.reach(common)
         first = first[mine > end] if mine[-1] > end else _next_rows(streams[0])
         second = second[theirs > end] if theirs[-1] > end else _next_rows(streams[1])
     for stream in streams:

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.logged_run import Milestones, Progress
 from adacd_hil.analysis.replay.log_source import CycleStretch, LogSource, Part, ReplaySource
 from adacd_hil.analysis.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.analysis.replay.scheme_comparison import (
@@ -41,7 +42,6 @@ SCRIPTED: Final = "script"
 """Of a log's metadata `operator`: nobody could type anything."""
 _PROGRESS_CYCLES: Final = 200_000
 
-Progress = Callable[[str], None]
 Watch = Callable[[int, Ticks, SchemeBatch], None]
 """Is shown the decisions of each variant, by its place among them, as they are made."""
 
@@ -216,13 +216,12 @@ def replay_source(
         asking = Asking(settings, script_of) if is_scripted and script_of is not None else None
         players.append(_Player(settings, truth, comparison, asking))
     decoders = _Decoders(source.codec, variants)
-    done = announced = 0
+    done = 0
+    milestones = Milestones(lambda count: progress(f"{count} cycles replayed"), _PROGRESS_CYCLES)
     for part in source:
         cycles, is_over = _replay_part(part, players, decoders, bounds_ns, watch)
         done += cycles
-        if done - announced >= _PROGRESS_CYCLES:
-            announced = done
-            progress(f"{done} cycles replayed")
+        milestones.reach(done)
         if is_over:
             break
     if not stretch.is_whole and not players[0].cycles:

@@ -17,7 +17,7 @@ from adacd_hil.analysis.logged_run import enters_react, host_span
 from adacd_hil.analysis.replay.scheme_comparison import Mismatch
 from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, TrueContacts, windows_of
 from adacd_hil.analysis.score.judge import Alarm, Score, TouchWindow, judge
-from adacd_hil.analysis.score.wording import found_text, why_not_found
+from adacd_hil.analysis.score.wording import NONE, found_text, why_not_found
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import LoggedContact
 from adacd_hil.records import PARAMETER_UNITS, FaultReason, SchemeState, Vector
@@ -222,7 +222,7 @@ def side_by_side(replays: Sequence[Replay]) -> list[Row]:
         rows.append(("detections at", *(_times(each, each.detections_ns) for each in replays)))
     rows += _contact_rows(replays)
     rows += [
-        ("missed", *("–" if each.score is None else str(each.score.missed) for each in replays)),
+        ("missed", *(NONE if each.score is None else str(each.score.missed) for each in replays)),
         ("false alarms", *map(_false_alarms, replays)),
         ("median delay, ms", *map(_median_delay, replays)),
     ]
@@ -245,7 +245,7 @@ def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
         first = next(contact for contact in known if contact is not None)
         name = f"contact {number}, link {first.link}, at {replays[0].time_s(first.onset_ns):.2f} s"
         cells = (
-            "–" if contact is None
+            NONE if contact is None
             else f"after {contact.delay_ms:.1f} ms" if contact.delay_ms is not None
             else why_not_found(contact.is_armed)
             for contact in known
@@ -261,12 +261,12 @@ def _detected(found: Replay) -> str:
 
 
 def _times(found: Replay, times_ns: Sequence[int]) -> str:
-    return ", ".join(f"{found.time_s(t_ns):.2f} s" for t_ns in times_ns) or "–"
+    return ", ".join(f"{found.time_s(t_ns):.2f} s" for t_ns in times_ns) or NONE
 
 
 def _false_alarms(found: Replay) -> str:
     if found.score is None:
-        return "–"
+        return NONE
     times_ns = [alarm.t_ns for alarm in found.score.false_alarms]
     count = len(times_ns)
     return f"{count}, at {_times(found, times_ns[:3])}{', …' if count > 3 else ''}" if count else "0"
@@ -274,18 +274,18 @@ def _false_alarms(found: Replay) -> str:
 
 def _median_delay(found: Replay) -> str:
     delays = () if found.score is None else found.score.delays_ms
-    return f"{statistics.median(delays):.1f}" if delays else "–"
+    return f"{statistics.median(delays):.1f}" if delays else NONE
 
 
 def _adaptation(found: Replay, index: int) -> str:
     if index >= len(found.adaptation_s):
-        return "–"
+        return NONE
     took_s = found.adaptation_s[index]
     return "not finished" if took_s is None else f"{took_s:.3f}"
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.6g}"
+    return NONE if value is None else f"{value:.6g}"
 
 
 def _end(found: Replay) -> str:

@@ -26,6 +26,12 @@ from adacd_hil.analysis.score.wording import NONE, number_text, pair_text, signs
 TRACED_CONTACTS: Final = 60
 
 
+SECTION_TITLES: Final = {
+    "adaptation": "adaptation",
+    "detection": "collision detection",
+    "payload": "payload change",
+    "fault": "fault",
+}
 SECTIONS: Final = 60
 """Sections with a row in the tables of sections and margins."""
 CONTACTS: Final = 200

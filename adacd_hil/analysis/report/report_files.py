@@ -25,7 +25,7 @@ from matplotlib.image import imsave
 from numpy.typing import NDArray
 
 from adacd_hil.analysis.drawing import COLOURS, Drawing, style
-from adacd_hil.analysis.logged_run import Run, StretchOfRun, section_at
+from adacd_hil.analysis.logged_run import Progress, Run, StretchOfRun, section_at
 from adacd_hil.analysis.report.page import (
     PRINTED_CONTACTS,
     Heading,
@@ -38,7 +38,7 @@ from adacd_hil.analysis.report.page import (
 )
 from adacd_hil.analysis.report.run_figures import draw
 from adacd_hil.analysis.report.run_page import report_page
-from adacd_hil.analysis.report.run_reading import Progress, read_run
+from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.report.timeline import stays_of
 from adacd_hil.analysis.report.timing_figures import draw_timing
 from adacd_hil.analysis.score.evaluation import evaluate

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 from adacd_hil.analysis.logged_run import QUANTITIES, Quantity, Run
 from adacd_hil.analysis.report.page import (
     ADAPTATIONS,
+    SECTION_TITLES,
     SECTIONS,
     Cell,
     Table,
@@ -102,14 +103,6 @@ def further_table(evidence: CertifiedEvidence | None) -> Table | None:
     return make_table(head, rows, left=(0, 1))
 
 
-_KINDS: Final = {
-    "adaptation": "adaptation",
-    "detection": "collision detection",
-    "payload": "payload change",
-    "fault": "fault",
-}
-
-
 def sections_table(metrics: Metrics, run: Run) -> Table:
     """Make a row per section, with its frozen residuals."""
     threshold = run.settings.detector.threshold_Nm
@@ -119,7 +112,7 @@ def sections_table(metrics: Metrics, run: Run) -> Table:
         rows.append(
             (
                 Cell(section.label, "strong"),
-                _KINDS[section.kind]
+                SECTION_TITLES[section.kind]
                 + ("" if section.is_complete or section.kind != "adaptation" else ", not finished"),
                 number_text(section.start_s, 3),
                 number_text(section.end_s, 3),

@@ -21,12 +21,13 @@ from adacd_hil.analysis.drawing import (
     label_below,
     label_decades,
     legend_above,
+    mark_lane,
     note,
     plot,
     style,
 )
 from adacd_hil.analysis.logged_run import Run, Section
-from adacd_hil.analysis.report.page import ADAPTATIONS
+from adacd_hil.analysis.report.page import ADAPTATIONS, SECTION_TITLES
 from adacd_hil.analysis.score.judge import filtered
 from adacd_hil.analysis.score.metrics import Metrics, ReportedContact
 from adacd_hil.analysis.score.touches import row_at
@@ -40,6 +41,8 @@ _SHADED: Final = 120
 """Sections that have room beside each other, with their letters."""
 _NUMBERED: Final = 60
 """Contacts that have room beside each other, with their numbers."""
+_LANE: Final = 0.915
+"""Height of the lane with the marks of contacts."""
 _BEFORE_S: Final = 0.012
 _AFTER_S: Final = 0.06
 """From the onset, and at least: a typical detection, and the isolation window after it."""
@@ -161,14 +164,6 @@ def _shade(axes: Axes, sections: Sequence[Section]) -> None:
         axes.axvline(section.start_s, color=COLOURS["rule"], linewidth=0.7, zorder=1)
 
 
-_KIND_TITLES: Final = {
-    "adaptation": "adaptation",
-    "detection": "collision detection",
-    "payload": "payload change",
-    "fault": "fault",
-}
-
-
 def _is_narrow(metrics: Metrics) -> bool:
     return len(metrics.sections) > _SHADED
 
@@ -185,7 +180,7 @@ def _label(axes: Axes, sections: Sequence[Section], end_s: float) -> None:
     """Write letter and kind of each section above the axes, the kind only where it has room."""
     for section in _wide(sections):
         room = 165.0 * section.duration_s / max(end_s, 1e-9)  # characters
-        kind = _KIND_TITLES[section.kind]
+        kind = SECTION_TITLES[section.kind]
         text = f"{section.label}  {kind}" if len(kind) + 3 < room else section.label
         axes.annotate(
             text,
@@ -202,69 +197,37 @@ def _label(axes: Axes, sections: Sequence[Section], end_s: float) -> None:
 
 def _pad(axes: Axes, identified: Vector, cad: Vector, h: float) -> None:
     """Fit the ordinate to the data and leave a lane on top for the contact marks."""
-    values = np.concatenate((identified, cad))
-    values = values[np.isfinite(values)]
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-    low, high = min(low, -2.0 * h), max(high, 2.0 * h)
+    low, high = _range((identified, cad), h)
     span = high - low
     axes.set_ylim(low - 0.06 * span, high + 0.24 * span)
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
 
 
 def _mark(axes: Axes, metrics: Metrics) -> None:
-    lane = ("data", "axes fraction")
+    """Mark contacts and false alarms on the lane on top."""
+    alarm = COLOURS["alarm"]
     is_crowded = len(metrics.contacts) > _NUMBERED
-    if is_crowded:
-        for is_seen in (True, False):
-            times_s = [contact.at_s for contact in metrics.contacts if (contact.detected_s is not None) == is_seen]
-            axes.plot(
-                times_s,
-                np.full(len(times_s), 0.915),
-                transform=axes.get_xaxis_transform(),
-                marker="|" if is_seen else "o",
-                markersize=7 if is_seen else 5,
-                color=COLOURS["alarm"],
-                markerfacecolor="none",
-                markeredgewidth=0.6 if is_seen else 0.9,
-                linestyle="none",
-            )
+    for is_seen in (True, False) if is_crowded else ():
+        times_s = [contact.at_s for contact in metrics.contacts if (contact.detected_s is not None) == is_seen]
+        marker, size, edge = ("|", 7, 0.6) if is_seen else ("o", 5, 0.9)
+        look = {"marker": marker, "markersize": size, "markeredgewidth": edge, "markerfacecolor": "none"}
+        mark_lane(axes, times_s, _LANE, color=alarm, **look)
     for contact in () if is_crowded else metrics.contacts:
-        at_s = contact.at_s
         is_seen = contact.detected_s is not None
-        face = COLOURS["alarm"] if is_seen else "none"
-        axes.plot(
-            [at_s],
-            [0.915],
-            transform=axes.get_xaxis_transform(),
-            marker="o",
-            markersize=10.5,
-            color=COLOURS["alarm"],
-            markerfacecolor=face,
-            markeredgecolor=COLOURS["alarm"],
-            markeredgewidth=0.9,
-            linestyle="none",
-        )
+        look = {"markerfacecolor": alarm if is_seen else "none", "markeredgecolor": alarm, "markeredgewidth": 0.9}
+        mark_lane(axes, [contact.at_s], _LANE, color=alarm, marker="o", markersize=10.5, **look)
         axes.annotate(
             str(contact.number),
-            (at_s, 0.915),
-            xycoords=lane,
+            (contact.at_s, _LANE),
+            xycoords=("data", "axes fraction"),
             ha="center",
             va="center_baseline",
             fontsize=7.0,
             fontweight="bold",
-            color=PAPER if is_seen else COLOURS["alarm"],
+            color=PAPER if is_seen else alarm,
         )
     if metrics.false_alarms_s:
-        axes.plot(
-            metrics.false_alarms_s,
-            np.full(len(metrics.false_alarms_s), 0.915),
-            transform=axes.get_xaxis_transform(),
-            marker="x",
-            markersize=8,
-            color=COLOURS["alarm"],
-            markeredgewidth=1.8,
-            linestyle="none",
-        )
+        mark_lane(axes, metrics.false_alarms_s, _LANE, marker="x", markersize=8, color=alarm, markeredgewidth=1.8)
 
 
 def parameter_label(name: str) -> str:
@@ -458,21 +421,21 @@ def _close_up(
     if paper_detected_s is not None:
         theirs_ms = (paper_detected_s - at_s) * 1e3
         axes.axvline(theirs_ms, color=COLOURS["beside"], linewidth=1.0, dashes=(4, 2.5), label="the paper's")
-    low, high = _limits(levels, h)
-    axes.set_ylim(low, high)
+    low, high = _range(levels, h)
+    margin = 0.08 * (high - low)
+    axes.set_ylim(low - margin, high + margin)
     axes.set_xlim(-1e3 * _BEFORE_S, 1e3 * after_s)
     axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
     _describe(axes, contact)
 
 
-def _limits(levels: list[Vector], h: float) -> tuple[float, float]:
+def _range(levels: Sequence[Vector], h: float) -> tuple[float, float]:
+    """Give the smallest and the largest value, twice the threshold h at least."""
     values = np.concatenate([level.ravel() for level in levels])
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-    low, high = min(low, -2.0 * h), max(high, 2.0 * h)
-    margin = 0.08 * (high - low)
-    return low - margin, high + margin
+    return min(low, -2.0 * h), max(high, 2.0 * h)
 
 
 def _ideal(run: Run, onset_s: float, after_s: float, a_rad_s: float) -> tuple[Vector, Vector]:

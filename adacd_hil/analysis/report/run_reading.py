@@ -20,7 +20,7 @@ bounded, whatever the length.
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -30,6 +30,8 @@ import numpy as np
 from adacd_hil.analysis.logged_run import (
     QUANTITIES,
     CycleColumns,
+    Milestones,
+    Progress,
     Rows,
     Run,
     StretchOfRun,
@@ -169,10 +171,8 @@ RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events"
 """Of a run's log, what a report reads."""
 FULL_CYCLES: Final = 500_000
 """Cycles that are kept and drawn one by one: eight minutes at 1 kHz; some 1.2 kB each in the log."""
-_PROGRESS_CYCLES: Final = 1_000_000
 _MOST_DIGITS: Final = 18
 
-Progress = Callable[[str], None]
 Bounds = tuple[int, int]
 """From when, and before when, ns of the run's clock."""
 
@@ -253,13 +253,12 @@ class _Reading:
     def _pieces(self, doing: str, bounds_ns: Bounds | None = None) -> Iterator[tuple[LogStream, Piece]]:
         """Read the log, or what of it lies between two times."""
         stream = LogStream(self._path, RUN_TOPICS)
-        cycles = said = 0
+        cycles = 0
+        milestones = Milestones(lambda count: self._progress(f"{self._path}: {doing}, {count} cycles"))
         for piece in stream:
             check_states(piece.series["/scheme"])
             cycles += len(piece.series["/scheme"])
-            if cycles - said >= _PROGRESS_CYCLES:
-                said = cycles
-                self._progress(f"{self._path}: {doing}, {cycles} cycles")
+            milestones.reach(cycles)
             if bounds_ns is None:
                 yield stream, piece
                 continue

@@ -8,7 +8,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from adacd_hil.analysis.drawing import COLOURS, Drawing, label_below, label_decades, legend_above, note, style
+from adacd_hil.analysis.drawing import (
+    COLOURS,
+    Drawing,
+    label_below,
+    label_decades,
+    legend_above,
+    mark_lane,
+    note,
+    style,
+)
 from adacd_hil.analysis.logged_run import COMPUTE, LATENESS, SLACK, SYNC_TO_COMMAND, CycleColumns, Quantity
 from adacd_hil.analysis.score.distribution import BINS_PER_DECADE
 from adacd_hil.analysis.score.metrics import TimeStatistics, TimingEvidence
@@ -148,7 +157,7 @@ def time_line(columns: CycleColumns, evidence: TimingEvidence, zero_ns: int, zer
             _queue_panel(axes, columns, time_s)
         else:
             _time_panel(axes, columns.times_us(quantity), time_s, quantity, evidence.period_us)
-        _mark_overruns(axes, overruns_s)
+        mark_lane(axes, overruns_s, 0.955, color=COLOURS["alarm"], marker="v", markersize=4.5)
         axes.set_xlim(float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3))
         axes.tick_params(labelbottom=axes is grid[-1])
     label_below(figure, f"time since {zero_name}, s")
@@ -231,15 +240,3 @@ def _queue_panel(axes: Axes, columns: CycleColumns, time_s: Vector) -> None:
     axes.set_ylabel("bytes")
     axes.set_title("Queues — of the bus, to be received and to be sent, and to the log's writer")
     axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.035), ncols=len(handles), columnspacing=1.6)
-
-
-def _mark_overruns(axes: Axes, overruns_s: Vector) -> None:
-    axes.plot(
-        overruns_s,
-        np.full(len(overruns_s), 0.955),
-        transform=axes.get_xaxis_transform(),
-        color=COLOURS["alarm"],
-        marker="v",
-        markersize=4.5,
-        linestyle="none",
-    )

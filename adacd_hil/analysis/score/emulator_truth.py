@@ -9,7 +9,7 @@ A log of another run is refused, as far as both logs say what was played.
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.logged_run import (
     Cycles,
     EmulatorSpan,
+    Progress,
     Truth,
     extreme_rows,
     host_cycles,
@@ -375,7 +376,7 @@ def windows_of(contacts: Sequence[TrueContact], host: HostCycles, settings: Sett
     return windows
 
 
-def contacts_beside(path: Path, progress: Callable[[str], None] = lambda _: None) -> TrueContacts | None:
+def contacts_beside(path: Path, progress: Progress = lambda _: None) -> TrueContacts | None:
     """Read the true contacts from the emulator's log in the same folder; None where there is none. Raises LogError.
 
     That of another run is left out, and `progress` is told why.

@@ -9,13 +9,11 @@ from adacd_hil.analysis.logged_run import Run, Section, is_realtime, rows_of, se
 from adacd_hil.analysis.score.judge import JudgedContact, Score
 from adacd_hil.analysis.score.margins import evaluate_certified, gather_untouched, last_row
 from adacd_hil.analysis.score.metrics import (
-    CertifiedEvidence,
     CycleStatistics,
     Gathered,
     Metrics,
     ReportedContact,
     TimingEvidence,
-    Untouched,
 )
 from adacd_hil.analysis.score.run_faults import find_causes, find_faults, gather_data
 from adacd_hil.analysis.score.timing import collect_evidence, find_reactions
@@ -43,7 +41,7 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
     sections = split_sections(run)
     contacts = list_contacts(run, sections, touches, detections, score)
     residuals = gathered.untouched.residuals
-    evidence = _evidence(run, sections, gathered.untouched)
+    evidence = evaluate_certified(run, sections, gathered.untouched)
     adaptation_s = {
         section.label: section.duration_s if section.is_complete else None
         for section in sections
@@ -80,20 +78,6 @@ def evaluate(run: Run, gathered: Gathered | None = None) -> Metrics:
         and missed == 0
         and not (has_false or faults or causes or data.excesses or is_margin_below_1(evidence) or is_revoked(evidence)),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
-    )
-
-
-def _evidence(run: Run, sections: tuple[Section, ...], untouched: Untouched) -> CertifiedEvidence | None:
-    if run.certified is None:
-        return None
-    return evaluate_certified(
-        run,
-        run.certified,
-        sections,
-        untouched.margins,
-        untouched.promotions,
-        untouched.beside,
-        untouched.smallest_push,
     )
 
 

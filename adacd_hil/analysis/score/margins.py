@@ -149,28 +149,23 @@ def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
     return parked
 
 
-def evaluate_certified(
-    run: Run,
-    stream: CertifiedStream,
-    sections: Sequence[Section],
-    margins: dict[str, tuple[ChannelMargin, ...]],
-    promotions: int,
-    beside: Beside | None,
-    smallest_push: SmallestPush | None,
-) -> CertifiedEvidence:
-    """Judge a run of the certified scheme. margins, promotions, smallest_push: of all its cycles, see `untouched`."""
+def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouched) -> CertifiedEvidence | None:
+    """Judge a run of the certified scheme; None of the paper's. untouched: of all its cycles."""
+    stream = run.certified
+    if stream is None:
+        return None
     adaptations = [section for section in sections if section.kind == "adaptation"]
     stays = {section.label: _tests(run, section) for section in adaptations}
     return CertifiedEvidence(
         tests={label: len(lengths_s) for label, lengths_s in stays.items()},
         test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
         estimates={section.label: _estimates(run, stream, section) for section in adaptations},
-        margins=margins,
-        promotions=promotions,
-        paper_beside=beside,
+        margins=untouched.margins,
+        promotions=untouched.promotions,
+        paper_beside=untouched.beside,
         is_anchored=all(event.level == "info" for _, event in run.events if event.name == "certificate"),
         revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
-        smallest_push=smallest_push,
+        smallest_push=untouched.smallest_push,
     )
 
 

@@ -21,7 +21,7 @@ from adacd_hil.analysis.score.metrics import (
     ReportedContact,
     Residual,
 )
-from adacd_hil.analysis.score.wording import found_text, number_of, percent_text, score_sentence
+from adacd_hil.analysis.score.wording import NONE, found_text, number_of, percent_text, score_sentence
 
 LISTED: Final = 4
 """Adaptations that are listed one by one."""
@@ -142,7 +142,6 @@ def identified_text(
 
 _EXPERIMENT = "paper"
 """The scenario that is the paper's experiment."""
-_NONE = "–"
 _ELSEWHERE = {
     "Adaptation after the payload change": "Second adaptation",
     "Payload": "Payload in the second adaptation",
@@ -181,8 +180,8 @@ def compare_with_paper(
     a, b = settings.filter.a_rad_s, settings.filter.b_rad_s
     within = "within ±0.15"
     seen = [contact.detected_s for contact in contacts if contact.detected_s is not None]
-    first = f"{seen[0]:.2f} s" if seen else "–"
-    kilograms = "–" if payload is None else f"{payload:g} kg"
+    first = f"{seen[0]:.2f} s" if seen else NONE
+    kilograms = NONE if payload is None else f"{payload:g} kg"
     settled = (
         ("Bound β of eq. (15)", "0.1 Nm", f"{settings.termination.beta_Nm:g} Nm"),
         ("Hold T of eq. (15)", "5 s", f"{settings.termination.hold_s:g} s"),
@@ -221,9 +220,9 @@ def compare_with_paper(
     found = [contact for contact in armed if contact.delay_ms is not None]
     has_truth = run.truth is not None
     rows += [
-        ("Contacts detected", "–", beside[8], found_text(len(found), len(armed)) if has_truth else str(len(contacts))),
-        ("Median delay", "–", beside[9], _median_text([c.delay_ms for c in found if c.delay_ms is not None])),
-        ("False alarms", "–", beside[10], str(false_alarms) if has_truth else "–"),
+        ("Contacts detected", NONE, beside[8], found_text(len(found), len(armed)) if has_truth else str(len(contacts))),
+        ("Median delay", NONE, beside[9], _median_text([c.delay_ms for c in found if c.delay_ms is not None])),
+        ("False alarms", NONE, beside[10], str(false_alarms) if has_truth else NONE),
     ]
     ours = (
         f"{settings.certified.beta_Nm:g} Nm, of the frozen model",
@@ -234,8 +233,8 @@ def compare_with_paper(
     )
     rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
     margin = evidence.smallest_margin
-    rows.append(("Smallest threshold / residual", "–", "–", "–" if margin is None else f"{margin:.2f}"))
-    rows.append(("Smallest push found within 100 ms, estimated, joints 1 / 2", "–", "–", _push_text(evidence)))
+    rows.append(("Smallest threshold / residual", NONE, NONE, NONE if margin is None else f"{margin:.2f}"))
+    rows.append(("Smallest push found within 100 ms, estimated, joints 1 / 2", NONE, NONE, _push_text(evidence)))
     rows.append(("Control rate", "1 kHz", rate, rate))
     return _of_what_was_played(run, [PaperRow(*row) for row in rows])
 
@@ -247,7 +246,7 @@ def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, .
     return tuple(
         row._replace(quantity=_ELSEWHERE.get(row.quantity, row.quantity), paper=None)
         for row in rows
-        if {row.beside, row.measured} - {None, _NONE}
+        if {row.beside, row.measured} - {None, NONE}
     )
 
 
@@ -256,13 +255,13 @@ def _tests_text(times_s: list[float | None]) -> str:
     found = [time_s for time_s in times_s if time_s is not None]
     if len(times_s) > LISTED and found:
         return f"tests of {min(found):.2f} to {max(found):.2f} s"
-    return "test of " + (" and ".join("–" if t is None else f"{t:.2f} s" for t in times_s) or "–")
+    return "test of " + (" and ".join(NONE if t is None else f"{t:.2f} s" for t in times_s) or NONE)
 
 
 def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str, str, str]) -> tuple[str, ...]:
     """Give the column of the paper's scheme on the same stream; same: payload and the CAD model's residuals."""
     if beside is None:
-        return ("–",) * 11
+        return (NONE,) * 11
     times_s = list(beside.adaptation_s.values())
     frozen = [beside.frozen_residual_max_Nm[label] for label in detections]
     armed = [contact for contact in beside.contacts if contact.is_armed]
@@ -275,23 +274,23 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
         _residual_text(frozen, 0),
         _residual_text(frozen, 1),
         *same[1:],
-        f"{seen[0]:.2f} s" if seen else "–",
-        "–" if beside.missed is None else found_text(len(found), len(armed)),
+        f"{seen[0]:.2f} s" if seen else NONE,
+        NONE if beside.missed is None else found_text(len(found), len(armed)),
         _median_text([contact.delay_ms for contact in found if contact.delay_ms is not None]),
-        "–" if beside.false_alarms is None else str(beside.false_alarms),
+        NONE if beside.false_alarms is None else str(beside.false_alarms),
     )
 
 
 def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
     """Say where the thresholds of the slowest channel lie: the smallest and the largest median of a section."""
     found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
-    return f"{min(found):.3f} to {max(found):.3f} Nm" if found else "–"
+    return f"{min(found):.3f} to {max(found):.3f} Nm" if found else NONE
 
 
 def _push_text(evidence: CertifiedEvidence) -> str:
     """Say how small a push is found, in the middle and at the worst moment."""
     if evidence.smallest_push is None:
-        return "–"
+        return NONE
     median, worst = (
         " / ".join(f"{joint[name]:.2f}" for joint in evidence.smallest_push.push_Nm) for name in ("p50", "max")
     )
@@ -299,25 +298,25 @@ def _push_text(evidence: CertifiedEvidence) -> str:
 
 
 def _median_text(delays_ms: list[float]) -> str:
-    return f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else "–"
+    return f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE
 
 
 def _seconds(times_s: list[float | None], index: int) -> str:
     if index >= len(times_s):
-        return "–"
+        return NONE
     value = times_s[index]
     return "not finished" if value is None else f"{value:.2f} s"
 
 
 def _pair(values: tuple[float, float] | None) -> str:
     if values is None:
-        return "–"
+        return NONE
     return f"{values[0]:g} Nm" if values[0] == values[1] else f"{values[0]:g} / {values[1]:g} Nm"
 
 
 def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
     values = frozen[index] if index < len(frozen) else None
-    return "–" if values is None else f"{values[0]:.3f} / {values[1]:.3f} Nm"
+    return NONE if values is None else f"{values[0]:.3f} / {values[1]:.3f} Nm"
 
 
 def data_text(data: CyclicData) -> str:

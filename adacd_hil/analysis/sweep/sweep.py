@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from adacd_hil.analysis.logged_run import Progress
 from adacd_hil.analysis.sweep.plan import Plan, Task, Values, failed
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.file_access import replace_file, replacing
@@ -105,7 +106,6 @@ _IN_FLIGHT = 4  # tasks per worker, so that none waits for the client
 _WRITE_NS = 5_000_000_000
 
 Work = Callable[[Task], list[Values]]
-Progress = Callable[[str], None]
 
 
 class SweepOutcome(NamedTuple):

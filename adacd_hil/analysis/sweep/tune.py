@@ -13,12 +13,13 @@ The suggestion names what it extends and the keys that change, with their origin
 import json
 import math
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 from adacd_hil import __version__
+from adacd_hil.analysis.logged_run import Progress
 from adacd_hil.analysis.replay.changed_settings import apply_settings, changed_keys, keep_facts
 from adacd_hil.analysis.replay.replay import replay_many
 from adacd_hil.analysis.replay.replayed_outcome import Replay
@@ -58,7 +59,7 @@ def tune(
     paths: Sequence[Path],
     rate_per_h: float,
     config: str | None,
-    progress: Callable[[str], None],
+    progress: Progress,
     stretch: TimeWindow = WHOLE,
 ) -> Tuning:
     """Find thresholds, filter and gain. config: name or file of the settings to start from.
@@ -98,7 +99,7 @@ def _choices(
     logs: Sequence[TunedLog],
     tried: Sequence[Changes],
     rate_per_h: float,
-    progress: Callable[[str], None],
+    progress: Progress,
     notes: list[str],
 ) -> tuple[list[Changes], list[Choice]]:
     """Choose thresholds for each filter and gain; leave out, with a note, what never monitors untouched motion."""
@@ -113,9 +114,7 @@ def _choices(
     return [changes for changes, _ in chosen], [choice for _, choice in chosen]
 
 
-def replay_all(
-    logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Callable[[str], None]
-) -> list[TuningOutcome]:
+def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Progress) -> list[TuningOutcome]:
     """Replay all logs with each of the variants. Raises LogError, ConfigError, CodecError."""
     results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
     for log in logs:

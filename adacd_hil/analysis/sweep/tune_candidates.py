@@ -10,16 +10,18 @@ motion. Each contact is seen by detectors that were at rest `WARM_UP_S` before i
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.logged_run import Progress
 from adacd_hil.analysis.replay.changed_settings import apply_settings
 from adacd_hil.analysis.replay.replay import Watch, replay_many
 from adacd_hil.analysis.sweep.tune_roc import Changes, Observed, Touched, TunedLog, Window, rising
-from adacd_hil.analysis.thresholds.free_motion import Progress, TorqueStream
+from adacd_hil.analysis.thresholds.detector_comparison import WARM_UP_S
+from adacd_hil.analysis.thresholds.free_motion import TorqueStream
 from adacd_hil.analysis.thresholds.recorded_thresholds import Statistics, run_detectors
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.records import JOINTS, SchemeState, Vector
@@ -87,9 +89,7 @@ def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
     return {"detector.threshold_Nm": in_toml([min(max(up * each, low), high) for each in thresholds[0].tolist()])}
 
 
-def observe_candidates(
-    logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Callable[[str], None]
-) -> list[Observed]:
+def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Progress) -> list[Observed]:
     """Replay the logs with every candidate. Raises LogError, ConfigError, CodecError."""
     gathered: list[list[_Shown]] = [[] for _ in tried]
     for log in logs:
@@ -199,9 +199,6 @@ class _Shown:
         for window in list(self._open):
             self._close(window)
         return [self._touches[window.number] for window in self._windows]
-
-
-WARM_UP_S: Final = 0.6
 
 
 def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:

@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.logged_run import AttemptBegins, host_span
+from adacd_hil.analysis.logged_run import AttemptBegins, Progress, host_span
 from adacd_hil.analysis.replay.changed_settings import changed_keys, keep_facts
 from adacd_hil.analysis.replay.log_source import LogSource
 from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, contacts_beside, windows_of
@@ -33,7 +33,7 @@ from adacd_hil.analysis.thresholds.false_alarms import (
     counted_hours,
     largest_ratio,
 )
-from adacd_hil.analysis.thresholds.free_motion import APART_S, LoggedMotion, Progress, read_motion, schemes
+from adacd_hil.analysis.thresholds.free_motion import APART_S, LoggedMotion, read_motion, schemes
 from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError

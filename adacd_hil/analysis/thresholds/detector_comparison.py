@@ -31,7 +31,7 @@ ROC_WITHIN_S: Final = 0.03
 HORIZON_S: Final = 0.1
 LOOP_LAG_S: Final = 1.6e-3
 """Of a 200 Hz tracking loop, with which the step reaches the measured velocity."""
-_WARM_UP_S: Final = 0.6  # until the slowest filter knows nothing of what was before
+WARM_UP_S: Final = 0.6  # until the slowest filter knows nothing of what was before
 _ONSETS: Final = 200
 _ROC_RATES_PER_H: Final = tuple(10.0 ** (0.25 * k) for k in range(-12, 9))
 NAME: Final = "detectors"
@@ -127,12 +127,12 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
     """
     found, missing = calibrate_all(statistics, rate_per_h)
     period_s = statistics.motion.period_s
-    before, after = round(_WARM_UP_S / period_s), round(HORIZON_S / period_s) + 2
+    before, after = round(WARM_UP_S / period_s), round(HORIZON_S / period_s) + 2
     bad = np.r_[0, np.cumsum(~statistics.is_free)]
     starts = np.arange(len(statistics.z) - before - after)
     starts = starts[bad[starts + before + after] == bad[starts]]
     if starts.size == 0:
-        raise TooLittleMotionError(f"no contact-free stretch is as long as {_WARM_UP_S + HORIZON_S:g} s")
+        raise TooLittleMotionError(f"no contact-free stretch is as long as {WARM_UP_S + HORIZON_S:g} s")
     generator = np.random.default_rng(seed)
     chosen = starts[np.sort(generator.integers(0, starts.size, onsets))]
     phases_s = generator.uniform(0.0, period_s, onsets)

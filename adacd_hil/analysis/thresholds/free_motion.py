@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
+from adacd_hil.analysis.logged_run import Milestones, Progress
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.log.time_window import WHOLE, TimeWindow
@@ -31,10 +32,8 @@ TOPICS: Final = ("/scheme",)
 _NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
 _PERIODS: Final = 1_000_000
 """Intervals of which the median is the period."""
-_PROGRESS_SAMPLES: Final = 1_000_000
 
 Mask = NDArray[np.bool_]
-Progress = Callable[[str], None]
 Watch = Callable[[Series], None]
 
 
@@ -110,7 +109,8 @@ def read_motion(
     period_s = _period(path, bounds_ns, where)
     parts: list[Mask] = []
     before: int | None = None
-    parameters = count = told = 0
+    parameters = count = 0
+    milestones = Milestones(lambda at: progress(f"{path}: looking for motion that nobody touched, {at} cycles"))
     for scheme in schemes(path, bounds_ns):
         watch(scheme)
         cycle = scheme["cycle"].astype(np.int64).reshape(-1)
@@ -120,9 +120,7 @@ def read_motion(
             is_good &= np.isfinite(scheme[name]).all(axis=1)
         parts.append(is_good)
         before, parameters, count = int(cycle[-1]), scheme["theta_hat"].shape[1], count + len(cycle)
-        if count - told >= _PROGRESS_SAMPLES:
-            told = count
-            progress(f"{path}: looking for motion that nobody touched, {count} cycles")
+        milestones.reach(count)
     is_free = ~_spread(~np.concatenate(parts), round(APART_S / period_s))
     if not is_free.any():
         raise LogError(f"log {path} has no motion in MONITOR that is free of contact{where}")

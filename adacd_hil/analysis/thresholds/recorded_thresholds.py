@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.analysis.logged_run import Milestones, Progress
 from adacd_hil.analysis.thresholds.false_alarms import (
     Limits,
     Prediction,
@@ -29,15 +30,7 @@ from adacd_hil.analysis.thresholds.false_alarms import (
     resolution,
     white_noise,
 )
-from adacd_hil.analysis.thresholds.free_motion import (
-    LoggedMotion,
-    Mask,
-    Motion,
-    Progress,
-    TorqueStream,
-    read_motion,
-    sample_of,
-)
+from adacd_hil.analysis.thresholds.free_motion import LoggedMotion, Mask, Motion, TorqueStream, read_motion, sample_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
@@ -46,7 +39,6 @@ from adacd_hil.scheme.model.regressor import mass_matrix
 from adacd_hil.settings.schema import setting
 
 BLOCK_S: Final = 0.1
-_PROGRESS_SAMPLES: Final = 1_000_000
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
 """Below this the model's errors stand out of the noise."""
@@ -129,7 +121,8 @@ def _peaks(
     free = np.concatenate([log.is_free for log in logs])
     peaks = np.zeros((-(-len(free) // block), len(settings.channels), JOINTS))
     rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
-    place = told = 0
+    place = 0
+    milestones = Milestones(lambda count: progress(f"{log.path}: running the detectors, {count} of {len(free)} cycles"))
     for log in logs:
         stream = TorqueStream(lag_s, settings.standstill_rad_s)
         for motion in log.pieces():
@@ -141,9 +134,7 @@ def _peaks(
             whole = (end - place) * block
             peaks[place:end] = bank.take(z[:whole], held_Nm[:whole], block)
             rest, place = (z[whole:], held_Nm[whole:]), end
-            if place * block - told >= _PROGRESS_SAMPLES:
-                told = place * block
-                progress(f"{log.path}: running the detectors, {told} of {len(free)} cycles")
+            milestones.reach(place * block)
     peaks[place:] = bank.take(*rest, block)
     peaks[~np.logical_and.reduceat(free, np.arange(0, len(free), block))] = np.nan
     return peaks
