@@ -1,7 +1,5 @@
 """The second look at an ArmState: what the devices' heartbeats and the host's own lateness make of it.
 
-Also what such watches are made of: things done every so many cycles, and events that come again and again.
-
 The heartbeat consumer finds nodes that are silent, or not in the state that they should be in. Source: CiA 301 (4.2),
 clause 7.2.8.2.2 (heartbeat protocol); t_ns is the host's time, the frames' stamps included.
 
@@ -13,10 +11,11 @@ or the arm brakes to rest and holds its place until the user acknowledges, where
 """
 
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from adacd_hil.device.profile import PlacedDevice
+from adacd_hil.device.repetition import Recurrence
 from adacd_hil.records import ArmState, Event, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame
@@ -46,56 +45,6 @@ class ArmWatch:
         if self.lost and arm.fault is FaultReason.NONE:
             arm = arm._replace(fault=FaultReason.HEARTBEAT)
         return self.deadline.judge(arm)
-
-
-class Recurrence:
-    """Something that is done every so many cycles, and after skipped ones as soon as there is a cycle again."""
-
-    def __init__(self, interval_s: float, period_s: float) -> None:
-        self._cycles = max(1, round(interval_s / period_s))
-        self._due_cycle = 0
-
-    def is_due(self, cycle: int) -> bool:
-        """Whether it is to be done in this cycle; asked once per cycle."""
-        if cycle < self._due_cycle:
-            return False
-        self._due_cycle = cycle - cycle % self._cycles + self._cycles
-        return True
-
-
-REPEAT_NS = 1_000_000_000
-"""Least time between two events of one kind."""
-
-
-class RateLimitedEvents:
-    """Collects events, each kind at once, then at most once a second with the count of those between.
-
-    `take_events` gives those since the last call.
-    """
-
-    def __init__(self) -> None:
-        self._said_ns: dict[Hashable, int] = {}
-        self._unsaid: dict[Hashable, int] = {}
-        self._events: list[Event] = []
-
-    def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
-        """Take an event of a kind at a time. `count`: how many it stands for."""
-        if not self.is_due(kind, t_ns):
-            self._unsaid[kind] = self._unsaid.get(kind, 0) + count
-            return
-        more = self._unsaid.pop(kind, 0)
-        self._said_ns[kind] = t_ns
-        self._events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
-
-    def is_due(self, kind: Hashable, t_ns: int) -> bool:
-        """Tell whether an event of a kind would be said at once."""
-        said_ns = self._said_ns.get(kind)
-        return said_ns is None or t_ns - said_ns >= REPEAT_NS
-
-    def take_events(self) -> list[Event]:
-        """Return and forget the events since the last call."""
-        events, self._events = self._events, []
-        return events
 
 
 PATIENCE_PERIODS = 2.5

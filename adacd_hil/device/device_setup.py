@@ -8,10 +8,10 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple, NoReturn
 
-from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
 from adacd_hil.device.canopen_bus import SDO_ABORT, DeviceError, explained, find_variable
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, torque_limit_permille
 from adacd_hil.device.profile import ObjectName, PlacedDevice
+from adacd_hil.device.repetition import RateLimitedEvents, Recurrence
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
