@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.wire.bus import CLASSIC_BYTES
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
 from adacd_hil.wire.contract_frames import move_contract
-from firmware_sim.canopen.pdo_record import CLASSIC_BYTES, FD_BYTES
+from firmware_sim.canopen.pdo_record import FD_BYTES
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
+from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.time_marks import NEVER_NS
-from firmware_sim.canopen.object_dictionary import NOT_VALID, Abort, ObjectDictionary, Send, refuse
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, Send, refuse
 
 HISTORY_LENGTH = 4
 """Entries of 0x1003 in the EDS files."""

@@ -18,8 +18,6 @@ from canopen.sdo.server import SdoServer
 
 Send = Callable[[int, bytes], None]
 
-NOT_VALID = 1 << 31
-"""Bit of a COB-ID entry: the object is off."""
 _FIRST_INDEX = 0x1000  # below are data types: dummy mapping entries, no objects
 _FORMATS = {
     datatypes.BOOLEAN: "B",

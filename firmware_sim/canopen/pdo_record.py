@@ -11,8 +11,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
+from adacd_hil.wire.bus import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.codec import MessageCodec
-from firmware_sim.canopen.object_dictionary import NOT_VALID, Abort, ObjectDictionary, refuse
+from adacd_hil.wire.contract_frames import NOT_VALID
+from firmware_sim.canopen.object_dictionary import Abort, ObjectDictionary, refuse
 
 EVENT_DRIVEN = (254, 255)
 """Transmission types."""
@@ -175,8 +177,7 @@ def _check_type(value: int) -> None:
         refuse(Abort.VALUE_RANGE)
 
 
-CLASSIC_BYTES, FD_BYTES = 8, 64
-_FD_LENGTHS = (8, 12, 16, 20, 24, 32, 48, 64)
+FD_BYTES = FD_LENGTHS[-1]
 
 _HEADERS = {
     2: ((0x2100, 1), (0x2100, 2)),  # AUTOSAR Profile 2: CRC; counter and status
@@ -240,7 +241,7 @@ def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bo
     skipped = len(_HEADERS[header_bytes]) if header_bytes else 0
     if any(key in _HEADER_OBJECTS for key in keys[skipped:]):
         refuse(Abort.INCOMPATIBLE)
-    length = size if size <= CLASSIC_BYTES else next(n for n in _FD_LENGTHS if n >= size)
+    length = size if size <= CLASSIC_BYTES else next(n for n in FD_LENGTHS if n >= size)
     packing = struct.Struct("<" + "".join(formats[skipped:]) + f"{length - size}x")
     mapped = tuple(key for key in keys[skipped:] if not dictionary.dummy_bits(key[0]))
     return PdoLayout(mapped, packing, header_bytes, length)
