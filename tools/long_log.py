@@ -30,13 +30,13 @@ from adacd_hil.log.log_files import (
     PART_KEY,
     RUN_METADATA,
     LogError,
-    count_frames,
     part_path,
 )
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.records import MESSAGE_HEAD
 from adacd_hil.log.recording.log_file import McapFile, Sink
 from adacd_hil.log.types.message_types import MessageType
+from adacd_hil.log.types.record_arrays import count_frames
 from adacd_hil.log.types.topics import LogChannel
 
 SECOND_NS: Final = 1_000_000_000

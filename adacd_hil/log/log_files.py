@@ -81,7 +81,6 @@ LOST_KEY = "lost"
 """Of the summary of a recovered log: what was lost, in words; missing when nothing was."""
 DROPPED_KEY = "dropped"
 """Of the summary: packets that are not in the log."""
-_FRAME_TOPICS = {"/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd"}
 
 
 def parts_of(path: Path) -> dict[int, Path]:
@@ -90,11 +89,6 @@ def parts_of(path: Path) -> dict[int, Path]:
         return find_parts(path) or {0: path}
     except OSError:
         return {0: path}
-
-
-def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
-    """Count the frames in a file by its channels' topics and their counts of messages."""
-    return sum(count for channel, count in counts.items() if topics.get(channel) in _FRAME_TOPICS)
 
 
 def summary_count(texts: Mapping[str, str], key: str) -> int:

@@ -7,7 +7,7 @@ On two processors one reads, checks and decompresses ahead while the other gathe
 asked for cost nothing but their decompression.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -39,16 +39,12 @@ from adacd_hil.log.types.record_arrays import (
     is_of_frames,
     joined_frames,
 )
-from adacd_hil.log.types.topics import DECODED, run_channels, truth_channels
+from adacd_hil.log.types.topics import CONTACT, DECODED, run_channels, truth_channels
 from adacd_hil.records import (
     PARAMETER_NAMES,
-    ContactKind,
-    ContactLevel,
     ContactReport,
     Event,
     FaultReason,
-    Location,
-    Reaction,
     SchemeState,
     Vector,
 )
@@ -300,19 +296,6 @@ def events_of(payloads: Mapping[str, Iterable[bytes]], topics: Mapping[str, Topi
     return events
 
 
-_CONTACT_TYPES: dict[str, Callable[[Any], Any]] = {
-    **dict.fromkeys(ContactReport._fields, float),
-    **dict.fromkeys(("cycle", "link"), int),
-    **dict.fromkeys(("is_final", "is_two_sided"), bool),
-    **dict.fromkeys(("direction", "tau_ext_peak", "impulse", "tau_ext_peak_sigma", "impulse_sigma"), tuple),
-    "level": ContactLevel,
-    "kind": ContactKind,
-    "reaction": Reaction,
-    "location": Location,
-}
-"""What each field of a report is made of the number or list that the log has."""
-
-
 _STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": FaultReason}
 
 
@@ -329,10 +312,10 @@ def check_states(scheme: Series) -> None:
 def contacts_of(series: Series) -> list[LoggedContact]:
     """Give what /contact has. Raises LogError for a level, kind, reaction or place that there is not."""
     contacts = []
-    names = [name for name in ContactReport._fields if name in series.fields]  # an older log has fewer
+    members = [member for member in CONTACT.head if member.name in series.fields]  # an older log has fewer
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
         try:
-            report = ContactReport(**{name: _CONTACT_TYPES[name](record[name].tolist()) for name in names})
+            report = ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
         except (ValueError, OverflowError) as error:  # "77 is not a valid ContactLevel"
             raise LogError(f"/contact has a report that this version does not know: {error}") from None
         contacts.append(LoggedContact(t_ns, report))

@@ -30,10 +30,9 @@ def setup_of(live: LiveSetup | None, path: Path = Path("run.mcap"), parameter_co
     """What a writer is told of a log in real time."""
     return WriterSetup(
         path=path,
-        is_truth=False,
         is_blocking=False,
+        channels=run_channels(parameter_count, tuple(CODEC.messages.values())),
         messages=plain_tables(CODEC.messages.values()),
-        parameter_count=parameter_count,
         epoch_ns=EPOCH_NS,
         part_bytes=0,
         part_ns=0,
@@ -54,7 +53,7 @@ class Feed:
         told = setup_of(setup, parameter_count=parameter_count)
         self.live = None if setup is None else LiveFeed(told, self._file.ids, EPOCH_NS)
         show = self.live.show if self.live else None
-        self._writer = PacketWriter(self._file, messages, EPOCH_NS, parameter_count, show)
+        self._writer = PacketWriter(self._file, messages, EPOCH_NS, show)
         self._packets: list[bytes] = []
 
     def cycles(self, run: Run, packets_at_once: int) -> None:

@@ -10,9 +10,18 @@ import mcap.writer
 
 from adacd_hil import __version__
 from adacd_hil.log.log_files import FIELDS_KEY, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.types.message_types import ENCAPSULATION, pack_can_frame, pack_fd_frame, pack_joint_state, pack_log
-from adacd_hil.log.types.topics import SCHEME_BLOCK, ChannelId
+from adacd_hil.log.types.message_types import (
+    ENCAPSULATION,
+    body_struct,
+    pack_can_frame,
+    pack_fd_frame,
+    pack_joint_state,
+    pack_log,
+)
+from adacd_hil.log.types.topics import SCHEME, ChannelId
 from adacd_hil.records import Event, scheme_layout
+
+SCHEME_BLOCK = body_struct(SCHEME.head, has_block=True).size
 
 
 class MemorySink(io.BytesIO):

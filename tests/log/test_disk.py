@@ -19,6 +19,7 @@ from adacd_hil.log.recording.packet import pack_cycle, pack_event
 from adacd_hil.log.recording.processes import WriterSetup
 from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.recording.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
+from adacd_hil.log.types.topics import run_channels
 from adacd_hil.wire.codec_columns import plain_tables
 
 pytestmark = pytest.mark.slow
@@ -50,10 +51,9 @@ class Writer:
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         setup = WriterSetup(
             path=path,
-            is_truth=False,
             is_blocking=False,
+            channels=run_channels(7),
             messages=(),
-            parameter_count=7,
             epoch_ns=0,
             part_bytes=part_bytes,
             part_ns=0,
@@ -248,6 +248,6 @@ def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):
 
 def test_the_setup_arrives_as_it_was_sent(tmp_path):
     messages = plain_tables(CODEC.messages.values())
-    setup = WriterSetup(tmp_path, True, False, messages, 7, 5, 1, 2, {"a": b"\xff"}, {"b": "c"})
+    setup = WriterSetup(tmp_path, True, run_channels(7, messages), messages, 5, 1, 2, {"a": b"\xff"}, {"b": "c"})
     assert WriterSetup.from_json(setup.to_json()) == setup
     assert len(messages) == len(CODEC.messages)

@@ -45,7 +45,7 @@ class Pair:
         self._generator = np.random.default_rng(seed)
         self.sinks = MemorySink(), MemorySink()
         self._file = McapFile(self.sinks[0], channels, ATTACHMENTS, METADATA)
-        self.writer = PacketWriter(self._file, messages, epoch_ns, parameter_count)
+        self.writer = PacketWriter(self._file, messages, epoch_ns)
         arguments = (channels, ATTACHMENTS, METADATA, messages, epoch_ns, parameter_count)
         self._reference = ReferenceWriter(self.sinks[1], *arguments)
         self._packets = []

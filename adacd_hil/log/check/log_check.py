@@ -28,7 +28,6 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
-    count_frames,
     find_parts,
     part_path,
     parts_of,
@@ -46,6 +45,7 @@ from adacd_hil.log.mcap.records import (
     parse,
     scan,
 )
+from adacd_hil.log.types.record_arrays import count_frames
 
 _DATA = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA}
 _SUMMARY = {

@@ -33,7 +33,6 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
-    count_frames,
     find_parts,
     part_path,
     parts_of,
@@ -53,6 +52,7 @@ from adacd_hil.log.mcap.records import (
 )
 from adacd_hil.log.reader import LoggedContact, read_log
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.log.types.record_arrays import count_frames
 
 
 class IntactLog:

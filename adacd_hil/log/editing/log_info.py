@@ -26,7 +26,6 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
-    count_frames,
     part_path,
     parts_of,
     summary_count,
@@ -44,11 +43,11 @@ from adacd_hil.log.mcap.records import (
     scan,
 )
 from adacd_hil.log.types.message_types import LOG, payload_dtype, unpack_log
-from adacd_hil.log.types.topics import EVENTS_TOPIC
+from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.topics import CONTACT, EVENTS
 from adacd_hil.records import ContactLevel, Event
 
-_CONTACTS = "/contact"
-_READ = (EVENTS_TOPIC, _CONTACTS)
+_READ = (EVENTS.name, CONTACT.name)
 
 
 class TopicInfo(NamedTuple):
@@ -225,9 +224,9 @@ class _InfoView:
             schema = definitions.schemas.get(channel.schema_id)
             if schema is None:
                 continue
-            if channel.topic == EVENTS_TOPIC and schema.name == LOG.name:
+            if channel.topic == EVENTS.name and schema.name == LOG.name:
                 self._take_events(payloads)
-            elif channel.topic == _CONTACTS and payload_size(channel, schema) is not None:
+            elif channel.topic == CONTACT.name and payload_size(channel, schema) is not None:
                 self._take_contacts(payloads, payload_dtype(schema.data.decode(), _fields(channel)))
 
     def _take_events(self, payloads: list[bytes]) -> None:

@@ -24,11 +24,11 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
-    count_frames,
     part_path,
     parts_of,
     summary_count,
 )
+from adacd_hil.log.types.record_arrays import count_frames
 
 
 class LogRecovery(NamedTuple):

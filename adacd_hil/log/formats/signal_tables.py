@@ -27,7 +27,8 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
 from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
-from adacd_hil.log.types.topics import DECODED, EVENTS_TOPIC
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
+from adacd_hil.log.types.topics import DECODED, EVENTS
 from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.codec_columns import ColumnCodec
@@ -194,7 +195,7 @@ def _import_pyarrow() -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-_RAW = ("to_can_bus", "from_can_bus", "to_can_bus_fd", "from_can_bus_fd")
+_RAW = tuple(name.removeprefix("/") for name in FRAME_TOPICS)
 """Ends of the topics of frames, which other formats are for."""
 
 
@@ -267,7 +268,7 @@ def _export_topics(
                 if topic in topics:
                     tables.write(topic, series_columns(series, stream.epoch_ns))
             if events := stream.events(piece):
-                tables.write(EVENTS_TOPIC, event_columns(events))
+                tables.write(EVENTS.name, event_columns(events))
             progress(sum(tables.rows.values()))
     return TableSummary(tables.rows, stream.problem)
 

@@ -201,6 +201,8 @@ class McapFile(ChunkedFile):
         super().__init__(sink, LIBRARY, ROS_PROFILE)
         self.ids: dict[int, int] = {}
         """The file's number of each channel, by ours."""
+        self.types = {channel.id: channel.type for channel in channels}
+        """Of each channel, by our number."""
         for name, data in attachments.items():
             media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "text/plain")
             self.attach(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))

@@ -45,8 +45,8 @@ from adacd_hil.log.types.message_types import (
     pack_log,
 )
 from adacd_hil.log.types.record_arrays import record_dtype
-from adacd_hil.log.types.topics import SCHEME_BLOCK, ChannelId
-from adacd_hil.records import JOINTS, Event, scheme_layout
+from adacd_hil.log.types.topics import ChannelId
+from adacd_hil.records import JOINTS, Event
 from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
 from adacd_hil.wire.codec_columns import ColumnCodec, MessageTable
 
@@ -84,7 +84,6 @@ class PacketWriter:
         file: McapFile,
         messages: tuple[MessageTable, ...],
         epoch_ns: int,
-        parameter_count: int,
         watch: Watch | None = None,
     ) -> None:
         """Write to `file`; `watch` is given every batch of records, too."""
@@ -102,12 +101,10 @@ class PacketWriter:
         self._decoders = [ColumnCodec(messages[index]) for _, index in known]
         self._decoded_ids = [file.ids[ChannelId.DECODED_FIRST + index] for _, index in known]
         self._lengths = np.array([decoder.length for decoder in self._decoders], np.int64)
-        slices = scheme_layout(parameter_count).slices
-        self._joint_slices = {
-            name: slice(_BODY + SCHEME_BLOCK + 8 * slices[name].start, _BODY + SCHEME_BLOCK + 8 * slices[name].stop)
-            for name in ("q", "dq", "tau_J")
-        }
-        self._least_scheme = max(place.stop for place in self._joint_slices.values()) - _BODY
+        scheme: Any = file.types[ChannelId.SCHEME].dtype.fields if ChannelId.SCHEME in file.types else {}
+        starts = {name: MESSAGE_HEAD + scheme[name][1] for name in ("q", "dq", "tau_J") if name in scheme}
+        self._joint_slices = {name: slice(start, start + 8 * JOINTS) for name, start in starts.items()}
+        self._least_scheme = max((place.stop for place in self._joint_slices.values()), default=_BODY) - _BODY
 
     def begin(self, file: McapFile) -> None:
         """Go on with another file of the same topics."""

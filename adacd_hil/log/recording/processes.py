@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from adacd_hil.log.types.message_types import MessageType
+from adacd_hil.log.types.topics import LogChannel
 from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
 
 MOST_VIEWERS = 8
@@ -41,24 +43,21 @@ class LiveSetup:
 
 @dataclass(frozen=True)
 class WriterSetup:
-    """`messages`: of the DBC; `is_truth` makes the emulator's own log, which has none.
+    """`channels`: of the file; `messages`: of the DBC, whose frames are decoded.
 
     `path`: absolute, of the first part. A part ends after `part_bytes` before compression or `part_ns` of log time,
     never where these are 0. `live`: served, unless None.
     """
 
     path: Path
-    is_truth: bool
     is_blocking: bool
+    channels: tuple[LogChannel, ...]
     messages: tuple[MessageTable, ...]
-    parameter_count: int
     epoch_ns: int
     part_bytes: int
     part_ns: int
     attachments: dict[str, bytes]
     metadata: dict[str, str]
-    further_count: int = 0
-    channel_count: int = 0
     live: LiveSetup | None = None
 
     def to_json(self) -> bytes:
@@ -73,6 +72,11 @@ class WriterSetup:
         """Read it."""
         table = json.loads(text)
         table["path"] = Path(table["path"])
+        table["channels"] = tuple(
+            LogChannel(channel["id"], channel["topic"], MessageType(**{**kind, "fields": tuple(kind["fields"])}))
+            for channel in table["channels"]
+            for kind in (channel["type"],)
+        )
         table["messages"] = tuple(
             MessageTable(**{**message, "signals": tuple(SignalCodec(**signal) for signal in message["signals"])})
             for message in table["messages"]

@@ -21,6 +21,7 @@ from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveSetup, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring, room_of
 from adacd_hil.log.recording.run_folder import check_free, make_room
+from adacd_hil.log.types.topics import run_channels, truth_channels
 from adacd_hil.log.viewer.robot_description import ROBOT_NAME
 from adacd_hil.log.viewer.viewer_layout import LAYOUT_NAME, viewer_layout
 from adacd_hil.records import PARAMETER_NAMES, Event
@@ -94,15 +95,18 @@ class Recorder:
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
         self._unannounced = 0  # bytes in the ring that the writer was not woken for
+        told = () if is_truth else plain_tables(_own_messages() if messages is None else messages)
+        try:
+            run = (parameter_count, told, further_count, channel_count)
+            channels = truth_channels() if is_truth else run_channels(*run)
+        except LogError as error:
+            raise LogError(f"log {path} can't be written: {error}") from None
         file = _create(path, is_truth)
         setup = WriterSetup(
             path=path.absolute(),
-            is_truth=is_truth,
             is_blocking=blocking,
-            messages=() if is_truth else plain_tables(_own_messages() if messages is None else messages),
-            parameter_count=parameter_count,
-            further_count=further_count,
-            channel_count=channel_count,
+            channels=channels,
+            messages=told,
             epoch_ns=epoch_ns,
             part_bytes=settings.part_MiB * _MIB,
             part_ns=round(settings.part_min * _MINUTE_NS),

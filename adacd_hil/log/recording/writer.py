@@ -31,7 +31,6 @@ from adacd_hil.log.recording.packet_writer import Numbers, PacketWriter, Rows
 from adacd_hil.log.recording.processes import WriterSetup
 from adacd_hil.log.recording.ring import RingReader, split
 from adacd_hil.log.recording.run_folder import is_there
-from adacd_hil.log.types.topics import run_channels, truth_channels
 from adacd_hil.log.viewer.feed import LiveFeed
 
 POLL_PERIOD_US = 25_000
@@ -52,10 +51,6 @@ class WriterProcess:
     def __init__(
         self, connection: socket.socket, ring: RingReader, sink: Sink, setup: WriterSetup, clock: Clock | None = None
     ) -> None:
-        messages = setup.messages
-        counts = setup.further_count, setup.channel_count
-        channels = run_channels(setup.parameter_count, messages, *counts)
-        self._channels = truth_channels() if setup.is_truth else channels
         self._connection = connection
         self._ring = ring
         self._sink = sink
@@ -66,7 +61,7 @@ class WriterProcess:
         self._clock = clock or MonotonicClock()
         self.live = self._open_live() if setup.live else None
         watch = self.live.show if self.live else None
-        self._packets = PacketWriter(self._file, messages, setup.epoch_ns, setup.parameter_count, watch)
+        self._packets = PacketWriter(self._file, setup.messages, setup.epoch_ns, watch)
         self._gathered: list[bytes] = []
         self._gathered_bytes = 0
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
@@ -195,7 +190,7 @@ class WriterProcess:
     def _begin_file(self) -> McapFile:
         setup = self._setup
         metadata = {**setup.metadata, PART_KEY: str(self._part)}
-        return McapFile(self._sink, self._channels, setup.attachments, metadata)
+        return McapFile(self._sink, setup.channels, setup.attachments, metadata)
 
     def _finish(self, ending: str) -> dict[str, str]:
         """End the part in progress; return the summary of all parts so far."""

@@ -16,6 +16,7 @@ import re
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -52,14 +53,31 @@ _FIELD_LINE = re.compile(r"(?P<type>[a-z0-9]+)(\[(?P<size>[0-9]{1,9})\])?\s+(?P<
 
 
 class Member(NamedTuple):
-    """One field of a message: `size` numbers of the ROS type `kind`. `constants` name the values that it can take."""
+    """One field of a message: `size` numbers of the ROS type `kind`.
+
+    values: names of the values that it can take, constants of the schema that begin with `prefix`, else with its name.
+    """
 
     name: str
     kind: str
     size: int = 1
     unit: str = ""
     meaning: str = ""
-    constants: tuple[tuple[str, int], ...] = ()
+    values: type[IntEnum] | None = None
+    prefix: str = ""
+
+    @property
+    def constants(self) -> tuple[tuple[str, int], ...]:
+        """Name the values that it can take."""
+        return tuple((f"{self.prefix or self.name.upper()}_{value.name}", int(value)) for value in self.values or ())
+
+    def value_of(self, number: Any) -> Any:
+        """Make a value of what a record holds. Raises ValueError, OverflowError for one that the field can't take."""
+        if self.size > 1:
+            return tuple(number)
+        if self.values is not None:
+            return self.values(number)
+        return {"bool": bool, "float64": float}.get(self.kind, int)(number)
 
 
 def ros_field_name(name: str) -> str:

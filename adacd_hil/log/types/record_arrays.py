@@ -8,7 +8,7 @@ cycle's, is higher than any before.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -111,6 +111,11 @@ FRAME_TOPICS = {
     "/from_can_bus_fd": FrameTopic(FD_FRAME.name, is_tx=False, is_long=True),
 }
 """The topics of frames."""
+
+
+def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
+    """Count the frames in a file by its channels' topics and their counts of messages."""
+    return sum(count for channel, count in counts.items() if topics.get(channel) in FRAME_TOPICS)
 
 
 def is_of_frames(topic: Topic) -> bool:

@@ -1,4 +1,8 @@
-"""The table of topics: what a log holds, under which type, how often, and how each message is packed.
+"""The topics of a log, each declared once: its number, name, fields, and how a message of it is packed.
+
+A topic is added here, by an `OwnTopic` in RUN_TOPICS, and where its messages are made. Schema, channel, reader, check,
+export and live view follow from the declaration. A field of /scheme is added to `records.scheme_layout`, or to the head
+of SCHEME and to `records.SchemeOutput`.
 
 The control side packs *bodies*: what follows the stamp. The writer puts encapsulation and stamp in front, the same
 for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its bytes.
@@ -19,10 +23,13 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 """
 
 import itertools
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from functools import cached_property
+from operator import attrgetter
+from typing import Any, NamedTuple
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import (
@@ -60,7 +67,6 @@ from adacd_hil.wire.e2e import E2eStatus
 
 PACKAGE = "adacd_hil_msgs/msg"
 DECODED = "/decoded/"
-EVENTS_TOPIC = "/events"
 
 
 class ChannelId(IntEnum):
@@ -83,99 +89,216 @@ class ChannelId(IntEnum):
 
 @dataclass(frozen=True)
 class LogChannel:
-    """One topic."""
+    """One topic of a file."""
 
     id: int
     topic: str
     type: MessageType
 
 
-def _constants(prefix: str, values: type[IntEnum]) -> tuple[tuple[str, int], ...]:
-    return tuple((f"{prefix}_{value.name}", int(value)) for value in values)
+class BlockSize(NamedTuple):
+    """What the block of /scheme is laid out for; further_count and channel_count: see `records.certified_layout`."""
+
+    parameter_count: int
+    further_count: int = 0
+    channel_count: int = 0
 
 
-def _members(layout: Layout) -> tuple[Member, ...]:
-    """Describe the fields of a float64 block."""
-    return tuple(Member(field.name, "float64", field.size, field.unit, field.meaning) for field in layout.fields)
+@dataclass(frozen=True)
+class OwnTopic:
+    """A topic of ours.
+
+    type: of its messages; a name makes it a type of our own. head: the fields that a message of that type begins with;
+    each is an attribute of the record that is packed, unless `given` names it: then it is handed over beside it. block:
+    lays out the float64 values that follow. rate_Hz: of the live view; 0: every message is shown.
+    """
+
+    id: int
+    name: str
+    type: MessageType | str
+    head: tuple[Member, ...] = ()
+    given: tuple[str, ...] = ()
+    block: Callable[[BlockSize], Layout] | None = None
+    rate_Hz: int = 0
+
+    def channel(self, size: BlockSize) -> LogChannel:
+        """Describe the topic to a file. Raises LogError when two fields share a name."""
+        if isinstance(self.type, MessageType):
+            return LogChannel(self.id, self.name, self.type)
+        fields = self.block(size).fields if self.block is not None else ()
+        members = (Member(field.name, "float64", field.size, field.unit, field.meaning) for field in fields)
+        return LogChannel(self.id, self.name, number_type(f"{PACKAGE}/{self.type}", (*self.head, *members)))
+
+    @cached_property
+    def _struct(self) -> struct.Struct:
+        return body_struct(self.head, has_block=self.block is not None)
+
+    @cached_property
+    def _attributes(self) -> Callable[[Any], tuple[Any, ...]]:
+        names = [member.name for member in self.head if member.name not in self.given]
+        return attrgetter(*names) if len(names) > 1 else lambda record: tuple(getattr(record, name) for name in names)
+
+    @cached_property
+    def _places(self) -> tuple[int, ...]:
+        return tuple(place for place, member in enumerate(self.head) if member.name in self.given)
+
+    @cached_property
+    def _has_arrays(self) -> bool:
+        return any(member.size > 1 for member in self.head)
+
+    def pack(self, record: Any, *given: Any, block: Vector | None = None) -> bytes:
+        """Pack the body of a message; `given` in the order of the head. Raises struct.error for too many or too few."""
+        values = given
+        if len(self.given) < len(self.head):
+            values = self._attributes(record)
+            for place, value in zip(self._places, given, strict=False):
+                values = (*values[:place], value, *values[place:])
+        if self._has_arrays:
+            pairs = zip(self.head, values, strict=True)
+            values = tuple(number for member, value in pairs for number in (value if member.size > 1 else (value,)))
+        head = self._struct.pack(*values)
+        return head if block is None else head + block.tobytes()
+
+    def unpack(self, body: bytes) -> dict[str, Any]:
+        """Unpack the head of a body. Raises struct.error when it is cut, ValueError for a value that has no name."""
+        numbers = iter(self._struct.unpack_from(body))
+        return {
+            member.name: member.value_of(
+                itertools.islice(numbers, member.size) if member.size > 1 else next(numbers),
+            )
+            for member in self.head
+        }
 
 
 _CYCLE_NUMBER = Member("cycle", "uint64", meaning="number of the cycle")
-_SCHEME = (
-    _CYCLE_NUMBER,
-    Member("state", "uint8", meaning="SchemeState", constants=_constants("STATE", SchemeState)),
-    Member("previous_state", "uint8", meaning="SchemeState of the cycle before"),
-    Member("fault", "uint8", meaning="FaultReason", constants=_constants("FAULT", FaultReason)),
-    Member("request", "uint8", meaning="Request", constants=_constants("REQUEST", Request)),
-    Member("contact_joints", "uint8", meaning="bit i: joint i over the threshold"),
-    Member("is_model_valid", "bool", meaning="theta_hat may be fed forward"),
+_FRAME_RATE_HZ = 10
+
+
+def _choice(name: str, values: type[IntEnum]) -> Member:
+    return Member(name, "uint8", meaning=values.__name__, values=values)
+
+
+TO_CAN_BUS = OwnTopic(ChannelId.TO_CAN_BUS, "/to_can_bus", CAN_FRAME, rate_Hz=_FRAME_RATE_HZ)
+FROM_CAN_BUS = OwnTopic(ChannelId.FROM_CAN_BUS, "/from_can_bus", CAN_FRAME, rate_Hz=_FRAME_RATE_HZ)
+TO_CAN_BUS_FD = OwnTopic(ChannelId.TO_CAN_BUS_FD, "/to_can_bus_fd", FD_FRAME, rate_Hz=_FRAME_RATE_HZ)
+FROM_CAN_BUS_FD = OwnTopic(ChannelId.FROM_CAN_BUS_FD, "/from_can_bus_fd", FD_FRAME, rate_Hz=_FRAME_RATE_HZ)
+JOINT_STATES = OwnTopic(ChannelId.JOINT_STATES, "/joint_states", JOINT_STATE, rate_Hz=50)
+"""The writer makes it of /scheme."""
+SCHEME = OwnTopic(
+    ChannelId.SCHEME,
+    "/scheme",
+    "Scheme",
+    head=(
+        _CYCLE_NUMBER,
+        _choice("state", SchemeState),
+        Member("previous_state", "uint8", meaning="SchemeState of the cycle before"),
+        _choice("fault", FaultReason),
+        _choice("request", Request),
+        Member("contact_joints", "uint8", meaning="bit i: joint i over the threshold"),
+        Member("is_model_valid", "bool", meaning="theta_hat may be fed forward"),
+    ),
+    given=("request",),
+    block=lambda size: certified_layout(*size) if size.channel_count else scheme_layout(size.parameter_count),
+    rate_Hz=50,
 )
-_CONTACT = (
-    _CYCLE_NUMBER,
-    Member("link", "uint8", meaning="link that was touched"),
-    Member("direction", "int8", 2, meaning="sign of the external torque, 0 below the threshold"),
-    Member("is_final", "bool", meaning="the isolation window has ended"),
-    Member("tau_ext_peak", "float64", 2, "Nm", "largest external torque, filter undone"),
-    Member("impulse", "float64", 2, "Nm s", "integral of the external torque"),
-    Member("level", "uint8", meaning="ContactLevel", constants=_constants("LEVEL", ContactLevel)),
-    Member("kind", "uint8", meaning="ContactKind", constants=_constants("KIND", ContactKind)),
-    Member("reaction", "uint8", meaning="Reaction", constants=_constants("REACTION", Reaction)),
-    Member("location", "uint8", meaning="Location", constants=_constants("LOCATION", Location)),
-    Member("is_two_sided", "bool", meaning="something has pushed from the other side too"),
-    Member("tau_ext_peak_sigma", "float64", 2, "Nm", "standard deviation, inf: not known"),
-    Member("impulse_sigma", "float64", 2, "Nm s", "standard deviation, inf: not known"),
-    Member("force_N", "float64", unit="N", meaning="at right angles to the link"),
-    Member("force_sigma", "float64", unit="N", meaning="standard deviation, inf: not known"),
-    Member("lever_m", "float64", unit="m", meaning="from joint 2"),
-    Member("lever_sigma", "float64", unit="m", meaning="standard deviation, inf: not known"),
-    Member("blind_rad", "float64", unit="rad", meaning="nearer to link 2's axis a force reads as one on link 1"),
+CONTACT = OwnTopic(
+    ChannelId.CONTACT,
+    "/contact",
+    "Contact",
+    head=(
+        _CYCLE_NUMBER,
+        Member("link", "uint8", meaning="link that was touched"),
+        Member("direction", "int8", 2, meaning="sign of the external torque, 0 below the threshold"),
+        Member("is_final", "bool", meaning="the isolation window has ended"),
+        Member("tau_ext_peak", "float64", 2, "Nm", "largest external torque, filter undone"),
+        Member("impulse", "float64", 2, "Nm s", "integral of the external torque"),
+        _choice("level", ContactLevel),
+        _choice("kind", ContactKind),
+        _choice("reaction", Reaction),
+        _choice("location", Location),
+        Member("is_two_sided", "bool", meaning="something has pushed from the other side too"),
+        Member("tau_ext_peak_sigma", "float64", 2, "Nm", "standard deviation, inf: not known"),
+        Member("impulse_sigma", "float64", 2, "Nm s", "standard deviation, inf: not known"),
+        Member("force_N", "float64", unit="N", meaning="at right angles to the link"),
+        Member("force_sigma", "float64", unit="N", meaning="standard deviation, inf: not known"),
+        Member("lever_m", "float64", unit="m", meaning="from joint 2"),
+        Member("lever_sigma", "float64", unit="m", meaning="standard deviation, inf: not known"),
+        Member("blind_rad", "float64", unit="rad", meaning="nearer to link 2's axis a force reads as one on link 1"),
+    ),
 )
-_CONTACT_KINDS: dict[str, Callable[[int], IntEnum]] = {
-    "level": ContactLevel,
-    "kind": ContactKind,
-    "reaction": Reaction,
-    "location": Location,
-}
-_CONTROL = (
-    _CYCLE_NUMBER,
-    Member("gate_flags", "uint8", meaning="limits that acted, one bit each"),
-    Member("enable", "bool", meaning="drives are asked to be enabled"),
-    Member("quick_stop", "bool", meaning="drives are asked for a quick stop"),
+CONTROL = OwnTopic(
+    ChannelId.CONTROL,
+    "/control",
+    "Control",
+    head=(
+        _CYCLE_NUMBER,
+        Member("gate_flags", "uint8", meaning="limits that acted, one bit each"),
+        Member("enable", "bool", meaning="drives are asked to be enabled"),
+        Member("quick_stop", "bool", meaning="drives are asked for a quick stop"),
+    ),
+    given=("cycle", "gate_flags", "enable", "quick_stop"),
+    block=lambda _: CONTROL_LAYOUT,
+    rate_Hz=50,
 )
-_CYCLE = (
-    _CYCLE_NUMBER,
-    Member("lateness_ns", "int64", unit="ns", meaning="wake-up after the grid point"),
-    Member("feedback_ns", "int64", unit="ns", meaning="SYNC sent to last frame decoded"),
-    Member("command_ns", "int64", unit="ns", meaning="SYNC sent to last command handed to the bus"),
-    Member("compute_ns", "int64", unit="ns", meaning="last cyclic frame received to last command handed to the bus"),
-    Member("slack_ns", "int64", unit="ns", meaning="last command to the next grid point; negative: overrun"),
-    Member("data_age", "uint64", meaning="age of the oldest value that was used, cycles"),
-    Member("overruns", "uint64", meaning="periods skipped since the run began"),
-    Member("frames_missing", "uint64", meaning="cyclic frames that did not arrive or failed their checks"),
-    Member("commands_late", "uint64", meaning="commands of the cycle before that missed this SYNC and act at the next"),
-    Member("frames_lost", "uint64", meaning="received frames that the kernel dropped since the run began"),
-    Member("receive_queue_bytes", "uint64", meaning="waits to be received, bytes of the kernel's memory"),
-    Member("transmit_queue_bytes", "uint64", meaning="waits to be sent, bytes of the kernel's memory"),
-    Member("log_queue_bytes", "uint64", meaning="waits for the log's writer, bytes"),
+CYCLE = OwnTopic(
+    ChannelId.CYCLE,
+    "/cycle",
+    "Cycle",
+    head=(
+        _CYCLE_NUMBER,
+        Member("lateness_ns", "int64", unit="ns", meaning="wake-up after the grid point"),
+        Member("feedback_ns", "int64", unit="ns", meaning="SYNC sent to last frame decoded"),
+        Member("command_ns", "int64", unit="ns", meaning="SYNC sent to last command handed to the bus"),
+        Member(
+            "compute_ns", "int64", unit="ns", meaning="last cyclic frame received to last command handed to the bus"
+        ),
+        Member("slack_ns", "int64", unit="ns", meaning="last command to the next grid point; negative: overrun"),
+        Member("data_age", "uint64", meaning="age of the oldest value that was used, cycles"),
+        Member("overruns", "uint64", meaning="periods skipped since the run began"),
+        Member("frames_missing", "uint64", meaning="cyclic frames that did not arrive or failed their checks"),
+        Member(
+            "commands_late", "uint64", meaning="commands of the cycle before that missed this SYNC and act at the next"
+        ),
+        Member("frames_lost", "uint64", meaning="received frames that the kernel dropped since the run began"),
+        Member("receive_queue_bytes", "uint64", meaning="waits to be received, bytes of the kernel's memory"),
+        Member("transmit_queue_bytes", "uint64", meaning="waits to be sent, bytes of the kernel's memory"),
+        Member("log_queue_bytes", "uint64", meaning="waits for the log's writer, bytes"),
+    ),
+    rate_Hz=20,
 )
 _DEVICES = ("drive1", "drive2", "sensor1", "sensor2")
-_FRAME_CHECKS = (
-    _CYCLE_NUMBER,
-    *(
-        Member(f"{device}_checks", "uint64", len(E2eStatus), meaning="frames so far, by E2eStatus", constants=constants)
-        for device, constants in zip(_DEVICES, (_constants("E2E", E2eStatus), (), (), ()), strict=True)
+FRAME_CHECKS = OwnTopic(
+    ChannelId.FRAME_CHECKS,
+    "/frame_checks",
+    "FrameChecks",
+    head=(
+        _CYCLE_NUMBER,
+        *(
+            Member(f"{device}_checks", "uint64", len(E2eStatus), "", "frames so far, by E2eStatus", values, "E2E")
+            for device, values in zip(_DEVICES, (E2eStatus, None, None, None), strict=True)
+        ),
+        Member("implausible", "uint64", len(_DEVICES), meaning="frames so far that failed their plausibility check"),
     ),
-    Member("implausible", "uint64", len(_DEVICES), meaning="frames so far that failed their plausibility check"),
+    given=tuple(f"{device}_checks" for device in _DEVICES),
 )
-_TRUTH = (_CYCLE_NUMBER,)
-
-_SCHEME_HEAD = body_struct(_SCHEME, has_block=True)
-_CONTACT_BODY = body_struct(_CONTACT)
-_CONTROL_HEAD = body_struct(_CONTROL, has_block=True)
-_CYCLE_BODY = body_struct(_CYCLE)
-_FRAME_CHECKS_BODY = body_struct(_FRAME_CHECKS)
-_TRUTH_HEAD = body_struct(_TRUTH, has_block=True)
-SCHEME_BLOCK = _SCHEME_HEAD.size
-"""Where the block begins in the body of /scheme, bytes."""
+EVENTS = OwnTopic(ChannelId.EVENTS, "/events", LOG)
+TRUTH = OwnTopic(
+    ChannelId.TRUTH, "/truth", "Truth", head=(_CYCLE_NUMBER,), given=("cycle",), block=lambda _: TRUTH_LAYOUT
+)
+RUN_TOPICS = (
+    TO_CAN_BUS,
+    FROM_CAN_BUS,
+    TO_CAN_BUS_FD,
+    FROM_CAN_BUS_FD,
+    JOINT_STATES,
+    SCHEME,
+    CONTACT,
+    CONTROL,
+    CYCLE,
+    FRAME_CHECKS,
+    EVENTS,
+)
+"""The topics of a run, in the order of the file; those of the DBC's messages follow."""
 
 
 def run_channels(
@@ -185,22 +308,8 @@ def run_channels(
 
     further_count, channel_count: of the certified scheme, see `records.certified_layout`; 0 for the paper's.
     """
-    layout = certified_layout(parameter_count, further_count, channel_count)
-    scheme = (*_SCHEME, *_members(layout if channel_count else scheme_layout(parameter_count)))
-    control = (*_CONTROL, *_members(CONTROL_LAYOUT))
-    own = (
-        LogChannel(ChannelId.TO_CAN_BUS, "/to_can_bus", CAN_FRAME),
-        LogChannel(ChannelId.FROM_CAN_BUS, "/from_can_bus", CAN_FRAME),
-        LogChannel(ChannelId.TO_CAN_BUS_FD, "/to_can_bus_fd", FD_FRAME),
-        LogChannel(ChannelId.FROM_CAN_BUS_FD, "/from_can_bus_fd", FD_FRAME),
-        LogChannel(ChannelId.JOINT_STATES, "/joint_states", JOINT_STATE),
-        LogChannel(ChannelId.SCHEME, "/scheme", number_type(f"{PACKAGE}/Scheme", scheme)),
-        LogChannel(ChannelId.CONTACT, "/contact", number_type(f"{PACKAGE}/Contact", _CONTACT)),
-        LogChannel(ChannelId.CONTROL, "/control", number_type(f"{PACKAGE}/Control", control)),
-        LogChannel(ChannelId.CYCLE, "/cycle", number_type(f"{PACKAGE}/Cycle", _CYCLE)),
-        LogChannel(ChannelId.FRAME_CHECKS, "/frame_checks", number_type(f"{PACKAGE}/FrameChecks", _FRAME_CHECKS)),
-        LogChannel(ChannelId.EVENTS, "/events", LOG),
-    )
+    size = BlockSize(parameter_count, further_count, channel_count)
+    own = tuple(topic.channel(size) for topic in RUN_TOPICS)
     decoded = tuple(
         _decoded_channel(ChannelId.DECODED_FIRST + index, message) for index, message in enumerate(messages)
     )
@@ -210,8 +319,7 @@ def run_channels(
 
 def truth_channels() -> tuple[LogChannel, ...]:
     """List the topics of the emulator's own log."""
-    truth = number_type(f"{PACKAGE}/Truth", (*_TRUTH, *_members(TRUTH_LAYOUT)))
-    return (LogChannel(ChannelId.TRUTH, "/truth", truth), LogChannel(ChannelId.EVENTS, "/events", LOG))
+    return TRUTH.channel(BlockSize(0)), EVENTS.channel(BlockSize(0))
 
 
 def _decoded_channel(channel_id: int, message: MessageTable) -> LogChannel:
@@ -230,56 +338,34 @@ def _check_names(channels: tuple[LogChannel, ...]) -> None:
 
 def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
     """Pack the body of /scheme."""
-    return (
-        _SCHEME_HEAD.pack(
-            output.cycle,
-            output.state,
-            output.previous_state,
-            output.fault,
-            request,
-            output.contact_joints,
-            output.is_model_valid,
-        )
-        + output.block.tobytes()
-    )
+    return SCHEME.pack(output, request, block=output.block)
 
 
 def pack_contact(report: ContactReport) -> bytes:
     """Pack the body of /contact."""
-    values = (value if isinstance(value, tuple) else (value,) for value in report)
-    by_name = dict(zip(report._fields, values, strict=True))
-    return _CONTACT_BODY.pack(*(value for member in _CONTACT for value in by_name[member.name]))
+    return CONTACT.pack(report)
 
 
 def unpack_contact(body: bytes) -> ContactReport:
     """Unpack the body of /contact. Raises struct.error when it is cut, ValueError for a value that has no name."""
-    values = iter(_CONTACT_BODY.unpack_from(body))
-    fields: dict[str, Any] = {}
-    for member in _CONTACT:
-        if member.size > 1:
-            fields[member.name] = tuple(itertools.islice(values, member.size))
-        else:
-            kind = _CONTACT_KINDS.get(member.name)
-            fields[member.name] = next(values) if kind is None else kind(next(values))
-    return ContactReport(**fields)
+    return ContactReport(**CONTACT.unpack(body))
 
 
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
     """Pack the body of /control; `block` is laid out by CONTROL_LAYOUT."""
-    return _CONTROL_HEAD.pack(cycle, gate_flags, enable, quick_stop) + block.tobytes()
+    return CONTROL.pack(None, cycle, gate_flags, enable, quick_stop, block=block)
 
 
 def pack_cycle(record: CycleRecord) -> bytes:
     """Pack the body of /cycle."""
-    return _CYCLE_BODY.pack(*record)
+    return CYCLE.pack(record)
 
 
 def pack_frame_checks(checks: FrameChecks) -> bytes:
     """Pack the body of /frame_checks."""
-    counts = [count for device in checks.counts for count in device]
-    return _FRAME_CHECKS_BODY.pack(checks.cycle, *counts, *checks.implausible)
+    return FRAME_CHECKS.pack(checks, *checks.counts)
 
 
 def pack_truth(cycle: int, block: Vector) -> bytes:
     """Pack the body of /truth; `block` is laid out by TRUTH_LAYOUT."""
-    return _TRUTH_HEAD.pack(cycle) + block.tobytes()
+    return TRUTH.pack(None, cycle, block=block)

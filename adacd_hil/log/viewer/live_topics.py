@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from adacd_hil.log.mcap.records import MESSAGE_HEAD
 from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.types.message_types import ENCAPSULATION, JOINT_STATE_DTYPE, MessageType
-from adacd_hil.log.types.topics import DECODED, ChannelId, LogChannel, unpack_contact
+from adacd_hil.log.types.topics import DECODED, RUN_TOPICS, ChannelId, LogChannel, unpack_contact
 from adacd_hil.log.viewer.feed import Batch
 from adacd_hil.log.viewer.scene import (
     DESCRIPTION_TOPIC,
@@ -38,21 +38,10 @@ from adacd_hil.log.viewer.scene import (
 )
 from adacd_hil.records import SchemeState
 
-RATES_HZ = {
-    "/scheme": 50,
-    "/joint_states": 50,
-    "/control": 50,
-    TRANSFORMS_TOPIC: 50,
-    "/cycle": 20,
-    SCENE_TOPIC: 10,
-    "/to_can_bus": 10,
-    "/from_can_bus": 10,
-    "/to_can_bus_fd": 10,
-    "/from_can_bus_fd": 10,
-}
+RATES_HZ = {TRANSFORMS_TOPIC: 50, SCENE_TOPIC: 10, **{topic.name: topic.rate_Hz for topic in RUN_TOPICS}}
 DECODED_RATE_HZ = 10
 EVERY_RECORD = 0
-"""The rate of all other topics, as /events, /contact and /frame_checks."""
+"""The rate of topics that have none, as /events, /contact and /frame_checks."""
 
 
 def rate_of(topic: str) -> int:

@@ -33,7 +33,6 @@ from websockets.typing import Subprotocol
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.recording.ring import RingReader, split
-from adacd_hil.log.types.topics import run_channels
 from adacd_hil.log.viewer.admission import (
     FULL,
     OPEN_TIMEOUT_S,
@@ -371,8 +370,7 @@ def make_server(told: ServerSetup, ring: RingReader, writer: socket.socket) -> L
     """Make the server of a log."""
     setup = told.setup
     assert setup.live is not None
-    channels = run_channels(setup.parameter_count, setup.messages, setup.further_count, setup.channel_count)
-    return LiveServer(setup.live, LiveTopics(setup.live, channels, told.ids, told.start_ns), ring, writer)
+    return LiveServer(setup.live, LiveTopics(setup.live, setup.channels, told.ids, told.start_ns), ring, writer)
 
 
 async def _serve(

@@ -1,0 +1,135 @@
+"""A topic, and a field of a topic, are added by declaring them: writer, reader, check and export follow."""
+
+import csv
+from dataclasses import replace
+from enum import IntEnum
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from recorded_run import CODEC
+
+from adacd_hil.log.check.log_check import check_log
+from adacd_hil.log.formats.signal_tables import export_tables
+from adacd_hil.log.reader import LogStream, read_log
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.log.types import topics
+from adacd_hil.log.types.message_types import Member
+from adacd_hil.log.types.topics import SCHEME, OwnTopic
+from adacd_hil.records import Field, Layout, Request, SchemeState, scheme_layout
+
+CYCLES = 40
+PERIOD_NS = 1_000_000
+
+
+class Charge(IntEnum):
+    EMPTY = 0
+    FULL = 3
+
+
+BATTERY = OwnTopic(
+    15,
+    "/battery",
+    "Battery",
+    head=(
+        Member("cycle", "uint64", meaning="number of the cycle"),
+        Member("charge", "uint8", meaning="Charge", values=Charge),
+        Member("cell_V", "float64", 3, "V", "voltage of each cell"),
+    ),
+    given=("cycle",),
+    block=lambda _: Layout((Field("heat", 2, "K", "of both ends"),)),
+)
+WIDER_SCHEME = replace(
+    SCHEME,
+    head=(*SCHEME.head, Member("mood", "int32", meaning="of the operator")),
+    block=lambda size: Layout(
+        (Field("first", 1, "", ""), *scheme_layout(size.parameter_count).fields, Field("warmth", 2, "K", ""))
+    ),
+)
+
+
+def battery(number: int) -> bytes:
+    record = SimpleNamespace(charge=Charge.FULL, cell_V=(3.0 + number, 2.0, 1.0))
+    return BATTERY.pack(record, number, block=np.array([0.5, float(number)]))
+
+
+def scheme(number: int) -> bytes:
+    block = np.arange(WIDER_SCHEME.block(topics.BlockSize(7)).size) + 100.0 * number
+    output = SimpleNamespace(
+        cycle=number, state=SchemeState.ADAPT, previous_state=0, fault=0, contact_joints=0, is_model_valid=True, mood=-7
+    )
+    return WIDER_SCHEME.pack(output, Request.NONE, block=block)
+
+
+def record(path, topic, pack):
+    """Write a log of one topic."""
+    with Recorder(path, messages=(), blocking=True) as recorder:
+        for number in range(CYCLES):
+            recorder.cycle((number + 1) * PERIOD_NS, [(topic.id, pack(number))])
+        assert recorder.close().is_complete
+
+
+@pytest.fixture
+def path(tmp_path, monkeypatch):
+    """Where a log is put that has both."""
+    others = tuple(topic for topic in topics.RUN_TOPICS if topic is not SCHEME)
+    monkeypatch.setattr(topics, "RUN_TOPICS", (*others, WIDER_SCHEME, BATTERY))
+    return tmp_path / "run.mcap"
+
+
+def test_a_topic_is_added_by_its_declaration(path):
+    record(path, BATTERY, battery)
+    series = read_log(path).topics["/battery"]
+    assert series.fields == ("cycle", "charge", "cell_V", "heat")
+    assert series["cycle"].tolist() == list(range(CYCLES))
+    assert series["charge"].tolist() == [Charge.FULL] * CYCLES
+    assert series["cell_V"].tolist() == [[3.0 + number, 2.0, 1.0] for number in range(CYCLES)]
+    assert series["heat"].tolist() == [[0.5, float(number)] for number in range(CYCLES)]
+    (piece,) = LogStream(path)
+    assert piece.series["/battery"].payloads() == series.payloads()
+
+
+def test_a_log_with_a_topic_that_was_added_is_sound(path):
+    record(path, BATTERY, battery)
+    assert check_log(path).findings == []
+
+
+def test_a_message_of_a_topic_that_was_added_is_as_long_as_it_says(path):
+    record(path, BATTERY, lambda number: battery(number) + bytes(8 * (number == 3)))
+    assert [finding.rule for finding in check_log(path).findings] == ["cdr"]
+
+
+def test_a_topic_that_was_added_is_exported(path, tmp_path):
+    record(path, BATTERY, battery)
+    export_tables(path, tmp_path / "out", "csv", ("battery",), CODEC)
+    with (tmp_path / "out" / "battery.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["cell_V_1"] for row in rows] == [str(3.0 + number) for number in range(CYCLES)]
+
+
+def test_the_names_of_values_stand_in_the_schema():
+    text = BATTERY.channel(topics.BlockSize(7)).type.text
+    assert "uint8 CHARGE_FULL=3\nuint8 charge  # charge: Charge\n" in text
+
+
+def test_what_is_packed_is_unpacked():
+    unpacked = BATTERY.unpack(battery(5))
+    assert unpacked == {"cycle": 5, "charge": Charge.FULL, "cell_V": (8.0, 2.0, 1.0)}
+    assert isinstance(unpacked["charge"], Charge)
+
+
+def test_fields_of_scheme_are_added_by_their_declaration(path):
+    record(path, WIDER_SCHEME, scheme)
+    log = read_log(path)
+    place = WIDER_SCHEME.block(topics.BlockSize(7)).slices
+    assert log.scheme["mood"].tolist() == [-7] * CYCLES
+    assert log.scheme["first"].tolist() == [100.0 * number for number in range(CYCLES)]
+    assert log.scheme["warmth"][1].tolist() == [100.0 + place["warmth"].start, 101.0 + place["warmth"].start]
+    assert check_log(path).findings == []
+
+
+def test_joint_states_follow_the_fields_of_scheme(path):
+    record(path, WIDER_SCHEME, scheme)
+    log = read_log(path)
+    for name in ("q", "dq", "tau_J"):
+        assert log.topics["/joint_states"][name].tolist() == log.scheme[name].tolist()
