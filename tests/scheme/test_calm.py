@@ -7,7 +7,7 @@ from smooth_motion import settings_with
 from adacd_hil.records import ArmBatch, FaultReason, Request, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import arm_at
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, ArmFinding, Observation, is_calm
+from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, ArmFinding, Observation, findings_of, is_calm
 
 SETTINGS = settings_with(
     safety={"commission_s": 0.012, "phase_timeout_s": 0.15},
@@ -73,7 +73,7 @@ def follow(arms, observations, requests, draw):
     draw: gives is_reporting and goes_on, which stay until the next look.
     """
     each, few = Supervisor(SETTINGS), Supervisor(SETTINGS)
-    findings = observations | few.findings(arms)
+    findings = observations | findings_of(arms)
     visited, looks, k = set(), 0, 0
     while k < len(requests):
         is_reporting, goes_on = draw()
@@ -135,7 +135,7 @@ def test_the_arm_s_findings_are_bits_of_their_own():
     joints = 0b11 << CONTACT_SHIFT
     assert not sum(ArmFinding) & (sum(Observation) | joints)
     arms, _, _ = walk(0)
-    found = Supervisor(SETTINGS).findings(arms)
+    found = findings_of(arms)
     for bit, holds in (
         (ArmFinding.ENABLED, arms.is_enabled),
         (ArmFinding.COMPLETE, arms.is_complete),
