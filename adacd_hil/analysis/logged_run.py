@@ -197,9 +197,6 @@ def whole_rounds(begins: Cycles) -> Cycles:
     return np.asarray(begins - begins % SYNC_OVERFLOW)
 
 
-Rows = NDArray[np.int64]
-
-
 Mask = NDArray[np.bool_]
 
 
@@ -374,20 +371,6 @@ class Run:
         return self.time_of_s(self.truth.cycle[rows]) if time_s is None else time_s[rows]
 
 
-def extreme_rows(series: Iterable[Vector], starts: Rows) -> Rows:
-    """Choose of every bucket the rows in which a series (n,) is smallest and largest, the first of equal ones.
-
-    starts: where the buckets begin, from 0, ascending. Rows ascend. NaN is chosen nowhere.
-    """
-    chosen: list[Rows] = [np.empty(0, np.int64)]
-    for values in series:
-        bucket = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
-        for extreme in (np.fmin, np.fmax):
-            hits = np.flatnonzero(values == extreme.reduceat(values, starts)[bucket])
-            chosen.append(hits[np.diff(bucket[hits], prepend=-1) != 0])
-    return np.unique(np.concatenate(chosen))
-
-
 @dataclass(frozen=True)
 class Section:
     """One part of a run; `is_complete` is False if the run ended, or failed, in it."""
@@ -483,3 +466,29 @@ def is_realtime(run: Run) -> bool:
 def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Mark the cycles (n,) that begin to react, from the states before them and their own."""
     return np.asarray((state == SchemeState.REACT) & ~is_interrupted(previous))
+
+
+class Mismatch(NamedTuple):
+    """A value that isn't the logged one. `place`: joint, parameter or channel of the field, "" for a plain one."""
+
+    topic: str
+    field: str
+    place: str
+    cycle: int
+    t_ns: int
+    logged: str
+    replayed: str
+
+    @property
+    def name(self) -> str:
+        """Topic, field and place."""
+        return f"{self.topic}.{self.field}" + (f"[{self.place}]" if self.place else "")
+
+    def line(self, zero_ns: int = 0) -> str:
+        """Say all of it in one line, with the time since `zero_ns`."""
+        time_s = (self.t_ns - zero_ns) * 1e-9
+        return f"cycle {self.cycle}, {time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
+
+
+SHOWN: Final = 20
+"""Mismatches that are kept; all are counted."""

@@ -13,12 +13,11 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.logged_run import settings_of
-from adacd_hil.analysis.replay.scheme_comparison import SHOWN, contact_records
+from adacd_hil.analysis.logged_run import SHOWN, settings_of
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
-from adacd_hil.records import CERTIFICATE_EVENTS, SchemeState
+from adacd_hil.records import CERTIFICATE_EVENTS, ContactReport, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
@@ -294,3 +293,10 @@ def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
     """Tell whether the run that the settings are of knew anchors: since then they say how a zero drifts."""
     tare = parse_toml(attachments["config.toml"]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
+
+
+def contact_records(series: Series) -> dict[int, dict[str, Any]]:
+    """Return the logged reports by the time at which they were made, ns."""
+    names = [name for name in ContactReport._fields if name in series.fields]
+    rows = zip(series.t_ns.tolist(), series.records, strict=True)
+    return {t_ns: {name: record[name].tolist() for name in names} for t_ns, record in rows}

@@ -15,14 +15,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.analysis.logged_run import Milestones, Progress
+from adacd_hil.analysis.logged_run import SHOWN, Milestones, Mismatch, Progress
 from adacd_hil.analysis.replay.log_source import CycleStretch, LogSource, Part, ReplaySource
 from adacd_hil.analysis.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.analysis.replay.scheme_comparison import (
-    SHOWN,
     TOLERANCE,
     Asking,
-    Mismatch,
     RequestCheck,
     SchemeComparison,
     ScriptOf,

@@ -13,8 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.analysis.logged_run import enters_react, host_span
-from adacd_hil.analysis.replay.scheme_comparison import Mismatch
+from adacd_hil.analysis.logged_run import Mismatch, enters_react, host_span
 from adacd_hil.analysis.score.emulator_truth import HostCycles, TrueContact, TrueContacts, windows_of
 from adacd_hil.analysis.score.judge import Alarm, Score, TouchWindow, judge
 from adacd_hil.analysis.score.wording import NONE, found_text, why_not_found

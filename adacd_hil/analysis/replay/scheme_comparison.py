@@ -13,11 +13,12 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.analysis.logged_run import SHOWN, Mismatch
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError, arithmetic
 from adacd_hil.log.reader import LoggedEvent, Series
@@ -28,31 +29,7 @@ from adacd_hil.settings.run_settings import OperatorSettings
 
 TOLERANCE: Final = 1e-9
 """Least squares over a minute amplify a rounding error of 1e-16 by the condition number, up to 1e6."""
-SHOWN: Final = 20
-"""Mismatches that are kept; all are counted."""
 _HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "is_model_valid")
-
-
-class Mismatch(NamedTuple):
-    """A value that isn't the logged one. `place`: joint, parameter or channel of the field, "" for a plain one."""
-
-    topic: str
-    field: str
-    place: str
-    cycle: int
-    t_ns: int
-    logged: str
-    replayed: str
-
-    @property
-    def name(self) -> str:
-        """Topic, field and place."""
-        return f"{self.topic}.{self.field}" + (f"[{self.place}]" if self.place else "")
-
-    def line(self, zero_ns: int = 0) -> str:
-        """Say all of it in one line, with the time since `zero_ns`."""
-        time_s = (self.t_ns - zero_ns) * 1e-9
-        return f"cycle {self.cycle}, {time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
 
 
 def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
@@ -195,13 +172,6 @@ def _same_bits(first: Vector, second: Vector) -> bool:
 def _text(value: float) -> str:
     """Write a value so that it reads back to the same bits."""
     return repr(value)
-
-
-def contact_records(series: Series) -> dict[int, dict[str, Any]]:
-    """Return the logged reports by the time at which they were made, ns."""
-    names = [name for name in ContactReport._fields if name in series.fields]
-    rows = zip(series.t_ns.tolist(), series.records, strict=True)
-    return {t_ns: {name: record[name].tolist() for name in names} for t_ns, record in rows}
 
 
 def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Iterator[tuple[str, str, float, float]]:

@@ -32,12 +32,10 @@ from adacd_hil.analysis.logged_run import (
     CycleColumns,
     Milestones,
     Progress,
-    Rows,
     Run,
     StretchOfRun,
     Truth,
     columns_of_series,
-    extreme_rows,
     is_realtime,
     settings_of,
     split_sections,
@@ -45,7 +43,14 @@ from adacd_hil.analysis.logged_run import (
 from adacd_hil.analysis.report.outline import Facts, Outline, SchemeRows, run_of_piece, settling_s, widen
 from adacd_hil.analysis.report.page import ADAPTATIONS, TRACED_CONTACTS
 from adacd_hil.analysis.report.traces import panels_of
-from adacd_hil.analysis.score.emulator_truth import TruthTable, foreign_truth, host_truth, read_truth
+from adacd_hil.analysis.score.emulator_truth import (
+    Rows,
+    TruthTable,
+    extreme_rows,
+    foreign_truth,
+    host_truth,
+    read_truth,
+)
 from adacd_hil.analysis.score.margins import UntouchedGatherer
 from adacd_hil.analysis.score.metrics import Gathered, ReportSource
 from adacd_hil.analysis.score.run_faults import CyclicDataGatherer

@@ -9,7 +9,7 @@ A log of another run is refused, as far as both logs say what was played.
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,6 @@ from adacd_hil.analysis.logged_run import (
     EmulatorSpan,
     Progress,
     Truth,
-    extreme_rows,
     host_cycles,
     host_span,
     is_interrupted,
@@ -37,6 +36,23 @@ from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
+
+Rows = NDArray[np.int64]
+
+
+def extreme_rows(series: Iterable[Vector], starts: Rows) -> Rows:
+    """Choose of every bucket the rows in which a series (n,) is smallest and largest, the first of equal ones.
+
+    starts: where the buckets begin, from 0, ascending. Rows ascend. NaN is chosen nowhere.
+    """
+    chosen: list[Rows] = [np.empty(0, np.int64)]
+    for values in series:
+        bucket = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
+        for extreme in (np.fmin, np.fmax):
+            hits = np.flatnonzero(values == extreme.reduceat(values, starts)[bucket])
+            chosen.append(hits[np.diff(bucket[hits], prepend=-1) != 0])
+    return np.unique(np.concatenate(chosen))
+
 
 _BEGINNING: Final = (10_000, 1_000)
 """Cycles kept as they are: of a contact at first, and of one once `_PLENTY` rows are kept."""
