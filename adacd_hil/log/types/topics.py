@@ -28,7 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple
 
 from adacd_hil.log.log_files import LogError
@@ -134,30 +134,40 @@ class OwnTopic:
         return body_struct(self.head, has_block=self.block is not None)
 
     @cached_property
-    def _attributes(self) -> Callable[[Any], tuple[Any, ...]]:
+    def pack(self) -> Callable[..., bytes]:
+        """`pack(record, *given, block=None)` packs the body of a message; `given` in the order of the head.
+
+        It raises struct.error for too many or too few. One function a topic: the control process packs three a cycle.
+        """
         names = [member.name for member in self.head if member.name not in self.given]
-        return attrgetter(*names) if len(names) > 1 else lambda record: tuple(getattr(record, name) for name in names)
+        head = (*names, *self.given)
+        places = [head.index(member.name) for member in self.head]
+        order: Callable[[Any], tuple[Any, ...]] = itemgetter(*places) if len(places) > 1 else tuple
+        taken: Callable[[Any], tuple[Any, ...]] = (
+            attrgetter(*names) if len(names) > 1 else lambda record: tuple(getattr(record, name) for name in names)
+        )
+        pack, is_ordered = self._struct.pack, head == tuple(member.name for member in self.head)
+        sizes = [member.size for member in self.head]
 
-    @cached_property
-    def _places(self) -> tuple[int, ...]:
-        return tuple(place for place, member in enumerate(self.head) if member.name in self.given)
+        def in_order(record: Any, given: tuple[Any, ...]) -> tuple[Any, ...]:
+            if len(given) != len(self.given):
+                raise struct.error(f"{self.name}: {len(given)} values given, {len(self.given)} expected")
+            return order((*taken(record), *given))
 
-    @cached_property
-    def _has_arrays(self) -> bool:
-        return any(member.size > 1 for member in self.head)
+        def pack_flat(record: Any, *given: Any, block: Vector | None = None) -> bytes:
+            packed = pack(*(given if not names else taken(record) if not given else (*taken(record), *given)))
+            return packed if block is None else packed + block.tobytes()
 
-    def pack(self, record: Any, *given: Any, block: Vector | None = None) -> bytes:
-        """Pack the body of a message; `given` in the order of the head. Raises struct.error for too many or too few."""
-        values = given
-        if len(self.given) < len(self.head):
-            values = self._attributes(record)
-            for place, value in zip(self._places, given, strict=False):
-                values = (*values[:place], value, *values[place:])
-        if self._has_arrays:
-            pairs = zip(self.head, values, strict=True)
-            values = tuple(number for member, value in pairs for number in (value if member.size > 1 else (value,)))
-        head = self._struct.pack(*values)
-        return head if block is None else head + block.tobytes()
+        def pack_mixed(record: Any, *given: Any, block: Vector | None = None) -> bytes:
+            packed = pack(*in_order(record, given))
+            return packed if block is None else packed + block.tobytes()
+
+        def pack_arrays(record: Any, *given: Any, block: Vector | None = None) -> bytes:
+            pairs = zip(sizes, in_order(record, given), strict=True)
+            packed = pack(*(number for size, value in pairs for number in (value if size > 1 else (value,))))
+            return packed if block is None else packed + block.tobytes()
+
+        return pack_arrays if any(size > 1 for size in sizes) else pack_flat if is_ordered else pack_mixed
 
     def unpack(self, body: bytes) -> dict[str, Any]:
         """Unpack the head of a body. Raises struct.error when it is cut, ValueError for a value that has no name."""
