@@ -27,7 +27,7 @@ from adacd_hil.log.log_files import (
     summary_count,
 )
 from adacd_hil.log.mcap.chunks import Block, Item, read_blocks
-from adacd_hil.log.mcap.records import (
+from adacd_hil.log.mcap.mcap_records import (
     CHANNEL_NUMBERS,
     HEAD,
     INDEX_ENTRY,

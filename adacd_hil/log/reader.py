@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import DROPPED_KEY, EPOCH_KEY, FIELDS_KEY, LOST_KEY, LogError, log_in
 from adacd_hil.log.log_walk import LogWalk
-from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,

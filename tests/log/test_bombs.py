@@ -20,7 +20,7 @@ from adacd_hil.log.formats.frame_log import read_frames
 from adacd_hil.log.formats.signal_tables import export_tables
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import FREE_BYTES, MOST_BYTES, MOST_RATIO, ChunkError, Opening, decompress
-from adacd_hil.log.mcap.records import MOST_RECORD_BYTES
+from adacd_hil.log.mcap.mcap_records import MOST_RECORD_BYTES
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import Event
 from adacd_hil.wire.codec import load_codec

@@ -9,7 +9,7 @@ from mcap.records import Channel, Schema
 from adacd_hil.log.check.findings import Findings
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import Contents
-from adacd_hil.log.mcap.records import CHANNEL_NUMBERS, MESSAGE_HEAD
+from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, MESSAGE_HEAD
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,

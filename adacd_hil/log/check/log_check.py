@@ -32,7 +32,7 @@ from adacd_hil.log.log_files import (
     part_path,
     parts_of,
 )
-from adacd_hil.log.mcap.records import (
+from adacd_hil.log.mcap.mcap_records import (
     HEAD,
     MAGIC,
     FileGap,

@@ -10,7 +10,7 @@ from mcap.records import Attachment, AttachmentIndex, Footer, MetadataIndex, Sta
 from adacd_hil.log.check.chunk_checks import ChunkCheck
 from adacd_hil.log.check.content_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings
-from adacd_hil.log.mcap.records import HEAD, RawRecord, parse
+from adacd_hil.log.mcap.mcap_records import HEAD, RawRecord, parse
 
 
 class SummaryCheck:

@@ -39,7 +39,7 @@ from adacd_hil.log.log_files import (
     summary_count,
 )
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
-from adacd_hil.log.mcap.records import (
+from adacd_hil.log.mcap.mcap_records import (
     MAGIC,
     Definitions,
     FileGap,

@@ -19,7 +19,7 @@ from adacd_hil.log.editing.log_info import read_info
 from adacd_hil.log.log_files import COPY_ENDINGS, PRODUCT, ROS_PROFILE, SUMMARY_METADATA, LogError, is_part_name
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
-from adacd_hil.log.mcap.records import CHANNEL_NUMBERS, read_end, read_header
+from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end, read_header
 
 _CHANNEL = 9
 """Where the number of the channel is in a message record, bytes."""

@@ -31,7 +31,7 @@ from adacd_hil.log.log_files import (
     summary_count,
 )
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
-from adacd_hil.log.mcap.records import (
+from adacd_hil.log.mcap.mcap_records import (
     MAGIC,
     MESSAGE_HEAD,
     Definitions,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
-from adacd_hil.log.mcap.records import (
+from adacd_hil.log.mcap.mcap_records import (
     DEFINITIONS,
     Definitions,
     FileGap,

@@ -36,7 +36,7 @@ from adacd_hil.log.log_files import (
 )
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS, LIBRARY
 from adacd_hil.log.mcap.chunks import Block, Contents, read_blocks
-from adacd_hil.log.mcap.records import HEAD, MAGIC, MESSAGE_HEAD, Problem, RawRecord, parse, summary_of
+from adacd_hil.log.mcap.mcap_records import HEAD, MAGIC, MESSAGE_HEAD, Problem, RawRecord, parse, summary_of
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     ENCAPSULATION,

@@ -25,7 +25,7 @@ from adacd_hil.file_access import is_anothers, open_input, replacing
 from adacd_hil.log.formats.frame_log import open_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
-from adacd_hil.log.mcap.records import MAGIC, RawRecord, parse, scan
+from adacd_hil.log.mcap.mcap_records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import DECODED, EVENTS

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from adacd_hil import __version__
 from adacd_hil.log.log_files import PRODUCT
-from adacd_hil.log.mcap.records import INDEX_ENTRY, MAGIC
+from adacd_hil.log.mcap.mcap_records import INDEX_ENTRY, MAGIC
 
 LIBRARY = f"{PRODUCT} {__version__}; {LIBRARY_IDENTIFIER}"
 CHUNK_BYTES = 256 * 1024

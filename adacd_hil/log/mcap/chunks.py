@@ -25,7 +25,7 @@ from mcap.records import Chunk
 from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.mcap.records import (
+from adacd_hil.log.mcap.mcap_records import (
     DEFINITIONS,
     HEAD,
     INDEX_ENTRY,

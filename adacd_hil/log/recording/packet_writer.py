@@ -18,7 +18,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from adacd_hil.log.mcap.records import MESSAGE_HEAD, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD, RECORD_HEAD_BYTES
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import (
     EVENT,

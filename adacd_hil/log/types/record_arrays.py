@@ -15,7 +15,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from adacd_hil.log.mcap.records import MESSAGE_HEAD
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.types.message_types import CAN_FRAME, FD_FRAME, LOG, MAX_DATA, is_log
 from adacd_hil.wire.bus import CLASSIC_BYTES, MAX_STANDARD_ID
 

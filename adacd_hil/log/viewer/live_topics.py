@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.mcap.records import MESSAGE_HEAD
+from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.recording.processes import LiveSetup
 from adacd_hil.log.types.message_types import ENCAPSULATION, JOINT_STATE_DTYPE, MessageType
 from adacd_hil.log.types.topics import DECODED, RUN_TOPICS, ChannelId, LogChannel, unpack_contact
