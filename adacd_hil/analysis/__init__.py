@@ -1,1 +1,1 @@
-"""What a log says: scores, reports, replays, sweeps, thresholds."""
+"""The analysis of logs: scores, reports, replays, sweeps, thresholds."""

@@ -1,11 +1,11 @@
 """The emulated arm on the bus: one body, two drives, two torque sensors, and what happens at every SYNC.
 
-At SYNC k:  latch the commands that came since SYNC k − 1 → sample the body → status frames that are due → feedback and
-torque frames, identifiers ascending → truth of k → integrate to k + 1 with the latched torque. The cyclic frames come
-last, so that a host in lockstep, which goes on when it has them, has everything of this SYNC.
+At SYNC k: latch the commands that came since SYNC k − 1 → sample the body → status frames that are due → feedback and
+torque frames, identifiers ascending → truth of k → integrate to k + 1 with the latched torque. The bench sends the
+cyclic frames last: a host in lockstep goes on when it has them, and then it has all frames of this SYNC.
 
-How time passes: `firmware_sim.bench.bench_time`; the nodes: `firmware_sim.bench.bench_nodes`; what goes wrong:
-`firmware_sim.bench.injector`; what is true: `firmware_sim.bench.truth_log`.
+Time: `firmware_sim.bench.bench_time`; nodes: `firmware_sim.bench.bench_nodes`; faults: `firmware_sim.bench.injector`;
+truth: `firmware_sim.bench.truth_log`.
 
 The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
 0 for a master that begins at 1; from there the counter 1…240 is unwrapped. SYNCs that come twice or out of order:

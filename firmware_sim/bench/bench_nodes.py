@@ -25,7 +25,7 @@ _LONGEST_PERIOD_US = 100_000
 
 
 class Movable(Protocol):
-    """The arm itself, as far as its devices have to do with it; `Body` says what each means."""
+    """The part of the arm that its devices use; `Body` documents each member."""
 
     @property
     def motor_torque_Nm(self) -> tuple[float, float]:

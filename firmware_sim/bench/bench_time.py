@@ -5,10 +5,10 @@
     wall   the body moves by the given clock on a 100 µs grid and a SYNC samples it where it is. The drives watch that
            SYNC keeps coming.
 
-By SYNC, heartbeats and deadlines go by the given clock while no SYNC comes, and so does the braking that they cause. A
-host in lockstep says itself how much time passes (`adacd_hil.wire.time_marks`), and hears from the bench what
-doesn't come at once. Once a host has died, `outlive_host` lets pass what time it takes the arm to come to rest. The
-truth is told on the way, a row per period, numbered and stamped on from the last SYNC.
+In `sync`, heartbeats, deadlines and the braking that they cause run by the given clock while no SYNC comes. A host in
+lockstep states how much time passes (`adacd_hil.wire.time_marks`), and the bench tells it which frames come later. Once
+a host has died, `outlive_host` lets the time pass that the arm needs to come to rest. Meanwhile the bench reports the
+truth, a row per period, numbered and stamped on from the last SYNC.
 """
 
 from adacd_hil.wire.time_marks import NEVER_NS, MarkKind, unpack_mark

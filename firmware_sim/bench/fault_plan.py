@@ -1,7 +1,7 @@
-"""What a scenario's faults do now: to frames, to measured values, and to nodes.
+"""The effects of a scenario's faults over time: on frames, on measured values, and on nodes.
 
-A bench tells the plan the time at every SYNC and whenever `wait_ns` is over; then it asks. Frames are known by the
-contract's identifiers. Nodes are places in `NODES`; times are ns.
+A bench tells the plan the time at every SYNC and whenever `wait_ns` is over; then it asks for the effects. The plan
+recognises frames by the contract's identifiers. Nodes are places in `NODES`; times are ns.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,9 @@
 """Rows of a scenario's faults: when each acts, what it draws, and what becomes of a frame or a value that it hits.
 
-Each row draws from a stream of its own, which follows from the seed, the row's kind, node and frame or signal, and how
-many rows before it are alike in these. So rows that come or go leave the draws of the others alone, and so do the
-numbers within a row. A row draws for each frame that it is about, whatever other rows do to that frame.
+Each row draws from a stream of its own, which follows from the seed, the row's kind, node and frame or signal, and the
+number of earlier rows that are alike in these. So rows that are added or removed, and changed numbers within a row,
+leave the draws of the others unchanged. A row draws for each frame that it selects, whatever other rows do to that
+frame.
 """
 
 import random

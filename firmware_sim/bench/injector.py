@@ -1,7 +1,7 @@
-"""Where a scenario's faults reach the bench: frames both ways, measured values, and the nodes themselves.
+"""The application of a scenario's faults to the bench: frames both ways, measured values, and the nodes themselves.
 
-`firmware_sim.bench.fault_plan` says what acts now; this lets it act. Host's frames that a fault delays are late by the
-time since the SYNC before them, because by SYNC nobody knows when within the period they came.
+`firmware_sim.bench.fault_plan` decides which faults act now; the injector applies them. The delay of a host's frame
+counts from the SYNC before it, because by SYNC nobody knows when within the period the frame came.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,8 @@
-"""What the devices send, on its way to the bus: at once, or later where a fault delays it.
+"""The devices' frames on their way to the bus: sent at once, or later where a fault delays them.
 
-By SYNC, time stands still while the bench answers one, so what is released within the period that follows goes out
-together, in the order of release. A host in lockstep is told by marks when each frame is released
-(`adacd_hil.wire.time_marks`); an undisturbed answer needs none.
+By SYNC, time stands still while the bench answers one, so the frames released within the next period go out together,
+in the order of release. Marks tell a host in lockstep when each frame is released (`adacd_hil.wire.time_marks`); an
+undisturbed answer needs none.
 """
 
 import heapq

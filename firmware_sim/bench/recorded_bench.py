@@ -1,11 +1,11 @@
-"""The emulated devices around a recorded arm: what answers SYNC comes from a recording, all else from live nodes.
+"""The emulated devices around a recorded arm: the answers to SYNC come from a recording, all else from live nodes.
 
 Object dictionary, NMT and CiA 402 states, heartbeats, status frames, EMCY and watchdogs are those of `Bench`, so any
-host can boot and command the devices. Torque moves nothing: the arm does what it did when it was recorded.
+host can boot and command the devices. Torque moves nothing: the arm repeats its recorded motion.
 
-The recording is read as it is asked for. An attempt begins with the first SYNC after an NMT reset, so a run that
-recovered from a fault has several. In each the cycles count from its first SYNC by the SYNC counter, as the bench
-counts them; SYNCs that were lost leave a gap.
+The bench reads the recording as the host asks for it. An attempt begins with the first SYNC after an NMT reset, so a
+run that recovered from a fault has several. In each the cycles count from its first SYNC by the SYNC counter, as the
+bench counts them; SYNCs that were lost leave a gap.
 """
 
 from collections.abc import Callable, Iterator, Sequence

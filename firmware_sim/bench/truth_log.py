@@ -1,7 +1,7 @@
-"""What was true at every SYNC: its rows, and the emulator's own log of them with the topics /truth and /events.
+"""The truth at every SYNC: its rows, and the emulator's own log of them with the topics /truth and /events.
 
-Where no SYNC comes, rows go on from the last one, one per period. The log explains itself: the resolved scenario is
-attached, and each of its faults has a line in the metadata, `fault_0` for bit 0 of the truth's field `faults`, and so
+Where no SYNC comes, rows go on from the last one, one per period. The log has the resolved scenario as an attachment,
+and a line for each of the scenario's faults in the metadata, `fault_0` for bit 0 of the truth's field `faults`, and so
 on.
 """
 

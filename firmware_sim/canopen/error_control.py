@@ -1,10 +1,10 @@
 """Error control of one emulated device: EMCY and its history, heartbeats both ways, watchdogs.
 
-Each watchdog trips once, says so by EMCY, and clears by itself when its cause has gone. An EMCY's byte 3 is the number
-of the watchdog, its bytes 4 to 7 the device's time in ms at which that happened. 0x2210 keeps the last one and counts
-them. A fault that a watchdog caused is the drive's business and stays latched. Source: CiA 301 (4.2), 7.2.7 (EMCY:
-objects 0x1001, 0x1003, 0x1014, 0x1015), 7.2.8.3.2 (heartbeats: 0x1016, 0x1017), table 27 (0x8100 … 0x8250); CiA 402-1,
-error codes 0x6320 "parameter error" and 0x8700 "sync controller".
+Each watchdog trips once, sends an EMCY, and clears by itself when its cause has gone. An EMCY's byte 3 is the number of
+the watchdog, its bytes 4 to 7 the device's time in ms at which the watchdog tripped. 0x2210 keeps the last trip and
+counts all. The drive handles a fault that a watchdog caused, and the fault stays latched. Source: CiA 301 (4.2), 7.2.7
+(EMCY: objects 0x1001, 0x1003, 0x1014, 0x1015), 7.2.8.3.2 (heartbeats: 0x1016, 0x1017), table 27 (0x8100 … 0x8250); CiA
+402-1, error codes 0x6320 "parameter error" and 0x8700 "sync controller".
 """
 
 import struct
@@ -130,7 +130,7 @@ class HeartbeatProducer:
 
 
 class HeartbeatListener(Protocol):
-    """Who is told of the master's heartbeat."""
+    """The object that is told of the master's heartbeat."""
 
     now_ns: int
 
@@ -220,7 +220,7 @@ WARNINGS = frozenset({Watchdog.LENGTH, Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH
 
 
 class Watchdogs:
-    """Which watchdogs are tripped now, and what was."""
+    """The watchdogs that are tripped now, and the record of earlier trips."""
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self.tripped: set[Watchdog] = set()

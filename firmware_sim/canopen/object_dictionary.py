@@ -1,7 +1,8 @@
-"""The object dictionary of one emulated device and the SDO server that strangers reach it by.
+"""The object dictionary of one emulated device and its SDO server for other nodes.
 
-The only door to `canopen` on the device side. `canopen` reads the EDS and keeps what was written; a read is answered by
-a live value where there is one, a write is checked before it is stored. Source: CiA 301, 7.2.4 (SDO), 7.4 (dictionary).
+The device side uses `canopen` only here. `canopen` reads the EDS and stores the written values. A live value, where
+there is one, answers a read; the dictionary checks a write before it stores it. Source: CiA 301, 7.2.4 (SDO), 7.4
+(dictionary).
 """
 
 import struct
@@ -73,7 +74,7 @@ def one_of(*allowed: int) -> Callable[[int], None]:
 
 
 class DictionaryVariable(NamedTuple):
-    """What mapping and access rules say of one numeric object. `format`: of `struct`, empty when it isn't a number."""
+    """The mapping and access rules of one numeric object. `format`: of `struct`, empty when it isn't a number."""
 
     bits: int
     format: str

@@ -5,10 +5,10 @@ transmission type   RPDO                        TPDO
 1 … 240             acts at the next SYNC       at every n-th SYNC
 254, 255            acts at once                on an event, and when the event timer ends
 
-An event is a change of an object that says how the device is (`events` of `Pdos`), or, in a PDO without such an object,
-any change of its content, looked for at every SYNC. An RPDO's event timer is its deadline. Frames whose mapping leads
-with the end-to-end header's objects are protected with the data ids of the message that has the PDO's default COB-ID.
-Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38.
+An event is a change of an object that describes the device's state (`events` of `Pdos`), or, in a PDO without such an
+object, any change of its content, looked for at every SYNC. An RPDO's event timer is its deadline. Frames whose mapping
+leads with the end-to-end header's objects are protected with the data ids of the message that has the PDO's default
+COB-ID. Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -25,7 +25,7 @@ COUNT = 4
 
 
 class PdoUser(Protocol):
-    """What a device does with its PDOs."""
+    """The device's side of its PDOs."""
 
     def act(self, t_ns: int) -> None:
         """Act on a frame that doesn't wait for SYNC; its values have been written."""

@@ -1,9 +1,9 @@
-"""Communication and mapping record of one PDO: what a master may write when, and where objects lie in the frame.
+"""Communication and mapping record of one PDO: which writes are allowed when, and where objects lie in the frame.
 
-A PDO is written while it is invalid (bit 31 of its COB-ID): number of entries to 0, entries, number of entries, valid.
-A mapping that begins with the end-to-end header's objects makes protected frames. Dummy entries (data types instead of
-objects) leave gaps in frames that are received. Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38, and table 34 (restricted
-identifiers).
+A master writes a PDO while it is invalid (bit 31 of its COB-ID): number of entries to 0, entries, number of entries,
+valid. A mapping that begins with the end-to-end header's objects makes protected frames. Dummy entries (data types
+instead of objects) leave gaps in frames that are received. Source: CiA 301 (4.2), 7.5.2.35 to 7.5.2.38, and table 34
+(restricted identifiers).
 """
 
 import struct
@@ -36,7 +36,7 @@ def _is_restricted(can_id: int) -> bool:
 
 
 class PdoOwner(Protocol):
-    """Who has the PDO."""
+    """The owner of the PDO."""
 
     dictionary: ObjectDictionary
     longest: int
@@ -194,7 +194,7 @@ class MappingEntry(NamedTuple):
 
 
 class PdoLayout(NamedTuple):
-    """What a frame holds: header_bytes, then `packing` with the values of `keys`, then padding up to `length`."""
+    """The layout of a frame: header_bytes, then `packing` with the values of `keys`, then padding up to `length`."""
 
     keys: tuple[tuple[int, int], ...]
     packing: struct.Struct

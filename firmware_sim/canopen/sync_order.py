@@ -8,9 +8,9 @@
     wrong length     one with a counter where 0x1019 is 0, without where it isn't         ignores it
 
 A counter that runs forward means SYNCs that were lost. Ahead of time is more than 0.4 periods ahead of its place after
-the SYNC before, less what SYNCs have been late: a master that stalls may come back to its grid, and frames that waited
-for a busy receiver may come in a row. That lateness is forgotten with a time constant of 100 SYNCs, so that a master
-whose clock is slow gathers none.
+the SYNC before, less the lateness of earlier SYNCs: a master that stalls may come back to its grid, and frames that
+waited for a busy receiver may come in a row. That lateness is forgotten with a time constant of 100 SYNCs, so that a
+master whose clock is slow gathers none.
 
 CAN itself may deliver a frame twice: if the last bit of its end-of-frame is disturbed, the sender repeats what
 receivers have taken already (ISO 11898-1). So a single odd SYNC is a warning. More than `TOLERATED` before
@@ -32,7 +32,7 @@ _LOST_SUB = 5  # of 0x2211
 
 
 class SyncKind(Enum):
-    """What one SYNC is to those before. The value of an odd one is its sub-index of 0x2211."""
+    """The place of one SYNC in the order of those before. The value of an odd one is its sub-index of 0x2211."""
 
     RIGHT = 0
     REPEATED = 1
@@ -96,7 +96,7 @@ class SyncOrder:
 
 
 class SyncCounts:
-    """What one device has heard: 0x2211."""
+    """The odd SYNCs that one device has received: 0x2211."""
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self.odd = 0

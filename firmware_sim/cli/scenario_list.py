@@ -1,4 +1,4 @@
-"""What the command line says about scenarios: which there are, what is in one, and what is wrong with a file."""
+"""The command line's output about scenarios: their list, the content of one, and the errors of a file."""
 
 import tomllib
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_sce
 
 @dataclass(frozen=True)
 class ScenarioFinding:
-    """What a check of one file came to. `problems`: one line each; `checked`: what was looked at, if all is good."""
+    """The result of checking one file. `problems`: one line each; `checked`: the checked content, if all is good."""
 
     file: str
     problems: tuple[str, ...]

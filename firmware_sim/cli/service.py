@@ -1,4 +1,4 @@
-"""What carries frames and time between a bench and a bus."""
+"""The service that carries frames and time between a bench and a bus."""
 
 import signal
 from collections.abc import Iterator

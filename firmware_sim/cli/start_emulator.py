@@ -1,4 +1,4 @@
-"""Where the console script `firmware-sim` enters."""
+"""Entry point of the console script `firmware-sim`."""
 
 from collections.abc import Callable
 from typing import NoReturn

@@ -1,8 +1,8 @@
 """One emulated CANopen device: NMT slave with object dictionary, PDOs, heartbeats, EMCY and watchdogs.
 
-It starts no thread: heartbeats and every other timer run on the time that comes in as `t_ns`. What a bench calls takes
-the bench's time; what a device and its application tell each other is in the time of its own clock.
-Source: CiA 301, 7.2 (services), 7.3 (NMT), 7.5.2.32 (0x1029, error behaviour).
+It starts no thread: heartbeats and every other timer run on the time that comes in as `t_ns`. Calls from a bench take
+the bench's time; a device and its application exchange times of the device's own clock. Source: CiA 301, 7.2
+(services), 7.3 (NMT), 7.5.2.32 (0x1029, error behaviour).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,7 +40,7 @@ _OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
 
 
 class Application(PdoUser, Protocol):
-    """What a device does besides communicating."""
+    """The application of a device: everything besides communication."""
 
     def leave_operational(self, t_ns: int) -> None:
         """Act on leaving Operational; EMCY messages can still be sent."""
@@ -69,7 +69,7 @@ class Application(PdoUser, Protocol):
 
 
 class EmulatedDevice(ObjectDictionary):
-    """A CANopen device: everything but what its application does."""
+    """A CANopen device: everything but its application."""
 
     def __init__(
         self,
@@ -313,7 +313,7 @@ class NodeClock:
     """A device's own clock: that of the bench, until it is set to run fast or slow.
 
     Everything that a device times goes by it: heartbeats, event timers, inhibit times, watchdogs, the time in an EMCY.
-    Both times are integer ns. A clock that drifts no more keeps the lead that it has.
+    Both times are integer ns. A clock that stops drifting keeps its lead.
     """
 
     def __init__(self) -> None:

@@ -52,7 +52,7 @@ _EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
 
 
 class DriveNode:
-    """One drive on the bus. `motor_mode` and `torque_Nm` are what its motor is told until the next SYNC."""
+    """One drive on the bus. `motor_mode` and `torque_Nm` are the motor's command until the next SYNC."""
 
     def __init__(
         self,

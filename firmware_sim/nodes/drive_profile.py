@@ -40,7 +40,7 @@ class DriveState(Enum):
 
 
 class DriveEvent(Enum):
-    """What moves the state machine: the controlword's commands and the drive's own findings."""
+    """The events of the state machine: the controlword's commands and the drive's own findings."""
 
     SHUTDOWN = "shutdown"
     SWITCH_ON = "switch on, disable operation"  # one bit pattern; its meaning depends on the state
@@ -245,7 +245,7 @@ class TorqueLimits:
 
 
 class Motor(NamedTuple):
-    """What the drive knows of its motor without the bus: velocity in rad/s, torque in Nm.
+    """The drive's knowledge of its motor without the bus: velocity in rad/s, torque in Nm.
 
     is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
     fault that the motor's state calls for now, 0 for none.

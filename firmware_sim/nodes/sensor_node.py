@@ -1,10 +1,10 @@
 """An emulated joint torque sensor: a CiA 404 analogue input whose process value is the torque in the contract's LSB.
 
-On every SYNC it sends the value. Where the frame has an end-to-end header, the header's status carries the low bits of
-0x6150, so that an overload is seen in the very frame that it spoils.
+The sensor sends the value on every SYNC. Where the frame has an end-to-end header, the header's status carries the low
+bits of 0x6150, so that a frame shows the overload that spoils its value.
 
-In Operational the sensor measures for somebody: SDO writes nothing but clears the error history. Autozero is asked for
-in Pre-operational; its samples are those of the SYNCs that follow, in whichever state.
+In Operational, where a host uses the measurement, SDO writes nothing but clears the error history. A master requests
+autozero in Pre-operational; the sensor takes its samples at the SYNCs that follow, in whichever state.
 
 Source: CiA 404, objects 0x6125, 0x6150, 0x9130.
 """

@@ -1,1 +1,1 @@
-"""What happens in a run, and what a host is to make of it."""
+"""Scenarios: the events of a run, and the expected outcome with a host."""

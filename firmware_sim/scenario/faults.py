@@ -1,7 +1,7 @@
 """Faults of a scenario: one timed row each, of a kind that says which keys the row has.
 
-A row acts from `at_s` for `duration_s`, or until it has acted `count` times, or, with neither, to the end. What it does
-to frames, values and nodes is in `fault_plan`. A row without length, such as a reboot, is active for one period.
+A row acts from `at_s` for `duration_s`, or until it has acted `count` times, or, with neither, to the end. `fault_plan`
+has the row's effect on frames, values and nodes. A row without length, such as a reboot, is active for one period.
 
 Nodes are named drive1, drive2, sensor1, sensor2; frames by what they carry, as in the contract's DBC.
 """

@@ -1,12 +1,13 @@
-"""A scenario: the arm, who touches it, its payload, what goes wrong, and what a host is to make of it.
+"""A scenario: the arm, its contacts, its payload, its faults, and the expected outcome with a host.
 
 Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
 package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults`, `expect` and
-`expect_certified` are for those who play a scenario and change nothing on the arm.
+`expect_certified` are for the programs that play a scenario; they change nothing on the arm.
 
-Section `[expect]` of a scenario says what a healthy host of configuration `paper` makes of it, as that host is: where
-it does badly, the expectation says so. `[expect_certified]` takes its place, as a whole, for a host of configuration
-`certified`; without it both make the same of it. Counts are exact unless the key that ends in `_most` gives them room.
+Section `[expect]` of a scenario states the outcome with a healthy host of configuration `paper`, as that host is: where
+the host does badly, the expectation says so. `[expect_certified]` replaces `[expect]`, as a whole, for a host of
+configuration `certified`; without it the same outcome is expected of both. Counts are exact unless the key that ends in
+`_most` gives them room.
 
 Ends of a run:
 
@@ -43,7 +44,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class ExpectSettings:
-    """What a healthy host makes of a scenario."""
+    """The outcome of a scenario with a healthy host."""
 
     adaptations: int = setting(low=0, high=1000, meaning="adaptations that come to their end")
     contacts: int = setting(low=0, high=100_000, meaning="true contacts that are detected")
@@ -100,7 +101,7 @@ _TROUBLES: Final = (("false_alarms", "false"), ("missed", "missed"))
 
 
 class ScenarioOutcome(NamedTuple):
-    """What a run came to, named as in `ExpectSettings`. Times since motion start; None: there is none."""
+    """The outcome of a run, named as in `ExpectSettings`. Times since motion start; None: there is none."""
 
     end: str
     fault: str | None

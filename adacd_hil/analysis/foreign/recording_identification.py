@@ -36,7 +36,7 @@ class Spell(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """What was found in a recording that the model has not seen."""
+    """The findings in a recording that the model has not seen."""
 
     recording: ForeignRecording
     tau_ext_hat: tuple[Vector, ...]  # per stretch (k, n), Nm

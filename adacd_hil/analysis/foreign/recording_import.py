@@ -1,8 +1,8 @@
 """A recording of an arm that others made: a CSV file and its map become samples at a fixed period, in SI units.
 
-The map is one TOML file: which column is what, in which unit, of which arm. A column is named by its head, or by its
-number from 1. Scales turn what is recorded, after its unit, into rad, rad/s and Nm, positive along the URDF's joint
-axes: -1.0 turns a sign, a drive's gain in Nm/A makes torques of currents.
+The map is one TOML file: the meaning and unit of each column, and the arm. It names a column by its head, or by its
+number from 1. Scales turn the recorded values, after their unit, into rad, rad/s and Nm, positive along the URDF's
+joint axes: -1.0 turns a sign, a drive's gain in Nm/A makes torques of currents.
 
 A gap in time, a value that is missing or not finite, and where a touch begins or ends, part a recording in stretches;
 the model is carried over, the filters begin anew. Values between two samples are interpolated.

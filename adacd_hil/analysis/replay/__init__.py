@@ -1,1 +1,1 @@
-"""Logs once more through codec, arm and scheme, and what other settings would have made of them."""
+"""Replays of logs through codec, arm and scheme, with the logged or other settings."""

@@ -1,8 +1,9 @@
 """Frames that somebody else recorded on the bus, as the cycles of a run: candump, BLF, ASC, MF4, or our own log.
 
-A recording has what was on the bus and when; a log of ours has besides what the host made of it. So a recording is put
-in order as the host would have met it: SYNC, whose counter says which cycle it is, begins one. What comes after all
-cyclic frames of a cycle, or when the host no longer waits for them, it would have read in the next.
+A recording has the frames of the bus and their times; a log of ours has the host's decisions too. So the replay orders
+a recording as the host would have met it. SYNC begins a cycle, and its counter gives the cycle's number. The host would
+have read in the next cycle the frames that come after all cyclic frames of a cycle, or when the host no longer waits
+for them.
 
 **With a run's log** (`against`) cycles, times and requests are the run's, and all decisions are compared with it; the
 frames are the recording's. **Without** one, the user is played by the script of the configuration; cycles at the end in

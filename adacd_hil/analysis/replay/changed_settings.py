@@ -1,4 +1,4 @@
-"""Other settings for a log: keys that change, variations, and what a log's own settings keep.
+"""Other settings for a log: changed keys, variations, and the kept part of the log's own settings.
 
 A key is dotted, `detector.threshold_Nm`; a value is TOML, where a word may go without quotes and a number stands for a
 list of such numbers.

@@ -1,8 +1,8 @@
 """Two runs beside each other: settings, decisions field by field, states, contacts, parameters, timing.
 
-Cycles are compared that lie equally long after *motion start*, the first cycle in ADAPT; where there is none, after the
-first of the log. Contacts are matched by the time of their detection since then. Logs are read in pieces; a digest of
-each run is kept.
+The comparison pairs cycles that lie equally long after *motion start*, the first cycle in ADAPT; where there is none,
+after the first of the log. It matches contacts by the time of their detection since then. It reads logs in pieces and
+keeps a digest of each run.
 """
 
 import math
@@ -43,7 +43,7 @@ class ComparedContact(NamedTuple):
 
 @dataclass(frozen=True)
 class RunDigest:
-    """What is kept of one run."""
+    """The kept data of one run."""
 
     path: Path
     settings: Settings

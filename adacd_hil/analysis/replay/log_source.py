@@ -1,4 +1,4 @@
-"""The cycles that a replay takes from a log of ours: its attempts, their stretches, and what was attached to the log.
+"""The cycles that a replay takes from a log of ours: its attempts, their stretches, and the log's attachments.
 
 After an acknowledged fault everything begins anew on the same log: with the reset of communication that the master
 sends first. Cycle numbers go on. In between lie cycles that the scheme has no part in: those that disable the drives
@@ -222,7 +222,7 @@ class ReplaySource(Protocol):
 
 
 class Part(NamedTuple):
-    """What one piece of a log holds. contacts: logged reports by time, ns; events: of the names in `said`."""
+    """The content of one piece of a log. contacts: logged reports by time, ns; events: of the names in `said`."""
 
     stretches: Iterable[CycleStretch]
     contacts: Mapping[int, Mapping[str, Any]]

@@ -1,11 +1,11 @@
-"""Replay: the raw frames of a log once more through codec, arm and scheme, and what that comes to beside the log.
+"""Replay: the raw frames of a log once more through codec, arm and scheme, and the result beside the log.
 
 The log is read in pieces, in constant memory. Each attempt of the run has an arm and a pipeline of its own, as it had
-on the arm. What the user asked for is in the log, and so is how the arm moved: a replay with other settings decides
-other things about the same motion.
+on the arm. The log has the user's requests and the motion of the arm: a replay with other settings decides otherwise
+about the same motion.
 
-Of a stretch of the log, a replay begins with the log all the same, as filters and model know what came before. It ends
-with the stretch; only what lies in it is compared and told.
+A replay of a stretch begins with the log too, because the state of filters and model depends on the cycles before. It
+ends with the stretch, and compares and reports only the cycles in it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

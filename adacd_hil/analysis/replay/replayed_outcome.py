@@ -1,7 +1,8 @@
-"""What a replay came to, gathered stretch by stretch in constant memory, and replays set side by side.
+"""The outcome of a replay, gathered stretch by stretch in constant memory, and replays side by side.
 
-Alarms are judged as those of a run (`adacd_hil.analysis.score.judge`). As the arm in the log moved as it did, a scheme
-with other settings may still be in REACT when the next contact comes: the first sample over a threshold then finds it.
+The judge of a run's alarms (`adacd_hil.analysis.score.judge`) judges those of a replay too. As the arm's motion is that
+of the log, a scheme with other settings may still be in REACT when the next contact comes: the first sample over a
+threshold then finds it.
 """
 
 import itertools
@@ -157,7 +158,7 @@ class OutcomeGatherer:
 
 @dataclass(frozen=True)
 class Replay:
-    """What one replay came to.
+    """The outcome of one replay.
 
     cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
     are not the log's. monitored_s: in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in

@@ -2,10 +2,10 @@
 
 Two values are the same if they have the same bits. Between machines whose arithmetic differs (`same_arithmetic`) a real
 value may be off by `TOLERANCE` of the largest one that its field has had so far, and by as much of one unit; then, too,
-all that is counted, named or switched has to be the same, and what is infinite or not a number.
+counts, names, switches, and values that are infinite or not a number have to be the same.
 
-Where nobody typed anything, the configuration's script made the requests. It goes by the time since the drives were
-enabled and by the state; whoever plays it, `control.operator` live, is handed in.
+Where nobody typed anything, the configuration's script made the requests. The script depends on the time since the
+drives were enabled and on the state; the caller hands in its player, `control.operator` live.
 """
 
 import itertools

@@ -40,7 +40,7 @@ class Stroke(NamedTuple):
 
 @dataclass(frozen=True)
 class ArmDrawing:
-    """What the picture has. view: its left, top, width and height with y down; force: strokes of arrow and spread."""
+    """The picture's content. view: its left, top, width and height with y down; force: strokes of arrow and spread."""
 
     description: str
     view: tuple[float, float, float, float]
@@ -100,9 +100,9 @@ CARDS: Final = 48
 
 
 class ContactCard(NamedTuple):
-    """What is known of a contact: what the report says with its uncertainty, the truth, the arm.
+    """The known data of a contact: the report with its uncertainty, the truth, the arm.
 
-    stretch_s: what a script shows of the traces.
+    stretch_s: the part of the traces that a script shows.
     """
 
     number: int

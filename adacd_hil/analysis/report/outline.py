@@ -1,9 +1,9 @@
-"""When things begin and end in a run: what one reading of its log from front to back finds, in bounded memory.
+"""The outline of a run: where its parts begin and end, from one reading of its log front to back, in bounded memory.
 
 Of its cycles an outline has the first and the last of every piece, those in which the state changes with their
-neighbours, those in which the paper's scheme is armed or disarmed, and those in which a true contact begins. That is
-all that sections, detections and contacts are made of; and the points where a run can be cut: not within a contact, a
-reaction or an adaptation. A stretch has them whole or not at all.
+neighbours, those in which the paper's scheme is armed or disarmed, and those in which a true contact begins. These
+cycles suffice for sections, detections and contacts, and for the points where a run can be cut: not within a contact, a
+reaction or an adaptation. A stretch has each of these whole or not at all.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ BUSY: Final = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.REACT, Scheme
 
 
 class Facts:
-    """What a reading learns of a run besides its rows."""
+    """The facts that a reading finds in a run besides its rows."""
 
     def __init__(self) -> None:
         self.cycles = 0

@@ -5,7 +5,7 @@ inline style, no request (content security policy). Every value is escaped; wher
 why it is. A template that asks for a value that it isn't given is an error. Pages follow the reader's light or dark
 scheme and print in the light one.
 
-The size of a report is bounded, whatever the length of the run. The tables as CSV and JSON have all.
+The size of a report is bounded, whatever the length of the run. The tables as CSV and JSON are complete.
 """
 
 import hashlib
@@ -59,7 +59,7 @@ class Heading(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """What a cell of a table shows, and its class."""
+    """The content of a table's cell, and its class."""
 
     content: object
     kind: str = ""

@@ -1,4 +1,4 @@
-"""A run out of its logs: what the report and the metrics need of them, in bounded memory.
+"""A run read from its logs: the data that report and metrics need, in bounded memory.
 
 A log is read once, and all of its cycles are kept, while they are no more than `FULL_CYCLES`. A longer one is read
 twice more: for when something begins or ends (`outline`), then for what all cycles come to and for those that are drawn

@@ -1,7 +1,8 @@
 """A run over time on a page: marks of the timeline, on the lanes of a drawing 1000 wide, and what a script draws below.
 
 Lanes are states, contacts and notices; below them the script draws the traces. A mark carries the stretch that it
-stands for, s since motion start, so that a script can show it closer; without one it still says what it is.
+stands for, s since motion start, so that a script can enlarge the stretch; without a script the mark still shows its
+words.
 """
 
 from collections.abc import Iterator
@@ -69,7 +70,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """What each lane has. ticks: place and label; is_thinned: what is narrower than a mark is drawn together."""
+    """The content of each lane. ticks: place and label; is_thinned: what is narrower than a mark is drawn together."""
 
     left: float
     width: float

@@ -1,1 +1,1 @@
-"""What a run came to: contacts, alarms, margins, verdict; the one judge of whether a contact was found, and when."""
+"""The score of a run: contacts, alarms, margins, verdict; the one judge of whether and when a contact was found."""

@@ -4,7 +4,7 @@ Of a contact the first cycles and the last second are kept as they are. In betwe
 with the smallest and largest torque of each joint and the largest force; that many contacts of many seconds fit in
 memory, and what is asked of them (peaks, the filtered torque at their end) stays what it was.
 
-A log of another run is refused, as far as both logs say what was played.
+The reader refuses a log of another run, as far as both logs name what was played.
 """
 
 import hashlib

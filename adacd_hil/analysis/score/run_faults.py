@@ -1,10 +1,10 @@
-"""What went wrong in a run, by its log: faults and their logged causes, and cyclic data that did not come in time.
+"""The failures of a run, by its log: faults and their logged causes, and cyclic data that did not come in time.
 
 Cyclic data is counted while the drives are to have torque. *Incomplete*: a cyclic frame was missing, late or wrong.
-*Aged*: the oldest value used was older than the cycle. Windows are the host's own, of one second
-(`device.arm_report`), and the limits those of the configuration's `[data]`. By device, the checks' running counts tell
-how many cycles had no new frame or a repeated one; they are logged once a second, so that of the last second, which a
-fault may have ended, nothing is told.
+*Aged*: the oldest value used was older than the cycle. Windows are the host's own, of one second (`device.arm_report`),
+and the limits those of the configuration's `[data]`. By device, the checks' running counts tell how many cycles had no
+new frame or a repeated one; they are logged once a second, so the counts of the last second, which a fault may have
+ended, are missing.
 """
 
 from itertools import pairwise

@@ -1,8 +1,8 @@
-"""Timing evidence: wake-up lateness, times within the cycle, slack, data age, queue depths and what was lost.
+"""Timing evidence: wake-up lateness, times within the cycle, slack, data age, queue depths and losses.
 
-All from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of what must be small p50,
-p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest. *Reaction latency* is the
-compute time of each cycle in which the state becomes REACT: from the data that decided to the first command that
+All values come from the columns of /cycle, records.CycleRecord. Percentiles are values that occurred: of what must be
+small p50, p99, p99.9 and the largest; of slack, which must be large, p50, p1, p0.1 and the smallest. *Reaction latency*
+is the compute time of each cycle in which the state becomes REACT: from the data that decided to the first command that
 reacts.
 """
 

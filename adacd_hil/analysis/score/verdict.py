@@ -1,7 +1,7 @@
-"""The verdict on a run in one sentence, what went wrong first; and the run beside what the paper printed.
+"""The verdict on a run in one sentence, failures first; and the run beside the paper's printed figures.
 
-The paper's numbers are those of its experiment: of a run that played anything else they are left out. Beside them
-stands what the paper's scheme makes of the same stream, where it ran beside.
+The paper's numbers are those of its experiment: a run that played anything else is shown without them. Beside them
+stands the result of the paper's scheme on the same stream, where it ran beside.
 """
 
 import itertools

@@ -1,9 +1,9 @@
-"""Where a sweep is computed: processes of this machine, or a Dask cluster, and how its connections are protected.
+"""The computing side of a sweep: processes of this machine, or a Dask cluster, and the protection of its connections.
 
-A Dask scheduler runs whatever is sent to it, as the user that started it. So the one that a sweep starts for itself
-takes only what comes with a certificate that was made for it and is nowhere but in this process and its workers; a
-cluster is addressed by tls:// with certificates, as Dask names them. Dask checks by whom a certificate was signed, not
-for which host.
+A Dask scheduler runs whatever is sent to it, as the user that started it. So a scheduler that a sweep starts for itself
+takes only work with a certificate that was made for it; only this process and its workers hold that certificate. A
+cluster is addressed by tls:// with certificates, as Dask names them. Dask checks who signed a certificate, not for
+which host.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ _TIMEOUT_S = 10
 
 
 class TlsFiles(NamedTuple):
-    """Files in PEM format; what is None is taken from Dask's configuration, `distributed.comm.tls`."""
+    """Files in PEM format; Dask's configuration, `distributed.comm.tls`, gives those that are None."""
 
     ca_file: Path | None = None
     cert: Path | None = None

@@ -1,7 +1,7 @@
 """The plan of a sweep: which logs or scenarios, with which settings and seeds; its rows, and the tasks they go out in.
 
 Every row has a key made of all that its result depends on. A sweep that is begun again computes the keys that its
-folder lacks: a log that has changed, other settings, another version of the package or of the code make other keys.
+folder lacks. A log that has changed, other settings, and another version of the package or of the code make other keys.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ Changes = tuple[tuple[str, str], ...]
 
 
 class Subject(NamedTuple):
-    """What one task is about: a log, or a scenario with a seed. `stamp`: what a log was when the plan was made."""
+    """The subject of one task: a log, or a scenario with a seed. `stamp`: the state of a log when the plan was made."""
 
     log: str = ""
     stamp: str = ""

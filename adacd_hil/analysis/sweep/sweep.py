@@ -4,9 +4,9 @@ The client holds a few tasks per worker in flight and writes what comes back eve
 grow with the plan. A worker that dies costs its tasks, which go to another; a task that raises is tried again; after
 that its rows say what it raised. Workers need the package and, of replays, the logs at the same paths.
 
-Results are parts as they come, one Parquet table in the end. A part is written beside and renamed, so that a sweep that
-is killed leaves whole parts only. Columns are those of all rows; a row that lacks one has null there. Readers:
-`duckdb`, `pandas.read_parquet`, `pyarrow.parquet`.
+Results are parts as they come, one Parquet table in the end. The sweep writes a part beside and renames it, so that a
+sweep that is killed leaves whole parts only. Columns are those of all rows; a row that lacks one has null there.
+Readers: `duckdb`, `pandas.read_parquet`, `pyarrow.parquet`.
 """
 
 import json
@@ -109,7 +109,7 @@ Work = Callable[[Task], list[Values]]
 
 
 class SweepOutcome(NamedTuple):
-    """What came of a sweep: rows that were computed, found done before, and failed."""
+    """The outcome of a sweep: rows that were computed, found done before, and failed."""
 
     computed: int
     found: int

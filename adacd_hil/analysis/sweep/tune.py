@@ -1,11 +1,11 @@
 """Thresholds, filter and gain found from logs: candidates, how each is judged, which one is suggested, as TOML.
 
 Every candidate gets the thresholds that one half of the logs gives it for the wanted rate of false alarms: those at
-which the tail's upper 95 % bound is that rate. Then the logs are replayed with it, thresholds and all. It is fit if it
-adapts as often as the logs' own settings do, misses none of the contacts that those were armed for, and has no more
-false alarms than the wanted rate allows; of the fit ones the one with the smallest median delay is suggested. Where a
-wanted rate is extrapolated too far, the bounds of the tails differ more by chance than the candidates do: then filter
-and gain stay as they are. Without the truth nobody knows a delay: only thresholds are found then, too.
+which the tail's upper 95 % bound is that rate. Then the logs are replayed with it, thresholds and all. A candidate is
+fit if it adapts as often as the logs' own settings do, misses none of the contacts that those were armed for, and has
+no more false alarms than the wanted rate allows. The suggestion is the fit candidate with the smallest median delay.
+Where a wanted rate is extrapolated too far, the bounds of the tails differ more by chance than the candidates do: then
+filter and gain stay as they are. Without the truth nobody knows a delay: only thresholds are found then, too.
 
 The suggestion names what it extends and the keys that change, with their origin as comments.
 """

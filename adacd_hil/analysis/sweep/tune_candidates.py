@@ -1,8 +1,8 @@
 """Candidates of tuning on the logs: the scheme with other filters and gains, replayed, and all detectors of the stream.
 
 The paper's scheme is replayed with thresholds that nothing exceeds, so that every candidate keeps monitoring and its
-residual is seen; the model is frozen while it does. The certified scheme learns on, and what is over a threshold it
-does not learn: it is replayed with its own thresholds, and its statistic is the largest ratio to them, which grow with
+residual is seen; the model is frozen while it does. The certified scheme keeps learning, but not from samples over a
+threshold: it is replayed with its own thresholds, and its statistic is the largest ratio to them, which grow with
 `certified.noise_sigmas` and `certified.model_sigmas` (but for the friction that is allowed at standstill).
 
 Detectors (`scheme.detectors`) take the stream with theta_hat as it is in the log and the lag as identified from all

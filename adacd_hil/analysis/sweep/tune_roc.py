@@ -1,4 +1,4 @@
-"""What a detector shows on logs, its thresholds for a wanted rate, and what they do: contacts found, delays, alarms.
+"""A detector's statistics on logs, its thresholds for a wanted rate, and their effect: contacts found, delays, alarms.
 
 A detector is over when some statistic of it is over its threshold: one per channel and joint. All its thresholds times
 one factor make its ROC. Alarms are counted where thresholds were not chosen; contacts are those of all logs.
@@ -51,7 +51,7 @@ _LEAST: Final = 1e-9
 
 
 class Touched(NamedTuple):
-    """What a detector showed of one true contact: since_s (k,) its onset, statistic (k, channels, n).
+    """A detector's statistics on one true contact: since_s (k,) its onset, statistic (k, channels, n).
 
     Both are empty where the detector was not armed, which counts as missed. Samples in which no statistic is larger
     than before may be left out: no threshold is crossed there for the first time.
@@ -74,7 +74,7 @@ def rising(touched: Touched) -> Touched:
 
 @dataclass(frozen=True)
 class Observed:
-    """What a detector showed: peaks (B, channels, n) per block of 0.1 s, NaN unless free; is_chosen_on (B,).
+    """A detector's statistics: peaks (B, channels, n) per block of 0.1 s, NaN unless free; is_chosen_on (B,).
 
     touches: the contacts for which the logged scheme was armed; None where no log says what touched the arm.
     """
@@ -90,7 +90,7 @@ class Observed:
 
 
 class Found(NamedTuple):
-    """What thresholds come to in some part of the logs. Delays in ms, of the contacts found; None of none."""
+    """The effect of thresholds on some part of the logs. Delays in ms, of the contacts found; None of none."""
 
     hours: float
     alarms: int
@@ -381,7 +381,7 @@ LIMITS: Final = (
 
 @dataclass(frozen=True)
 class TuningOutcome:
-    """What replays of all logs with the same settings came to. missed, false_alarms: None without the truth.
+    """The outcome of replays of all logs with the same settings. missed, false_alarms: None without the truth.
 
     armed_false_alarms: of them those in MONITOR, where the hours are counted.
     """
@@ -409,7 +409,7 @@ class TuningOutcome:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A filter and a gain with the thresholds chosen for them, what they come to, and why they are not fit."""
+    """A filter and a gain with the thresholds chosen for them, their outcome, and why they are not fit."""
 
     name: str
     changes: Changes
@@ -430,7 +430,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Tuning:
-    """What was found. detectors: those of `scheme.detectors`, empty where the motion is too short for them."""
+    """The result of tuning. detectors: those of `scheme.detectors`, empty where the motion is too short for them."""
 
     rate_per_h: float
     logs: tuple[TunedLog, ...]

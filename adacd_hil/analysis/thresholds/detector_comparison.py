@@ -1,11 +1,11 @@
 """Detectors compared on one stream: delay against the size of a step, at equal predicted rates of false alarms.
 
 The stream is recorded contact-free motion; a step of external torque is added to it at many instants, as a velocity
-that lags makes of it: 1 - (1 + x) e^-x with x = 2 t / lag, a critically damped tracking loop. Everything here is
-linear up to the statistics, so that is what a push would have made of the recording, but for the motion that it causes.
+that lags makes of it: 1 - (1 + x) e^-x with x = 2 t / lag, a critically damped tracking loop. Everything here is linear
+up to the statistics, so the sum is the recording that a push would have given, but for the motion that it causes.
 
 A delay is from the onset to the sample with which the detector is over, in ms; one bus cycle until the host has that
-sample is not in it. What is not found within `HORIZON_S` is late by more than that.
+sample is not in it. A step that is not found within `HORIZON_S` has a delay of more than that.
 """
 
 import json

@@ -1,8 +1,8 @@
 """The false-alarm budget: which threshold gives which rate of false alarms, from motion that nobody touched.
 
 A detector's statistic is kept as its largest value per block of time. Values above a level u that are less than
-`CLUSTER_S` apart are one alarm, of which the largest value counts. What lies above u is described by a generalised
-Pareto tail (peaks over threshold), by probability-weighted moments:
+`CLUSTER_S` apart are one alarm, of which the largest value counts. A generalised Pareto tail describes the values above
+u (peaks over threshold), by probability-weighted moments:
 
     rate(h) = rate(u) (1 + xi (h - u) / sigma)^(-1 / xi),          exponential at xi = 0
 
@@ -215,7 +215,7 @@ def calibrate_detector(
 
 @dataclass(frozen=True)
 class Prediction:
-    """A predicted rate and what held-out motion did."""
+    """A predicted rate and the rate of held-out motion."""
 
     predicted_per_h: float
     counted: int
@@ -298,7 +298,7 @@ def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
 
 @dataclass(frozen=True)
 class Limits:
-    """What keeps the threshold of one low-pass channel and joint up, largest first, for a wanted rate."""
+    """The sources that keep up the threshold of one low-pass channel and joint, largest first, for a wanted rate."""
 
     sources: tuple[ThresholdSource, ...]
     achievable_Nm: float
@@ -312,7 +312,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Sensing:
-    """What the measurements of one joint are, as far as a threshold depends on it."""
+    """The properties of one joint's measurements that a threshold depends on."""
 
     torque_noise_Nm: float
     torque_LSB_Nm: float

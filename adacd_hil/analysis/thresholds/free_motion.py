@@ -1,9 +1,9 @@
 """Recorded motion: the samples of logs, and which of them nobody touched, piece by piece, in bounded memory.
 
-Of a log counts what lies in MONITOR at least `APART_S` after its beginning, after a gap and after a contact, and at
-least as long before one. A touch that no detector flagged counts as motion.
+The samples of a log count that lie in MONITOR at least `APART_S` after its beginning, after a gap and after a contact,
+and at least as long before one. A touch that no detector flagged counts as motion.
 
-Of N samples a byte each is kept: whether it is free. All else is read again from the log when it is needed.
+Of each of N samples one byte is kept: whether it is free. All other data is read again from the log when it is needed.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -1,10 +1,10 @@
-"""Thresholds from logs: the recorded motion that nobody touched, each detector's statistics on it, what they allow.
+"""Thresholds from logs: recorded motion that nobody touched, each detector's statistics on it, and the thresholds.
 
-Which motion counts: see `free_motion`. A touch that no detector flagged counts, and raises thresholds.
+`free_motion` defines the motion that counts. A touch that no detector flagged counts, and raises thresholds.
 
-The detectors run over all of it, and thresholds come from all that they show. The velocity's lag (what the filtered
-slope of the torque explains of the stream), the stream's covariance and the sources of a threshold are found from the
-same motion, of more than `MOST_SAMPLES` from some windows.
+The detectors run over all of this motion, and thresholds come from all of their statistics. The velocity's lag (what
+the filtered slope of the torque explains of the stream), the stream's covariance and the sources of a threshold are
+found from the same motion, of more than `MOST_SAMPLES` from some windows.
 """
 
 from collections.abc import Sequence
@@ -155,7 +155,7 @@ class ChannelRow:
 
 @dataclass(frozen=True)
 class DetectorRow:
-    """What all thresholds of a detector do together, a row of the thresholds file."""
+    """The joint effect of all thresholds of a detector, a row of the thresholds file."""
 
     name: str = setting(meaning="name of the detector")
     rate_bound_per_h: float = setting(unit="1/h", low=0.0, meaning="upper 95 % bound of the rate of false alarms")

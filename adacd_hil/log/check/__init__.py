@@ -1,1 +1,1 @@
-"""Whether a log is sound: the rules, and what breaks them."""
+"""The check of a log: the rules, and the findings that break them."""

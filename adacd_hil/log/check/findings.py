@@ -1,4 +1,4 @@
-"""What a check of a log finds: rules that are broken, where, and how gravely."""
+"""The findings of a log's check: broken rules, their places, and their severity."""
 
 from collections import Counter
 from dataclasses import dataclass, field

@@ -1,8 +1,8 @@
-"""The check of logs: each file by itself, then what the parts of a log say of each other.
+"""The check of logs: each file by itself, then the parts of a log against each other.
 
 The rules are in `findings.RULES`: those of `mcap doctor` (foxglove/mcap), all CRCs, indexes against records, and our
-own. A file is read once, from front to back, in constant memory but for 0.5 kB per chunk; each record goes to the rules
-that it concerns.
+own. The check reads a file once, from front to back, in constant memory but for 0.5 kB per chunk, and passes each
+record to the rules that concern it.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -60,7 +60,7 @@ _FOOTER_CRC = 4
 
 
 class FileFacts(NamedTuple):
-    """What a checked file says of itself."""
+    """The facts that a checked file states about itself."""
 
     findings: Findings
     metadata: dict[str, dict[str, str]]
@@ -226,7 +226,7 @@ class _FileCheck:
 
 
 class LogCheck(NamedTuple):
-    """What was found in a log, with all its parts."""
+    """The findings in a log, with all its parts."""
 
     path: Path
     files: int

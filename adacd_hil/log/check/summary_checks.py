@@ -1,4 +1,4 @@
-"""The rules on the summary: what it says of attachments, metadata, messages and itself."""
+"""The rules on the summary: its statements about attachments, metadata, messages and itself."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +14,7 @@ from adacd_hil.log.mcap.mcap_records import HEAD, RawRecord, parse
 
 
 class SummaryCheck:
-    """Watches the summary of a file, and what it must say."""
+    """Watches the summary of a file, and the facts that it must state."""
 
     def __init__(self, findings: Findings, definitions: DefinitionCheck, chunks: ChunkCheck) -> None:
         self.statistics: Statistics | None = None

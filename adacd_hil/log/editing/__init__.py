@@ -1,1 +1,1 @@
-"""Logs made from logs: recovered, cut, merged; and what a log holds."""
+"""Logs made from logs: recovered, cut, merged; and the content of a log at a glance."""

@@ -1,14 +1,12 @@
 """Logs made of sound logs: a stretch of one, or several in one. At the first damage both commands say so and stop.
 
-Cut: of our own logs whole cycles are taken, by their publish_time; of others messages, by their log_time. Times count
-from adacd_hil.log.log_files import parts_of
-from adacd_hil.log.log_files import parts_of
-from the first of them in the log.
+Cut: `cut` takes whole cycles from our own logs, by their publish_time; from others it takes messages, by their
+log_time. Times count from the first of them in the log.
 
 Merge: several logs by log_time, of several hosts, or of a run and the emulator beside it. Each log keeps the order of
-its own messages, with all its parts; a message comes as soon as no other log has an earlier one. Each has channels of
-its own, so that a topic that two logs have is told apart by its channel, or by a prefix. The run's metadata of the
-first log stay `run`; those of the others are `run:NAME`, and an attachment that differs from one of the same name is
+its own messages, with all its parts; a message comes as soon as no other log has an earlier one. Each log has channels
+of its own, so that the channel, or a prefix, distinguishes a topic that two logs have. The run's metadata of the first
+log stay `run`; those of the others become `run:NAME`, and an attachment that differs from one of the same name becomes
 `NAME/attachment`.
 """
 
@@ -148,7 +146,7 @@ def _damaged(path: Path, offset: int) -> LogError:
 
 
 class Cut(NamedTuple):
-    """What `cut` did."""
+    """The result of `cut`."""
 
     path: Path
     out: Path
@@ -246,7 +244,7 @@ def _is_within(times: NDArray[np.int64], start_ns: int, stretch: TimeWindow) -> 
 
 
 class Merge(NamedTuple):
-    """What `merge` did. `shared`: topics that more than one log has."""
+    """The result of `merge`. `shared`: topics that more than one log has."""
 
     out: Path
     names: tuple[str, ...]

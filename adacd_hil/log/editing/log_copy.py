@@ -1,4 +1,4 @@
-"""A log that is made of the records of others: recovered, cut or merged. It appears when it is whole.
+"""A log made of the records of others: recovered, cut or merged. It appears when it is whole.
 
 Records stay as they are, but for the numbers of their channels: each source has channels of its own, and schemas are
 shared where they are equal.
@@ -124,7 +124,7 @@ def _is_ros(header: Header) -> bool:
 
 
 class CopySource:
-    """One log that is copied from."""
+    """One log that a copy takes records from."""
 
     def __init__(self, copy: LogCopy, prefix: str, topics: frozenset[str] | None) -> None:
         self._copy = copy

@@ -1,6 +1,6 @@
 """A log at a glance: from its summaries and the chunks with its events and contacts, without reading it all.
 
-A file whose summary can't be trusted is read whole, as far as it can be.
+A file whose summary can't be trusted is read whole, as far as it is readable.
 """
 
 import struct
@@ -62,7 +62,7 @@ class TopicInfo(NamedTuple):
 
 @dataclass
 class LogInfo:
-    """What a log holds. Times in ns of the log, s since its first message."""
+    """The content of a log. Times in ns of the log, s since its first message."""
 
     path: Path
     files: int = 0

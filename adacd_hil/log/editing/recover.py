@@ -1,4 +1,4 @@
-"""A damaged log made whole again, of everything in it that can be trusted: see salvage.py.
+"""A damaged log made whole again from its trusted records: see salvage.py.
 
 The result is one file, whatever the number of parts: definitions, attachments, metadata and messages as they were, and
 an index, statistics and a summary made anew, whose `ending` says "recovered" and what was lost. The source stays as it
@@ -32,7 +32,7 @@ from adacd_hil.log.types.record_arrays import count_frames
 
 
 class LogRecovery(NamedTuple):
-    """What `recover` did."""
+    """The result of `recover`."""
 
     path: Path
     out: Path

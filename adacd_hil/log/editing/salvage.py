@@ -1,8 +1,9 @@
-"""What of a file can be trusted, whatever happened to it.
+"""The trusted records of a file, whatever happened to it.
 
-A message is trusted when a CRC vouches for it: that of its chunk, or that of the whole data section. So the beginning
-of a chunk that was cut or damaged is left alone: of 1000 decompressed so, two gave wrong messages. Metadata and
-message indexes have no CRC of their own; indexes are made anew, metadata are taken where their shape is right.
+Salvage trusts a message when a CRC vouches for it: that of its chunk, or that of the whole data section. So it takes
+nothing from the beginning of a chunk that was cut or damaged: of 1000 decompressed so, two gave wrong messages.
+Metadata and message indexes have no CRC of their own; recovery makes indexes anew and takes metadata where their shape
+is right.
 """
 
 import contextlib
@@ -49,7 +50,7 @@ class Hole(NamedTuple):
 
 @dataclass
 class Losses:
-    """What could not be saved. `messages`: None where nothing says how many there were."""
+    """The records that could not be saved. `messages`: None where their number is unknown."""
 
     chunks: int = 0
     bytes: int = 0
@@ -88,7 +89,7 @@ class Losses:
 
 
 class Salvage:
-    """One file: iterate for what can be trusted, then ask for `losses`. `definitions` fill up on the way."""
+    """One file: iterate for its trusted records, then ask for `losses`. `definitions` fill up on the way."""
 
     def __init__(self, path: Path) -> None:
         """Look at both ends of a file. Raises LogError when it can't be read."""

@@ -1,7 +1,7 @@
 """The plugin of python-can for `.mcap`: `can_logger`, `can_player` and `can_logconvert` read and write our logs.
 
-python-can finds the two classes by the entry points `can.io.message_reader` and `can.io.message_writer`. A message that
-was read knows its time in whole nanoseconds, which the writer uses; others have python-can's float.
+python-can finds the two classes by the entry points `can.io.message_reader` and `can.io.message_writer`. The reader's
+messages carry their time in whole nanoseconds, which the writer uses; other messages have python-can's float.
 """
 
 import os
@@ -19,7 +19,7 @@ from adacd_hil.log.formats.mcap_frames import FrameWriter, McapFrames, RecordedF
 class McapReader(BinaryIOMessageReader):
     """The messages of an MCAP file, in its order; of a log of ours all parts.
 
-    `problem` says afterwards what is missing, "" for a whole file.
+    `problem` names afterwards the missing data, "" for a whole file.
     """
 
     def __init__(self, file: Any, **_: Any) -> None:

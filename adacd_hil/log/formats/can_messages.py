@@ -3,7 +3,7 @@
 A channel of digits is a number to python-can and a name here: "0" is its 0, "" its None.
 
 Times: python-can's are float64 seconds, which stand 238 ns apart at today's dates. BLF and MF4 count from the start of
-the recording, so their nanoseconds are had by reading without the start, and adding it as an integer.
+the recording, so we read their nanoseconds without the start, and add the start as an integer.
 """
 
 import io
@@ -38,7 +38,7 @@ _MOST_DIGITS = 9
 
 
 class TimedMessage(can.Message):
-    """A message that knows its time in whole nanoseconds, besides python-can's `timestamp`."""
+    """A message with its time in whole nanoseconds, besides python-can's `timestamp`."""
 
     def __init__(self, t_ns: int, **fields: Any) -> None:
         super().__init__(timestamp=t_ns / 1_000_000_000, **fields)

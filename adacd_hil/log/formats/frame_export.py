@@ -1,7 +1,8 @@
 """Frames of a recording, chosen by sender, identifier and time, to BLF, ASC and candump files.
 
-What a format can't hold is counted. Times are exact to what the format has: BLF 1 ns, ASC and candump 1 µs. BLF and ASC
-begin at a whole millisecond; a time before 1990, as of a run in lockstep, has no date in BLF and counts from 0.
+The export counts data that a format can't hold. Times are exact to what the format has: BLF 1 ns, ASC and candump 1 µs.
+BLF and ASC begin at a whole millisecond; a time before 1990, as of a run in lockstep, has no date in BLF and counts
+from 0.
 """
 
 from collections import Counter
@@ -32,7 +33,7 @@ _HALF_NS_S = 0.25e-9
 
 
 class ExportSummary(NamedTuple):
-    """What was written; `losses` say in a line each what the format couldn't hold."""
+    """The written frames; `losses` name, a line each, the data that the format couldn't hold."""
 
     frames: int
     losses: tuple[str, ...]
@@ -199,7 +200,7 @@ HOST: Final = "HOST"
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """A choice of frames. Whose a frame is, the contract says by its identifier, of an unknown one its direction.
+    """A choice of frames. The contract gives the sender by the identifier; for an unknown one the direction does.
 
     `start_ns`, `end_ns` count from the first frame of the recording; `can_ids` empty: all.
     """

@@ -1,8 +1,8 @@
 """Frames from and to MCAP files: our logs, files of the python-can plugin, and recordings of ROS 2.
 
 A topic with `to_can_bus` in its name has frames that were sent. The first CAN channel that is written has the topics of
-our logs, each further one its own, with its name in front. What the types have no field for stands in the metadata of
-the MCAP channel, of which a topic may have several:
+our logs, each further one its own, with its name in front. The metadata of the MCAP channel, of which a topic may have
+several, hold the values that the types have no field for:
 
 | key | is |
 |---|---|

@@ -200,7 +200,7 @@ _RAW = tuple(name.removeprefix("/") for name in FRAME_TOPICS)
 
 
 class TableSummary(NamedTuple):
-    """What was written: rows of each file. `problem`: what is missing of the recording, one line."""
+    """The written rows of each file. `problem`: the missing part of the recording, one line."""
 
     rows: Mapping[Path, int]
     problem: str

@@ -1,7 +1,7 @@
 """An MCAP file made of finished records: definitions and messages in chunks, then the summary.
 
-Settings follow what viewers need: message indexes, statistics and summary offsets on; and what a damaged file needs:
-small chunks, CRCs of chunks and of the whole data section.
+Viewers need message indexes, statistics and summary offsets; a damaged file needs small chunks, and CRCs of chunks and
+of the whole data section.
 
 Messages come as finished records, many at a time. mcap's own writer takes them one by one, at 4 µs each, and has no
 place where a finished chunk could be handed over; so the order of the records is ours, and their encoding mcap's. The
@@ -53,7 +53,7 @@ FOOTER_HEAD = struct.Struct("<BQQQ")
 
 
 class Target(Protocol):
-    """What a file is written to."""
+    """The target that a file is written to."""
 
     def write(self, data: bytes, packets: int = 0) -> int:
         """Take `data`, which completes so many packets."""

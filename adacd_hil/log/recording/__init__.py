@@ -1,1 +1,1 @@
-"""How a run is recorded: the control side, the writer process, and the files that it writes."""
+"""The recording of a run: the control side, the writer process, and the files that it writes."""

@@ -3,9 +3,9 @@
 The file: header, attachments and metadata first, then chunks, then the summary. Attachments and metadata come before
 the first chunk, so that they survive when the file is cut.
 
-The thread: what waits for the disk is bounded. When it is more, `is_behind` says so until half of that is written, and
-whoever must lose nothing lets `write` wait. The first failure (disk full) ends a file at the last whole write; what
-comes after is swallowed and its packets are counted, until another file is begun.
+The thread: the amount of data that waits for the disk is bounded. Above the bound `is_behind` is true until half of it
+is written, and a caller that must lose nothing lets `write` wait. The first failure (disk full) ends a file at the last
+whole write; the thread drops later data and counts its packets, until another file is begun.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ class _Write(NamedTuple):
 
 
 class Sink:
-    """What `McapFile` needs of a stream, over a file descriptor that it closes."""
+    """The stream that `McapFile` needs, over a file descriptor that it closes."""
 
     def __init__(
         self,

@@ -82,7 +82,7 @@ def pack_event(t_ns: int, dropped: int, event: Event) -> bytes:
 
 
 class Columns(NamedTuple):
-    """What many packets hold, as arrays; rows are in the order of the packets and, within a packet, as packed."""
+    """The content of many packets, as arrays; rows are in the order of the packets and, within a packet, as packed."""
 
     data: NDArray[np.uint8]  # the packets' bytes, with room after the last
     starts: NDArray[np.int64]  # (n,) where each packet begins

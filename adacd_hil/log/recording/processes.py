@@ -1,4 +1,4 @@
-"""The processes of a log: how the control process starts the others, what each is told, and the words between them.
+"""The processes of a log: how the control process starts the others, the setup of each, and the words between them.
 
 At its start a process reads its setup as JSON from its standard input. It has the messages of the DBC, as far as frames
 are decoded by them: to read a DBC takes longer than all else that the writer does before it is ready.

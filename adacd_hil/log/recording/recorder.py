@@ -2,7 +2,7 @@
 
 In real time a packet costs no system call: it goes into memory that the writer looks into by itself. A full ring (the
 writer is behind, stopped or dead) costs packets, never time and never an exception: `dropped` counts. In lockstep
-(`blocking`) the writer is woken now and then, a full ring is waited for, and nothing is lost.
+(`blocking`) the recorder wakes the writer now and then, waits while the ring is full, and loses nothing.
 """
 
 import contextlib

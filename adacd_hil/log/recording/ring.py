@@ -5,9 +5,9 @@ aligned uint64 that one side alone writes: HEAD, bytes ever put; TAIL, bytes eve
 put; PEAK, most bytes that were found waiting; WRITTEN, packets that are on the disk. Then the ring: a packet is its
 size in 4 bytes, its bytes, and what fills up to 8; one that reaches the end goes on at the beginning.
 
-HEAD moves last: a process that is killed in between leaves whole packets only. That the other side sees the bytes
-before it sees HEAD is left to the processor, which on x86-64 keeps the order of what it writes; elsewhere some 10 ns
-pass in which it may not, and a packet that was read too early is one that makes no sense, and is counted as such.
+HEAD moves last: a process that is killed in between leaves whole packets only. Whether the other side sees the bytes
+before it sees HEAD depends on the processor: x86-64 keeps the order of its writes. Elsewhere some 10 ns pass in which
+the processor may not; a packet that the reader takes too early makes no sense, and is counted as such.
 """
 
 import mmap

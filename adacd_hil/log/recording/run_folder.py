@@ -1,6 +1,6 @@
-"""Where a new log may be: in place of no other log, but for one of a start that failed before the first cycle.
+"""The place of a new log: it replaces no other log, but for one of a start that failed before the first cycle.
 
-That one is moved aside, so that the same command can be given again once the cause is mended.
+The log of such a start is moved aside, so that the user can give the same command again once the cause is mended.
 """
 
 import itertools

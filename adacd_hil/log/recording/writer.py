@@ -2,10 +2,10 @@
 
 It shares nothing with the control process but the ring and a socket for words: neither its CAN sockets nor its
 scheduling, nor its session, so that Ctrl-C reaches only the control process. It ends the log when it is told to or when
-the control process dies, after it has taken what that left in the ring.
+the control process dies, after it has taken the packets that the control process left in the ring.
 
-Packets are gathered and written many at a time, at the latest when a chunk has to end: see packet_writer.py. While
-somebody watches the live view that is more often.
+The writer gathers packets and writes many at a time, at the latest when a chunk has to end: see packet_writer.py. It
+writes more often while somebody watches the live view.
 
 In lockstep the files depend on the packets only, bit for bit; so chunks end by log time there, and nothing is lost but
 to a full disk. Otherwise they end by the clock, so that silence doesn't keep data from the disk; and a disk that is too

@@ -1,1 +1,1 @@
-"""What a log holds: the types of its messages, its topics, its records as arrays."""
+"""The content of a log: the types of its messages, its topics, its records as arrays."""

@@ -1,9 +1,10 @@
-"""Who may watch a run: decided by the request that opens a connection, before anything is said.
+"""The admission of viewers to a run: decided by the request that opens a connection, before any data is sent.
 
 A browser sends with every WebSocket the origin of the page that opens it, and lets any page open one to this machine:
 so a page that is not a viewer's must be refused, or a stranger's page could read the run (cross-site WebSocket
 hijacking). A page that reaches this machine by a name of its own (DNS rebinding) also shows itself by the Host that it
-asks for. Programs that are no browsers send no origin; who can start one on this network is not kept out here.
+asks for. Programs that are no browsers send no origin; admission does not keep out anybody who can start one on this
+network.
 """
 
 import ipaddress
@@ -29,7 +30,7 @@ _OWN_NAMES = ("localhost", "localhost.localdomain")
 
 
 class ViewerRefusal(NamedTuple):
-    """Why somebody may not watch. `notice`: the line for the run's terminal; no word of it is the other side's."""
+    """The reason why a viewer is refused. `notice`: the line for the run's terminal; no word of it is the viewer's."""
 
     status: HTTPStatus
     reason: str

@@ -1,8 +1,8 @@
-"""The topics that the live view shows: those of a log, fewer records of them, and three that are drawn from these.
+"""The topics of the live view: those of a log, fewer records of them, and three that are drawn from these.
 
-A person watches, and the network may be a radio, so each topic has a rate. A rate is kept by log time: time is divided
-into slots of 1 / rate, and of each slot all records of the first cycle in it are shown. So frames of one cycle stay
-together, and what comes more seldom than its rate is shown whole.
+A person watches, and the network may be a radio, so each topic has a rate. The decimator keeps a rate by log time: it
+divides time into slots of 1 / rate, and shows all records of the first cycle in each slot. So frames of one cycle stay
+together, and a topic that comes more seldom than its rate is shown whole.
 
 Encoding (`cdr`), schemas (`ros2msg`) and stamps are those of the file.
 """

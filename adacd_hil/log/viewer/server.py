@@ -4,9 +4,9 @@ Server to viewer, JSON: serverInfo, advertise, status. Binary, little endian: 1,
 (uint64), payload; and 2, time (uint64), since the capability `time` is offered: log time, which never runs backwards.
 Viewer to server: subscribe, unsubscribe; whatever else is answered with one warning and changes nothing.
 
-A viewer that reads slowly loses its oldest messages; one that answers no ping for some 40 s is closed. How many there
-may be is limited, and the connections that are still opening are, too. What somebody sends is never logged or printed:
-the run's terminal gets a fixed line of each kind of refusal, once.
+A viewer that reads slowly loses its oldest messages; one that answers no ping for some 40 s is closed. The number of
+viewers is limited, and so is the number of connections that are still opening. The server never logs or prints data
+that a viewer sends: the run's terminal gets a fixed line of each kind of refusal, once.
 
 It runs with lower priority than the writer, and ends with it.
 """
@@ -116,7 +116,7 @@ class Viewer:
 
 
 class LiveServer:
-    """Serves what comes out of a ring, as long as the writer is there."""
+    """Serves the batches of a ring, as long as the writer is there."""
 
     def __init__(self, setup: LiveSetup, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
         self._setup = setup

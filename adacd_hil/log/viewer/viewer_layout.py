@@ -1,4 +1,4 @@
-"""The layout that Foxglove and Lichtblick load: what one wants to see of a run at once."""
+"""The layout that Foxglove and Lichtblick load: the signals of a run at a glance."""
 
 import base64
 import json
