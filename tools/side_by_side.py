@@ -9,6 +9,7 @@ the kernel's account is fine enough.
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -130,6 +131,8 @@ class Run:
     command: list[str | Path]
     read: Callable[[str], tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]]
     has_logger: bool = False
+    log_folder: Path | None = None
+    """Where it logs; what an earlier block has logged there goes before it runs again."""
 
 
 def count_overruns(due_ns: NDArray[np.int64], period_us: int) -> int:
@@ -274,6 +277,8 @@ def running(run: Run, folder: Path, preload: Path | None = None) -> Iterator[Run
     """
     complaints = folder / f"{run.name}.stderr"
     environment = dict(ENVIRONMENT)
+    if run.log_folder is not None:
+        shutil.rmtree(run.log_folder, ignore_errors=True)
     if preload is not None:
         waits_path(run, folder).unlink(missing_ok=True)
         environment |= {"LD_PRELOAD": str(preload), "WAITS": str(waits_path(run, folder))}
@@ -370,7 +375,7 @@ def host_run(channel: str, folder: Path, config: Path, *options: str) -> Run:
         return due_ns, times_ns, rest | {name: described[name] for name in kept if name in described}
 
     command = [BIN / "adacd-hil", "run", "-i", "socketcan", "-c", channel, "--config", config, "--clock", "realtime"]
-    return Run(HOST, [*command, "--out", out, "--json", *options], read, has_logger=True)
+    return Run(HOST, [*command, "--out", out, "--json", *options], read, has_logger=True, log_folder=out)
 
 
 def read_cycles(log: RunLog) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]:

@@ -70,8 +70,6 @@ def run_hour(chosen: argparse.Namespace) -> dict[str, Any]:
     total_s = chosen.minutes * 60.0
     contacts = write_contacts(folder / "contacts.toml", total_s + 3600.0, chosen.every)
     config = patient_config(folder, period_us=chosen.period_us, more=chosen.settings)
-    for old in (folder / "host").glob(LOG_PARTS):
-        old.unlink()
     memory: list[list[float]] = []
     with ExitStack() as stack:
         where = ["--scenario", str(folder / "contacts.toml"), "--clock", chosen.clock]
