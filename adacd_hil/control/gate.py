@@ -22,7 +22,7 @@ KEPT_CYCLES = 5
 """How long old feedback may keep a torque up: as long as the model may be blind. What is commanded by older feedback
 belongs to no motion that anybody knows."""
 FADING = 0.8
-"""What is left of it in each further cycle: none after 20."""
+"""The part of it that is left in each further cycle: 1 % after 20."""
 
 
 class Gate:

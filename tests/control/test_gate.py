@@ -23,9 +23,11 @@ JOINTS_AND_SIGNS = list(itertools.product((0, 1), (1.0, -1.0)))
 OFFSETS = [sign * 10.0**exponent for exponent in range(-12, 4) for sign in (1.0, -1.0)]
 
 
-def limited(gate: Gate, tau_d: tuple[float, float], is_open: bool = True) -> tuple[tuple[float, float], GateFlag]:
+def limited(
+    gate: Gate, tau_d: tuple[float, float], is_open: bool = True, age: int = 1
+) -> tuple[tuple[float, float], GateFlag]:
     tau_c = np.full(2, np.nan)
-    flags = gate.limit(np.array(tau_d), is_open, tau_c)
+    flags = gate.limit(np.array(tau_d), is_open, tau_c, age)
     return (float(tau_c[0]), float(tau_c[1])), flags
 
 
@@ -184,3 +186,66 @@ def test_the_flags_have_the_numbers_that_logs_hold() -> None:
     numbers = {flag.name: int(flag) for flag in GateFlag}
     assert numbers == {"TORQUE": 1, "RATE": 2, "NOT_A_NUMBER": 4, "CLOSED": 8, "HELD": 16}
     assert GateFlag.NONE.value == 0
+
+
+LAST_NM = 4.0
+WANTED_NM = (
+    -9.0,
+    -4.0,
+    -0.5,
+    0.0,
+    0.5,
+    3.1,
+    math.nextafter(3.2, 0.0),
+    3.2,
+    3.3,
+    3.9,
+    4.0,
+    math.nextafter(4.0, 5.0),
+    9.0,
+)
+
+
+@pytest.mark.parametrize("wanted", WANTED_NM)
+@pytest.mark.parametrize(
+    ("age", "most"), [(0, None), (1, None), (2, 4.0), (4, 4.0), (5, 4.0), (6, 3.2), (7, 3.2), (40, 3.2)]
+)
+@pytest.mark.parametrize(("joint", "sign"), JOINTS_AND_SIGNS)
+def test_by_old_feedback_torque_falls_and_does_not_grow(
+    joint: int, sign: float, age: int, most: float | None, wanted: float
+) -> None:
+    gate = Gate(UNRATED, PERIOD_S)
+    limited(gate, at_joint(joint, sign * LAST_NM))
+    allowed = min(max(wanted, -LIMIT_NM[joint]), LIMIT_NM[joint])
+    expected = GateFlag.NONE if allowed == wanted else GateFlag.TORQUE
+    if most is not None:
+        allowed = 0.0 if wanted < 0.0 else min(wanted, most)
+        expected = GateFlag.NONE if allowed == wanted else GateFlag.HELD
+    reached, flags = limited(gate, at_joint(joint, sign * wanted), age=age)
+    assert (reached, flags) == (at_joint(joint, sign * allowed), expected)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_torque_that_old_feedback_keeps_fades_to_nothing_within_twenty_cycles(sign: float) -> None:
+    gate = Gate(UNRATED, PERIOD_S)
+    limited(gate, (sign * LIMIT_NM[0], 0.0))
+    kept = [limited(gate, (sign * LIMIT_NM[0], 0.0), age=age)[0][0] * sign for age in range(2, 26)]
+    assert kept[:4] == [LIMIT_NM[0]] * 4
+    assert kept[4:] == pytest.approx([LIMIT_NM[0] * 0.8**count for count in range(1, 21)])
+    assert kept[-1] < 0.02 * LIMIT_NM[0]
+
+
+def test_a_torque_held_by_old_feedback_grows_again_at_the_limited_rate() -> None:
+    gate = gate_at((4.0, 0.0))
+    limited(gate, (0.5, 0.0), age=2)
+    low, _ = limited(gate, (0.5, 0.0), age=2)
+    held, flags = limited(gate, (9.0, 0.0), age=2)
+    assert (held, flags) == (low, GateFlag.HELD)
+    assert limited(gate, (9.0, 0.0)) == ((low[0] + STEP_NM[0], 0.0), GateFlag.RATE)
+
+
+def test_both_joints_say_what_was_changed() -> None:
+    gate = Gate(UNRATED, PERIOD_S)
+    limited(gate, (4.0, 4.0))
+    assert limited(gate, (9.0, 3.0), age=2) == ((4.0, 3.0), GateFlag.HELD)
+    assert limited(gate, (3.0, 9.0), age=2) == ((3.0, 3.0), GateFlag.HELD)
