@@ -5,6 +5,7 @@ right one. Whatever else comes, the frames held so far go through the classes of
 in which they came; the result is the same.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -36,7 +37,7 @@ class CyclicFrame(NamedTuple):
     rate: float = 0.0
 
 
-class CyclicDevice:
+class CyclicDevice(ABC):
     """A device that answers every SYNC with one frame, and may send its status in another.
 
     is_protected: whether the cyclic frame carries an end-to-end header; else it is checked by plausibility.
@@ -100,19 +101,21 @@ class CyclicDevice:
         return is_valid
 
     @property
+    @abstractmethod
     def values(self) -> tuple[float, ...]:
         """What is in use, the main value first."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         """Say whether a frame may come so many cycles after one with the main value `last`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:
-        raise NotImplementedError
+        """Bring the values of a checked cyclic frame into use."""
 
+    @abstractmethod
     def _use_status(self, values: Sequence[float], cycle: int) -> None:
-        raise NotImplementedError
+        """Bring the values of a checked status frame into use."""
 
     @property
     def is_steady(self) -> bool:

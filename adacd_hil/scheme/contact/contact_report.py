@@ -24,6 +24,8 @@ ends, else link 1. At the alarm the answer is often too early: joint 1 has the l
 is given at once and becomes final when the window ends.
 """
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 
 from adacd_hil.compiled import compiled
@@ -108,7 +110,7 @@ def _peak(tau: Vector, sigma: float) -> float:
     return float(np.sign(best) * max(abs(best) - bias, 0.0))
 
 
-class ContactEvidence:
+class ContactEvidence(ABC):
     """What a scheme knows of a contact that it reports; of what a scheme doesn't do, nothing."""
 
     due_cycles: tuple[int, ...]
@@ -128,9 +130,9 @@ class ContactEvidence:
     def begin(self) -> None:
         """Take in that a contact is detected in this cycle."""
 
+    @abstractmethod
     def report(self, detected: int, elapsed: int, direction: tuple[int, int], is_final: bool) -> ContactReport:
         """Report the contact that was detected in a cycle, so many cycles ago."""
-        raise NotImplementedError
 
 
 class ContactReporter:
