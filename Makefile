@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-realtime check compiled-certified compiled-paper vcan bench clean
+.PHONY: help demo test test-all test-realtime check compiled-certified compiled-paper vcan docs bench clean
 
 help:
 	@echo "make demo   the paper's experiment with an emulated arm, certified scheme and paper's side by side; report in runs/demo/report.html (the last demo's)"
@@ -16,6 +16,7 @@ help:
 	@echo "make test-all   all checks and all tests"
 	@echo "make test-realtime   SocketCAN tests that need a machine which doesn't stall: 1 kHz contacts, two arms"
 	@echo "make check  format, lint, types, direction of imports"
+	@echo "make docs   the documentation's site, in docs/_site"
 	@echo "make bench  codec, step, plant, log hand-off; the cycle over vcan beside a C yardstick and a straightforward loop"
 
 $(BIN)/python:
@@ -69,9 +70,13 @@ test test-all: $(VENV)/.dev
 test-realtime: $(VENV)/.dev
 	tools/test-on-vcan -m "vcan and realtime"
 
+docs: $(VENV)/.dev
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs docs/_site
+	@echo "docs/_site/index.html"
+
 bench: $(VENV)/.run
 	$(BIN)/python tools/bench.py
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) docs/_site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find adacd_hil firmware_sim tests tools -name __pycache__ -prune -exec rm -r {} +

@@ -38,7 +38,10 @@ from firmware_sim.scenario.scenario import Scenario, load_scenario
 Complaints = list[str]
 
 PROGRAMS = {"adacd-hil": host_cli, "firmware-sim": emulator_cli}
-OTHERS = {"apt-get", "candump", "canbusload", "canplayer", "dask", "duckdb", "ip", "openssl", "sleep", "ssh"}
+OTHERS = {
+    *("apt-get", "candump", "canbusload", "canplayer", "cp", "dask", "duckdb", "echo", "grep", "groupadd", "ip"),
+    *("openssl", "python3", "sleep", "ssh", "systemctl", "udevadm", "useradd", "usermod"),
+}
 """Programs that aren't ours: known to be meant, their arguments are not looked at."""
 PREFIXES = {"chrt": 3, "nice": 3}
 """Programs that run another one, with the words before it."""
@@ -79,7 +82,7 @@ def split_commands(text: str) -> list[list[str]]:
 def command_complaints(words: list[str], is_whole: bool = True) -> Complaints:
     """Check one command line. `is_whole`: what the command requires must be there."""
     program, *rest = words
-    program = program.removeprefix(".venv/bin/")
+    program = program.removeprefix(".venv/bin/").removeprefix("/opt/adacd-hil/bin/")
     if program in PROGRAMS:
         return _click_complaints(program, rest, is_whole)
     if program == "python" and rest:
@@ -94,6 +97,8 @@ def command_complaints(words: list[str], is_whole: bool = True) -> Complaints:
         return [f"the Makefile has no target {target}" for target in rest if target not in make_targets()]
     if program == "pip":
         return _pip_complaints(rest)
+    if program == "podman":
+        return command_complaints(rest[rest.index("adacd-hil") :]) if "run" in rest else []
     if program.startswith("can_"):
         return [] if program in _scripts("python-can") else [f"python-can has no program {program}"]
     if program in OTHERS:

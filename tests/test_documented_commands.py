@@ -103,6 +103,8 @@ def failures(pieces: list[tuple[Piece, list[str]]]) -> str:
 
 def block_complaints(block: Piece, folder: Path) -> list[str]:
     """Check a block by its language; a language that has no rule is a complaint."""
+    if block.language.startswith(("{toctree}", "{include}")):
+        return []  # building the site checks them
     rule = RULES.get(block.language)
     if rule is None:
         return [f"a block of language {block.language!r}; known: {', '.join(RULES)}"]
@@ -227,9 +229,9 @@ def test_every_link_leads_somewhere(page, documents):
     assert failures(found) == ""
 
 
-def test_every_page_is_reached_from_the_readme(documents):
-    readme = (ROOT / "README.md").read_text()
-    assert [path.name for path in PAGES[1:] if path.parent.name == "docs" and path.name not in readme] == []
+def test_the_readme_leads_to_the_contents_of_the_site(documents):
+    """Building the site complains of a page that the contents don't name."""
+    assert "docs/index.md" in [link.text for link in documents["README.md"].links]
 
 
 # -- what can be run without a bus -----------------------------------------------------------------------------------

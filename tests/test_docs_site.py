@@ -1,0 +1,55 @@
+"""The documentation's site is built from every page, without a warning: no broken link, no page left out."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def build(pages: Path, out: Path) -> str:
+    """Build the site; return what Sphinx complains of."""
+    words = ["--quiet", "--keep-going", "--no-color", str(pages), str(out)]
+    built = subprocess.run([sys.executable, "-m", "sphinx", *words], capture_output=True, text=True, check=True)
+    return built.stderr
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    out = tmp_path_factory.mktemp("site")
+    assert build(ROOT / "docs", out) == ""
+    return out
+
+
+def test_every_page_is_in_the_site(site):
+    pages = {path.relative_to(ROOT / "docs").with_suffix(".html") for path in (ROOT / "docs").rglob("*.md")}
+    assert {page for page in pages if not (site / page).is_file()} == set()
+
+
+def test_pages_outside_of_the_folder_are_in_the_site_and_their_links_lead_inside(site):
+    contributing = (site / "contributing.html").read_text()
+    assert "How a change lands" in contributing
+    assert 'href="timing.html"' in contributing
+    assert 'href="contributing.html"' in (site / "adding-things.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("added", "complaint"),
+    [
+        ("[x](no-such-page.md)", "no-such-page"),
+        ("[x](scheme.md#no-such-heading)", "no-such-heading"),
+    ],
+)
+def test_a_broken_link_is_found(tmp_path, added, complaint):
+    for name in ("docs", "adacd_hil", "CONTRIBUTING.md", "CHANGELOG.md", "pyproject.toml"):
+        place = tmp_path / name
+        if name == "docs":
+            shutil.copytree(ROOT / name, place, ignore=shutil.ignore_patterns("_site"))
+        else:
+            place.symlink_to(ROOT / name)
+    page = tmp_path / "docs" / "glossary.md"
+    page.write_text(f"{page.read_text()}\n{added}\n")
+    assert complaint in build(tmp_path / "docs", tmp_path / "site")
