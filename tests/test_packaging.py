@@ -1,6 +1,7 @@
 """What a user installs: the wheel holds every file that the code reads, the licences, and the types."""
 
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -95,3 +96,26 @@ def test_both_commands_are_entry_points(installed: Path) -> None:
 @pytest.mark.parametrize("package", ["adacd_hil", "firmware_sim"])
 def test_the_packages_say_that_they_are_typed(installed: Path, package: str) -> None:
     assert (installed / package / "py.typed").is_file()
+
+
+def test_systemd_knows_every_line_of_the_unit(tmp_path: Path) -> None:
+    if not (systemd := shutil.which("systemd-analyze")):
+        pytest.skip("systemd-analyze isn't installed")
+    text = (ROOT / "tools/deploy/adacd-hil@.service").read_text()
+    unit = tmp_path / "adacd-hil@can0.service"
+    unit.write_text(text.replace("/opt/adacd-hil/bin/adacd-hil", "/bin/true"))
+    verified = subprocess.run([systemd, "verify", str(unit)], capture_output=True, text=True, check=True)
+    assert verified.stderr == ""
+
+
+def test_no_arm_moves_because_a_computer_boots_or_a_run_has_failed() -> None:
+    text = (ROOT / "tools/deploy/adacd-hil@.service").read_text()
+    assert "\n[Install]" not in text
+    assert "\nRestart=no\n" in text
+
+
+def test_the_container_copies_what_the_wheel_is_built_from() -> None:
+    lines = (ROOT / "tools/deploy/Containerfile").read_text().splitlines()
+    copied = {word for line in lines if line.startswith("COPY ") for word in line.split()[1:-1]}
+    assert {word for word in copied if not (ROOT / word).exists()} == set()
+    assert {"pyproject.toml", "README.md", "LICENSE", "NOTICE", "dbc", "adacd_hil", "firmware_sim"} <= copied
