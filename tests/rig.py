@@ -19,7 +19,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
+from adacd_hil.settings.arm_settings import BusSettings, LockstepSettings
 from adacd_hil.settings.configuration import Settings, load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import Bus, EmbeddedBus, Frame, Tap

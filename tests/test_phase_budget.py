@@ -11,7 +11,7 @@ import pytest
 from rig import play_lockstep
 
 from adacd_hil.log.reader import RunLog
-from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
+from adacd_hil.settings.arm_settings import BusSettings, LockstepSettings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 
 

@@ -5,7 +5,7 @@ import pytest
 from rig import play_lockstep
 
 from adacd_hil.log.reader import RunLog
-from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.arm_settings import LockstepSettings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame

@@ -21,7 +21,7 @@ from adacd_hil.cli.commands.monitor_command import Screen
 from adacd_hil.cli.output import Progress
 from adacd_hil.log.reader import read_log
 from adacd_hil.terminal import fit_table, in_line, one_line, plain, terminal_columns
-from firmware_sim.bench.truth_log import TruthLog
+from firmware_sim.bench.bench_time import TruthLog
 
 OK, USAGE, PARTIAL, INTERRUPTED = 0, 2, 3, 130
 LONG = ([BIN / "adacd-hil", "budget", "--json"], [BIN / "firmware-sim", "list", "--json"])

@@ -21,9 +21,8 @@ from adacd_hil.records import (
     SchemeState,
     Vector,
 )
-from adacd_hil.scheme.contact.contact_course import ContactCourse
 from adacd_hil.scheme.contact.contact_report import RecalledContact
-from adacd_hil.scheme.contact.reaction import ReactionChoice
+from adacd_hil.scheme.contact.reaction import ContactCourse, ReactionChoice
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.supervisor.supervisor import Supervisor
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, Observation

@@ -19,9 +19,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import LoggedEvent, Series
-from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings, renewed
 from adacd_hil.settings.schema import parse

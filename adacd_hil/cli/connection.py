@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames

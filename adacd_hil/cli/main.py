@@ -16,7 +16,6 @@ from adacd_hil.cli.commands.play_command import play
 from adacd_hil.cli.commands.replay_command import replay
 from adacd_hil.cli.commands.sweep_command import sweep
 from adacd_hil.cli.commands.tune_command import tune
-from adacd_hil.cli.exit_codes import EPILOG, ExitCode, complain, explained
 from adacd_hil.cli.options import (
     clock_option,
     config_option,
@@ -29,7 +28,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import tell, tried
+from adacd_hil.cli.output import EPILOG, ExitCode, complain, explained, tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.terminal import is_interrupted, open_terminals
@@ -37,7 +36,7 @@ from adacd_hil.terminal import is_interrupted, open_terminals
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
     from adacd_hil.control.session import LiveAddress
-    from adacd_hil.log.time_window import TimeWindow
+    from adacd_hil.log.log_files import TimeWindow
 
 
 @click.group(epilog=EPILOG, context_settings={"auto_envvar_prefix": "ADACD_HIL", "help_option_names": ["-h", "--help"]})

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
+from adacd_hil.cli.output import CommandError, ExitCode, explained
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.recording.processes import MOST_VIEWERS
 from adacd_hil.remedies import install_command
@@ -50,7 +50,7 @@ def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]
 
     @functools.wraps(command)
     def bounded(*args: Any, from_s: float | None, until_s: float | None, **kwargs: Any) -> ExitCode:
-        from adacd_hil.log.time_window import TimeWindow
+        from adacd_hil.log.log_files import TimeWindow
 
         for name, bound_s in (("--from", from_s), ("--until", until_s)):
             if bound_s is not None and not math.isfinite(bound_s):

@@ -6,7 +6,7 @@ from typing import NoReturn
 from adacd_hil.start import start_program
 
 INTERRUPTED = 130
-"""`adacd_hil.cli.exit_codes.ExitCode.INTERRUPTED`, which takes numpy to import."""
+"""`adacd_hil.cli.output.ExitCode.INTERRUPTED`, which takes numpy to import."""
 
 
 def start_host() -> NoReturn:

@@ -12,9 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.clock import Clock
-from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
+from adacd_hil.commission.communication_test import (
+    CommunicationReport,
+    CommunicationTest,
+    Verdict,
+    ZeroTorqueCycle,
+    ZeroTorqueLoop,
+)
 from adacd_hil.commission.diagnosis import Check, CheckOutcome, failed, ok, skipped, warning
-from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import read_object

@@ -12,6 +12,7 @@ import numpy as np
 
 from adacd_hil import __version__
 from adacd_hil.clock import Clock, format_date, wall_ns
+from adacd_hil.commission.communication_test import ZeroTorqueLoop
 from adacd_hil.commission.tare import (
     ArmMovedError,
     Pose,
@@ -22,7 +23,6 @@ from adacd_hil.commission.tare import (
     measure_pose,
     solve_tare,
 )
-from adacd_hil.commission.zero_torque import ZeroTorqueLoop
 from adacd_hil.control.session import git_commit
 from adacd_hil.control.tare_file import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.device.arm import Arm

@@ -13,19 +13,17 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.exchange import Exchange
-from adacd_hil.control.fault_report import FaultReport
+from adacd_hil.control.fault_report import FaultReport, SelfChecks
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator
 from adacd_hil.control.pacing import Pacer
 from adacd_hil.control.recovery import StopEscalation
 from adacd_hil.control.reference import Reference
-from adacd_hil.control.self_checks import SelfChecks
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import DataShares, DataWatch
-from adacd_hil.device.arm_watch import ArmWatch
+from adacd_hil.device.arm_watch import ArmWatch, Recurrence
 from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.network import Master
-from adacd_hil.device.repetition import Recurrence
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_control, pack_cycle, pack_frame_checks, pack_scheme
 from adacd_hil.records import (

@@ -8,8 +8,8 @@ from typing import NamedTuple
 from adacd_hil.clock import Clock
 from adacd_hil.control.pacing import MOST_FRAMES, Pacer, Tick
 from adacd_hil.device.arm import FEEDBACK_SHARE, Arm
+from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
 from adacd_hil.device.network import Master
-from adacd_hil.device.repetition import RateLimitedEvents, Recurrence
 from adacd_hil.records import ArmCommand, ArmState, CycleRecord, Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import NOTHING_QUEUED, Frame, SilenceError, Tap

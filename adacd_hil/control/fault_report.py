@@ -1,17 +1,111 @@
-"""What the log's line of a fault says: the causes, by the fault's reason, and what is wrong with the devices."""
+"""What the host finds itself, and what the log's line of a fault says.
 
+`SelfChecks` compare what the host wanted with what came of it: torque, motion, and the devices' parameters. The scheme
+knows none of it: what fails goes to it as a request for FAULT, so that a log replays to the same decision.
+`FaultReport` gives the causes, by the fault's reason, and what is wrong with the devices.
+"""
+
+import math
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
-from adacd_hil.control.self_checks import SelfChecks
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.arm_watch import ArmWatch
+from adacd_hil.device.device_setup import ParameterWatch
+from adacd_hil.device.drive import Drive
 from adacd_hil.device.network import Master
-from adacd_hil.records import JOINTS, ArmState, FaultReason, SchemeState
+from adacd_hil.records import JOINTS, ArmState, FaultReason, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.settings.configuration import Settings
+
+TORQUE_STATUSES = 2
+"""Statuses in a row that have to show a wrong torque. One may be of the moment in which a command was late."""
+TORQUE_S = 0.05
+"""How long a drive's torque may differ at the least: five times the settling time of a slow current loop."""
+_JUDGED = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR, SchemeState.PAYLOAD)
+"""States in which the arm follows a motion that nothing disturbs."""
+
+
+class SelfChecks:
+    """Judges every cycle of an enabled arm. `reason`, `line`: what failed first; NONE and empty before."""
+
+    def __init__(self, settings: Settings, arm: Arm, parameters: ParameterWatch, q_d: Vector) -> None:
+        """`q_d` (2,): the desired position, rad, as it was when the present cycle began."""
+        period_s = settings.bus.period_s
+        self._arm, self._parameters, self._q_d = arm, parameters, q_d
+        self._window_rad = [math.radians(deg) for deg in settings.controller.following_window_deg]
+        self._following_cycles = max(1, round(settings.controller.following_timeout_s / period_s))
+        self._torque_share = settings.arm.torque_error_share
+        self._torque_cycles = max(1, round(TORQUE_S / period_s))
+        self._away_cycles = 0
+        self._wrong: dict[str, tuple[int, int]] = {}  # since which cycle, how many statuses
+        self.reason = FaultReason.NONE
+        self.line = ""
+
+    def judge(self, arm: ArmState, state: SchemeState) -> Request:
+        """Take in a cycle, with the scheme's state after the one before; return what is to be asked of the scheme."""
+        if not arm.is_enabled:
+            return Request.NONE
+        if self._parameters.difference:
+            return self._fail(FaultReason.TAMPERED, Request.FAULT_TAMPERED, self._parameters.difference)
+        line = self._judge_torque(arm.cycle)
+        if line:
+            return self._fail(FaultReason.TORQUE, Request.FAULT_TORQUE, line)
+        line = self._judge_motion(arm) if state in _JUDGED else self._follow()
+        return self._fail(FaultReason.FOLLOWING, Request.FAULT_FOLLOWING, line) if line else Request.NONE
+
+    def _fail(self, reason: FaultReason, request: Request, line: str) -> Request:
+        if self.reason is FaultReason.NONE:
+            self.reason, self.line = reason, line
+        return request
+
+    def _follow(self) -> str:
+        self._away_cycles = 0
+        return ""
+
+    def _judge_motion(self, arm: ArmState) -> str:
+        errors = [abs(float(arm.q[joint] - self._q_d[joint])) for joint in range(JOINTS)]
+        is_near = all(error <= window for error, window in zip(errors, self._window_rad, strict=True))
+        self._away_cycles = 0 if is_near else self._away_cycles + arm.periods
+        if self._away_cycles < self._following_cycles:
+            return ""
+        joint = max(range(JOINTS), key=lambda k: errors[k] / self._window_rad[k])
+        return (
+            f"joint {joint + 1}: {math.degrees(errors[joint]):.1f} deg from the desired position, "
+            f"controller.following_window_deg = {math.degrees(self._window_rad[joint]):g} deg"
+        )
+
+    def _judge_torque(self, cycle: int) -> str:
+        for drive in self._arm.drives:
+            if drive.status_cycle != cycle or not drive.shows_torque:
+                continue
+            excess = self._excess(drive)
+            if excess <= 1000.0 * self._torque_share:
+                self._wrong.pop(drive.name, None)
+                continue
+            since, count = self._wrong.get(drive.name, (cycle, 0))
+            self._wrong[drive.name] = since, count + 1
+            if count + 1 >= TORQUE_STATUSES and cycle - since >= self._torque_cycles:
+                return (
+                    f"{drive.name}: torque {drive.torque_actual_permille / 10:.1f} % of rated torque, "
+                    f"{drive.recent_permille[-1] / 10:.1f} % commanded, "
+                    f"arm.torque_error_share = {100.0 * self._torque_share:g} %"
+                )
+        return ""
+
+    @staticmethod
+    def _excess(drive: Drive) -> float:
+        """Return by how much, per mille, a drive's torque is beyond all that it was told of late.
+
+        A drive that says that it is at a limit of its own may have less.
+        """
+        low, high = min(drive.recent_permille), max(drive.recent_permille)
+        if drive.is_limited:
+            low, high = min(low, 0), max(high, 0)
+        actual = drive.torque_actual_permille
+        return max(low - actual, actual - high, 0)
 
 
 class FaultReport:

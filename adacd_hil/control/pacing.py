@@ -12,7 +12,7 @@ import numpy as np
 
 from adacd_hil.clock import Clock, VirtualClock
 from adacd_hil.scheduling import RealtimeGrant
-from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.arm_settings import LockstepSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import BusError, Frame, Tap
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW

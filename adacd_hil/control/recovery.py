@@ -11,9 +11,9 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.operator import FaultAnswer, Operator
 from adacd_hil.control.pacing import MOST_FRAMES
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.device.drive import Cia402State
 from adacd_hil.device.network import Master
-from adacd_hil.device.repetition import RateLimitedEvents
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import Event, FaultReason
 from adacd_hil.wire.bus import BusError, Tap

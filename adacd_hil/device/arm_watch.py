@@ -8,18 +8,70 @@ its SYNC was never sent. A SYNC that is late by less than a period is none; the 
 counts with the interval that was measured. Pauses that are meant, as between two attempts, are no misses.
 `realtime.misses` of them within `realtime.misses_window_s` are too many. By `realtime.on_misses` the run then faults,
 or the arm brakes to rest and holds its place until the user acknowledges, where the scheme knows such a state.
+
+Events that come again and again are said once a second, with a count (`RateLimitedEvents`).
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 
 from adacd_hil.device.profile import PlacedDevice
-from adacd_hil.device.repetition import Recurrence
 from adacd_hil.records import ArmState, Event, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
+
+
+class Recurrence:
+    """Something that is done every so many cycles, and after skipped ones as soon as there is a cycle again."""
+
+    def __init__(self, interval_s: float, period_s: float) -> None:
+        self._cycles = max(1, round(interval_s / period_s))
+        self._due_cycle = 0
+
+    def is_due(self, cycle: int) -> bool:
+        """Whether it is to be done in this cycle; asked once per cycle."""
+        if cycle < self._due_cycle:
+            return False
+        self._due_cycle = cycle - cycle % self._cycles + self._cycles
+        return True
+
+
+REPEAT_NS = 1_000_000_000
+"""Least time between two events of one kind."""
+
+
+class RateLimitedEvents:
+    """Collects events, each kind at once, then at most once a second with the count of those between.
+
+    `take_events` gives those since the last call.
+    """
+
+    def __init__(self) -> None:
+        self._said_ns: dict[Hashable, int] = {}
+        self._unsaid: dict[Hashable, int] = {}
+        self._events: list[Event] = []
+
+    def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
+        """Take an event of a kind at a time. `count`: how many it stands for."""
+        if not self.is_due(kind, t_ns):
+            self._unsaid[kind] = self._unsaid.get(kind, 0) + count
+            return
+        more = self._unsaid.pop(kind, 0)
+        self._said_ns[kind] = t_ns
+        self._events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
+
+    def is_due(self, kind: Hashable, t_ns: int) -> bool:
+        """Tell whether an event of a kind would be said at once."""
+        said_ns = self._said_ns.get(kind)
+        return said_ns is None or t_ns - said_ns >= REPEAT_NS
+
+    def take_events(self) -> list[Event]:
+        """Return and forget the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
 
 _LOOKS = 0.1
 """How often heartbeats are looked at, in their periods."""

@@ -1,22 +1,93 @@
-"""What the devices must be and are told over SDO before a run, and what of it is read again while the arm runs.
+"""A device as its master sees it; what it must be and is told over SDO before a run; what of it is read again later.
 
 A failure is one line with device, object and value. Sources: CiA 402-2 / IEC 61800-7-201 (drives); CiA 404, CiA 303-2
-(sensors and units); CiA 301 (4.2), clause 7.2.4.3 (expedited SDO upload: a request of 8 bytes, and its answer).
+(sensors and units); CiA 301 (4.2), clause 7.2.4 (SDO; 7.2.4.3: expedited upload, a request of 8 bytes and its answer).
 """
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
-from adacd_hil.device.canopen_bus import SDO_ABORT
+from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
+from adacd_hil.device.canopen_bus import SDO_ABORT, DeviceError, explained, find_variable
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, torque_limit_permille
-from adacd_hil.device.repetition import RateLimitedEvents, Recurrence
-from adacd_hil.device.slave import Slave
+from adacd_hil.device.profile import ObjectName, PlacedDevice
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import SDO_REQUEST_ID, SDO_RESPONSE_ID
+
+
+class Slave:
+    """A device of the arm on the bus, as its master sees it."""
+
+    def __init__(self, device: PlacedDevice, node: Any) -> None:
+        self.device = device
+        self.name = device.name
+        self.node_id = device.node_id
+        self.known: dict[tuple[int, int], int] = {}
+        """What the set-up has written or compared, by index and sub-index."""
+        self._node = node
+
+    def has(self, index: int, sub: int = 0) -> bool:
+        """Whether the EDS lists an object."""
+        return find_variable(self._node.object_dictionary, index, sub) is not None
+
+    def default(self, index: int, sub: int = 0) -> int:
+        """Return the value that the EDS gives, 0 when it gives none."""
+        variable = find_variable(self._node.object_dictionary, index, sub)
+        return 0 if variable is None or variable.default is None else variable.default
+
+    def read(self, index: int, sub: int = 0) -> int:
+        """Read a number. Raises DeviceError."""
+        with explained(self.name, self.node_id, f"reading {self.describe(index, sub)}"):
+            return int(self._entry(index, sub).raw)
+
+    def write(self, index: int, sub: int, value: int) -> None:
+        """Write a number. Raises DeviceError."""
+        with explained(self.name, self.node_id, f"writing {self.describe(index, sub)} = {_number(value)}"):
+            self._entry(index, sub).raw = value
+        self.known[index, sub] = value
+
+    def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
+        """Write a number and read it back. Raises DeviceError."""
+        self.write(index, sub, value)
+        found = self.read(index, sub)
+        if found != value:
+            self.fail(f"{self.describe(index, sub)} reads back {_with(found, unit)}, {_with(value, unit)} written")
+
+    def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> None:
+        """Compare an object with what it must be. Raises DeviceError."""
+        found = self.read(index, sub)
+        self.known[index, sub] = expected
+        if found != expected:
+            values = [f"0x{value:08X}" if is_hex else _with(value, unit) for value in (found, expected)]
+            self.fail(f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected")
+
+    def describe(self, index: int, sub: int) -> str:
+        """Name an object as the EDS does."""
+        variable = find_variable(self._node.object_dictionary, index, sub)
+        return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
+
+    def fail(self, text: str) -> NoReturn:
+        """Raise DeviceError with the device's name."""
+        raise DeviceError(f"{self.name} (node {self.node_id}): {text}")
+
+    def _entry(self, index: int, sub: int) -> Any:
+        entry = self._node.sdo.get_variable(index, sub)
+        if entry is None:
+            self.fail(f"{ObjectName(index, sub)} is not in the EDS")
+        return entry
+
+
+def _with(value: int, unit: str) -> str:
+    return f"{_number(value)} {unit}".rstrip()
+
+
+def _number(value: int) -> str:
+    return f"0x{value:08X}" if value > 0xFFFFFF else str(value)
+
 
 _CST_SUPPORTED = 1 << 9  # of 0x6502
 _MODE_READS = 20

@@ -8,8 +8,8 @@ Source: CiA 301 (4.2), clauses 7.5.2.35 to 7.5.2.38.
 from typing import Any, NamedTuple
 
 from adacd_hil.device.canopen_bus import read_object
+from adacd_hil.device.device_setup import Slave
 from adacd_hil.device.profile import ObjectName, PdoSettings
-from adacd_hil.device.slave import Slave
 from adacd_hil.wire.bus import MAX_STANDARD_ID
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import NOT_VALID

@@ -13,9 +13,9 @@ CRC and alive counter are no secret: they find errors, not intent. See `docs/thr
 from collections import deque
 
 from adacd_hil.clock import Clock
+from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.profile import place_devices
-from adacd_hil.device.repetition import RateLimitedEvents
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame

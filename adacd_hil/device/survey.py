@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
-from adacd_hil.device.slave import Slave
+from adacd_hil.device.device_setup import Slave
 from adacd_hil.wire.bus import MAX_STANDARD_ID, Bus, Tap
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.traffic import Talk, Traffic, listen

@@ -10,19 +10,26 @@ import numpy as np
 
 from adacd_hil.records import JOINTS, POSITION_TERMS, Vector
 from adacd_hil.scheduling import RealtimeRequest
-from adacd_hil.settings.arm_settings import ArmSettings, DevicesSettings
-from adacd_hil.settings.bus_settings import BusSettings, DataSettings, LockstepSettings
-from adacd_hil.settings.certified_settings import CROSS_TALK, CertifiedSettings
+from adacd_hil.settings.arm_settings import ArmSettings, BusSettings, DataSettings, DevicesSettings, LockstepSettings
 from adacd_hil.settings.commission_settings import HistorySettings, SafetySettings, TareSettings
-from adacd_hil.settings.control_settings import (
+from adacd_hil.settings.run_settings import (
     ControllerSettings,
     ExcitationSettings,
+    LogSettings,
+    OperatorSettings,
     ReactionSettings,
+    RealtimeSettings,
     TrajectorySettings,
 )
-from adacd_hil.settings.paper_settings import DetectorSettings, EstimatorSettings, FilterSettings, TerminationSettings
-from adacd_hil.settings.run_settings import LogSettings, OperatorSettings, RealtimeSettings
 from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.scheme_settings import (
+    CROSS_TALK,
+    CertifiedSettings,
+    DetectorSettings,
+    EstimatorSettings,
+    FilterSettings,
+    TerminationSettings,
+)
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 
 _LONGEST_CHAIN = 8

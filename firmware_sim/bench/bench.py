@@ -5,7 +5,7 @@ torque frames, identifiers ascending → truth of k → integrate to k + 1 with 
 cyclic frames last: a host in lockstep goes on when it has them, and then it has all frames of this SYNC.
 
 Time: `firmware_sim.bench.bench_time`; nodes: `firmware_sim.bench.bench_nodes`; faults: `firmware_sim.bench.injector`;
-truth: `firmware_sim.bench.truth_log`.
+truth: `firmware_sim.bench.bench_time`.
 
 The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
 0 for a master that begins at 1; from there the counter 1…240 is unwrapped. SYNCs that come twice or out of order:
@@ -20,11 +20,9 @@ from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import HOST_MARK
 from firmware_sim.bench.bench_nodes import TICK_NS, BenchNodes, Movable
-from firmware_sim.bench.bench_time import BenchTime
+from firmware_sim.bench.bench_time import BenchTime, OnTruth, TruthFeed
 from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS
-from firmware_sim.bench.injector import Handler, Injector, OnEvent
-from firmware_sim.bench.outbox import Outbox
-from firmware_sim.bench.truth_log import OnTruth, TruthFeed
+from firmware_sim.bench.injector import Handler, Injector, OnEvent, Outbox
 from firmware_sim.body.body import Body
 from firmware_sim.canopen.contracts import EmulatedContract, contract_of
 from firmware_sim.canopen.sync_order import SyncKind, SyncOrder

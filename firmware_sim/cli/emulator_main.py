@@ -26,10 +26,9 @@ from adacd_hil.wire.codec import Codec, CodecError, load_codec
 from adacd_hil.wire.contract_frames import HOST_NODE, move_contract
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.bench.bench import Bench, ClockMode
-from firmware_sim.bench.injector import OnEvent
-from firmware_sim.bench.outbox import Departure
+from firmware_sim.bench.bench_time import TruthLog
+from firmware_sim.bench.injector import Departure, OnEvent
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
-from firmware_sim.bench.truth_log import TruthLog
 from firmware_sim.canopen.contracts import CONTRACTS
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.scenario_list import as_text, check, describe_all, show, show_as_table

@@ -12,7 +12,7 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import HOST_MARK, NEVER_NS
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.bench.bench_time import LONGEST_ORPHANAGE_NS
-from firmware_sim.bench.outbox import Departure
+from firmware_sim.bench.injector import Departure
 from firmware_sim.canopen.contracts import is_fd
 from firmware_sim.canopen.pdo_record import LISTENED_IDS
 

@@ -11,11 +11,11 @@ from scipy.signal import lsim
 
 from adacd_hil.analysis.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.cli.main import cli
-from adacd_hil.control.motion_laws import Excitation
+from adacd_hil.control.reference import Excitation
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.regressor import regressor
 from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.settings.control_settings import ExcitationSettings, TrajectorySettings
+from adacd_hil.settings.run_settings import ExcitationSettings, TrajectorySettings
 from adacd_hil.settings.schema import ConfigError
 
 TWO = ((-0.04, 0.01), (-0.04, 0.01))

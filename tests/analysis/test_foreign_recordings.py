@@ -12,8 +12,7 @@ from adacd_hil.analysis.foreign import recording_import
 from adacd_hil.analysis.foreign.recording_identification import identify
 from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
 from adacd_hil.cli.main import cli
-from adacd_hil.log.log_files import LogError
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.scheme.identify.offline import model_of
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.schema import ConfigError

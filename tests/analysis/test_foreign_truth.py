@@ -16,7 +16,7 @@ from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.settings.toml_files import to_toml
-from firmware_sim.bench.truth_log import TruthLog
+from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 
 CONFIG = 'name = "mine"\n[filter]\na_rad_s = 10.0\n'

@@ -22,10 +22,9 @@ from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.verdict import identified_text
 from adacd_hil.cli.main import cli
 from adacd_hil.log import reader
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import Series, start_of_log
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
 from adacd_hil.records import CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import layout_of

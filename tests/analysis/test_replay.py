@@ -16,11 +16,10 @@ from adacd_hil.analysis.score.emulator_truth import contacts_beside
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.judge import Score
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import begin_of_log, read_log
-from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import FaultReason, SchemeState
-from firmware_sim.bench.truth_log import TruthLog
+from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,7 @@ from click.testing import CliRunner
 
 from adacd_hil.analysis.replay.replayed_outcome import Replay
 from adacd_hil.analysis.sweep.plan import Plan, plan_logs, plan_scenarios
-from adacd_hil.analysis.sweep.rows import replay_task
-from adacd_hil.analysis.sweep.sweep import SweepStore, run_sweep
+from adacd_hil.analysis.sweep.sweep import SweepStore, replay_task, run_sweep
 from adacd_hil.cli.main import cli
 from adacd_hil.log.log_files import LogError
 

@@ -8,8 +8,7 @@ from rig import Rig
 
 from adacd_hil.analysis.score.wording import number_text
 from adacd_hil.cli.commands.commtest_command import as_text, describe, write_pictures
-from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest
-from adacd_hil.commission.zero_torque import ZeroTorqueLoop
+from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, ZeroTorqueLoop
 
 
 def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:

@@ -11,7 +11,7 @@ from adacd_hil.cli import output as run_folder_module
 from adacd_hil.cli.output import run_folder
 from adacd_hil.log.log_files import LogExistsError
 from adacd_hil.log.reader import read_log
-from firmware_sim.bench.truth_log import TruthLog
+from firmware_sim.bench.bench_time import TruthLog
 
 USAGE, BUS_MISSING = 2, 5
 

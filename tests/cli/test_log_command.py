@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
-from firmware_sim.bench.truth_log import TruthLog
+from firmware_sim.bench.bench_time import TruthLog
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "log"))
 

@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from adacd_hil.cli.exit_codes import CommandError
 from adacd_hil.cli.main import cli
-from adacd_hil.cli.output import tell, tried
+from adacd_hil.cli.output import CommandError, tell, tried
 from adacd_hil.file_access import is_disk_full
-from adacd_hil.settings.control_settings import ExcitationSettings
+from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import parse_toml
 

@@ -7,7 +7,7 @@ from rig import CODEC, PERIOD_NS, Rig
 from adacd_hil.control.exchange import Exchange, say_trouble
 from adacd_hil.control.pacing import GridPacer
 from adacd_hil.device.arm_report import ArmReport
-from adacd_hil.device.repetition import RateLimitedEvents
+from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.records import ArmCommand, ArmState
 from adacd_hil.wire.bus import EmbeddedBus, Frame
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.control.pacing import HostLatency
-from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.arm_settings import LockstepSettings
 from adacd_hil.settings.schema import ConfigError
 
 

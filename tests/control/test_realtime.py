@@ -8,7 +8,7 @@ import pytest
 from adacd_hil.clock import MonotonicClock, VirtualClock
 from adacd_hil.control.pacing import GridPacer, Pacer, Tick, calibrate, make_pacer, prepare_spin
 from adacd_hil.scheduling import RealtimeGrant
-from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.arm_settings import LockstepSettings
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.bus import EmbeddedBus, Tap
 

@@ -1,6 +1,6 @@
 """What is done every so many cycles."""
 
-from adacd_hil.device.repetition import Recurrence
+from adacd_hil.device.arm_watch import Recurrence
 
 
 def test_a_recurrence_is_due_every_so_many_cycles() -> None:

@@ -18,7 +18,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.outbox import Departure
+from firmware_sim.bench.injector import Departure
 from firmware_sim.cli.emulator_main import EPILOG, main
 from firmware_sim.cli.service import Service, StopRequest
 

@@ -17,7 +17,7 @@ from test_main import MS, ScriptedBus, enabling_script
 from adacd_hil.clock import VirtualClock
 from adacd_hil.records import TRUTH_LAYOUT
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.outbox import Departure
+from firmware_sim.bench.injector import Departure
 from firmware_sim.cli.service import Service, StopRequest
 
 REST_RAD_S = 0.02

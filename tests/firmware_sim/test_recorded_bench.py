@@ -13,7 +13,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
 from adacd_hil.log.formats.mcap_frames import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import topic_bytes
-from adacd_hil.settings.bus_settings import BusSettings, LockstepSettings
+from adacd_hil.settings.arm_settings import BusSettings, LockstepSettings
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import EmbeddedBus, Frame

@@ -11,7 +11,7 @@ from firmware_sim.arm.mechanics_settings import MechanicsSettings
 from firmware_sim.arm.scripted_contact import TICK_S, ContactSettings, contact_table, contact_torque
 from firmware_sim.arm.touch_forces import ENERGY, touch
 from firmware_sim.arm.touch_settings import BODY_REGIONS, BodySettings, HandSettings, WallSettings
-from firmware_sim.body.touch_table import initial_touch_state, largest_rate_rad_s, touch_table
+from firmware_sim.body.body import initial_touch_state, largest_rate_rad_s, touch_table
 
 POSE = (0.3, 0.7)
 SOFT = {"mass_kg": 1.5, "stiffness_N_m": 2000.0}

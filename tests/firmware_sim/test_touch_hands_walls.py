@@ -22,7 +22,7 @@ from firmware_sim.arm.touch_forces import (
     touch,
 )
 from firmware_sim.arm.touch_settings import BodySettings, HandSettings, WallSettings
-from firmware_sim.body.touch_table import largest_rate_rad_s
+from firmware_sim.body.body import largest_rate_rad_s
 from firmware_sim.scenario.scenario import load_scenario
 
 POSE = (0.3, 0.7)

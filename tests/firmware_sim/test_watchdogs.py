@@ -20,7 +20,7 @@ from test_main import ScriptedBus, enabling_script
 
 from adacd_hil.clock import VirtualClock
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.outbox import Departure
+from firmware_sim.bench.injector import Departure
 from firmware_sim.cli.service import Service, StopRequest
 
 SYNC, COMMAND, HEARTBEAT, OPERATIONAL, LENGTH = 1, 2, 3, 4, 5

@@ -14,7 +14,7 @@ from adacd_hil.scheme.model.regressor import (
     fill_terms,
     smooth_sign,
 )
-from adacd_hil.settings.certified_settings import FRICTION_TERMS
+from adacd_hil.settings.scheme_settings import FRICTION_TERMS
 
 STILL, NO_WIDTH, V_S = 0.002, 0.0, 0.05
 DQ, TAU_J = np.array([0.04, -0.3]), np.array([-2.0, 3.0])

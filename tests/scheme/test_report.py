@@ -8,9 +8,8 @@ import pytest
 from smooth_motion import settings_with
 
 from adacd_hil.records import ContactKind, ContactLevel, Location, Reaction, SchemeState
-from adacd_hil.scheme.contact.contact_course import ContactCourse
 from adacd_hil.scheme.contact.contact_report import ContactHistory, ContactReporter, RecalledContact
-from adacd_hil.scheme.contact.reaction import ReactionChoice
+from adacd_hil.scheme.contact.reaction import ContactCourse, ReactionChoice
 from adacd_hil.scheme.supervisor.transitions import COLLISION, CONTACT, CONTACT_SHIFT
 
 SETTINGS = settings_with(reaction={"collision": ["stop", "stop"]})

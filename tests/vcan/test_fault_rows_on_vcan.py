@@ -21,7 +21,7 @@ from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import crc8
-from firmware_sim.bench.truth_log import TruthLog
+from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]

@@ -12,7 +12,7 @@ from hang import HANG_S
 from rig import play_lockstep
 
 from adacd_hil.log.reader import topic_bytes
-from adacd_hil.settings.bus_settings import LockstepSettings
+from adacd_hil.settings.arm_settings import LockstepSettings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.long]

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from adacd_hil.file_access import open_input, read_input
-from adacd_hil.log.log_files import LogError
-from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.records import Vector
 from adacd_hil.remedies import nearest_name
 from adacd_hil.scheme.identify.offline import OfflineSettings, Record

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from adacd_hil.analysis.logged_run import Milestones, Progress, settings_of
 from adacd_hil.analysis.replay.changed_settings import changed_keys
 from adacd_hil.analysis.score.distribution import Distribution
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
-from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings
 

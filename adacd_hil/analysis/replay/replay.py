@@ -29,8 +29,7 @@ from adacd_hil.analysis.replay.scheme_comparison import (
 from adacd_hil.analysis.score.emulator_truth import TrueContacts, contacts_beside
 from adacd_hil.analysis.score.wording import unjudged_sentence
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.log_files import LogError
-from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
+from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch, arm_at
 from adacd_hil.settings.configuration import Settings

@@ -45,8 +45,7 @@ from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.metrics import CertifiedEvidence, Gathered, Metrics, ReportedContact, ReportSource
 from adacd_hil.analysis.score.wording import NONE
 from adacd_hil.file_access import replace_file
-from adacd_hil.log.log_files import LogError
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.terminal import fit_table, in_line, terminal_columns
 

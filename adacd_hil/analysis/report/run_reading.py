@@ -57,9 +57,8 @@ from adacd_hil.analysis.score.run_faults import CyclicDataGatherer
 from adacd_hil.analysis.score.timing import QUEUES, TimingGatherer, find_reactions
 from adacd_hil.analysis.score.touches import find_detections, true_contacts
 from adacd_hil.analysis.score.wording import unjudged_sentence
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, LogError
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import LogStream, Piece, Series, check_states, start_of_log
-from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.terminal import one_line
 

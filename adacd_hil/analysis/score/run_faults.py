@@ -19,7 +19,7 @@ from adacd_hil.analysis.score.wording import percent_text
 from adacd_hil.device.arm_report import SHORTEST_SHARE, WINDOW_S
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.scheme.supervisor.supervisor import POWERED
-from adacd_hil.settings.bus_settings import DataSettings
+from adacd_hil.settings.arm_settings import DataSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.terminal import one_line
 from adacd_hil.wire.e2e import E2eStatus

@@ -36,9 +36,8 @@ from adacd_hil.analysis.thresholds.false_alarms import (
 from adacd_hil.analysis.thresholds.free_motion import APART_S, LoggedMotion, read_motion, schemes
 from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S
 from adacd_hil.file_access import open_input
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import Series
-from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.configuration import Settings, load_settings
 

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from adacd_hil.analysis.logged_run import Milestones, Progress
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
-from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.detect import detectors
 

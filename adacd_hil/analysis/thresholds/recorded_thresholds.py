@@ -31,8 +31,7 @@ from adacd_hil.analysis.thresholds.false_alarms import (
     white_noise,
 )
 from adacd_hil.analysis.thresholds.free_motion import LoggedMotion, Mask, Motion, TorqueStream, read_motion, sample_of
-from adacd_hil.log.log_files import LogError
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.detect import detectors
 from adacd_hil.scheme.model.regressor import mass_matrix

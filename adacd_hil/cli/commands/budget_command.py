@@ -3,7 +3,7 @@
 import textwrap
 from typing import Any, NamedTuple
 
-from adacd_hil.cli.exit_codes import ExitCode
+from adacd_hil.cli.output import ExitCode
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.terminal import in_line

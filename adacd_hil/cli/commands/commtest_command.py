@@ -10,10 +10,15 @@ from adacd_hil.analysis.score.distribution import bar_chart, doubling_bins
 from adacd_hil.analysis.score.metrics import TimingEvidence
 from adacd_hil.analysis.score.timing import collect_evidence
 from adacd_hil.cli.connection import Connection, on_interrupt
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import MonotonicClock, wall_ns
-from adacd_hil.commission.communication_test import CommunicationReport, CommunicationTest, Verdict
-from adacd_hil.commission.zero_torque import ZeroTorqueCycle, ZeroTorqueLoop
+from adacd_hil.commission.communication_test import (
+    CommunicationReport,
+    CommunicationTest,
+    Verdict,
+    ZeroTorqueCycle,
+    ZeroTorqueLoop,
+)
 from adacd_hil.control.pacing import prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import ArmReport

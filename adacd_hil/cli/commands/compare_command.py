@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import ExitCode, explained
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import Progress, format_table
+from adacd_hil.cli.output import ExitCode, Progress, explained, format_table
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.records import Location
@@ -16,7 +15,7 @@ from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_comparison import ComparedContact, LogComparison
-    from adacd_hil.log.time_window import TimeWindow
+    from adacd_hil.log.log_files import TimeWindow
 
 _EPILOG = (
     "Exit status: 0 both decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "

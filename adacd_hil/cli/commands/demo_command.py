@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from adacd_hil.analysis.score.emulator_truth import config_digest
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
-from adacd_hil.cli.output import Progress, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, run_folder
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveAddress, Session, SessionSummary
@@ -22,7 +21,7 @@ from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus, EmbeddedBus
 from firmware_sim.bench.bench import Bench
-from firmware_sim.bench.truth_log import TruthLog
+from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.canopen.contracts import playable_contract
 from firmware_sim.scenario.scenario import Scenario, ScenarioOutcome, load_scenario, named_profile
 

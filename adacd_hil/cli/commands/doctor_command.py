@@ -4,8 +4,7 @@ import sys
 from typing import Any
 
 from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
-from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.cli.output import format_table
+from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.commission.arm_checks import ARM_CHECKS, ArmExamination
 from adacd_hil.commission.diagnosis import Finding, Status, diagnose, summarise

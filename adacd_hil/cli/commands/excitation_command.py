@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.analysis.excitation_search import ExcitationLimits, Figures, NoExcitationError, Search
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.output import Progress, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.settings.configuration import builtin_names, load_settings
-from adacd_hil.settings.control_settings import ExcitationSettings
+from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.toml_files import to_toml
 
 _LABELS = (

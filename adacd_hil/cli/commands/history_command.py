@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import format_table
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, format_table
 from adacd_hil.file_access import is_anothers, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import Progress, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table
 from adacd_hil.file_access import replace_file
 from adacd_hil.given_path import GIVEN_FILE, WrittenPath
 from adacd_hil.terminal import in_line
@@ -49,7 +48,7 @@ def identify(
     """
     from adacd_hil.analysis.foreign.recording_identification import identify as run
     from adacd_hil.analysis.foreign.recording_import import read_map, read_recording
-    from adacd_hil.log.time_window import TimeWindow
+    from adacd_hil.log.log_files import TimeWindow
 
     if not start_s < end_s:
         raise CommandError(f"--from {start_s:g} s is not before --until {end_s:g} s", ExitCode.USAGE)

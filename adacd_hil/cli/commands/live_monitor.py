@@ -13,8 +13,7 @@ import numpy as np
 
 from adacd_hil.cli.commands.monitor_command import Screen
 from adacd_hil.cli.connection import on_interrupt
-from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.cli.output import format_table
+from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import unpack_log

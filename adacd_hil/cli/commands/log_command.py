@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.commands.log_export import export
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import format_table
+from adacd_hil.cli.output import CommandError, ExitCode, explained, format_table
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from adacd_hil.log.check.log_check import LogCheck
     from adacd_hil.log.editing.log_info import LogInfo
     from adacd_hil.log.editing.recover import LogRecovery
-    from adacd_hil.log.time_window import TimeWindow
+    from adacd_hil.log.log_files import TimeWindow
 
 _TOLD_FAULTS = 5
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import CommandError, ExitCode, explained
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.terminal import in_line
 

@@ -8,8 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 from adacd_hil.cli.connection import Connection, on_interrupt
-from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.cli.output import format_table
+from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.device.bus_view import BusView, MessageView, Snapshot
 from adacd_hil.terminal import plain, write_screen

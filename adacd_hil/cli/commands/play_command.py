@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.cli.commands.log_export import contract_of, dbc_option, id_option, only_option
-from adacd_hil.cli.exit_codes import EPILOG, CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import LogError

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option, profile_option, stretch_options
-from adacd_hil.cli.output import Progress, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
@@ -16,7 +15,7 @@ from adacd_hil.terminal import in_line
 if TYPE_CHECKING:
     from adacd_hil.analysis.replay.log_source import ReplaySource
     from adacd_hil.analysis.replay.replayed_outcome import Replay
-    from adacd_hil.log.time_window import TimeWindow
+    from adacd_hil.log.log_files import TimeWindow
     from adacd_hil.settings.configuration import Settings
 
 _EPILOG = (

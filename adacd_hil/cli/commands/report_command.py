@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adacd_hil.analysis.report.report_files import INDEX_NAME, IndexEntry, Report, count_text, index_page, write_report
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.output import Progress
+from adacd_hil.cli.output import CommandError, ExitCode, Progress
 from adacd_hil.file_access import replace_file
-from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, log_in
-from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, TimeWindow, log_in
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 

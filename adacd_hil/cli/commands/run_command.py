@@ -20,8 +20,7 @@ from adacd_hil.cli.connection import (
     never_stopped,
     on_interrupt,
 )
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, exit_code
-from adacd_hil.cli.output import Progress, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, exit_code, run_folder
 from adacd_hil.clock import format_date, wall_ns
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import ConsoleOperator, Operator, ScriptedOperator

@@ -4,8 +4,7 @@ import sys
 from typing import Any
 
 from adacd_hil.cli.connection import Connection
-from adacd_hil.cli.exit_codes import ExitCode
-from adacd_hil.cli.output import format_table
+from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.device.network import Master
 from adacd_hil.device.survey import Node, Survey, compare, expected_nodes, message_name, survey

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import Progress
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.terminal import in_line
@@ -66,8 +65,7 @@ def sweep(
     A folder stands for every run.mcap below it. Begun again with the same folder, a sweep computes what is missing.
     """
     from adacd_hil.analysis.sweep.cluster import TLS, TlsFiles, connect
-    from adacd_hil.analysis.sweep.rows import replay_task
-    from adacd_hil.analysis.sweep.sweep import SweepStore, run_sweep
+    from adacd_hil.analysis.sweep.sweep import SweepStore, replay_task, run_sweep
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
@@ -152,7 +150,7 @@ def _simulate(task: "Task", row: "SweepRow") -> "Values":
     from adacd_hil.analysis.replay.changed_settings import apply_settings
     from adacd_hil.analysis.replay.replay import replay
     from adacd_hil.analysis.sweep.plan import REFUSALS, failed
-    from adacd_hil.analysis.sweep.rows import finished
+    from adacd_hil.analysis.sweep.sweep import finished
     from adacd_hil.cli.commands.demo_command import resolve, run_embedded
 
     subject = task.subject

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.output import Progress
+from adacd_hil.cli.output import CommandError, ExitCode, Progress
 from adacd_hil.clock import VirtualClock
 from adacd_hil.commission.tare import TareRefusedError
 from adacd_hil.commission.tare_session import TareInterruptedError, TareSession

@@ -7,10 +7,8 @@ from pathlib import Path
 from adacd_hil.analysis.thresholds.detector_comparison import Comparison, compare_detectors
 from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.analysis.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
-from adacd_hil.cli.exit_codes import CommandError, ExitCode
-from adacd_hil.cli.output import Progress, format_table
-from adacd_hil.log.log_files import log_in
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, format_table
+from adacd_hil.log.log_files import WHOLE, TimeWindow, log_in
 
 
 def find(

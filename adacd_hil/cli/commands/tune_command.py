@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.exit_codes import CommandError, ExitCode, explained
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import Progress, format_table, tell, tried
+from adacd_hil.cli.output import CommandError, ExitCode, Progress, explained, format_table, tell, tried
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
 from adacd_hil.terminal import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.analysis.sweep.tune_roc import Candidate, Found, Tuning
-    from adacd_hil.log.time_window import TimeWindow
+    from adacd_hil.log.log_files import TimeWindow
 
 
 @click.command(
@@ -73,7 +72,7 @@ def tune(
         else:
             tell(said, out, suggested_toml(found, found.best, *base), as_json)
     if report is not None:
-        from adacd_hil.analysis.sweep.tune_figures import write_tuning
+        from adacd_hil.analysis.sweep.tune import write_tuning
 
         write_tuning(found, report)
     return ExitCode.OK if found.is_shown else ExitCode.PARTIAL

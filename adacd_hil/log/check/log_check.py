@@ -14,10 +14,9 @@ from mcap.opcode import Opcode
 from mcap.records import Header, Metadata
 
 from adacd_hil.file_access import open_input
-from adacd_hil.log.check.chunk_checks import ChunkCheck
 from adacd_hil.log.check.content_checks import DefinitionCheck
 from adacd_hil.log.check.findings import Findings, LogFinding, Severity
-from adacd_hil.log.check.summary_checks import SummaryCheck
+from adacd_hil.log.check.structure_checks import ChunkCheck, SummaryCheck
 from adacd_hil.log.log_files import (
     CONTINUED,
     DROPPED_KEY,

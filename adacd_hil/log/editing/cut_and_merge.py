@@ -31,6 +31,7 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
+    TimeWindow,
     find_parts,
     part_path,
     parts_of,
@@ -49,7 +50,6 @@ from adacd_hil.log.mcap.mcap_records import (
     scan,
 )
 from adacd_hil.log.reader import LoggedContact, read_log
-from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.log.types.record_arrays import count_frames
 
 

@@ -43,7 +43,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.model import filter_bank, regressor
-from adacd_hil.settings.certified_settings import CertifiedSettings
+from adacd_hil.settings.scheme_settings import CertifiedSettings
 
 SECOND_DIFFERENCE = 0.36
 """Rms of the velocity's second difference over the largest error of a sample: 1e-3 of 3.3e-3 rad/s, and a fifth."""

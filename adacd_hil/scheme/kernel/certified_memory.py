@@ -15,8 +15,8 @@ from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import anchor, belief, certificate, doubt, earlier, fit_check, missing_torque
 from adacd_hil.scheme.kernel.kernel_samples import Numbers, block_dtype, limits_of
 from adacd_hil.scheme.model import filter_bank, regressor
-from adacd_hil.settings.certified_settings import CROSS_TALK, FRICTION_TERMS
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.scheme_settings import CROSS_TALK, FRICTION_TERMS
 
 SETTLED = 3.0
 """Time constants of the learnt filter for which a moving arm teaches nothing after a gap: the filter begins anew with a

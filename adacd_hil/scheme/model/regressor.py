@@ -37,7 +37,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector
-from adacd_hil.settings.certified_settings import FRICTION_TERMS
+from adacd_hil.settings.scheme_settings import FRICTION_TERMS
 
 # Columns of the regressors, named so that no offset is written by hand.
 _NAMES = PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES

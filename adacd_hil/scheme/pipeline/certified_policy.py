@@ -7,9 +7,8 @@ alarms are in the block; it decides nothing.
 import numpy as np
 
 from adacd_hil.records import PARAMETER_UNITS, ContactReport, Event, Request, SchemeState
-from adacd_hil.scheme.contact.contact_course import ContactCourse
 from adacd_hil.scheme.contact.contact_report import RecalledContact
-from adacd_hil.scheme.contact.reaction import ReactionChoice
+from adacd_hil.scheme.contact.reaction import ContactCourse, ReactionChoice
 from adacd_hil.scheme.detect import margin
 from adacd_hil.scheme.detect.margin import MarginWatch
 from adacd_hil.scheme.identify import earlier, termination

@@ -9,9 +9,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from adacd_hil.records import ContactReport, Event, Request, SchemeState, Vector, scheme_layout
-from adacd_hil.scheme.contact.contact_course import ContactCourse
 from adacd_hil.scheme.contact.contact_report import IntegratedContact
-from adacd_hil.scheme.contact.reaction import PaperReaction
+from adacd_hil.scheme.contact.reaction import ContactCourse, PaperReaction
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.kernel.kernel_samples import Numbers, Recorded, Samples
