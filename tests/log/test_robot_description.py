@@ -172,5 +172,28 @@ def test_a_layout_without_an_arm_has_no_3d_panel():
     assert "3D!arm" not in layout["configById"]
 
 
+VIEWERS_KEYS = {
+    "Plot": "paths showXAxisLabels showYAxisLabels showLegend legendDisplay showPlotValuesInLegend sidebarDimension "
+    "isSynced xAxisVal",
+    "StateTransitions": "paths isSynced",
+    "RawMessages": "topicPath diffEnabled",
+    "RosOut": "searchTerms minLogLevel topicToRender",
+    "3D": "cameraState followTf layers topics",
+}
+"""What each panel's configuration must have, after the types of Lichtblick's panels (August 2026)."""
+
+
+def test_every_panel_has_a_title_and_the_keys_that_its_viewer_reads():
+    layout = json.loads(viewer_layout(robot_description(settings_of(False)).encode()))
+    for name, panel in layout["configById"].items():
+        titles = {panel.pop("lichtblickPanelTitle"), panel.pop("foxglovePanelTitle")}
+        assert len(titles) == 1
+        assert titles != {""}
+        assert set(panel) == set(VIEWERS_KEYS[name.split("!")[0]].split()), name
+        for path in panel.get("paths", ()):
+            assert path["timestampMethod"] in ("receiveTime", "headerStamp")
+            assert path["enabled"] is True
+
+
 def shown(place):
     return [place] if isinstance(place, str) else shown(place["first"]) + shown(place["second"])

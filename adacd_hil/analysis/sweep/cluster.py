@@ -93,9 +93,7 @@ def _security_of(scheduler: str, tls: TlsFiles) -> Any:
     used = {"CA file": security.tls_ca_file, "certificate": security.tls_client_cert, "key": security.tls_client_key}
     for name, option in (("CA file", "--tls-ca-file"), ("certificate", "--tls-cert")):
         if not used[name]:
-            raise ConfigError(
-                f"{scheduler} needs {option}, or Dask's configuration of distributed.comm.tls; see docs/sweep.md"
-            )
+            raise ConfigError(f"{scheduler} needs {option}, or Dask's configuration of distributed.comm.tls")
     try:
         security.get_connection_args("client")
     except (OSError, ValueError) as error:

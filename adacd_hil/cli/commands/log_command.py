@@ -60,7 +60,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     """Check logs: the rules of `mcap doctor`, all CRCs, indexes against records, and what our own logs promise.
 
-    A folder stands for the logs in it. docs/log-tools.md lists the rules.
+    A folder stands for the logs in it.
     """
     from adacd_hil.log.check.log_check import check_log, find_logs
 

@@ -76,7 +76,9 @@ def sweep(
     with Progress() as progress:
         progress(f"{plan.size} rows: {len(plan.subjects)} {'logs' if logs else 'runs'} × {len(plan.variants)} settings")
         if scheduler and not scheduler.startswith(TLS) and not any(tls):
-            progress(f"{scheduler} is open: it runs whatever anybody sends who reaches it (docs/sweep.md)")
+            progress(
+                f"{scheduler} is open: it runs whatever anybody sends who reaches it; tls:// asks for a certificate"
+            )
         with connect(scheduler, workers or os.cpu_count() or 1, tls) as client:
             outcome = run_sweep(plan, work, store, client, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}

@@ -40,12 +40,12 @@ class ViewerRefusal(NamedTuple):
 _ORIGIN = ViewerRefusal(
     HTTPStatus.FORBIDDEN,
     "this web page may not watch the run: allow its origin with --live-origin",
-    "live view: a web page was refused, its origin is none of --live-origin (docs/live.md, Who may watch)",
+    "live view: a web page was refused, its origin is none of --live-origin",
 )
 _HOST = ViewerRefusal(
     HTTPStatus.FORBIDDEN,
     "this machine has no such name: ask for it by address, or allow the name with --live-name",
-    "live view: a request for another host name was refused; --live-name allows one (docs/live.md, Who may watch)",
+    "live view: a request for another host name was refused; --live-name allows one",
 )
 _PROTOCOL = ViewerRefusal(
     HTTPStatus.BAD_REQUEST,

@@ -10,17 +10,24 @@ from adacd_hil.log.viewer.scene import SCENE_TOPIC
 LAYOUT_NAME = "viewer-layout.json"
 
 
+def _titled(title: str, panel: dict[str, Any]) -> dict[str, Any]:
+    """Give a panel its title: each of the two viewers has a key of its own."""
+    return {"lichtblickPanelTitle": title, "foxglovePanelTitle": title, **panel}
+
+
 def _plot(title: str, *paths: str) -> dict[str, Any]:
-    return {
-        "title": title,
+    panel = {
         "paths": [{"value": path, "enabled": True, "timestampMethod": "receiveTime"} for path in paths],
         "showXAxisLabels": True,
         "showYAxisLabels": True,
         "showLegend": True,
         "legendDisplay": "floating",
+        "showPlotValuesInLegend": False,
+        "sidebarDimension": 240,
         "isSynced": True,
         "xAxisVal": "timestamp",
     }
+    return _titled(title, panel)
 
 
 def _both_joints(field: str) -> tuple[str, str]:
@@ -42,12 +49,13 @@ def _scene(robot: bytes) -> dict[str, Any]:
         "framePrefix": "",
     }
     grid = {"instanceId": "grid", "layerId": "foxglove.Grid", "label": "Grid", "visible": True, "size": 2}
-    return {
+    panel = {
         "cameraState": {"distance": 1.8, "phi": 25, "thetaOffset": 0, "targetOffset": [0.3, 0, 0], "perspective": True},
         "followTf": WORLD,
         "layers": {"arm": arm, "grid": {**grid, "divisions": 20}},
         "topics": {SCENE_TOPIC: {"visible": True}, "/joint_states": {"visible": True}},
     }
+    return _titled("Arm", panel)
 
 
 def viewer_layout(robot: bytes = b"") -> bytes:
@@ -68,12 +76,18 @@ def viewer_layout(robot: bytes = b"") -> bytes:
         "Plot!queues": _plot(
             "Queues, bytes", *(f"/cycle.{name}_queue_bytes" for name in ("receive", "transmit", "log"))
         ),
-        "StateTransitions!state": {
-            "paths": [{"value": f"/scheme.{field}", "timestampMethod": "receiveTime"} for field in ("state", "fault")],
-            "isSynced": True,
-        },
-        "RawMessages!contact": {"topicPath": "/contact", "diffEnabled": False},
-        "RosOut!events": {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/events"},
+        "StateTransitions!state": _titled(
+            "State and fault",
+            {
+                "paths": [
+                    {"value": f"/scheme.{field}", "label": field, "enabled": True, "timestampMethod": "receiveTime"}
+                    for field in ("state", "fault")
+                ],
+                "isSynced": True,
+            },
+        ),
+        "RawMessages!contact": _titled("Last contact", {"topicPath": "/contact", "diffEnabled": False}),
+        "RosOut!events": _titled("Events", {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/events"}),
     }
     left: list[str] = ["Plot!contact", "Plot!torque", "Plot!motion", "Plot!theta"]
     right = ["StateTransitions!state", "RosOut!events", "RawMessages!contact", "Plot!cycle", "Plot!queues"]
