@@ -112,7 +112,13 @@ def block_complaints(block: Piece, folder: Path) -> list[str]:
 
 
 def shell_complaints(block: Piece, folder: Path) -> list[str]:
-    return [line for words in check.split_commands(block.text) for line in check.command_complaints(words)]
+    typed = check.split_commands(block.text)
+    bare = [f"{words[0]}: the system's Python lacks its packages; say python" for words in typed if _is_bare(words[0])]
+    return bare + [line for words in typed for line in check.command_complaints(words)]
+
+
+def _is_bare(program: str) -> bool:
+    return re.fullmatch(r"(tools|tests)/\S+\.py", program) is not None
 
 
 def console_complaints(block: Piece, folder: Path) -> list[str]:
@@ -330,6 +336,7 @@ WRONG = [
     ("sh", "tools/with-vcan --can vcan0 -- sh -c '\n  firmware-sim run -i socketcan -c vcan0 --onse &\n  sleep 3'"),
     ("sh", "tools/with-vcan --cam vcan0 -- sleep 1"),
     ("sh", "python tools/campain.py my.toml"),
+    ("sh", "tools/campaign.py my.toml"),
     ("sh", "make tests"),
     ("sh", "frobnicate run.mcap"),
     ("sh", "adacd-hil tune LOG... --out tuned.toml [--rate 0.01]"),

@@ -1,8 +1,7 @@
-#!/usr/bin/env python3
 """Writes a run of the emulated arm as somebody else's CSV: degrees, mNm, 500 Hz, no velocity, the elbow's sign turned.
 
     adacd-hil demo --out runs/demo
-    tools/foreign_csv.py runs/demo recording.csv
+    python tools/foreign_csv.py runs/demo recording.csv
     adacd-hil identify recording.csv --map docs/examples/foreign/map.toml
 
 The last column says when somebody touched the arm, by the emulator's truth.

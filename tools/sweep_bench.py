@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Measures a sweep: one worker, two, two of which one is killed halfway, and a scheduler started by hand.
 
 Replays of short runs of the emulated arm, `--logs` of them, with `--settings` thresholds each. The tables have to be
