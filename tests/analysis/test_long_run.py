@@ -13,7 +13,8 @@ from test_run_report import record_truth
 from adacd_hil.analysis.report import run_reading
 from adacd_hil.analysis.report.outline import Facts, TruthClock
 from adacd_hil.analysis.report.page import left_out_text, shown_contacts
-from adacd_hil.analysis.report.report_files import report_json, write_run_report
+from adacd_hil.analysis.report.report_files import write_run_report
+from adacd_hil.analysis.report.report_json import report_json
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.report.timeline import timeline_of
 from adacd_hil.analysis.score import emulator_truth

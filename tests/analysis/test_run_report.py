@@ -16,7 +16,8 @@ from hand_made_run import A, M, like_an_old_log, make_run, react, record, record
 from parsed_page import Page
 
 from adacd_hil.analysis.report.page import render
-from adacd_hil.analysis.report.report_files import report_json, write_report, write_run_report
+from adacd_hil.analysis.report.report_files import write_report, write_run_report
+from adacd_hil.analysis.report.report_json import report_json
 from adacd_hil.analysis.report.report_tables import timing_tables
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.metrics import ReportSource

@@ -9,7 +9,6 @@ import csv
 import dataclasses
 import io
 import json
-import math
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,13 +35,14 @@ from adacd_hil.analysis.report.page import (
     render_page,
     shown_contacts,
 )
+from adacd_hil.analysis.report.report_json import JSON_NAME, report_json
 from adacd_hil.analysis.report.run_figures import draw
 from adacd_hil.analysis.report.run_page import report_page
 from adacd_hil.analysis.report.run_reading import read_run
 from adacd_hil.analysis.report.timeline import stays_of
 from adacd_hil.analysis.report.timing_figures import draw_timing
 from adacd_hil.analysis.score.evaluation import evaluate
-from adacd_hil.analysis.score.metrics import CertifiedEvidence, Gathered, Metrics, ReportedContact, ReportSource
+from adacd_hil.analysis.score.metrics import Gathered, Metrics, ReportedContact, ReportSource
 from adacd_hil.analysis.score.wording import NONE
 from adacd_hil.file_access import replace_file
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
@@ -50,7 +50,6 @@ from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.terminal import fit_table, in_line, terminal_columns
 
 HTML_NAME: Final = "report.html"
-JSON_NAME: Final = "report.json"
 _PNG_FIGURES: Final = ("fig5", "fig6", "fig7")
 
 
@@ -148,84 +147,6 @@ def write_run_report(
     except OSError as error:
         raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
     return report
-
-
-SCHEMA: Final = 3
-"""Version of report.json; goes up when a key changes its meaning or disappears."""
-_DIGITS: Final = 6
-
-
-def report_json(
-    metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
-) -> dict[str, Any]:
-    """Give the content of report.json; the keys are described in `adacd_hil.analysis.score.metrics`."""
-    fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
-    plain: dict[str, Any] = _plain(
-        {
-            "schema": SCHEMA,
-            "verdict": metrics.verdict,
-            "is_clean": metrics.is_clean,
-            "time_zero": "first cycle in ADAPT (motion start)",
-            "adaptation_s": metrics.adaptation_s,
-            "sections": {
-                section.label: {**dataclasses.asdict(section), "duration_s": section.duration_s}
-                for section in metrics.sections
-            },
-            "frozen_residual_max_Nm": {
-                label: dataclasses.asdict(residual) for label, residual in metrics.frozen_residual_max_Nm.items()
-            },
-            "contacts": [dataclasses.asdict(contact) for contact in metrics.contacts],
-            "false_alarms": metrics.false_alarms,
-            "false_alarms_s": metrics.false_alarms_s,
-            "false_alarm_bound_per_h": metrics.false_alarm_bound_per_h,
-            "missed": metrics.missed,
-            "parameters": metrics.parameters,
-            "payload_kg": metrics.payload_kg,
-            "certified": None if metrics.evidence is None else _evidence_json(metrics.evidence),
-            "fault": fault,
-            "cycle": dataclasses.asdict(metrics.cycle),
-            "timing": metrics.timing.as_json(),
-            "data": metrics.data.as_json(),
-            "log": {
-                "name": source.log_name,
-                "frames": metrics.frames,
-                "dropped": metrics.dropped,
-                "is_complete": source.is_complete,
-                "problem": source.problem,
-            },
-            "stretch": None if stretch is None else _stretch_json(stretch),
-            "paper": [row._asdict() for row in metrics.paper],
-            "run": dict(sorted(metadata.items())),
-        }
-    )
-    return plain
-
-
-def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
-    """Give a stretch, s since the beginning of the log; null where it is not bounded."""
-    return {
-        "from_s": stretch.found.start_s,
-        "until_s": stretch.found.end_s,
-        "asked_from_s": stretch.asked.start_s,
-        "asked_until_s": stretch.asked.end_s,
-        "motion_start_s": stretch.motion_start_s,
-    }
-
-
-def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
-    """Give what only the certified scheme has; the keys are described in `adacd_hil.analysis.score.margins`."""
-    return {**dataclasses.asdict(evidence), "smallest_margin": evidence.smallest_margin}
-
-
-def _plain(value: Any) -> Any:
-    """Make a value of JSON's types: numbers with six digits, null for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float | np.floating):
-        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
-    return value
 
 
 _PARAMETERS: Final = ("section", "parameter", "unit", "true", "identified", "std", "cad")
