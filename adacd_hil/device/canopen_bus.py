@@ -5,12 +5,15 @@ concerns. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 """
 
 import configparser
+import functools
 import io
 import logging
 import re
 import struct
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -226,3 +229,44 @@ def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:
             if error.code not in _ABSENT:
                 raise
             return None
+
+
+@functools.cache
+def _emergency_names() -> dict[str, dict[int, str]]:
+    text = resources.files("adacd_hil.device").joinpath("emergency_codes.toml").read_text(encoding="utf-8")
+    return {kind: {int(key, 16): name for key, name in names.items()} for kind, names in tomllib.loads(text).items()}
+
+
+WATCHDOGS = {
+    1: "SYNC",
+    2: "command",
+    3: "host heartbeat",
+    4: "left Operational",
+    5: "PDO length",
+    6: "SYNC order",
+    7: "SYNC length",
+    8: "no RPDO brings commands",
+}
+"""Byte 3 of an EMCY of devices with the feature `watchdog_in_emcy`; bytes 4 to 7 are the device's time in ms."""
+
+
+def name_error(code: int) -> str:
+    """Name an error code; an unlisted one gets the name of its class."""
+    names = _emergency_names()
+    codes, classes = names["codes"], names["classes"]
+    return codes.get(code) or classes.get(code >> 8) or classes.get((code >> 8) & 0xF0, "unknown")
+
+
+def describe_emergency(code: int, manufacturer: bytes, has_watchdog: bool) -> str:
+    """Describe an EMCY message in one line. `manufacturer`: its bytes 3 to 7.
+
+    `has_watchdog`: these bytes are the watchdog's number and the device's time.
+    """
+    text = f"EMCY 0x{code:04X}: {name_error(code) if code else 'error reset'}"
+    if not any(manufacturer):
+        return text
+    watchdog = manufacturer[0]
+    if not has_watchdog or watchdog not in WATCHDOGS:
+        return f"{text}, manufacturer bytes {manufacturer.hex(' ')}"
+    time_ms = int.from_bytes(manufacturer[1:5], "little")
+    return f"{text}, watchdog {watchdog} ({WATCHDOGS[watchdog]}) at device time {time_ms} ms"
