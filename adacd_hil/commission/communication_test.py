@@ -51,18 +51,14 @@ class ZeroTorqueLoop:
         self._clock = clock
         self._bus = bus
         self._is_enabling = is_enabling
-        self._is_interrupted = False
+        self.is_interrupted = False
+        """Whether somebody asked for the end."""
         self._exchange = Exchange(settings, bus, arm, master, self.pacer, clock)
         self._max_age_cycles = settings.bus.max_age_cycles
 
-    @property
-    def is_interrupted(self) -> bool:
-        """Whether somebody asked for the end."""
-        return self._is_interrupted
-
     def interrupt(self) -> None:
         """End after the present cycle. Safe in a signal handler."""
-        self._is_interrupted = True
+        self.is_interrupted = True
 
     def run(
         self,
@@ -73,7 +69,7 @@ class ZeroTorqueLoop:
         """Cycle for a while, then disable the drives; returns what a device faulted with. Raises BusError."""
         last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE
-        while self._clock.now_ns() < last_ns and not (self._is_interrupted or is_over() or fault):
+        while self._clock.now_ns() < last_ns and not (self.is_interrupted or is_over() or fault):
             cycle = self.step(self._is_enabling)
             fault = self._fault(cycle.state)
             observe(cycle)

@@ -67,7 +67,8 @@ class Bench:
         self._on_answer = on_answer
         self._order = SyncOrder(is_timed=self._is_wall)
         self._lost_syncs = 0  # before the last one
-        self._is_started = False
+        self.is_scenario_started = False
+        """Whether both drives have been in Operation enabled at once."""
         scenario_seed = scenario.seed if seed is None else seed
         self._injector = Injector(scenario, scenario_seed, PLANNED_PERIOD_NS, codec, self._outbox, on_event)
         self._plan = self._injector.plan
@@ -119,11 +120,6 @@ class Bench:
     def is_operational(self) -> bool:
         """Whether all nodes are in NMT state Operational."""
         return all(device.is_operational for device in self.devices)
-
-    @property
-    def is_scenario_started(self) -> bool:
-        """Whether both drives have been in Operation enabled at once."""
-        return self._is_started
 
     @property
     def now_ns(self) -> int:
@@ -334,8 +330,8 @@ class Bench:
                 self._nodes.lose_sync(heard, now_ns)
         if now_ns >= self.time.due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
             self.time.poll(now_ns)
-        if not self._is_started and drive1.is_enabled and drive2.is_enabled:
-            self._is_started = True
+        if not self.is_scenario_started and drive1.is_enabled and drive2.is_enabled:
+            self.is_scenario_started = True
             self._injector.start(now_ns)
             self._body.start_scenario()
         for place, send in self._nodes.senders:

@@ -142,16 +142,12 @@ class ContactReporter:
         self.evidence = evidence
         self._detected_cycle = 0
         self._direction = [0] * JOINTS
-        self._is_open = False
-
-    @property
-    def is_open(self) -> bool:
+        self.is_open = False
         """Whether a report is out that is not final yet."""
-        return self._is_open
 
     def calm(self, calm: Calm, cycle: int) -> Calm:
         """Narrow the bounds to those within which, from this cycle on, no report is due and no direction is new."""
-        if not self._is_open:
+        if not self.is_open:
             return calm
         last = self.evidence.due_cycles[-1]
         due = next((due for due in self.evidence.due_cycles if due >= cycle - self._detected_cycle), last)
@@ -163,11 +159,11 @@ class ContactReporter:
         self._detected_cycle = cycle
         self.evidence.begin()
         self._direction = [0] * JOINTS
-        self._is_open = True
+        self.is_open = True
 
     def cancel(self) -> None:
         """Close the window without a final report, as a fault does."""
-        self._is_open = False
+        self.is_open = False
 
     def report(self, cycle: int, joints: int) -> ContactReport | None:
         """Return the report that is due in this cycle, if one is. joints: bits of those over their threshold."""
@@ -178,7 +174,7 @@ class ContactReporter:
                 self._direction[i] = int(np.sign(self.evidence.tau_ext[i]))
         if elapsed not in self.evidence.due_cycles and not is_final:
             return None
-        self._is_open = not is_final
+        self.is_open = not is_final
         direction = self._direction[0], self._direction[1]
         return self.evidence.report(self._detected_cycle, elapsed, direction, is_final)
 

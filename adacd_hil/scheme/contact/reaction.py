@@ -168,18 +168,15 @@ class ReactionChoice:
         self._two_sided = Reaction[wish.two_sided.upper()]
         self._collision_Nm = np.array(settings.detector.collision_Nm)
         self._blind_cycles = round(BLIND_S / settings.bus.period_s)
-        self._reaction = Reaction.NONE
+        self.reaction = Reaction.NONE
+        """What is to be done now; NONE also while nothing touches."""
         self._cause = (ContactLevel.CONTACT, 0)
-        self._is_two_sided = False
+        self.is_two_sided = False
+        """Whether something has pushed from the other side too."""
         self._is_given_up = False
         self._way = np.zeros(0)
         self._cycles = 0
         self._turned_cycles = 0
-
-    @property
-    def reaction(self) -> Reaction:
-        """What is to be done now; NONE also while nothing touches."""
-        return self._reaction
 
     @property
     def level(self) -> ContactLevel:
@@ -187,14 +184,9 @@ class ReactionChoice:
         return self._cause[0]
 
     @property
-    def is_two_sided(self) -> bool:
-        """Whether something has pushed from the other side too."""
-        return self._is_two_sided
-
-    @property
     def goes_on(self) -> bool:
         """Whether the arm moves on along its path."""
-        return self._reaction in (Reaction.NONE, Reaction.SLOW_DOWN)
+        return self.reaction in (Reaction.NONE, Reaction.SLOW_DOWN)
 
     def hold(self) -> None:
         """Begin to stop without a contact, as for a host that is late."""
@@ -208,7 +200,7 @@ class ReactionChoice:
 
     def begin(self, level: ContactLevel, link: int, tau_ext_hat: Vector, is_model_valid: bool) -> None:
         """Choose for a contact that begins. Without a valid model there is nothing to float with: the arm stops."""
-        self._is_two_sided = self._is_given_up = False
+        self.is_two_sided = self._is_given_up = False
         self._cause = (level, link)
         self._choose(tau_ext_hat, is_model_valid)
 
@@ -254,7 +246,7 @@ class ReactionChoice:
 
     @property
     def _is_judging(self) -> bool:
-        return self._reaction is Reaction.WITHDRAW and self._way.size > 0
+        return self.reaction is Reaction.WITHDRAW and self._way.size > 0
 
     @property
     def _bound_Nm(self) -> float:
@@ -264,7 +256,7 @@ class ReactionChoice:
     def _choose(self, tau_ext_hat: Vector, is_model_valid: bool) -> None:
         level, link = self._cause
         reaction = self._table[level][link - 1]
-        if reaction is not self._reaction:
+        if reaction is not self.reaction:
             self._begin(self._possible(reaction, is_model_valid), tau_ext_hat)
 
     @staticmethod
@@ -272,7 +264,7 @@ class ReactionChoice:
         return Reaction.STOP if reaction is Reaction.FLOAT and not is_model_valid else reaction
 
     def _begin(self, reaction: Reaction, tau_ext_hat: Vector) -> None:
-        self._reaction = reaction
+        self.reaction = reaction
         size = float(np.linalg.norm(tau_ext_hat)) if tau_ext_hat.size else 0.0
         self._way = tau_ext_hat / size if size > 0.0 else np.zeros(0)
         self._cycles = self._turned_cycles = 0
@@ -284,8 +276,8 @@ class ReactionChoice:
             return
         along = float(tau_ext_hat @ self._way)
         self._turned_cycles = self._turned_cycles + 1 if along < -self._bound_Nm else 0
-        self._is_two_sided = self._is_two_sided or self._turned_cycles >= TURNED_CYCLES
-        if self._is_two_sided:
+        self.is_two_sided = self.is_two_sided or self._turned_cycles >= TURNED_CYCLES
+        if self.is_two_sided:
             self._is_given_up = True
             self._begin(self._possible(self._two_sided, is_model_valid), tau_ext_hat)
 
