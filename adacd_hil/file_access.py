@@ -11,7 +11,7 @@ import fcntl
 import itertools
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -200,6 +200,14 @@ def replace_file(path: Path, content: bytes | str) -> None:
     """Write a whole file in one step, text as UTF-8; see `Replacement`. Raises OSError."""
     with replacing(path) as beside:
         beside.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
+    """Write whole files, by their names, into a folder that is made if need be; return their paths. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in contents.items():
+        replace_file(folder / name, content)
+    return tuple(folder / name for name in contents)
 
 
 def is_anothers(path: Path, head: bytes) -> bool:

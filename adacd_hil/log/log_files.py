@@ -6,7 +6,8 @@ A window of time in a log is given in s since the beginning of the log, its firs
 import math
 import platform
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,15 @@ class LogError(Exception):
 
 class LogExistsError(LogError):
     """A log that would have to take the place of another; the message is one line."""
+
+
+@contextmanager
+def failing_as(what: str) -> Iterator[None]:
+    """Raise LogError for an OSError in the block: `what` failed, and the reason."""
+    try:
+        yield
+    except OSError as error:
+        raise LogError(f"{what}: {error.strerror or error}") from None
 
 
 PRODUCT = "adacd-hil"

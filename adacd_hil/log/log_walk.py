@@ -22,6 +22,7 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
+    failing_as,
     part_path,
     parts_of,
     summary_count,
@@ -87,30 +88,20 @@ class _Part(NamedTuple):
 def _read_head(path: Path) -> _Extras:
     """Read what comes before the messages. Raises LogError when the file can't be read or isn't MCAP."""
     extras = _Extras()
-    try:
-        with open_input(path) as file:
-            for record in walk(file, str(path), _NOT_OF_HEAD):
-                if isinstance(record, RawRecord):
-                    with contextlib.suppress(LogError):
-                        extras.take(record)
-                if RUN_METADATA in extras.metadata:
-                    break
-    except OSError as error:
-        raise _unreadable(path, error) from None
+    with failing_as(f"log {path} can't be read"), open_input(path) as file:
+        for record in walk(file, str(path), _NOT_OF_HEAD):
+            if isinstance(record, RawRecord):
+                with contextlib.suppress(LogError):
+                    extras.take(record)
+            if RUN_METADATA in extras.metadata:
+                break
     return extras
 
 
 def _read_items(path: Path) -> Iterator[Item]:
     """Read a file from front to end. Raises LogError as `_read_head` does."""
-    try:
-        with open_input(path) as file:
-            yield from read_blocks(file, str(path))
-    except OSError as error:
-        raise _unreadable(path, error) from None
-
-
-def _unreadable(path: Path, error: OSError) -> LogError:
-    return LogError(f"log {path} can't be read: {error.strerror}")
+    with failing_as(f"log {path} can't be read"), open_input(path) as file:
+        yield from read_blocks(file, str(path))
 
 
 class _Definitions:

@@ -16,7 +16,6 @@ line for each of the scenario's faults in the metadata: `fault_0` for bit 0 of t
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -120,9 +119,7 @@ class TruthLog:
     def __enter__(self) -> "TruthLog":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from adacd_hil.device.emergency import describe_emergency, name_error
+from adacd_hil.device.canopen_bus import describe_emergency, name_error
 
 
 @pytest.mark.parametrize(

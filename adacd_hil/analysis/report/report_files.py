@@ -44,8 +44,8 @@ from adacd_hil.analysis.report.timing_figures import draw_timing
 from adacd_hil.analysis.score.evaluation import evaluate
 from adacd_hil.analysis.score.metrics import Gathered, Metrics, ReportedContact, ReportSource
 from adacd_hil.analysis.score.wording import NONE
-from adacd_hil.file_access import replace_file
-from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.file_access import replace_files
+from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.terminal import fit_table, in_line, terminal_columns
 
@@ -129,23 +129,18 @@ def write_run_report(
         stretch=run.stretch,
     )
     table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
-    texts = {
+    files: dict[str, bytes | str] = {
         **report_tables(run, metrics),
+        **{f"{name}.png": png for name, png in pngs.items()},
         report.json_path.name: table + "\n",
         report.html_path.name: report_page(metrics, run, source, drawings, timing),
     }
-    files = {f"{name}.png": png for name, png in pngs.items()}
-    files |= {name: text.encode() for name, text in texts.items()}
     if is_printed:
         shown, verdict = [*drawings, *timing], (metrics.verdict, metrics.is_clean)
         files["report.pdf"] = report_pdf(*verdict, _tables(metrics, source), shown)
         files["report.png"] = report_png(*verdict, shown)
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            replace_file(out_dir / name, content)
-    except OSError as error:
-        raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
+    with failing_as(f"report in {out_dir} can't be written"):
+        replace_files(out_dir, files)
     return report
 
 

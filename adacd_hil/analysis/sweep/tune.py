@@ -52,8 +52,8 @@ from adacd_hil.analysis.sweep.tune_roc import (
 from adacd_hil.analysis.thresholds.detector_comparison import paper_svg
 from adacd_hil.analysis.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.clock import wall_ns
-from adacd_hil.file_access import replace_file
-from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.file_access import replace_files
+from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
 from adacd_hil.settings.configuration import Settings, builtin_names, load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import to_toml
@@ -357,13 +357,8 @@ def write_tuning(tuning: Tuning, out_dir: Path) -> tuple[Path, ...]:
     drawings = [draw_roc(tuning)]
     if tuning.candidates[0].choice.chosen.contacts:
         drawings.append(draw_delays(tuning))
-    contents = {"tune.json": (json.dumps(tuning.as_json(), indent=2, allow_nan=False) + "\n").encode()}
+    contents: dict[str, bytes | str] = {"tune.json": json.dumps(tuning.as_json(), indent=2, allow_nan=False) + "\n"}
     for drawing in drawings:
-        contents |= {f"{drawing.name}.png": drawing.png(), f"{drawing.name}.svg": paper_svg(drawing).encode()}
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            replace_file(out_dir / name, content)
-    except OSError as error:
-        raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
-    return tuple(out_dir / name for name in contents)
+        contents |= {f"{drawing.name}.png": drawing.png(), f"{drawing.name}.svg": paper_svg(drawing)}
+    with failing_as(f"report in {out_dir} can't be written"):
+        return replace_files(out_dir, contents)

@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from adacd_hil.analysis.drawing import COLOURS, Drawing, note, style
 from adacd_hil.analysis.thresholds.false_alarms import DetectorCalibration, TooLittleMotionError, calibrate_detector
 from adacd_hil.analysis.thresholds.recorded_thresholds import BLOCK_S, Statistics
-from adacd_hil.file_access import replace_file
-from adacd_hil.log.log_files import LogError
+from adacd_hil.file_access import replace_files
+from adacd_hil.log.log_files import failing_as
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import detectors
 
@@ -253,16 +253,14 @@ def draw_comparison(comparison: Comparison) -> Drawing:
 def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
     """Write detectors.json, .png and .svg into a folder. Raises LogError when they can't be written."""
     drawing = draw_comparison(comparison)
-    paths = tuple(out_dir / f"{NAME}.{kind}" for kind in ("json", "png", "svg"))
     text = json.dumps(comparison.as_json(), indent=2, allow_nan=False) + "\n"
-    contents = (text.encode(), drawing.png(), paper_svg(drawing).encode())
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        for path, content in zip(paths, contents, strict=True):
-            replace_file(path, content)
-    except OSError as error:
-        raise LogError(f"report in {out_dir} can't be written: {error.strerror}") from None
-    return paths
+    contents: dict[str, bytes | str] = {
+        f"{NAME}.json": text,
+        f"{NAME}.png": drawing.png(),
+        f"{NAME}.svg": paper_svg(drawing),
+    }
+    with failing_as(f"report in {out_dir} can't be written"):
+        return replace_files(out_dir, contents)
 
 
 def paper_svg(drawing: Drawing) -> str:

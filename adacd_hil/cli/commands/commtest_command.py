@@ -25,8 +25,8 @@ from adacd_hil.device.arm_report import ArmReport
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
-from adacd_hil.file_access import replace_file
-from adacd_hil.log.log_files import LogError
+from adacd_hil.file_access import replace_files
+from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
@@ -174,13 +174,12 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
         timing=timing_tables(evidence),
         timing_figures=drawings,
     )
-    pictures = {HTML_NAME: page.encode()} | {f"{drawing.name}.png": drawing.png() for drawing in drawings}
-    try:
-        for name, data in pictures.items():
-            replace_file(out / name, data)
-    except OSError as error:
-        raise LogError(f"pictures in {out} can't be written: {error.strerror}") from None
-    return [out / name for name in pictures]
+    pictures: dict[str, bytes | str] = {
+        HTML_NAME: page,
+        **{f"{drawing.name}.png": drawing.png() for drawing in drawings},
+    }
+    with failing_as(f"pictures in {out} can't be written"):
+        return [*replace_files(out, pictures)]
 
 
 def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from adacd_hil.analysis.report.report_files import INDEX_NAME, IndexEntry, Report, count_text, index_page, write_report
 from adacd_hil.cli.output import CommandError, ExitCode, Progress
 from adacd_hil.file_access import replace_file
-from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, TimeWindow, log_in
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, TimeWindow, failing_as, log_in
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.terminal import one_line
 
@@ -91,11 +91,9 @@ def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWind
             progress(one_line(error))
             entries.append(IndexEntry(name.as_posix(), None, one_line(error)))
     index = Index(out / INDEX_NAME, tuple(entries))
-    try:
+    with failing_as(f"{index.path} can't be written"):
         out.mkdir(parents=True, exist_ok=True)  # as after no run could be reported
         replace_file(index.path, index_page(out, entries))
-    except OSError as error:
-        raise LogError(f"{index.path} can't be written: {error.strerror}") from error
     return index
 
 

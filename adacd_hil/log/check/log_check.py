@@ -27,6 +27,7 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
+    failing_as,
     find_parts,
     part_path,
     parts_of,
@@ -70,11 +71,8 @@ class FileFacts(NamedTuple):
 
 def check_file(path: Path) -> FileFacts:
     """Check a file by itself. Raises LogError when it can't be read."""
-    try:
-        with open_input(path) as file:
-            return _FileCheck(path.name, file).run()
-    except OSError as error:
-        raise LogError(f"log {path} can't be read: {error.strerror}") from None
+    with failing_as(f"log {path} can't be read"), open_input(path) as file:
+        return _FileCheck(path.name, file).run()
 
 
 class _FileCheck:

@@ -32,6 +32,7 @@ from adacd_hil.log.log_files import (
     SUMMARY_METADATA,
     LogError,
     TimeWindow,
+    failing_as,
     find_parts,
     part_path,
     parts_of,
@@ -83,16 +84,13 @@ class IntactLog:
                 yield item
 
     def _read(self, path: Path) -> Iterator[Attachment | Contents]:
-        try:
-            with open_input(path) as file:
-                _check_ends(path, file)
-                for item in scan(file):
-                    if isinstance(item, FileGap):
-                        raise _damaged(path, item.offset)
-                    if isinstance(item, RawRecord):
-                        yield from self._take(path, item)
-        except OSError as error:
-            raise LogError(f"log {path} can't be read: {error.strerror}") from None
+        with failing_as(f"log {path} can't be read"), open_input(path) as file:
+            _check_ends(path, file)
+            for item in scan(file):
+                if isinstance(item, FileGap):
+                    raise _damaged(path, item.offset)
+                if isinstance(item, RawRecord):
+                    yield from self._take(path, item)
 
     def _take(self, path: Path, record: RawRecord) -> Iterator[Attachment | Contents]:
         """Give what is in a record of the data section; the summary only repeats it."""

@@ -7,7 +7,6 @@ shared where they are equal.
 import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,15 @@ from numpy.typing import NDArray
 
 from adacd_hil.file_access import Replacement, open_input
 from adacd_hil.log.editing.log_info import read_info
-from adacd_hil.log.log_files import COPY_ENDINGS, PRODUCT, ROS_PROFILE, SUMMARY_METADATA, LogError, is_part_name
+from adacd_hil.log.log_files import (
+    COPY_ENDINGS,
+    PRODUCT,
+    ROS_PROFILE,
+    SUMMARY_METADATA,
+    LogError,
+    failing_as,
+    is_part_name,
+)
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end, read_header
@@ -107,9 +114,7 @@ class LogCopy:
     def __enter__(self) -> "LogCopy":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._target.discard()
 
 
@@ -184,11 +189,9 @@ class _CopyTarget:
             raise LogError(f"log {path} would be taken for a part of the log beside it; give another name")
         if path.is_file() and not path.is_symlink() and path.stat().st_size and not _is_copy(path):
             raise LogError(f"log {path} can't be created: what is there is no result of these commands")
-        try:
+        with failing_as(f"log {path} can't be created"):
             self._replacement = Replacement(path, is_log=_is_copy(path))
             self._file = self._replacement.beside.open("wb")
-        except OSError as error:
-            raise LogError(f"log {path} can't be created: {error.strerror}") from None
 
     def write(self, data: bytes, packets: int = 0) -> int:
         del packets

@@ -26,6 +26,7 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
+    failing_as,
     part_path,
     parts_of,
     summary_count,
@@ -101,13 +102,10 @@ def read_info(path: Path) -> LogInfo:
     is_mcap = False
     missing = [part for part in range(max(parts)) if part not in parts]
     for part in parts.values():
-        try:
-            with open_input(part) as file:
-                info.size_bytes += part.stat().st_size
-                is_mcap |= file.read(len(MAGIC)) == MAGIC
-                view.take(part, file)
-        except OSError as error:
-            raise LogError(f"log {part} can't be read: {error.strerror}") from None
+        with failing_as(f"log {part} can't be read"), open_input(part) as file:
+            info.size_bytes += part.stat().st_size
+            is_mcap |= file.read(len(MAGIC)) == MAGIC
+            view.take(part, file)
     if info.ending == CONTINUED:
         missing.append(max(parts) + 1)
     info.problems += [f"{part_path(path, part).name} is missing" for part in missing]

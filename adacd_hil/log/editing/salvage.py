@@ -18,7 +18,7 @@ from mcap.records import Attachment, Chunk, Metadata, Statistics
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
 from adacd_hil.log.mcap.mcap_records import (
     DEFINITIONS,
@@ -108,11 +108,8 @@ class Salvage:
         self._chunk: tuple[Contents, NDArray[np.void]] | None = None  # the latest one, and what its index must say
         self._data_end = RawRecord(0, Opcode.DATA_END, b"")
         self._left_out = 0  # messages for lack of what vouches for them, or of their channel
-        try:
-            with open_input(path) as file:
-                self._look_at_end(file)
-        except OSError as error:
-            raise LogError(f"log {path} can't be read: {error.strerror}") from None
+        with failing_as(f"log {path} can't be read"), open_input(path) as file:
+            self._look_at_end(file)
 
     def _look_at_end(self, file: IO[bytes]) -> None:
         """Take the summary where its CRC fits, and compare the CRC of the data section."""

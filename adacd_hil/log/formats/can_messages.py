@@ -28,7 +28,7 @@ from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import MOST_BYTES, Opening
 from adacd_hil.log.types.message_types import MAX_DATA
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
@@ -164,14 +164,12 @@ class PythonCanFrames:
         self.problem = ""
         self._path = path
         kind: Any = _BlfReader if path.suffix.lower() == ".blf" else MESSAGE_READERS[path.suffix.lower()]
-        try:
-            # Vendors' tools write their texts in the Windows of the country; frames are ASCII.
+        with failing_as(f"{path} can't be read"):
             binary = open_input(path)
+            # Vendors' tools write their texts in the Windows of the country; frames are ASCII.
             file: Any = (
                 io.TextIOWrapper(binary, encoding="latin-1") if issubclass(kind, TextIOMessageReader) else binary
             )
-        except OSError as error:
-            raise LogError(f"{path} can't be read: {error.strerror}") from None
         try:
             self._reader = kind(file)
             self._start_ns = _take_start(self._reader)

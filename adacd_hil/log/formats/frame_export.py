@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from adacd_hil.file_access import placing
 from adacd_hil.log.formats.can_messages import to_messages
 from adacd_hil.log.formats.frame_log import FrameSource, candump_channel, candump_line
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import failing_as
 from adacd_hil.wire.codec import Codec
 
 _MS_NS = 1_000_000
@@ -70,15 +70,16 @@ def export_frames(
     """
     losses: Counter[str] = Counter()
     count = 0
-    try:
-        with placing(path, _DATED_LINES.get(kind, 0)) as beside, closing(_open(kind, beside, has_direction)) as target:
-            for frames in pieces:
-                for what, is_lost in target.write(frames, source.channels, source.epoch_ns):
-                    losses[what] += int(np.count_nonzero(is_lost))
-                count += len(frames)
-                progress(count)
-    except OSError as error:
-        raise LogError(f"{path} can't be written: {error.strerror or error}") from None
+    with (
+        failing_as(f"{path} can't be written"),
+        placing(path, _DATED_LINES.get(kind, 0)) as beside,
+        closing(_open(kind, beside, has_direction)) as target,
+    ):
+        for frames in pieces:
+            for what, is_lost in target.write(frames, source.channels, source.epoch_ns):
+                losses[what] += int(np.count_nonzero(is_lost))
+            count += len(frames)
+            progress(count)
     return ExportSummary(count, tuple(f"{number} {what}" for what, number in losses.items() if number))
 
 

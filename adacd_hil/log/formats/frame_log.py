@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.formats.mcap_frames import McapFrames
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE, FrameLog
 from adacd_hil.remedies import install_command, nearest_name
 
@@ -90,10 +90,8 @@ class CandumpFrames:
         self.epoch_ns = 0
         self.problem = ""
         self._path = path
-        try:
+        with failing_as(f"{path} can't be read"):
             open_input(path).close()
-        except OSError as error:
-            raise LogError(f"{path} can't be read: {error.strerror}") from None
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Give the frames, (n,) of RECORDED_FRAME_DTYPE."""

@@ -32,6 +32,7 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
+    failing_as,
     parts_of,
 )
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS, LIBRARY
@@ -104,15 +105,13 @@ class McapFrames:
         self._sources: dict[int, _Source | None] = {}
         self._files = list(parts_of(source).values()) if isinstance(source, Path) else [source]
         first = self._files[0]
-        try:
+        with failing_as(f"log {source} can't be read"):
             if isinstance(first, Path):
                 with open_input(first) as file:
                     _check_magic(file, str(first))
             else:
                 _check_magic(first, "the file")
                 first.seek(0)
-        except OSError as error:
-            raise LogError(f"log {source} can't be read: {error.strerror or error}") from None
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Give the frames of each chunk, (n,) of RECORDED_FRAME_DTYPE."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.file_access import is_anothers, open_input, replacing
 from adacd_hil.log.formats.frame_log import open_frames
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import ChunkError, Opening, read_contents
 from adacd_hil.log.mcap.mcap_records import MAGIC, RawRecord, parse, scan
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
@@ -104,15 +104,13 @@ class Tables:
         self._files = ExitStack()
         if kind == "parquet":
             _import_pyarrow()
-        try:
+        with failing_as(f"{folder} can't be made a folder"):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise LogError(f"{folder} can't be made a folder: {error.strerror}") from None
 
     def write(self, topic: str, columns: Columns) -> None:
         """Add rows to the table of a topic; none make an empty table. Raises LogError."""
         path = self._paths.get(topic) or self._path(topic)
-        try:
+        with failing_as(f"{path} can't be written"):
             if topic not in self._tables:
                 if is_anothers(path, _HEADS[self._kind]):  # as a recording may be, which is CSV, too
                     raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
@@ -123,8 +121,6 @@ class Tables:
                 self._tables[topic].write(columns)
             elif len(columns["t_ns"]):
                 self._tables[topic].write(columns)
-        except OSError as error:
-            raise LogError(f"{path} can't be written: {error.strerror or error}") from None
         self.rows[path] += len(columns["t_ns"])
 
     def _path(self, topic: str) -> Path:
@@ -142,10 +138,8 @@ class Tables:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         """End all files, or remove them after an error. Raises LogError."""
-        try:
+        with failing_as(f"{self._folder} can't be written"):
             self._files.__exit__(kind, value, trace)
-        except OSError as error:
-            raise LogError(f"{self._folder} can't be written: {error.strerror or error}") from None
 
 
 class _Csv:
@@ -292,10 +286,8 @@ def _export_frames(
 def _topics(path: Path) -> list[str]:
     """List the topics that the first chunk of an MCAP file defines. Raises LogError when it is none."""
     topics: list[str] = []
-    try:
+    with failing_as(f"log {path} can't be read"):
         file = open_input(path)
-    except OSError as error:
-        raise LogError(f"log {path} can't be read: {error.strerror}") from None
     with file:
         if file.read(len(MAGIC)) != MAGIC:
             raise LogError(f"{path} is not an MCAP file")

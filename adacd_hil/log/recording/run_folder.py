@@ -7,7 +7,7 @@ import itertools
 from pathlib import Path
 
 from adacd_hil.file_access import InUseError, check_unused
-from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
+from adacd_hil.log.log_files import LogError, LogExistsError, failing_as, find_parts
 
 _FAILED_NAME = "failed-start-{}.mcap"
 
@@ -25,10 +25,8 @@ def make_room(path: Path) -> None:
         return
     names = (path.with_name(_FAILED_NAME.format(number)) for number in itertools.count(1))
     aside = next(name for name in names if not is_there(name))
-    try:
+    with failing_as(f"log {path} of a start that failed can't become {aside.name}"):
         path.rename(aside)
-    except OSError as error:
-        raise LogError(f"log {path} of a start that failed can't become {aside.name}: {error.strerror}") from None
 
 
 def is_taken(path: Path) -> bool:
